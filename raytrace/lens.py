@@ -1,0 +1,77 @@
+"""Lens: surfaces, stop, aperture, fields and wavelengths, as one value."""
+
+import torch
+from torch import Tensor
+
+from raytrace.surface import Surface
+from raytrace.value import value
+
+#: Units of a field point by the kind of field.
+FIELD_UNITS = {
+    "angle": "degrees",
+    "object_height": "mm",
+    "paraxial_image_height": "mm",
+    "real_image_height": "mm",
+}
+
+#: What the number of a system aperture means.
+APERTURE_KINDS = {
+    "entrance_pupil_diameter": "mm",
+    "image_f_number": "EFL / entrance pupil diameter",
+    "working_f_number": "paraxial working F/#",
+    "object_na": "n sin θ of the marginal ray at the object",
+    "object_cone_angle": "degrees, half angle of the marginal ray at the object",
+    "float_by_stop": "mm, semi-diameter of the stop",
+}
+
+
+@value
+class SystemAperture:
+    """The size of the beam: a kind of APERTURE_KINDS and its number."""
+
+    kind: str
+    value: Tensor
+
+
+@value
+class Fields:
+    """Field points of one kind (a key of FIELD_UNITS), their weights and vignetting factors.
+
+    x, y, weight: (F,) in degrees or mm.
+    vignetting: (5, F): decentre VDX, VDY, compression VCX, VCY (pupil fractions) and angle VAN (degrees), or None.
+    telecentric: chief rays parallel to the axis in object space.
+    """
+
+    kind: str
+    x: Tensor
+    y: Tensor
+    weight: Tensor
+    vignetting: Tensor | None = None
+    telecentric: bool = False
+
+
+@value
+class Lens:
+    """A sequential lens in mm and µm. `lens.surfaces[k]` is surface k of the file: 0 the object, the last the image.
+
+    surfaces: tuple of Surface; surfaces[0].thickness is the object distance (inf allowed), surfaces[-2].thickness
+        the sensor distance.
+    stop: number of the stop surface.
+    aperture, fields: SystemAperture, Fields.
+    wavelengths: (W,) µm; wavelength_weights: (W,); primary_wavelength: 0-based position in `wavelengths`.
+    name, notes: title and comment lines of the file.
+    catalogs: glass catalogs in the order of the file.
+    ray_aiming: True if the file asks for rays aimed at the real stop.
+    """
+
+    surfaces: tuple[Surface, ...]
+    stop: int
+    aperture: SystemAperture
+    fields: Fields
+    wavelengths: Tensor
+    wavelength_weights: Tensor
+    primary_wavelength: int = 0
+    name: str = ""
+    notes: tuple[str, ...] = ()
+    catalogs: tuple[str, ...] = ()
+    ray_aiming: bool = False

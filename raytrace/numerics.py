@@ -1,0 +1,45 @@
+"""Arithmetic whose value and gradient stay finite: every argument is made safe *before* the operation."""
+
+import torch
+from torch import Tensor
+
+
+def safe_sqrt(x: Tensor) -> Tensor:
+    """√x where x > 0, else 0 with gradient 0 (a plain `where` after `sqrt` would leave a NaN gradient)."""
+    positive = x > 0
+    return torch.where(positive, torch.sqrt(torch.where(positive, x, 1.0)), 0.0)
+
+
+def safe_divide(numerator: Tensor, denominator: Tensor) -> Tensor:
+    """numerator/denominator where the denominator is not 0, else 0 with gradient 0."""
+    nonzero = denominator != 0
+    return torch.where(nonzero, numerator / torch.where(nonzero, denominator, 1.0), 0.0)
+
+
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """Scalar product over the leading axis of length 3.
+
+    Written out, not summed over an axis: a reduction may associate differently in batches of different shape, and
+    results must not depend on how rays are batched.
+    """
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def unit(vector: Tensor) -> Tensor:
+    """vector/|vector| over the leading axis of length 3; scaled first, so that 1e-200 and 1e200 keep their direction.
+
+    A zero or non-finite vector comes back as NaN-free zeros, which callers flag by `norm == 0`.
+    """
+    largest = vector.detach().abs().amax(0)
+    usable = (largest > 0) & torch.isfinite(largest)
+    scaled = torch.where(usable, vector, 0.0) / torch.where(usable, largest, 1.0)
+    norm = torch.sqrt(torch.where(usable, dot(scaled, scaled), 1.0))
+    return scaled / norm
+
+
+def polynomial(coefficients: Tensor, x: Tensor) -> Tensor:
+    """Σ_j coefficients[j]·x^j by Horner's rule; `coefficients`: (m, ...), broadcast against `x`."""
+    total = torch.zeros_like(x)
+    for coefficient in reversed(coefficients.unbind(0)):
+        total = total * x + coefficient
+    return total
