@@ -1,9 +1,57 @@
-"""Glass: dispersion formulas and the media that use them.  (SKELETON: the glass helper owns and completes this file.)"""
+"""Glass: dispersion formulas, the media that use them, and the door where a wavelength is refused.
+
+Two ways to an index, on purpose:
+
+* `refractive_index(glass, wavelength)` is pure mathematics, for use inside `torch.func`, `torch.compile` and
+  optimisation. Where the formula has no real index (n² ≤ 0, a pole, a wavelength that is no length) it returns 0 with
+  gradient 0, never NaN: 0 is the index of no medium and reads as the mask `index > 0`.
+* `check_wavelengths(glass, wavelengths)` is the door: it raises `InvalidIndex` there and warns `OutOfRange` where the
+  glass's coefficients were not fitted. `index(glass, wavelength)` is both in one call.
+
+The thirteen formulas are those of the AGF glass catalog format, numbered as there; wavelengths in µm, indices relative
+to air at the catalog's reference temperature.
+"""
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
 
+from raytrace.numerics import safe_divide, safe_sqrt
 from raytrace.value import value
+
+#: Spectral lines, µm (ISO 7944 and the neighbours that catalogs list).
+LINES = {
+    "i": 0.3650146,
+    "h": 0.4046561,
+    "g": 0.4358343,
+    "F'": 0.4799914,
+    "F": 0.4861327,
+    "e": 0.5460740,
+    "d": 0.5875618,
+    "D": 0.5892938,
+    "C'": 0.6438469,
+    "C": 0.6562725,
+    "r": 0.7065188,
+    "s": 0.8521100,
+    "t": 1.0139800,
+}
+
+#: Wavelengths, µm, outside which no formula is evaluated: powers down to λ⁻¹² and their derivatives stay finite inside.
+_SHORTEST, _LONGEST = 1e-20, 1e12
+#: Relative slack at the ends of a wavelength range: a few float32 spacings.
+_RANGE_SLACK = 1e-6
+
+
+class InvalidIndex(ValueError):
+    """A glass has no real, positive refractive index at a wavelength asked of it."""
+
+
+class OutOfRange(UserWarning):
+    """A wavelength lies outside the range that the coefficients of a glass were fitted to."""
 
 
 @value
@@ -12,9 +60,15 @@ class Glass:
 
     name: as written in the lens file, "" for air.
     formula: key of FORMULAS ("constant", "model", "schott", "sellmeier_1", ...), or "mirror".
-    coefficients: (m, ...) of the formula, float64.
+    coefficients: (m, ...) of the formula, float64; trailing axes broadcast against the wavelength.
     catalog: name of the catalog the glass came from, "" if none.
     wavelength_range: µm (shortest, longest) or None.
+    status: "standard", "preferred", "obsolete", "special", "melt", or "" if not listed.
+    nd_listed, abbe_listed: n_d and V_d as the catalog lists them (rounded by its maker), None if it does not.
+    alternatives: names of present-day glasses of the same catalog that come near, as the catalog comments say.
+    listed_name: the catalog's own spelling of the name.
+    comment: the catalog's comment on the glass.
+    records: further figures of the catalog, (keyword, numbers) in file order: ED, TD, MD, OD, IT.
     """
 
     name: str
@@ -22,11 +76,346 @@ class Glass:
     coefficients: Tensor
     catalog: str = ""
     wavelength_range: tuple[float, float] | None = None
+    status: str = ""
+    nd_listed: float | None = None
+    abbe_listed: float | None = None
+    alternatives: tuple[str, ...] = ()
+    listed_name: str = ""
+    comment: str = ""
+    records: tuple[tuple[str, tuple[float, ...]], ...] = ()
+
+
+# -- the formulas: (coefficients (m, ...), wavelength (...) µm) -> n, 0 where there is no real index -------------------
+
+
+def _gap(wavelength: Tensor, pole: Tensor | float) -> tuple[Tensor, Tensor]:
+    """λ² - pole to the last digit, also next to the pole, and where it is 0; there the gap is 1 to divide safely.
+
+    λ² is rounded by up to half a unit in the last place, which near a pole is most of the difference. The rounding
+    error is recovered exactly (Dekker, Numer. Math. 18, 224 (1971)); it is a constant to every derivative.
+    """
+    square = wavelength * wavelength
+    exact = wavelength.detach()
+    split = 134217729.0 * exact  # 2²⁷ + 1: halves the 53 bits
+    high = split - (split - exact)
+    low = exact - high
+    rounding = ((high * high - square.detach()) + 2.0 * high * low) + low * low
+    gap = (square - pole) + rounding
+    at_pole = gap == 0
+    return torch.where(at_pole, 1.0, gap), at_pole
+
+
+def _resonance(wavelength: Tensor, pole: Tensor) -> tuple[Tensor, Tensor]:
+    """λ²/(λ² - pole), and where that is infinite (there it is λ²).
+
+    Far above the pole it is evaluated as 1 + pole/(λ² - pole): its slope is then one term, where the quotient's is the
+    difference of two that cancel (3,500 units in the last place at 1 mm in a glass).
+    """
+    square = wavelength * wavelength
+    gap, at_pole = _gap(wavelength, pole)
+    return torch.where(square > 2.0 * torch.abs(pole), 1.0 + pole / gap, square / gap), at_pole
+
+
+def _sellmeier(coefficients: Tensor, wavelength: Tensor) -> Tensor:
+    """n² = 1 + Σ_i K_i λ²/(λ² - L_i); coefficients K_1, L_1, K_2, L_2, … (formulas Sellmeier 1, 3 and 5)."""
+    n_squared, impossible = torch.ones_like(wavelength), torch.zeros_like(wavelength, dtype=torch.bool)
+    for strength, pole in zip(coefficients[0::2].unbind(0), coefficients[1::2].unbind(0), strict=True):
+        resonance, at_pole = _resonance(wavelength, pole)
+        n_squared = n_squared + strength * resonance
+        impossible = impossible | (at_pole & (strength != 0))
+    return safe_sqrt(torch.where(impossible, 0.0, n_squared))
+
+
+def _laurent(rising: Sequence[int], falling: Sequence[int], coefficients: Tensor, wavelength: Tensor) -> Tensor:
+    """n² = Σ_j a_rising[j] λ^(2j) + Σ_j a_falling[j] λ^(-2j-2): the power-series formulas, each by Horner's rule."""
+    square = wavelength * wavelength
+    upper = lower = torch.zeros_like(wavelength)
+    for j in reversed(rising):
+        upper = upper * square + coefficients[j]
+    for j in reversed(falling):
+        lower = (lower + coefficients[j]) / square
+    return safe_sqrt(upper + lower)
+
+
+def _herzberger(coefficients: Tensor, wavelength: Tensor) -> Tensor:
+    """n = A + B L + C L² + D λ² + E λ⁴ + F λ⁶ with L = 1/(λ² - 0.028)."""
+    gap, at_pole = _gap(wavelength, 0.028)
+    a, b, c, d, e, f = coefficients[:6].unbind(0)
+    square = wavelength * wavelength
+    n = a + (b + c / gap) / gap + square * (d + square * (e + square * f))
+    return torch.where(at_pole, 0.0, n)
+
+
+def _sellmeier_2(coefficients: Tensor, wavelength: Tensor) -> Tensor:
+    """n² = 1 + A + B1 λ²/(λ² - λ1²) + B2/(λ² - λ2²); coefficients A, B1, λ1, B2, λ2."""
+    a, b1, pole1, b2, pole2 = coefficients[:5].unbind(0)
+    resonance, at_pole1 = _resonance(wavelength, pole1 * pole1)
+    gap, at_pole2 = _gap(wavelength, pole2 * pole2)
+    impossible = (at_pole1 & (b1 != 0)) | (at_pole2 & (b2 != 0))
+    return safe_sqrt(torch.where(impossible, 0.0, 1.0 + a + b1 * resonance + b2 / gap))
+
+
+def _conrady(coefficients: Tensor, wavelength: Tensor) -> Tensor:
+    """n = n0 + A/λ + B/λ^3.5."""
+    n0, a, b = coefficients[:3].unbind(0)
+    return n0 + a / wavelength + b * wavelength**-3.5
+
+
+def _handbook_1(coefficients: Tensor, wavelength: Tensor) -> Tensor:
+    """n² = A + B/(λ² - C) - D λ²."""
+    a, b, c, d = coefficients[:4].unbind(0)
+    gap, at_pole = _gap(wavelength, c)
+    n_squared = a + b / gap - d * wavelength * wavelength
+    return safe_sqrt(torch.where(at_pole & (b != 0), 0.0, n_squared))
+
+
+def _handbook_2(coefficients: Tensor, wavelength: Tensor) -> Tensor:
+    """n² = A + B λ²/(λ² - C) - D λ²."""
+    a, b, c, d = coefficients[:4].unbind(0)
+    resonance, at_pole = _resonance(wavelength, c)
+    n_squared = a + b * resonance - d * wavelength * wavelength
+    return safe_sqrt(torch.where(at_pole & (b != 0), 0.0, n_squared))
+
+
+def _sellmeier_4(coefficients: Tensor, wavelength: Tensor) -> Tensor:
+    """n² = A + B λ²/(λ² - C) + D λ²/(λ² - E)."""
+    a, b, c, d, e = coefficients[:5].unbind(0)
+    (first, at_pole1), (second, at_pole2) = _resonance(wavelength, c), _resonance(wavelength, e)
+    impossible = (at_pole1 & (b != 0)) | (at_pole2 & (d != 0))
+    return safe_sqrt(torch.where(impossible, 0.0, a + b * first + d * second))
+
+
+def _constant(coefficients: Tensor, wavelength: Tensor) -> Tensor:
+    """n at every wavelength."""
+    return coefficients[0].expand(torch.broadcast_shapes(coefficients[0].shape, wavelength.shape))
+
+
+#: The lines of the model-glass fit, µm, rounded as the programs that wrote the files round them.
+_D, _F, _C, _G = 0.5876, 0.4861, 0.6563, 0.4358
+
+
+def _model(coefficients: Tensor, wavelength: Tensor) -> Tensor:
+    """A glass by n_d, V_d and ΔP_gF: n = A + B/λ + C/λ^3.5 (Conrady) through
+
+        n(d) = n_d,  n(F) - n(C) = Δ = (n_d - 1)/V_d,  n(g) - n(F) = P_gF Δ,  P_gF = 0.6438 - 0.001682 V_d + ΔP_gF.
+
+    The 2×2 system for B and C is solved in closed form. V_d = 0 means a constant index, as in lens files.
+    """
+    nd, vd, dpgf = coefficients[:3].unbind(0)
+    first_fc, first_gf = 1 / _F - 1 / _C, 1 / _G - 1 / _F
+    power_fc, power_gf = _F**-3.5 - _C**-3.5, _G**-3.5 - _F**-3.5
+    determinant = first_fc * power_gf - first_gf * power_fc
+    dispersion = safe_divide(nd - 1.0, vd)
+    partial_dispersion = (0.6438 - 0.001682 * vd + dpgf) * dispersion
+    b = (power_gf * dispersion - power_fc * partial_dispersion) / determinant
+    c = (first_fc * partial_dispersion - first_gf * dispersion) / determinant
+    return nd + b * (1.0 / wavelength - 1 / _D) + c * (wavelength**-3.5 - _D**-3.5)
+
+
+#: Number in an AGF file -> key of FORMULAS.
+AGF_FORMULAS = {
+    1: "schott",
+    2: "sellmeier_1",
+    3: "herzberger",
+    4: "sellmeier_2",
+    5: "conrady",
+    6: "sellmeier_3",
+    7: "handbook_1",
+    8: "handbook_2",
+    9: "sellmeier_4",
+    10: "extended",
+    11: "sellmeier_5",
+    12: "extended_2",
+    13: "extended_3",
+}
+
+#: Key -> function of (coefficients (m, ...), wavelength (...) µm), float64, giving n.
+FORMULAS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    # n² = a0 + a1 λ² + a2 λ⁻² + a3 λ⁻⁴ + a4 λ⁻⁶ + a5 λ⁻⁸
+    "schott": partial(_laurent, (0, 1), (2, 3, 4, 5)),
+    "sellmeier_1": _sellmeier,
+    "herzberger": _herzberger,
+    "sellmeier_2": _sellmeier_2,
+    "conrady": _conrady,
+    "sellmeier_3": _sellmeier,
+    "handbook_1": _handbook_1,
+    "handbook_2": _handbook_2,
+    "sellmeier_4": _sellmeier_4,
+    # the Schott formula continued by a6 λ⁻¹⁰ + a7 λ⁻¹²
+    "extended": partial(_laurent, (0, 1), (2, 3, 4, 5, 6, 7)),
+    "sellmeier_5": _sellmeier,
+    # the Schott formula continued by a6 λ⁴ + a7 λ⁶
+    "extended_2": partial(_laurent, (0, 1, 6, 7), (2, 3, 4, 5)),
+    # n² = a0 + a1 λ² + a2 λ⁴ + a3 λ⁻² + … + a8 λ⁻¹²
+    "extended_3": partial(_laurent, (0, 1, 2), (3, 4, 5, 6, 7, 8)),
+    "constant": _constant,
+    "model": _model,
+}
+
+#: Number of coefficients of each formula.
+COEFFICIENT_COUNTS = {
+    "schott": 6,
+    "sellmeier_1": 6,
+    "herzberger": 6,
+    "sellmeier_2": 5,
+    "conrady": 3,
+    "sellmeier_3": 8,
+    "handbook_1": 4,
+    "handbook_2": 4,
+    "sellmeier_4": 5,
+    "extended": 8,
+    "sellmeier_5": 10,
+    "extended_2": 8,
+    "extended_3": 9,
+    "constant": 1,
+    "model": 3,
+}
+
+
+# -- the index --------------------------------------------------------------------------------------------------------
+
+
+def refractive_index(glass: Glass, wavelength: Tensor) -> Tensor:
+    """n of a glass, evaluated in float64; 0 with gradient 0 where the formula has no real, positive index.
+
+    wavelength: (...) µm; returns (...), broadcast with the trailing axes of the coefficients, in the dtype and on the
+    device of `wavelength`. No check, no warning, no host synchronisation: see the module's docstring.
+    Raises InvalidIndex for MIRROR, which has no index: light stays in the medium before it.
+    """
+    if glass.formula == "mirror":
+        raise InvalidIndex("a mirror has no refractive index: the light stays in the medium before it")
+    exact = wavelength.to(torch.float64)
+    coefficients = glass.coefficients.to(device=wavelength.device, dtype=torch.float64)
+    meaningful = (exact > _SHORTEST) & (exact < _LONGEST)
+    finite = torch.isfinite(coefficients)
+    n = FORMULAS[glass.formula](torch.where(finite, coefficients, 0.0), torch.where(meaningful, exact, 1.0))
+    usable = meaningful & finite.all(0) & torch.isfinite(n) & (n > 0)
+    return torch.where(usable, n, 0.0).to(wavelength.dtype)
+
+
+def check_wavelengths(glass: Glass, wavelengths: Tensor | Sequence[float] | float, *, where: str = "") -> None:
+    """Refuse wavelengths (µm) at which a glass has no index; warn of those outside its range.
+
+    where: the place to name in the message ("lens.zmx:31, surface 2"). Raises InvalidIndex; warns OutOfRange.
+    """
+    if glass.formula == "mirror":
+        return
+    wavelengths = _as_wavelength(wavelengths).detach()
+    place = f"{where}: " if where else ""
+    name = f"{glass.name or 'medium'} ({glass.catalog})" if glass.catalog else glass.name or "medium"
+    span = glass.wavelength_range
+    fitted = f"its coefficients hold from {span[0]:g} to {span[1]:g} µm" if span else "it lists no wavelength range"
+    n = refractive_index(glass, wavelengths).detach()
+    missing = wavelengths.expand(n.shape)[~(n > 0)]
+    if missing.numel():
+        raise InvalidIndex(
+            f"{place}{name} has no real refractive index at {_spell(missing)} µm (formula {glass.formula}: "
+            f"n² ≤ 0, a pole, or not a wavelength); {fitted}. Check the wavelength, in µm, or choose another glass"
+        )
+    if span:
+        shortest, longest = span[0] * (1 - _RANGE_SLACK), span[1] * (1 + _RANGE_SLACK)
+        outside = wavelengths[(wavelengths < shortest) | (wavelengths > longest)]
+        if outside.numel():
+            message = f"{place}{name} is extrapolated to {_spell(outside)} µm; {fitted}"
+            warnings.warn(message, OutOfRange, stacklevel=2)
+
+
+def index(glass: Glass, wavelength: Tensor | float) -> Tensor:
+    """n of a glass at wavelengths (...) µm, checked: raises InvalidIndex, warns OutOfRange (`check_wavelengths`)."""
+    wavelength = _as_wavelength(wavelength)
+    check_wavelengths(glass, wavelength)
+    return refractive_index(glass, wavelength)
+
+
+def _as_wavelength(wavelength: Tensor | Sequence[float] | float) -> Tensor:
+    if isinstance(wavelength, Tensor) and wavelength.is_floating_point():
+        return wavelength
+    return torch.as_tensor(wavelength, dtype=torch.float64)
+
+
+def _spell(wavelengths: Tensor) -> str:
+    listed = list(dict.fromkeys(f"{number:.7g}" for number in wavelengths.flatten().tolist()))
+    return ", ".join(listed[:5]) + (f" and {len(listed) - 5} more" if len(listed) > 5 else "")
+
+
+def _at_lines(glass: Glass, lines: str) -> tuple[Tensor, ...]:
+    device = glass.coefficients.device
+    return tuple(
+        refractive_index(glass, torch.tensor(LINES[line], dtype=torch.float64, device=device)) for line in lines
+    )
+
+
+def nd(glass: Glass) -> Tensor:
+    """n at the helium d line (0.5875618 µm), by the formula also where that lies outside the glass's range."""
+    return _at_lines(glass, "d")[0]
+
+
+def abbe_number(glass: Glass) -> Tensor:
+    """V_d = (n_d - 1)/(n_F - n_C); 0 for a medium without dispersion, as lens files write it."""
+    d, blue, red = _at_lines(glass, "dFC")
+    return safe_divide(d - 1.0, blue - red)
+
+
+# -- media ------------------------------------------------------------------------------------------------------------
 
 
 def constant(index: float | Tensor, name: str = "") -> Glass:
     """A medium of one refractive index at every wavelength."""
     return Glass(name, "constant", torch.as_tensor(index, dtype=torch.float64).reshape(1))
+
+
+def sellmeier(strengths: Tensor | Sequence[float], poles: Tensor | Sequence[float], name: str = "", **known) -> Glass:
+    """The glass n² = 1 + Σ_i B_i λ²/(λ² - C_i): strengths B_i and poles C_i (µm²), (m, ...) with m ≤ 5.
+
+    known: further fields of Glass, such as `wavelength_range`.
+    """
+    b, c = (torch.as_tensor(part, dtype=torch.float64) for part in (strengths, poles))
+    terms = next((terms for terms in (3, 4, 5) if terms >= b.shape[0]), None)
+    if b.shape[:1] != c.shape[:1] or terms is None:
+        raise ValueError(f"expected as many strengths as poles and at most 5, found {b.shape[0]} and {c.shape[0]}")
+    b, c = torch.broadcast_tensors(b, c)
+    pairs = torch.stack([b, c], 1).flatten(0, 1)
+    padding = pairs.new_zeros(2 * terms - pairs.shape[0], *pairs.shape[1:])
+    return Glass(
+        name, {3: "sellmeier_1", 4: "sellmeier_3", 5: "sellmeier_5"}[terms], torch.cat([pairs, padding]), **known
+    )
+
+
+def model_glass(nd: float | Tensor, vd: float | Tensor, dpgf: float | Tensor = 0.0, *, name: str = "") -> Glass:
+    """The medium of index n_d, Abbe number V_d and deviation ΔP_gF from the normal line (`FORMULAS["model"]`).
+
+    Differentiable in all three. V_d = 0 is a constant index. Raises ValueError where a number is not finite or nd ≤ 0.
+    """
+    numbers = torch.broadcast_tensors(*(torch.as_tensor(part, dtype=torch.float64) for part in (nd, vd, dpgf)))
+    coefficients = torch.stack(numbers)
+    if not (torch.isfinite(coefficients).all() and (numbers[0] > 0).all() and (numbers[1] >= 0).all()):
+        raise ValueError(f"a model glass needs finite nd > 0, Vd ≥ 0 and ΔPgF; found {nd}, {vd}, {dpgf}")
+    return Glass(name, "model", coefficients)
+
+
+def mil_glass(code: str) -> Glass:
+    """The model glass of a six-digit code: "517642" is n_d = 1.517, V_d = 64.2.
+
+    The code holds three decimals of n_d - 1, so an index of 2 or more cannot be written (003283 reads 1.003).
+    Raises ValueError for anything but six digits.
+    """
+    if len(code) != 6 or not (code.isascii() and code.isdigit()):
+        raise ValueError(f"a MIL glass code is six digits, as 517642 for nd = 1.517 and Vd = 64.2; found {code!r}")
+    return model_glass(float(f"1.{code[:3]}"), float(f"{code[3:5]}.{code[5]}"), name=code)
+
+
+def normal_line_deviation(glass: Glass) -> Tensor:
+    """ΔP_gF = (n_g - n_F)/(n_F - n_C) - 0.6438 + 0.001682 V_d, the number a model glass takes; 0 without dispersion."""
+    violet, blue, red = _at_lines(glass, "gFC")
+    normal = 0.6438 - 0.001682 * abbe_number(glass)
+    return torch.where(blue == red, 0.0, safe_divide(violet - blue, blue - red) - normal)
+
+
+def listing_error(glass: Glass) -> tuple[float, float]:
+    """How far n_d and V_d by the coefficients lie from the listed ones; (nan, nan) where the catalog lists none."""
+    if glass.nd_listed is None or glass.abbe_listed is None:
+        return math.nan, math.nan
+    return float(nd(glass)) - glass.nd_listed, float(abbe_number(glass)) - glass.abbe_listed
 
 
 AIR = constant(1.0)
