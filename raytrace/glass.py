@@ -212,23 +212,6 @@ def _model(coefficients: Tensor, wavelength: Tensor) -> Tensor:
     return nd + b * (1.0 / wavelength - 1 / _D) + c * (wavelength**-3.5 - _D**-3.5)
 
 
-#: Number in an AGF file -> key of FORMULAS.
-AGF_FORMULAS = {
-    1: "schott",
-    2: "sellmeier_1",
-    3: "herzberger",
-    4: "sellmeier_2",
-    5: "conrady",
-    6: "sellmeier_3",
-    7: "handbook_1",
-    8: "handbook_2",
-    9: "sellmeier_4",
-    10: "extended",
-    11: "sellmeier_5",
-    12: "extended_2",
-    13: "extended_3",
-}
-
 #: Key -> function of (coefficients (m, ...), wavelength (...) µm), float64, giving n.
 FORMULAS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     # n² = a0 + a1 λ² + a2 λ⁻² + a3 λ⁻⁴ + a4 λ⁻⁶ + a5 λ⁻⁸
@@ -252,24 +235,11 @@ FORMULAS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "model": _model,
 }
 
-#: Number of coefficients of each formula.
-COEFFICIENT_COUNTS = {
-    "schott": 6,
-    "sellmeier_1": 6,
-    "herzberger": 6,
-    "sellmeier_2": 5,
-    "conrady": 3,
-    "sellmeier_3": 8,
-    "handbook_1": 4,
-    "handbook_2": 4,
-    "sellmeier_4": 5,
-    "extended": 8,
-    "sellmeier_5": 10,
-    "extended_2": 8,
-    "extended_3": 9,
-    "constant": 1,
-    "model": 3,
-}
+#: Number in an AGF file -> key of FORMULAS, which begins with the thirteen in that order.
+AGF_FORMULAS = dict(zip(range(1, 14), FORMULAS, strict=False))
+
+#: Number of coefficients of each formula, in the order of FORMULAS.
+COEFFICIENT_COUNTS = dict(zip(FORMULAS, (6, 6, 6, 5, 3, 8, 4, 4, 5, 8, 10, 8, 9, 1, 3), strict=True))
 
 
 # -- the index --------------------------------------------------------------------------------------------------------
