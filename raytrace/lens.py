@@ -1,5 +1,7 @@
 """Lens: surfaces, stop, aperture, fields and wavelengths, as one value."""
 
+import dataclasses
+
 import torch
 from torch import Tensor
 
@@ -75,3 +77,20 @@ class Lens:
     notes: tuple[str, ...] = ()
     catalogs: tuple[str, ...] = ()
     ray_aiming: bool = False
+
+
+def with_object_distance(lens: Lens, object_distance: Tensor) -> Lens:
+    """The lens with its object at another distance, mm from surface 1; inf allowed."""
+    return _with_thickness(lens, 0, object_distance)
+
+
+def with_sensor_distance(lens: Lens, sensor_distance: Tensor) -> Lens:
+    """The lens with its sensor at another distance, mm from the last surface before the image."""
+    return _with_thickness(lens, len(lens.surfaces) - 2, sensor_distance)
+
+
+def _with_thickness(lens: Lens, number: int, thickness: Tensor) -> Lens:
+    surfaces = list(lens.surfaces)
+    thickness = torch.as_tensor(thickness, dtype=surfaces[number].thickness.dtype, device=lens.wavelengths.device)
+    surfaces[number] = dataclasses.replace(surfaces[number], thickness=thickness)
+    return dataclasses.replace(lens, surfaces=tuple(surfaces))

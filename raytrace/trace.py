@@ -179,7 +179,7 @@ def start(position: Tensor, direction: Tensor, opl: Tensor | None = None) -> Ray
 
 
 def axial_path(surfaces: Sequence[Surface], indices: Sequence[Tensor], side: int = 1) -> Tensor:
-    """Σ n T σ (...) in mm of the axial ray from the first to the last vertex: add it to `Rays.opl` for the full path."""
+    """Σ n T σ (...) in mm of the axial ray, first to last vertex: add it to `Rays.opl` for the full path."""
     total = torch.zeros_like(indices[0])
     for surface, n in zip(surfaces[:-1], indices[1:-1], strict=True):
         side = -side if surface.is_mirror else side

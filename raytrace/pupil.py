@@ -1,0 +1,103 @@
+"""Points and weights on the unit disc. Every rule returns points (2, P) and weights (P,) that sum to 1.
+
+The weights integrate over the area of the disc: Σ w f(x, y) ≈ (1/π) ∬ f dx dy.
+"""
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+def gauss_rings(
+    rings: int = 6, arms: int | None = None, *, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+) -> tuple[Tensor, Tensor]:
+    """Gaussian quadrature in r², equal angles: exact for polynomials up to degree 4·rings - 2 (Forbes, JOSA A 5, 1988).
+
+    arms: angles per ring, 4·rings by default (exact for as many azimuthal harmonics); the first lies half a step off
+    the x axis, so that the pattern is symmetric in x and in y.
+    """
+    arms = 4 * rings if arms is None else arms
+    nodes, weights = np.polynomial.legendre.leggauss(rings)
+    radius = np.sqrt(0.5 * (nodes + 1))
+    angle = (np.arange(arms) + 0.5) * (2 * math.pi / arms)
+    points = np.stack([np.outer(radius, np.cos(angle)).ravel(), np.outer(radius, np.sin(angle)).ravel()])
+    return _tensors(points, np.repeat(0.5 * weights / arms, arms), dtype, device)
+
+
+def hexapolar(
+    rings: int = 6, *, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+) -> tuple[Tensor, Tensor]:
+    """The centre and `rings` rings of 6, 12, 18, … points at radii j/rings; each ring carries its share of the area."""
+    points, weights = [np.zeros((2, 1))], [np.array([0.25])]
+    for ring in range(1, rings + 1):
+        angle = np.arange(6 * ring) * (math.pi / 3 / ring)
+        points.append(ring / rings * np.stack([np.cos(angle), np.sin(angle)]))
+        outer = min(ring + 0.5, rings)  # annuli end half way between rings, the last at the edge; units of 1/rings
+        weights.append(np.full(6 * ring, (outer**2 - (ring - 0.5) ** 2) / (6 * ring)))
+    return _tensors(np.concatenate(points, axis=1), np.concatenate(weights) / rings**2, dtype, device)
+
+
+def square(
+    across: int = 16, *, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+) -> tuple[Tensor, Tensor]:
+    """Cell centres of an across × across grid over [-1, 1]² that lie inside the disc, equal weights."""
+    axis = (2 * np.arange(across) + 1 - across) / across
+    x, y = (grid.ravel() for grid in np.meshgrid(axis, axis))
+    kept = x * x + y * y <= 1
+    return _equal(np.stack([x[kept], y[kept]]), dtype, device)
+
+
+def sobol(
+    count: int = 256, *, seed: int = 0, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+) -> tuple[Tensor, Tensor]:
+    """Scrambled Sobol points mapped to the disc by r = √u, equal weights; the same points for the same seed."""
+    engine = torch.quasirandom.SobolEngine(2, scramble=True, seed=seed)
+    return _disc(engine.draw(count, dtype=torch.float64), dtype, device)
+
+
+def random(
+    count: int = 256,
+    *,
+    generator: torch.Generator | None = None,
+    seed: int = 0,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Independent uniform points of the disc, equal weights; drawn from `generator`, or from a new one of `seed`."""
+    generator = torch.Generator().manual_seed(seed) if generator is None else generator
+    return _disc(torch.rand(count, 2, generator=generator, dtype=torch.float64), dtype, device)
+
+
+def fan(
+    count: int = 21, axis: str = "y", *, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+) -> tuple[Tensor, Tensor]:
+    """`count` points from -1 to 1 along x or y, equal weights: for drawing, not for integrating."""
+    line = np.linspace(-1, 1, count) if count > 1 else np.zeros(1)
+    zero = np.zeros_like(line)
+    return _equal(np.stack([line, zero] if axis == "x" else [zero, line]), dtype, device)
+
+
+def _disc(uniform: Tensor, dtype: torch.dtype, device: torch.device | None) -> tuple[Tensor, Tensor]:
+    radius, angle = torch.sqrt(uniform[:, 0]), 2 * math.pi * uniform[:, 1]
+    return _equal(torch.stack([radius * torch.cos(angle), radius * torch.sin(angle)]).numpy(), dtype, device)
+
+
+def _equal(points: np.ndarray, dtype: torch.dtype, device: torch.device | None) -> tuple[Tensor, Tensor]:
+    count = points.shape[1]
+    return _tensors(points, np.full(count, 1.0 / count), dtype, device)
+
+
+def _tensors(points: np.ndarray, weights: np.ndarray, dtype, device) -> tuple[Tensor, Tensor]:
+    return torch.as_tensor(points, dtype=dtype, device=device), torch.as_tensor(weights, dtype=dtype, device=device)
+
+
+#: Samplings by name, each called with one size: rings, points across, or points.
+SAMPLINGS = {
+    "gauss": gauss_rings,
+    "hexapolar": hexapolar,
+    "square": square,
+    "sobol": sobol,
+    "random": random,
+}
