@@ -1,0 +1,247 @@
+"""The shipped lenses: focal lengths as published, sources named, glasses found, rays that reach the image."""
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from raytrace.formats import read_lens
+from raytrace.launch import rays_from_infinity
+from raytrace.lens import Lens
+from raytrace.paraxial import first_order
+from raytrace.trace import media, steps, trace
+
+LENSES = Path(__file__).parents[1] / "lenses"
+FILES = sorted(LENSES.glob("*.zmx"))
+
+
+@dataclass(frozen=True)
+class Published:
+    """What the source prints, in mm.
+
+    focal_length, back_focus: (value, tolerance), the tolerance being what the printed digits allow (`why`).
+    source: words that the notes of the file must hold.
+    marginal: height on the image surface of the real ray through the rim of the entrance pupil, on axis at the
+        primary wavelength, from a tracer that shares nothing with this package (numpy, Newton from the vertex plane).
+    """
+
+    focal_length: tuple[float, float]
+    back_focus: tuple[float, float] | None
+    source: str
+    why: str
+    marginal: float | None = None
+
+
+PUBLISHED = {
+    "cemented_achromat": Published(
+        (100.1, 0.05),
+        (97.1, 0.15),
+        "AC254-100-A",
+        "f printed to 0.1; radii printed to 0.1 (half a digit is up to 0.1 mm a surface in back focus)",
+        -0.01750270410775734,
+    ),
+    "cooke_triplet": Published(
+        (101.181, 0.0005),
+        (77.405, 0.0005),
+        "W. J. Smith, Modern Optical Engineering",
+        "half of the last printed digit",
+        0.007558905718930475,
+    ),
+    "double_gauss": Published(
+        (99.5145515666, 1e-9),
+        (57.4851290372, 1e-9),
+        "",
+        "ten decimals of an independent calculation at 0.530 um",
+    ),
+    "double_gauss_28deg": Published(
+        (100.0, 0.05),
+        (58.914, 0.002),
+        "US patent 4,123,144",
+        "f printed as 100; back focus to 0.001, and the catalog glasses meet the printed indices to 2e-5",
+        0.012596225431353858,
+    ),
+    "hubble": Published(
+        (57600.0, 50.0),
+        None,
+        "Sinclair Optics",
+        "57.6 m, three digits",
+        -1.4336146332442428e-05,
+    ),
+    "kingslake_doublet": Published(
+        (12.0, 0.00005),
+        None,
+        "R. Kingslake, Lens Design Fundamentals",
+        "12.0000, half of the last printed digit",
+        0.0013680664635649098,
+    ),
+    "petzval": Published(
+        (100.0, 0.05),
+        (56.5, 0.05),
+        "US patent 2,500,046",
+        "normalised to 100; indices printed to 0.001; back focus to 0.1",
+        -0.031220685051414065,
+    ),
+    "phone": Published(
+        (4.10, 0.005),
+        None,
+        "2016/0341934",
+        "half of the last printed digit (its image distance is the best focus, not the paraxial one)",
+        0.0024507108540926074,
+    ),
+    "retrofocus": Published(
+        (25.0, 0.125),
+        (37.1925, 0.0025),
+        "DE 1 250 153",
+        "f = 1.00 and back focus 1.4877, times 25; one last digit, as every input is rounded to it too",
+        0.009953322056176717,
+    ),
+    "singlet": Published(
+        (100.0, 0.001),
+        (100.0, 0.001),
+        "J. Sasian",
+        "half of the last digit of the radius 51.680, over n - 1",
+        -0.10725926239942662,
+    ),
+    "split_triplet": Published(
+        (99.79, 0.005),
+        (56.89, 0.005),
+        "British patent 237,212",
+        "half of the last printed digit",
+        0.059147670760566484,
+    ),
+    "telephoto": Published(
+        (99.9, 0.05),
+        (32.46, 0.005),
+        "W. J. Smith, Modern Optical Engineering",
+        "half of the last printed digit",
+        -0.014713121568385112,
+    ),
+    "tessar": Published(
+        (100.0, 0.05),
+        (79.831, 0.0005),
+        "US patent 2,854,889",
+        "f printed as 100; back focus: half of the last printed digit",
+        0.1214257549317832,
+    ),
+}
+
+NANOMETRE = 1e-6  # mm
+DISTORTION = 0.04  # of f tan θ; no shipped lens is a fisheye
+
+
+@pytest.fixture(params=FILES, ids=lambda path: path.stem)
+def name(request) -> str:
+    return request.param.stem
+
+
+@pytest.fixture
+def lens(name) -> Lens:
+    return read_lens(LENSES / f"{name}.zmx", strict=True)
+
+
+def test_every_lens_has_a_published_focal_length():
+    assert {path.stem for path in FILES} == set(PUBLISHED)
+
+
+def test_source_is_named(name, lens):
+    notes = " ".join(lens.notes)
+    assert "source" in notes.lower()
+    assert PUBLISHED[name].source in notes
+
+
+def test_focal_length_is_the_published_one(name, lens):
+    value, tolerance = PUBLISHED[name].focal_length
+    found = float(first_order(lens).effective_focal_length)
+    assert abs(found - value) <= tolerance, f"{found} mm, published {value} ± {tolerance}: {PUBLISHED[name].why}"
+
+
+def test_back_focus_is_the_published_one(name, lens):
+    if PUBLISHED[name].back_focus is None:
+        pytest.skip("the source prints no paraxial back focus")
+    value, tolerance = PUBLISHED[name].back_focus
+    found = float(first_order(lens).back_focal_distance)
+    assert abs(found - value) <= tolerance, f"{found} mm, published {value} ± {tolerance}: {PUBLISHED[name].why}"
+
+
+def test_glasses_are_found(lens):
+    indices = torch.stack([n.expand(lens.wavelengths.shape) for n in media(lens, lens.wavelengths)])
+    glass = (indices > 1.4) & (indices < 2.0)
+    assert bool(((indices == 1) | glass).all())
+    assert bool(glass.any()) or any(surface.is_mirror for surface in lens.surfaces)
+
+
+def test_on_axis_marginal_ray_meets_the_image_where_it_should(name, lens):
+    """To a nanometre where an independent tracer says; in any case within 2 % of the beam's radius."""
+    radius = float(first_order(lens).entrance_pupil_diameter) / 2
+    height = float(_to_image(lens, 0.0, torch.tensor([[0.0], [1.0]]))[0][1, 0])
+    assert abs(height) < 0.02 * radius
+    if PUBLISHED[name].marginal is not None:
+        assert abs(height - PUBLISHED[name].marginal) < NANOMETRE
+
+
+def test_semi_diameters_pass_the_axial_beam(lens):
+    """Every surface's stored semi-diameter holds the marginal ray; 2 % for stops sized by the paraxial one."""
+    aim = _aim(lens, torch.tensor([[0.0], [1.0]]))
+    indices = media(lens, lens.wavelengths[lens.primary_wavelength])
+    crossings = steps(lens.surfaces[1:], _launch(lens, 0.0, aim), indices=indices)
+    for surface, crossing in zip(lens.surfaces[1:], crossings, strict=True):
+        height = float(crossing.rays.position[:2].norm(dim=0).max())
+        assert surface.semi_diameter is not None
+        assert height <= 1.02 * surface.semi_diameter
+
+
+def test_every_field_reaches_the_image(name, lens):
+    """The rim of the vignetted pupil of every field passes all surfaces, and lands about where f tan θ says."""
+    angle = 2 * math.pi * torch.arange(24) / 24
+    rim = torch.stack([angle.cos(), angle.sin()])
+    focal_length = float(first_order(lens).effective_focal_length)
+    for k, degrees in enumerate(lens.fields.y.tolist()):
+        pupil = rim
+        if lens.fields.vignetting is not None:
+            vdx, vdy, vcx, vcy, _ = lens.fields.vignetting[:, k].tolist()
+            pupil = torch.stack([vdx + rim[0] * (1 - vcx), vdy + rim[1] * (1 - vcy)])
+        position, valid = _to_image(lens, degrees, pupil)
+        assert bool(valid.all()), f"field {degrees}°: {int((~valid).sum())} of 24 rays lost"
+        expected = focal_length * math.tan(math.radians(degrees))
+        assert abs(float(position[1].mean()) - expected) <= DISTORTION * abs(expected) + 0.1
+
+
+def test_hubble_is_obscured_in_the_centre():
+    """The disc of 0.33 of the aperture stops what lies inside it, to either side of its edge, and nothing else."""
+    lens = read_lens(LENSES / "hubble.zmx")
+    pupil = torch.tensor([[0.0, 0.0, 0.0, 0.0], [0.0, 0.329, 0.331, 1.0]])
+    assert _to_image(lens, 0.0, pupil)[1].tolist() == [False, False, True, True]
+
+
+def test_phone_aspheres_matter():
+    """The even aspheres of the phone lens bring its marginal ray to 3 µm of the axis; without them it misses by far."""
+    lens = read_lens(LENSES / "phone.zmx")
+    assert sum(s.coefficients is not None for s in lens.surfaces) == 12
+    bare = replace(lens, surfaces=tuple(replace(s, coefficients=None) for s in lens.surfaces))
+    rim = torch.tensor([[0.0], [1.0]])
+    assert abs(float(_to_image(lens, 0.0, rim)[0][1, 0])) < 0.003
+    assert abs(float(_to_image(bare, 0.0, rim)[0][1, 0])) > 0.03
+
+
+def _aim(lens: Lens, pupil: torch.Tensor) -> torch.Tensor:
+    """(3, N) mm in the frame of surface 1: points of the paraxial entrance pupil; pupil: (2, N), the rim is 1."""
+    data = first_order(lens)
+    xy = pupil.to(torch.float64) * data.entrance_pupil_diameter / 2
+    return torch.cat([xy, data.entrance_pupil_position.expand(1, xy.shape[1])])
+
+
+def _launch(lens: Lens, degrees: float, aim: torch.Tensor):
+    """Plane wave of the field, each ray started at the plane of surface 1 (its line through the pupil point)."""
+    slope = math.tan(math.radians(degrees))
+    start = aim - torch.stack([torch.zeros_like(aim[2]), slope * aim[2], aim[2]])
+    direction = torch.tensor([0.0, slope, 1.0], dtype=torch.float64)[:, None].expand_as(aim)
+    return rays_from_infinity(direction, start, index=torch.ones((), dtype=torch.float64))
+
+
+def _to_image(lens: Lens, degrees: float, pupil: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Positions (3, N) on the image surface and whether the ray got there, at the primary wavelength."""
+    rays = _launch(lens, degrees, _aim(lens, pupil))
+    rays = trace(lens, rays, lens.wavelengths[lens.primary_wavelength])
+    return rays.position, rays.valid
