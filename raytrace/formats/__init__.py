@@ -1,0 +1,90 @@
+"""Lens files: the suffix of a file names its format; reading gives a Lens, writing brings every number back exactly."""
+
+import os
+import secrets
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from raytrace.formats import table, table_write, zemax, zemax_write
+from raytrace.formats.report import ImportReport as ImportReport
+from raytrace.formats.source import LensFileError as LensFileError
+from raytrace.formats.source import LensFileWarning as LensFileWarning
+from raytrace.formats.source import Place, read_text
+from raytrace.formats.source import UnsupportedSurface as UnsupportedSurface
+from raytrace.lens import Lens
+
+
+class Format(NamedTuple):
+    """read(text, file, catalogs, strict) -> (Lens, ImportReport); write(lens, file, catalogs) -> content."""
+
+    read: Callable[..., tuple[Lens, ImportReport]]
+    write: Callable[..., bytes]
+
+
+#: The formats by suffix, in lower case.
+FORMATS = {
+    ".zmx": Format(zemax.read, zemax_write.write),
+    ".csv": Format(table.read, table_write.write_comma),
+    ".tsv": Format(table.read, table_write.write_tab),
+    ".txt": Format(table.read, table_write.write_tab),
+}
+
+
+def read_lens(path: str | os.PathLike, *, catalogs: Sequence[str | Path] = (), strict: bool = False) -> Lens:
+    """The lens of a file, in mm and µm: .zmx (Zemax OpticStudio), or a prescription table .csv, .tsv, .txt.
+
+    catalogs: further glass catalogs (.agf), searched as `raytrace.catalog.find_glass` does. strict: raise where the
+    file holds something unknown or something has to be assumed; otherwise that is one LensFileWarning.
+    Raises LensFileError, its subclass UnsupportedSurface, and UnknownGlass, each naming file, line and surface.
+    """
+    lens, report = read_lens_with_report(path, catalogs=catalogs, strict=strict)
+    if report.warnings:
+        warnings.warn("; ".join(report.warnings), LensFileWarning, stacklevel=2)
+    return lens
+
+
+def read_lens_with_report(
+    path: str | os.PathLike, *, catalogs: Sequence[str | Path] = (), strict: bool = False
+) -> tuple[Lens, ImportReport]:
+    """As `read_lens`, with the report of what became of every keyword; its warnings are in it, and not issued."""
+    path = Path(path)
+    form = _format(path)
+    return form.read(read_text(path), str(path), catalogs=tuple(catalogs), strict=strict)
+
+
+def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | Path] = ()) -> None:
+    """Write a lens in the format of the suffix. The file is replaced as a whole or not at all.
+
+    catalogs: the glass catalogs (.agf) that the lens was read with. Raises LensFileError for what the format cannot
+    hold and where the file cannot be written.
+    """
+    path = Path(path)
+    _replace(path, _format(path).write(lens, str(path), catalogs=tuple(catalogs)))
+
+
+def _format(path: Path) -> Format:
+    form = FORMATS.get(path.suffix.lower())
+    if form is None:
+        known = ", ".join(FORMATS)
+        found = f"the suffix {path.suffix!r}" if path.suffix else "no suffix"
+        raise LensFileError(f"{found} names no format of lens files; expected one of {known}", Place(str(path)))
+    return form
+
+
+def _replace(path: Path, content: bytes) -> None:
+    target = Path(os.path.realpath(path))
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(6)}.tmp")
+    try:
+        with open(temporary, "xb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, target)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise LensFileError(f"cannot be written: {error.strerror or error}", Place(str(path))) from error
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise

@@ -1,0 +1,140 @@
+"""The text of a lens file, read with care: size, encoding, numbers, and the errors that name file, line and surface."""
+
+import os
+import re
+import stat
+from pathlib import Path
+from typing import NamedTuple
+
+#: Larger files are refused before they are read; the largest real lens files are a few hundred kB.
+MAX_BYTES = 16 * 2**20
+
+#: More surfaces than any sequential lens has; a file with more is damaged or not a lens.
+MAX_SURFACES = 1000
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d{1,4})?", re.ASCII)
+_INFINITE = re.compile(r"[+-]?(inf|infinity|infinite|∞|1\.#inf)", re.ASCII | re.IGNORECASE)
+_NOT_TEXT = re.compile(r"[\x00-\x08\x0e-\x1f\ufffd]")
+
+
+class Place(NamedTuple):
+    """Where in a lens file something stands: file name, line from 1, surface from 0 (None where they do not apply)."""
+
+    file: str
+    line: int | None = None
+    surface: int | None = None
+
+    def __str__(self) -> str:
+        place = self.file if self.line is None else f"{self.file}:{self.line}"
+        return place if self.surface is None else f"{place}, surface {self.surface}"
+
+
+class LensFileError(ValueError):
+    """A lens file that cannot be read or written, said in one line: where, what was found, what to do.
+
+    file, line, surface: where it was found; None where that does not apply.
+    """
+
+    def __init__(self, message: str, place: Place):
+        super().__init__(" ".join(f"{place}: {message}".split()))
+        self.file, self.line, self.surface = place
+
+
+class UnsupportedSurface(LensFileError):
+    """A surface of a type that is not modelled; it is never dropped and never read as another type."""
+
+
+class LensFileWarning(UserWarning):
+    """A lens file that was read, but from which something was left out or assumed."""
+
+
+def read_text(path: Path) -> str:
+    """The text of a lens file: UTF-16 (either order, with or without mark), UTF-8, else Latin-1.
+
+    Raises LensFileError for a file that is missing, not a regular file, larger than MAX_BYTES, or not text.
+    """
+    place = Place(str(path))
+    try:
+        status = os.stat(path)
+        if not stat.S_ISREG(status.st_mode):
+            raise LensFileError("is not a regular file; give the path of a lens file", place)
+        if status.st_size > MAX_BYTES:
+            size = f"{status.st_size / 1e6:.0f} MB"
+            raise LensFileError(f"is {size} long, more than any lens file ({MAX_BYTES / 1e6:.0f} MB); not read", place)
+        with open(path, "rb") as file:
+            content = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise LensFileError(f"cannot be read: {error.strerror or error}", place) from error
+    except ValueError as error:
+        if isinstance(error, LensFileError):
+            raise
+        raise LensFileError(f"cannot be opened: {error}", place) from error
+    return decode(content, place)
+
+
+def decode(content: bytes, place: Place) -> str:
+    """Bytes to text by the rules of `read_text`."""
+    if not content.strip():
+        raise LensFileError("is empty", place)
+    encoding = _encoding(content)
+    try:
+        text = content.decode(encoding)
+    except UnicodeDecodeError as error:
+        message = f"is not valid {encoding.upper()} at byte {error.start}: damaged or cut off; save it again as UTF-8"
+        raise LensFileError(message, place) from error
+    text = text.removeprefix("\ufeff").rstrip("\x1a\x00 \t\r\n") + "\n"
+    found = _NOT_TEXT.search(text)
+    if found:
+        line = text.count("\n", 0, found.start()) + 1
+        message = f"holds the character U+{ord(found[0]):04X}: binary, or of an unknown encoding; save it as UTF-8"
+        raise LensFileError(message, place._replace(line=line))
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def _encoding(content: bytes) -> str:
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return "utf-16"
+    # Lens files are mostly ASCII, so in UTF-16 without its mark every second byte of the beginning is zero.
+    head = content[: min(len(content), 512) // 2 * 2]
+    if head and head[1::2].count(0) > 0.4 * len(head):
+        return "utf-16-le"
+    if head and head[0::2].count(0) > 0.4 * len(head):
+        return "utf-16-be"
+    try:
+        content.decode("utf-8")
+    except UnicodeDecodeError:
+        return "latin-1"
+    return "utf-8"
+
+
+def number(text: str, what: str, place: Place) -> float:
+    """A finite decimal number, Fortran's D exponent included. Raises LensFileError for anything else."""
+    if not _NUMBER.fullmatch(text):
+        raise LensFileError(f"{what} is {shown(text)}, expected a finite number", place)
+    result = float(text.replace("D", "E").replace("d", "e"))
+    if result in (float("inf"), float("-inf")):
+        raise LensFileError(f"{what} is {shown(text)}, too large for a 64-bit number", place)
+    return result
+
+
+def integer(text: str, what: str, place: Place) -> int:
+    """A whole number below a million in size, written with or without a decimal point."""
+    result = number(text, what, place)
+    if result != int(result) or abs(result) >= 1e6:
+        raise LensFileError(f"{what} is {shown(text)}, expected a whole number", place)
+    return int(result)
+
+
+def is_number(text: str) -> bool:
+    """True if `number` would accept the text."""
+    return bool(_NUMBER.fullmatch(text)) and abs(float(re.sub("[dD]", "e", text))) != float("inf")
+
+
+def is_infinite(text: str) -> bool:
+    """True for the spellings of infinity met in lens files."""
+    return bool(_INFINITE.fullmatch(text))
+
+
+def shown(text: str) -> str:
+    """A piece of a file as an error quotes it: at most 40 characters."""
+    return repr(text if len(text) <= 40 else text[:37] + "...")

@@ -1,0 +1,173 @@
+"""A row of a prescription table as a `Surface`: shape, medium and apertures."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from raytrace.formats.media import listed_glass
+from raytrace.formats.report import Draft
+from raytrace.formats.source import LensFileError, Place, UnsupportedSurface, is_infinite, is_number, number, shown
+from raytrace.formats.table_columns import order
+from raytrace.formats.table_text import Row
+from raytrace.glass import AIR, MIRROR, Glass, constant, mil_glass, model_glass
+from raytrace.glass import nd as index_at_d
+from raytrace.surface import Aperture, Surface
+
+_MIRROR = re.compile(r"\b(mirror|reflect|reflecting|refl)\b", re.IGNORECASE)
+
+#: What a type may be called. Any other word is a shape that is not modelled.
+_TYPE = re.compile(
+    r"standard|spher(e|ical)|plan(e|o)?|flat|conic(oid)?|aspher(e|ic|ical)|even|evenasph|lens|surface|s"
+    r"|stop|sto|aperture|diaphragm|iris|image|ima|img|sensor|detector|object|obj"
+    r"|mirror|refl|reflect(ing)?|refract(ing)?|dummy"
+)
+_UNSUPPORTED = re.compile(
+    r"coord|toroid|toric|cylind|grating|biconic|anamorph|paraxial|zernike|free.?form|odd.?asph|fresnel|binary|\bgrin\b"
+    r"|hologram|diffract|decent|tilt",
+    re.IGNORECASE,
+)
+
+
+def refuse_unsupported(rows: Sequence[Row]) -> None:
+    """Raise UnsupportedSurface for the first row whose type, or name, is that of a surface that is not modelled."""
+    for row in rows:
+        kind, label = row.cells.get("type", ""), row.cells.get("label", "")
+        words = re.findall(r"[^\W\d_]+", kind.lower())
+        unknown = any(not _TYPE.fullmatch(word) for word in words)
+        found = kind if unknown else label if _UNSUPPORTED.search(label) else ""
+        if found:
+            message = f"type {shown(found)} is not modelled; modelled are conics and even aspheres"
+            raise UnsupportedSurface(message, row.place)
+
+
+def build(row: Row, unit: float, catalogs: tuple[str, ...], user: Sequence[Path], report: Draft) -> Surface:
+    """The surface of a row, its lengths in units of `unit` mm."""
+    cells, place = row.cells, row.place
+    conic = _cell(row, "conic")
+    return Surface(
+        thickness=_scalar(_thickness(row) * unit),
+        curvature=_curvature(row, unit),
+        conic=_scalar(conic) if conic else None,
+        coefficients=_coefficients(row, unit),
+        glass=_glass(row, catalogs, user, report),
+        semi_diameter=_semi_diameter(row, unit),
+        apertures=tuple(_aperture(text, unit, place) for text in cells.get("apertures", "").split("+") if text.strip()),
+        comment=cells.get("comment") or ("" if is_number(cells.get("label", "0")) else cells["label"]),
+    )
+
+
+def _cell(row: Row, column: str) -> float | None:
+    """The number of a cell, None if it is empty; a decimal comma is taken where it can be nothing else."""
+    text = row.cells.get(column)
+    if text is None or text.lower() in ("-", "nan", "none"):
+        return None
+    if re.fullmatch(r"[+-]?\d*,\d+([eE][+-]?\d+)?", text):
+        text = text.replace(",", ".")
+    return number(text, column, row.place)
+
+
+def _thickness(row: Row) -> float:
+    text = row.cells.get("thickness", "")
+    if is_infinite(text) and row.place.surface == 0 and not text.startswith("-"):
+        return float("inf")
+    found = _cell(row, "thickness")
+    return 0.0 if found is None else found
+
+
+def _curvature(row: Row, unit: float) -> Tensor | None:
+    curvature = _cell(row, "curvature")
+    radius = None if is_infinite(row.cells.get("radius", "")) else _cell(row, "radius")
+    if radius and not abs(radius) > 1e-300:
+        raise LensFileError(f"radius is {radius:g}, too small", row.place)
+    if radius and curvature and abs(radius * curvature - 1) > 1e-3:
+        raise LensFileError(f"curvature {curvature:g} and radius {radius:g} contradict each other", row.place)
+    found = curvature if curvature is not None else 1 / radius if radius else 0.0
+    return _scalar(found / unit) if found else None
+
+
+def _coefficients(row: Row, unit: float) -> Tensor | None:
+    """a_j of r^(2j) in mm^(1-2j), up to the last cell that is filled."""
+    powers = {n: column for column in row.cells if (n := order(column)) is not None}
+    terms = {n: found for n, column in powers.items() if (found := _cell(row, column)) is not None}
+    for n, found in terms.items():
+        if n % 2 and found:
+            raise UnsupportedSurface(f"the term r^{n} is odd; modelled are conics and even aspheres", row.place)
+    even = [n for n in terms if n % 2 == 0]
+    if not even:
+        return None
+    numbers = [terms.get(n, 0.0) / unit ** (n - 1) for n in range(2, max(even) + 1, 2)]
+    return torch.tensor(numbers, dtype=torch.float64)
+
+
+def _semi_diameter(row: Row, unit: float) -> float | None:
+    semi_diameter, diameter = _cell(row, "semi_diameter"), _cell(row, "diameter")
+    found = semi_diameter if semi_diameter is not None else (diameter or 0.0) / 2
+    if found < 0:
+        raise LensFileError(f"semi-diameter is {found:g}, expected 0 or more", row.place)
+    return found * unit or None
+
+
+def _glass(row: Row, catalogs: tuple[str, ...], user: Sequence[Path], report: Draft) -> Glass:
+    text, place = row.cells.get("glass", ""), row.place
+    if text.lower() in ("", "air", "-", "none", "nan", "vacuum"):
+        mirror = _MIRROR.search(row.cells.get("type", ""))
+        return MIRROR if mirror else _by_figures("", _figures_of(row), place, report) if "nd" in row.cells else AIR
+    if text.lower() in ("mirror", "refl", "reflect"):
+        return MIRROR
+    name, equals, figures = text.partition("=")
+    figures = figures if equals else text
+    name = name.strip() if equals else ""
+    if not equals and len(text) == 6 and text.isascii() and text.isdigit():
+        report.glass(place.surface, text, "six-digit code: nd and Vd by its digits")
+        return mil_glass(text)
+    if equals or all(is_number(part.strip()) for part in figures.split("/")):
+        return _by_figures(name, figures, place, report)
+    glass = listed_glass(text, catalogs=catalogs, user=user, place=place, report=report)
+    stated = _cell(row, "nd")
+    if stated is not None and abs(float(index_at_d(glass)) - stated) > 2e-3:
+        message = f"index {stated:g} stated for {text}, whose nd is {float(index_at_d(glass)):.5f}; the catalog is used"
+        report.warn(message, place)
+    return glass
+
+
+def _figures_of(row: Row) -> str:
+    """The columns nd, Vd, ΔPgF of a row as nd/Vd/ΔPgF."""
+    return "/".join(row.cells[column] for column in ("nd", "vd", "dpgf") if column in row.cells)
+
+
+def _by_figures(name: str, figures: str, place: Place, report: Draft) -> Glass:
+    """A medium by its numbers: n, nd/Vd or nd/Vd/ΔPgF."""
+    values = [number(part.strip(), "glass", place) for part in figures.split("/")]
+    nd, vd, dpgf = [*values, 0.0, 0.0][:3]
+    if len(values) > 3 or nd <= 0 or vd < 0:
+        raise LensFileError(f"glass is {shown(figures)}, expected an index, nd/Vd or nd/Vd/ΔPgF", place)
+    if nd == 1 and vd == 0 and not name:
+        return AIR
+    report.glass(place.surface, name, f"constant index {nd!r}" if vd == dpgf == 0 else f"model glass {figures}")
+    return constant(nd, name) if vd == dpgf == 0 else model_glass(nd, vd, dpgf, name=name)
+
+
+def _aperture(text: str, unit: float, place: Place) -> Aperture:
+    words = text.lower().split()
+    obscures = words[0] == "obscuration"
+    words = words[1:] if obscures else words
+    if (
+        len(words) not in (3, 6)
+        or words[0] not in ("circular", "rectangular", "elliptic")
+        or words[3:4] not in ([], ["at"])
+    ):
+        raise LensFileError(
+            f"aperture is {shown(text)}, expected for example 'circular 0 12.5' or 'rectangular 3 4'", place
+        )
+    sizes = [number(word, "size of the aperture", place) * unit for word in words[1:3]]
+    centre = [number(word, "centre of the aperture", place) * unit for word in words[4:6]] or [0.0, 0.0]
+    if min(sizes) < 0:
+        raise LensFileError(f"aperture {shown(text)} has a negative size", place)
+    return Aperture(words[0], (sizes[0], sizes[1]), obscures, (centre[0], centre[1]))
+
+
+def _scalar(number: float) -> Tensor:
+    return torch.tensor(number, dtype=torch.float64)

@@ -1,0 +1,138 @@
+"""Write a lens as a prescription table, every number with the digits that bring it back exactly."""
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+from raytrace.formats.source import LensFileError, Place
+from raytrace.formats.writing import (
+    catalogs_needed,
+    exact,
+    exact_list,
+    is_air,
+    is_listed,
+    listed_name,
+    one_line,
+    thickness,
+)
+from raytrace.glass import Glass, mil_glass
+from raytrace.lens import Lens
+from raytrace.surface import Aperture, Surface
+
+Metadata = list[tuple[str, str]]
+
+
+def write_comma(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
+    """The content of a .csv file: header lines '# key: value', headings, one row per surface; UTF-8.
+
+    file: its name, for messages. catalogs: the user's glass catalogs that the lens was read with.
+    Raises LensFileError for what a table cannot hold: a batch of lenses, nan, a line break in a text, a glass whose
+    figures are not those of its catalog.
+    """
+    return _write(lens, ",", file, catalogs)
+
+
+def write_tab(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
+    """As `write_comma`, separated by tabs."""
+    return _write(lens, "\t", file, catalogs)
+
+
+def _write(lens: Lens, separator: str, file: str, catalogs: Sequence[Path]) -> bytes:
+    text = io.StringIO()
+    for key, value in header(lens, Place(file), catalogs):
+        text.write(f"# {key}: {value}".rstrip() + "\n")
+    writer = csv.writer(text, delimiter=separator, lineterminator="\n")
+    columns = rows(lens, file)
+    writer.writerow(columns)
+    writer.writerows(zip(*columns.values(), strict=True))
+    return text.getvalue().encode("utf-8")
+
+
+def header(lens: Lens, place: Place, catalogs: Sequence[Path] = ()) -> Metadata:
+    """The system of a lens as keys and values of header lines."""
+    fields = lens.fields
+    lines = [("title", _text(lens.name, place))] if lens.name else []
+    lines += [("note", _text(note, place)) for note in lens.notes]
+    size = exact(lens.aperture.value, "system aperture", place)
+    lines.append(("aperture", f"{lens.aperture.kind.replace('_', ' ')} {size}"))
+    x, y = exact_list(fields.x, "field", place), exact_list(fields.y, "field", place)
+    points = y if not any(fields.x) else [f"({a}, {b})" for a, b in zip(x, y, strict=True)]
+    lines.append(("fields", f"{fields.kind.replace('_', ' ')} {' '.join(points)}"))
+    lines.append(("field weights", " ".join(exact_list(fields.weight, "weight of a field", place))))
+    if fields.vignetting is not None:
+        for key, row in zip(("vdx", "vdy", "vcx", "vcy", "van"), fields.vignetting, strict=True):
+            lines.append((key, " ".join(exact_list(row, "vignetting factor", place))))
+    if fields.telecentric:
+        lines.append(("telecentric", "yes"))
+    lines.append(("wavelengths", " ".join(exact_list(lens.wavelengths, "wavelength", place))))
+    lines.append(("wavelength weights", " ".join(exact_list(lens.wavelength_weights, "weight", place))))
+    lines.append(("primary wavelength", str(lens.primary_wavelength + 1)))
+    names = catalogs_needed(lens, catalogs, place.file)
+    if names:
+        lines.append(("catalogs", " ".join(names)))
+    if lens.ray_aiming:
+        lines.append(("ray aiming", "yes"))
+    return lines
+
+
+def rows(lens: Lens, file: str) -> dict[str, list[str]]:
+    """The columns of the table by heading; columns that would be empty are left out."""
+    terms = max((len(s.coefficients) for s in lens.surfaces if s.coefficients is not None), default=0)
+    names = ["conic", "semi_diameter", *(f"a{2 * j}" for j in range(1, terms + 1)), "apertures", "comment"]
+    listed = [_row(lens, k, surface, Place(file, None, k)) for k, surface in enumerate(lens.surfaces)]
+    used = [name for name in names if any(name in row for row in listed)]
+    always = ["surface", "type", "curvature", "thickness", "glass"]
+    return {name: [row.get(name, "") for row in listed] for name in always + used}
+
+
+def _row(lens: Lens, number: int, surface: Surface, place: Place) -> dict[str, str]:
+    last = len(lens.surfaces) - 1
+    asphere = "standard" if surface.coefficients is None else "even asphere"
+    kinds = {0: "object", lens.stop: "stop" if surface.coefficients is None else "stop, even asphere", last: "image"}
+    row = {
+        "surface": str(number),
+        "type": kinds.get(number, asphere),
+        "curvature": "0.0" if surface.curvature is None else exact(surface.curvature, "curvature", place),
+        "thickness": thickness(surface.thickness, "inf", place),
+        "glass": _glass(surface.glass, place),
+    }
+    if surface.conic is not None:
+        row["conic"] = exact(surface.conic, "conic constant", place)
+    if surface.semi_diameter is not None:
+        row["semi_diameter"] = exact(surface.semi_diameter, "semi-diameter", place)
+    if surface.coefficients is not None:
+        found = exact_list(surface.coefficients, "aspheric terms", place)
+        row |= {f"a{2 * j}": term for j, term in enumerate(found, 1)}
+    if surface.apertures:
+        row["apertures"] = " + ".join(_aperture(aperture, place) for aperture in surface.apertures)
+    comment = one_line(surface.comment, "the comment", place)
+    return row | {"comment": comment} if comment else row
+
+
+def _glass(glass: Glass, place: Place) -> str:
+    if is_air(glass):
+        return ""
+    if glass.formula == "mirror":
+        return "MIRROR"
+    name = listed_name(glass, place) if glass.name else ""
+    if is_listed(glass):
+        return name
+    figures = exact_list(glass.coefficients, "glass", place)
+    if len(name) == 6 and name.isdigit() and figures == exact_list(mil_glass(name).coefficients, "glass", place):
+        return name
+    if "=" in name:
+        raise LensFileError(f"the name {name!r} of a glass holds '=', which a table cannot hold", place)
+    return f"{name}={'/'.join(figures)}" if name else "/".join(figures)
+
+
+def _aperture(aperture: Aperture, place: Place) -> str:
+    words = ["obscuration"] if aperture.obscures else []
+    words += [aperture.shape, *(exact(size, "size of the aperture", place) for size in aperture.extent)]
+    if any(aperture.centre):
+        words += ["at", *(exact(part, "centre of the aperture", place) for part in aperture.centre)]
+    return " ".join(words)
+
+
+def _text(text: str, place: Place) -> str:
+    return one_line(text, "the title or a note", place)

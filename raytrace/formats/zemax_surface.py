@@ -1,0 +1,186 @@
+"""A surface of a .zmx file as a `Surface`: shape, medium and aperture."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from raytrace.formats.media import listed_glass
+from raytrace.formats.report import Draft
+from raytrace.formats.source import LensFileError, UnsupportedSurface, is_infinite, shown
+from raytrace.formats.zemax_keywords import APERTURES, MODELLED_TYPES, TYPE_NAMES
+from raytrace.formats.zemax_records import Block, Record
+from raytrace.glass import AIR, MIRROR, Glass, constant, mil_glass, model_glass
+from raytrace.surface import Aperture, Surface
+
+
+def refuse_unsupported(blocks: Sequence[Block]) -> None:
+    """Raise UnsupportedSurface for the first surface that is not modelled, and name the others."""
+    found = [(block, reason) for block in blocks if (reason := _unsupported(block))]
+    if not found:
+        return
+    block, reason = found[0]
+    record = block.last("TYPE", "SURF")
+    place = record.place if record else block.place
+    others = [f"{other.place.surface} ({why.split()[1]})" for other, why in found[1:7]]
+    more = " …" if len(found) > 7 else ""
+    also = f"; neither are surfaces {', '.join(others)}{more}" if others else ""
+    raise UnsupportedSurface(f"{reason} is not modelled{also}; modelled are STANDARD and EVENASPH", place)
+
+
+def _unsupported(block: Block) -> str:
+    kind = _type(block)
+    if kind not in MODELLED_TYPES:
+        name = TYPE_NAMES.get(kind)
+        return f"type {kind[:40]}" + (f" ({name})" if name else "")
+    for record in block.all("SCBD"):
+        if any(record.number(position, "tilt or decentre") for position in range(3, len(record.words))):
+            return f"type {kind} with a tilt or decentre of the surface (SCBD)"
+    ignored = block.last("IGNR")
+    if ignored and ignored.words[:1] not in ((), ("0",)):
+        return f"type {kind} marked as to be ignored (IGNR)"
+    return ""
+
+
+def _type(block: Block) -> str:
+    record = block.last("TYPE")
+    if record is None:
+        return "STANDARD"
+    if not record.words:
+        raise LensFileError("TYPE without a name; expected STANDARD or EVENASPH", record.place)
+    return record.words[0].upper()
+
+
+def build(
+    block: Block, millimetres: float, *, catalogs: tuple[str, ...], user: Sequence[Path], report: Draft
+) -> Surface:
+    """The surface of a block, its lengths in units of `millimetres`.
+
+    GLAS names are looked up in `catalogs`, then `user` files; raises UnknownGlass as `find_glass` does.
+    """
+    thickness = block.last("DISZ")
+    if thickness is None:
+        message = "has no DISZ (thickness): file cut off? A plane image has DISZ 0"
+        raise LensFileError(f"surface {message}", block.place)
+    comment = block.last("COMM")
+    return Surface(
+        thickness=_thickness(thickness, millimetres),
+        curvature=_nonzero(block, "CURV", "curvature", millimetres),
+        conic=_nonzero(block, "CONI", "conic constant", 1.0),
+        coefficients=_coefficients(block, millimetres, report),
+        glass=_medium(block, catalogs, user, report),
+        semi_diameter=semi_diameter(block, millimetres),
+        apertures=_apertures(block, millimetres, report),
+        comment=comment.text.strip() if comment else "",
+    )
+
+
+def _thickness(record: Record, millimetres: float) -> Tensor:
+    word = record.words[0] if record.words else ""
+    if is_infinite(word):
+        if record.place.surface != 0 or word.startswith("-"):
+            raise LensFileError(f"DISZ is {shown(word)}; only the object may be at infinity", record.place)
+        return _scalar(float("inf"))
+    return _scalar(record.number(0, "thickness") * millimetres)
+
+
+def _nonzero(block: Block, keyword: str, what: str, divisor: float) -> Tensor | None:
+    record = block.last(keyword)
+    found = record.number(0, what) / divisor if record else 0.0
+    return _scalar(found) if found else None
+
+
+def _coefficients(block: Block, millimetres: float, report: Draft) -> Tensor | None:
+    """a_j of r^(2j) from PARM j, j = 1…8, mm^(1-2j); an EVENASPH without PARM has eight zeros."""
+    parameters = block.all("PARM")
+    if _type(block) == "STANDARD":
+        for record in parameters:
+            if record.number(1, "value", 0.0):
+                report.note(f"{record.place}: PARM {record.words[0]} is not used by a STANDARD surface")
+        return None
+    terms: dict[int, float] = {}
+    for record in parameters:
+        j = record.integer(0, "number of the parameter")
+        found = record.number(1, "value")
+        if 1 <= j <= 8:
+            terms[j] = found / millimetres ** (2 * j - 1)
+        elif found:
+            report.warn(f"PARM {j}: an EVENASPH has parameters 1 to 8 (r² to r^16); left out", record.place)
+    count = max(terms, default=8)
+    return torch.tensor([terms.get(j, 0.0) for j in range(1, count + 1)], dtype=torch.float64)
+
+
+def semi_diameter(block: Block, millimetres: float) -> float | None:
+    """DIAM, which is a semi-diameter, in mm; None if absent or 0 (left to be computed)."""
+    record = block.last("DIAM")
+    found = record.number(0, "semi-diameter") * millimetres if record and record.words else 0.0
+    if found < 0:
+        raise LensFileError(f"DIAM is {shown(record.words[0])}, expected a semi-diameter of 0 or more", record.place)
+    return found or None
+
+
+def _medium(block: Block, catalogs: tuple[str, ...], user: Sequence[Path], report: Draft) -> Glass:
+    """The medium of a GLAS record: name, flag (0 catalog, 1 model, 2 pickup, 3 substitute), -, nd, Vd, ΔPgF.
+
+    The columns after the name are placeholders unless the flag says model glass or the name is ___BLANK.
+    """
+    record = block.last("GLAS")
+    if record is None:
+        return AIR
+    if not record.words:
+        raise LensFileError("GLAS without a name; delete the line for air", record.place)
+    name, surface = record.words[0], record.place.surface
+    if name.upper() == "AIR":
+        return AIR
+    if name.upper() == "MIRROR":
+        return MIRROR
+    blank = name.upper() == "___BLANK"
+    if blank or record.integer(1, "flag", 0) == 1:
+        return _model(record, "" if blank else name, report)
+    if len(name) == 6 and name.isascii() and name.isdigit():
+        report.glass(surface, name, "six-digit code: nd and Vd by its digits")
+        return mil_glass(name)
+    return listed_glass(name, catalogs=catalogs, user=user, place=record.place, report=report)
+
+
+def _model(record: Record, name: str, report: Draft) -> Glass:
+    nd, vd = record.number(3, "index nd"), record.number(4, "Abbe number Vd", 0.0)
+    dpgf = record.number(5, "ΔPgF", 0.0)
+    if nd <= 0 or vd < 0:
+        raise LensFileError(f"model glass of nd {nd:g}, Vd {vd:g}; expected nd > 0 and Vd ≥ 0", record.place)
+    report.glass(record.place.surface, name, f"model glass nd {nd!r}, Vd {vd!r}, ΔPgF {dpgf!r}")
+    return constant(nd, name) if vd == dpgf == 0 else model_glass(nd, vd, dpgf, name=name)
+
+
+def _apertures(block: Block, millimetres: float, report: Draft) -> tuple[Aperture, ...]:
+    """The aperture of a surface; OpticStudio keeps one per surface.
+
+    A floating aperture (FLAP) follows the semi-diameter of its surface: it clips at DIAM as it now is.
+    """
+    found = block.all(*APERTURES, "USAP", "USOB")
+    if not found:
+        return ()
+    record = found[-1]
+    if len({other.keyword for other in found}) > 1:
+        names = ", ".join(other.keyword for other in found)
+        report.warn(f"several apertures on one surface ({names}); the last is used", record.place)
+    if record.keyword in ("USAP", "USOB"):
+        points = len(block.all("UDAD"))
+        message = f"user-defined aperture ({record.keyword}, {points} UDAD lines) is not modelled: it blocks no ray"
+        report.warn(message, record.place)
+        return ()
+    shape, obscures = APERTURES[record.keyword]
+    first = record.number(0, "first size of the aperture") * millimetres
+    second = record.number(1, "second size of the aperture") * millimetres
+    if record.keyword == "FLAP":
+        first, second = 0.0, semi_diameter(block, millimetres) or second
+    if first < 0 or second < 0:
+        raise LensFileError(f"{record.keyword} has a negative size", record.place)
+    centre = block.last("OBDC")
+    x, y = (centre.number(axis, "decentre") * millimetres for axis in (0, 1)) if centre else (0.0, 0.0)
+    return (Aperture(shape, (first, second), obscures, (x, y)),)
+
+
+def _scalar(number: float) -> Tensor:
+    return torch.tensor(number, dtype=torch.float64)

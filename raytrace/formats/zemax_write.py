@@ -1,0 +1,167 @@
+"""Write a lens as a .zmx file that Zemax OpticStudio reads, every number with the digits that bring it back exactly."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from raytrace.formats.source import LensFileError, Place
+from raytrace.formats.writing import catalogs_needed, exact, exact_list, is_air, listed_name, one_line, thickness
+from raytrace.formats.zemax_keywords import APERTURES, FIELD_KINDS
+from raytrace.formats.zemax_system import NOTE_PIECE
+from raytrace.glass import Glass, mil_glass
+from raytrace.lens import Lens
+from raytrace.surface import Aperture, Surface
+
+#: OpticStudio has this many wavelengths.
+_WAVELENGTHS = 24
+
+_APERTURE_LINES = {
+    "entrance_pupil_diameter": "ENPD {}",
+    "image_f_number": "FNUM {} 0",
+    "working_f_number": "FNUM {} 1",
+    "object_na": "OBNA {} 0",
+    "object_cone_angle": "OBNA {} 1",
+    "float_by_stop": "FLOA",
+}
+_SHAPES = {shape: keyword for keyword, shape in APERTURES.items() if keyword != "FLAP"}
+
+
+def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
+    """The content of a .zmx file of the lens, in mm: ASCII, or UTF-16 where a text needs it.
+
+    file: its name, for messages. catalogs: the user's glass catalogs that the lens was read with.
+    Raises LensFileError for what a .zmx file cannot hold: a batch of lenses, nan, two apertures on one surface, more
+    than 8 aspheric terms or 24 wavelengths, a glass whose figures are not those of its catalog.
+    """
+    lines = _system(lens, Place(file), catalogs)
+    for number, surface in enumerate(lens.surfaces):
+        lines += _surface(lens, number, surface, Place(file, None, number))
+    lines += ["TOL TOFF   0   0 0 0   0 0 0 0 0", "MNUM 1 1", 'MOFF   0   1 "" 0 0 0 1 1 0 0.0 ""']
+    text = "\n".join(lines) + "\n"
+    return text.encode("ascii") if text.isascii() else b"\xff\xfe" + text.encode("utf-16-le")
+
+
+def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
+    fields, aperture = lens.fields, lens.aperture
+    if len(lens.wavelengths) > _WAVELENGTHS:
+        message = f"{len(lens.wavelengths)} wavelengths, a .zmx file has at most {_WAVELENGTHS}; write a table (.csv)"
+        raise LensFileError(message, place)
+    size = exact(aperture.value, "system aperture", place)
+    _check_floating_stop(lens, place)
+    vignetting = fields.vignetting if fields.vignetting is not None else fields.x.new_zeros(5, len(fields.x))
+    kind = FIELD_KINDS.index(fields.kind)
+    weights = exact_list(lens.wavelength_weights, "weight of a wavelength", place)
+    waves = zip(exact_list(lens.wavelengths, "wavelength", place), weights, strict=True)
+    return [
+        "VERS 171115 0 0",
+        "MODE SEQ",
+        f"NAME {one_line(lens.name, 'the title', place)}".rstrip(),
+        *_notes(lens.notes, place),
+        "PFIL 0 0 0",
+        "LANG 0",
+        "UNIT MM X W X CM MR CPMM",
+        _APERTURE_LINES[aperture.kind].format(size),
+        "ENVD 20 1 0",
+        "GFAC 0 0",
+        f"GCAT {' '.join(catalogs_needed(lens, catalogs, place.file))}".rstrip(),
+        f"RAIM 0 {2 if lens.ray_aiming else 0} 1 1 0 0 0 0 0",
+        "PUSH 0 0 0 0 0 0",
+        "SDMA 0 1 0",
+        f"FTYP {kind} {int(fields.telecentric)} {len(fields.x)} {len(lens.wavelengths)} 0 0 0",
+        "ROPD 2",
+        "PICB 1",
+        f"XFLN {' '.join(exact_list(fields.x, 'field', place))}",
+        f"YFLN {' '.join(exact_list(fields.y, 'field', place))}",
+        f"FWGN {' '.join(exact_list(fields.weight, 'weight of a field', place))}",
+        *(
+            f"{keyword} {' '.join(exact_list(row, 'vignetting factor', place))}"
+            for keyword, row in zip(("VDXN", "VDYN", "VCXN", "VCYN", "VANN"), vignetting, strict=True)
+        ),
+        *(f"WAVM {slot} {wavelength} {weight}" for slot, (wavelength, weight) in enumerate(waves, 1)),
+        f"PWAV {lens.primary_wavelength + 1}",
+    ]
+
+
+def _check_floating_stop(lens: Lens, place: Place) -> None:
+    """FLOA has no number of its own: it is the stop's DIAM."""
+    stored = lens.surfaces[lens.stop].semi_diameter
+    if lens.aperture.kind == "float_by_stop" and stored is not None and stored != float(lens.aperture.value):
+        message = (
+            f"the aperture floats by a stop of {float(lens.aperture.value)!r} mm, but its semi-diameter is {stored!r}"
+        )
+        raise LensFileError(f"{message}; a .zmx file holds one of them", place._replace(surface=lens.stop))
+
+
+def _notes(notes: Sequence[str], place: Place) -> list[str]:
+    lines = []
+    for note in notes:
+        text = one_line(note, "a note", place)
+        pieces = [text[start : start + NOTE_PIECE] for start in range(0, len(text), NOTE_PIECE)]
+        lines += [f"NOTE 0 {piece}" for piece in pieces] + ["NOTE 4"]
+    return lines
+
+
+def _surface(lens: Lens, number: int, surface: Surface, place: Place) -> list[str]:
+    curvature = "0.0" if surface.curvature is None else exact(surface.curvature, "curvature", place)
+    semi_diameter = surface.semi_diameter
+    if number == lens.stop and lens.aperture.kind == "float_by_stop":
+        semi_diameter = float(lens.aperture.value)
+    size = "0 0" if semi_diameter is None else f"{exact(semi_diameter, 'semi-diameter', place)} 1"
+    lines = [
+        f"SURF {number}",
+        *(["  STOP"] if number == lens.stop else []),
+        f"  TYPE {'STANDARD' if surface.coefficients is None else 'EVENASPH'}",
+        f'  CURV {curvature} 0 0 0 0 ""',
+        *_coefficients(surface, place),
+        f"  DISZ {thickness(surface.thickness, 'INFINITY', place)}",
+        *_glass(surface.glass, place),
+        *([] if surface.conic is None else [f"  CONI {exact(surface.conic, 'conic constant', place)}"]),
+        f'  DIAM {size} 0 0 1 ""',
+        *_apertures(surface.apertures, place),
+    ]
+    comment = one_line(surface.comment, "the comment", place)
+    return [*lines, f"  COMM {comment}"] if comment else lines
+
+
+def _coefficients(surface: Surface, place: Place) -> list[str]:
+    if surface.coefficients is None:
+        return []
+    terms = exact_list(surface.coefficients, "aspheric terms", place)
+    if any(float(term) for term in terms[8:]):
+        message = f"{len(terms)} aspheric terms (to r^{2 * len(terms)}), an EVENASPH has 8 (to r^16)"
+        raise LensFileError(f"{message}; write a table (.csv)", place)
+    return [f"  PARM {j} {term}" for j, term in enumerate(terms[:8], 1)]
+
+
+def _glass(glass: Glass, place: Place) -> list[str]:
+    if is_air(glass):
+        return []
+    if glass.formula == "mirror":
+        return ["  GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0"]
+    if glass.formula == "constant":
+        figures = [*exact_list(glass.coefficients, "index", place), "0", "0"]
+    elif glass.formula == "model":
+        figures = exact_list(glass.coefficients, "model glass", place)
+    else:
+        return [f"  GLAS {listed_name(glass, place)} 0 0 1.5 40 0 0 0 0 0 0"]
+    flag, name = 1, listed_name(glass, place) if glass.name else "___BLANK"
+    if name.upper() in ("AIR", "MIRROR"):
+        raise LensFileError(f"a glass of index {figures[0]} is named {name!r}; give it another name", place)
+    if len(name) == 6 and name.isascii() and name.isdigit():
+        listed = exact_list(mil_glass(name).coefficients, "model glass", place)
+        flag = 0 if listed == figures else 1
+    return [f"  GLAS {name} {flag} 0 {' '.join(figures)} 0 0 0 0 0"]
+
+
+def _apertures(apertures: tuple[Aperture, ...], place: Place) -> list[str]:
+    if not apertures:
+        return []
+    if len(apertures) > 1:
+        message = f"{len(apertures)} apertures, a surface of a .zmx file has one"
+        raise LensFileError(f"{message}; put the others on dummy surfaces, or write a table (.csv)", place)
+    aperture = apertures[0]
+    first, second = (exact(number, "size of the aperture", place) for number in aperture.extent)
+    lines = [f"  {_SHAPES[aperture.shape, aperture.obscures]} {first} {second} 0"]
+    if any(aperture.centre):
+        x, y = (exact(number, "decentre of the aperture", place) for number in aperture.centre)
+        lines.append(f"  OBDC {x} {y}")
+    return lines
