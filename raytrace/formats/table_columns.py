@@ -28,8 +28,6 @@ HEADINGS = {spelling: name for name, spellings in _SPELLINGS.items() for spellin
 #: Headings of the coefficient of r^n: a4, A4, r4, r^4, 4th, 4th order.
 _TERM = re.compile(r"(?:a|r\^?|alpha_?r\^?)(\d{1,2})|(\d{1,2})(?:st|nd|rd|th)(?:order)?(?:term)?")
 
-_LENGTHS = {"": True, "mm": True, "1/mm": True, "mm-1": True, "mm^-1": True, "mm⁻¹": True}
-
 
 def meaning(heading: str, place: Place) -> str | None:
     """What a heading means: a key of the spellings, "a4" for the coefficient of r⁴, or None if it is not known.
@@ -54,9 +52,11 @@ def order(column: str) -> int | None:
     return int(column[1:]) if column[0] == "a" and column[1:].isdigit() else None
 
 
-def is_header(cells: list[str], place: Place) -> bool:
-    """True for a line that names a thickness and a curvature or radius."""
-    if len(cells) < 2 or len(cells) > 200:
+def is_header(cells: list[str], place: Place, *, known: float = 0.5) -> bool:
+    """True for a line that names a thickness and a curvature or radius, with a `known` share of its cells headings."""
+    cells = [cell for cell in cells if cell]
+    if not 2 <= len(cells) <= 200 or max(map(len, cells)) > 60:
         return False
-    found = {meaning(cell, place) for cell in cells if cell and len(cell) < 60}
-    return "thickness" in found and bool(found & {"curvature", "radius"})
+    found = [meaning(cell, place) for cell in cells]
+    complete = "thickness" in found and ("curvature" in found or "radius" in found)
+    return complete and len(found) - found.count(None) >= known * len(found)

@@ -87,9 +87,9 @@ def add_row(table: Table, columns: Sequence[str | None], cells: Sequence[str], p
 
 def metadata_line(table: Table, line: str, place: Place, report: Draft) -> bool:
     """Take a line '# key: value', or a comment '# text', which becomes a note."""
-    content = line.strip().strip(",;\t ")
+    content = re.sub(r"([,;]{2,}|\s)+$", "", line.strip())  # a spreadsheet pads lines with separators
     if content.startswith('"') and content.endswith('"') and len(content) > 1:
-        content = content[1:-1].replace('""', '"').strip()  # a spreadsheet has quoted it
+        content = content[1:-1].replace('""', '"').strip()  # and quotes them
     if not content.startswith("#"):
         return False
     content = content.lstrip("#").strip()
@@ -129,13 +129,17 @@ def _preamble(table: Table, line: str, place: Place, report: Draft) -> None:
 
 def _header_splitter(line: str, place: Place):
     """The function that splits lines like this one into cells, or None if this is no line of headings."""
-    line = line.lstrip("#") if line.lstrip().startswith("#") else line
+    commented = line.lstrip().startswith("#")
+    if commented:
+        if key_of(line.strip("# \t").partition(":")[0])[0]:
+            return None
+        line = line.replace("#", " ", 1)
     for separator in "\t;,":
-        if separator in line and is_header(_cells(line, separator, place), place):
+        if separator in line and is_header(line.replace('"', "").split(separator), place, known=0.5 + 0.5 * commented):
             return lambda text, where: _cells(text, separator, where)
     for gap in (r"\s{2,}", r"\s+"):
         spans = _spans(line, gap)
-        if is_header([line[start:end] for start, end in spans], place):
+        if is_header([line[start:end] for start, end in spans], place, known=1.0):
             return lambda text, where: _aligned(text, spans, line, where)
     return None
 
