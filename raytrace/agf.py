@@ -1,6 +1,7 @@
 """AGF, the file format of glass catalogs: a Catalog from a file and back."""
 
 import codecs
+import math
 import os
 import re
 import tempfile
@@ -11,6 +12,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 import torch
+from torch import Tensor
 
 from raytrace.glass import AGF_FORMULAS, COEFFICIENT_COUNTS, Glass
 
@@ -131,21 +133,21 @@ def _records(text: str, unknown: dict[str, int]) -> Iterator[tuple[int, str, str
     A line that begins with a number continues the numeric record before it; one that begins with "!" explains a
     status; what is neither is noted in `unknown` as word -> line.
     """
-    pending: tuple[int, str, str] | None = None
+    line_of_record, keyword, parts = 0, "", []
     for line, content in enumerate(re.split(r"\r\n|\r|\n", text), 1):
-        keyword, *rest = content.split(maxsplit=1) or [""]
-        if not keyword or keyword.startswith("!"):
+        word, *rest = content.split(maxsplit=1) or [""]
+        if not word or word.startswith("!"):
             continue
-        if pending and pending[1] in _NUMERIC and _NUMBER.fullmatch(keyword):
-            pending = (pending[0], pending[1], f"{pending[2]} {content.strip()}")
-        elif keyword in _KEYWORDS:
-            if pending:
-                yield pending
-            pending = (line, keyword, rest[0].strip() if rest else "")
-        else:
-            unknown.setdefault(keyword[:20], line)
-    if pending:
-        yield pending
+        if keyword in _NUMERIC and _NUMBER.fullmatch(word):
+            parts.append(content)
+        elif word in _KEYWORDS:
+            if keyword:
+                yield line_of_record, keyword, " ".join(parts).strip()
+            line_of_record, keyword, parts = line, word, rest
+        elif len(unknown) < 100:
+            unknown.setdefault(word[:20], line)
+    if keyword:
+        yield line_of_record, keyword, " ".join(parts).strip()
 
 
 def _blocks(records: Iterator[tuple[int, str, str]]) -> Iterator[list[tuple[int, str, str]]]:
@@ -164,54 +166,66 @@ def _glass(block: Sequence[tuple[int, str, str]], catalog: str, path: Path) -> G
     line, _, rest = block[0]
     words = rest.split()
     if len(words) < 5:
-        raise _fault(path, line, f"NM {rest}", "NM name formula code nd Vd …", "is the line cut off?")
+        raise _fault(path, line, f"NM {rest[:40]}", "NM name formula code nd Vd …", "is the line cut off?")
     name = words[0]
     number, nd_listed, abbe_listed, *flags = _numbers([words[1], *words[3:7]], path, line, blanks=True)
     formula = AGF_FORMULAS.get(number)
     if formula is None:
         raise _fault(path, line, f"dispersion formula {words[1]} for {name}", "1 to 13, as the AGF format numbers them")
-    found: dict[str, tuple[int, tuple[float, ...]]] = {}
-    records, comments = [], []
-    for line_, keyword, rest_ in block[1:]:
-        if keyword in ("GC", "CC"):
-            comments += [rest_] if keyword == "GC" and rest_ else []
-            continue
-        numbers = _numbers(rest_.split(), path, line_, blanks=keyword not in ("CD", "LD"))
-        if keyword not in ("CD", "LD"):
-            records.append((keyword, numbers))
-        elif keyword in found:
-            fix = "is the NM line of the next glass missing or misspelt?"
-            raise _fault(path, line_, f"a second {keyword} record for {name}", "one for each glass", fix)
-        else:
-            found[keyword] = (line_, numbers)
-    for keyword in ("CD", "LD"):
-        if keyword not in found:
-            last = block[-1][0]
-            raise _fault(path, last, f"{name} (line {line}) without a {keyword} record", "one", "is the file cut off?")
-    count, (line_cd, coefficients), (line_ld, span) = COEFFICIENT_COUNTS[formula], found["CD"], found["LD"]
-    if len(coefficients) < count:
-        expected = f"at least {count} for formula {formula}"
-        raise _fault(path, line_cd, f"{len(coefficients)} coefficients for {name}", expected, "is the line cut off?")
-    if len(span) < 2 or not (0 < span[0] < span[1] or span[0] == span[1] == 0):
-        listed = " ".join(f"{limit:g}" for limit in span)
-        raise _fault(path, line_ld, f"LD {listed} for {name}", "the shortest and the longest wavelength in µm")
-    comment = "\n".join(comments)
+    comment = "\n".join(text for _, keyword, text in block if keyword == "GC" and text)
     listing = re.search(r"\balternatives: *([^;\n]+)", comment)
     unlisted = nd_listed <= 0 or (nd_listed == 1 and abbe_listed == 0)  # what catalogs write where nd is not known
     return Glass(
         name=name,
         formula=formula,
-        coefficients=torch.tensor(coefficients[:count], dtype=torch.float64),
+        coefficients=_coefficients(block, name, formula, path),
         catalog=catalog,
-        wavelength_range=None if span[0] == span[1] else span[:2],
+        wavelength_range=_wavelength_range(block, name, path),
         status=_STATUSES.get(flags[1], "") if len(flags) > 1 else "",
         nd_listed=None if unlisted else nd_listed,
         abbe_listed=None if unlisted else abbe_listed,
         alternatives=tuple(listing[1].replace(",", " ").split()) if listing else (),
         listed_name=name,
         comment=comment,
-        records=tuple(record for record in records if record[1]),
+        records=tuple(
+            (keyword, _numbers(text.split(), path, line, blanks=True))
+            for line, keyword, text in block
+            if keyword in ("ED", "TD", "MD", "OD", "IT") and text
+        ),
     )
+
+
+def _coefficients(block: Sequence[tuple[int, str, str]], name: str, formula: str, path: Path) -> Tensor:
+    line, text = _only(block, "CD", name, path)
+    numbers, count = _numbers(text.split(), path, line), COEFFICIENT_COUNTS[formula]
+    if len(numbers) < count:
+        expected = f"at least {count} for formula {formula}"
+        raise _fault(path, line, f"{len(numbers)} coefficients for {name}", expected, "is the line cut off?")
+    return torch.tensor(numbers[:count], dtype=torch.float64)
+
+
+def _wavelength_range(block: Sequence[tuple[int, str, str]], name: str, path: Path) -> tuple[float, float] | None:
+    line, text = _only(block, "LD", name, path)
+    numbers = _numbers(text.split(), path, line)[:2]
+    if numbers == (0.0, 0.0):
+        return None
+    if len(numbers) < 2 or not 0 < numbers[0] < numbers[1]:
+        raise _fault(path, line, f"LD {text[:40]} for {name}", "the shortest and the longest wavelength in µm")
+    return numbers
+
+
+def _only(block: Sequence[tuple[int, str, str]], keyword: str, name: str, path: Path) -> tuple[int, str]:
+    """The one record of a keyword that every glass must have, (line, text).
+
+    A second one is the sign of a lost NM line, and must not give one glass the figures of the next.
+    """
+    found = [(line, text) for line, key, text in block if key == keyword]
+    if not found:
+        raise _fault(path, block[-1][0], f"{name} without a {keyword} record", "one", "is the file cut off?")
+    if len(found) > 1:
+        fix = "is the NM line of the next glass missing or misspelt?"
+        raise _fault(path, found[1][0], f"a second {keyword} record for {name}", "one for each glass", fix)
+    return found[0]
 
 
 def _numbers(words: Sequence[str], path: Path, line: int, *, blanks: bool = False) -> tuple[float, ...]:
@@ -220,12 +234,14 @@ def _numbers(words: Sequence[str], path: Path, line: int, *, blanks: bool = Fals
     for word in words:
         if blanks and word in ("-", "_"):
             word = "-1"
-        if not _NUMBER.fullmatch(word):
+        try:
+            number = float(word if "D" not in word else word.replace("D", "E"))  # Fortran writes 1.0D-03
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number) or "_" in word:
             fix = "write decimals with a point" if "," in word else "is the line damaged?"
-            raise _fault(path, line, repr(word[:40]), "a number", fix)
-        numbers.append(float(word.upper().replace("D", "E")))
-        if abs(numbers[-1]) == float("inf"):
-            raise _fault(path, line, repr(word[:40]), "a number that a double can hold")
+            raise _fault(path, line, repr(word[:40]), "a finite number", fix)
+        numbers.append(number)
     return tuple(numbers)
 
 

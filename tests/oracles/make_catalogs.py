@@ -12,17 +12,20 @@ table only if two sources agree on the coefficients; sources that deviate are li
   resistances -1. ΔP_gF is computed from the coefficients where g, F, d and C lie in range, else 0.
 * "alternatives" of an obsolete glass: up to three standard or preferred glasses of the same catalog with
   |Δn_d| < 5e-4 and |ΔV_d| < 0.5 %, the nearest first. They are hints for a reader, never used in a lookup.
+* "caution" where the curve is not that of a transparent medium over all of its listed range: the stretches in which n
+  rises with wavelength or is below 1 (some plastics list a range wider than their polynomial holds).
 """
 
 import csv
 import sys
 from collections import defaultdict
+from itertools import pairwise
 from pathlib import Path
 
 import torch
 
 from raytrace.agf import Catalog, write_agf
-from raytrace.glass import AGF_FORMULAS, COEFFICIENT_COUNTS, LINES, Glass, normal_line_deviation
+from raytrace.glass import AGF_FORMULAS, COEFFICIENT_COUNTS, LINES, Glass, normal_line_deviation, refractive_index
 
 TITLE = "{name}: dispersion coefficients that agree in two or more public sources; each glass names them in its comment"
 
@@ -43,6 +46,7 @@ def glass(row: dict[str, str], alternatives: list[str]) -> Glass:
         row[column].split(";") if row[column] else [] for column in ("sources_agreeing", "sources_deviating(max|dn|)")
     )
     comment = [f"alternatives: {' '.join(alternatives)}"] if alternatives else []
+    comment += caution(bare)
     comment += [f"confidence {row['confidence']}", f"nd and Vd by the coefficients: {row['nd_Vd_consistency']}"]
     comment += [f"{len(agreeing)} sources agree: {', '.join(agreeing)}"]
     comment += [f"{len(deviating)} deviate by max |dn|: {', '.join(deviating)}"] if deviating else []
@@ -62,6 +66,22 @@ def glass(row: dict[str, str], alternatives: list[str]) -> Glass:
             ("OD", (-1.0,) * 6),
         ),
     )
+
+
+def caution(glass: Glass) -> list[str]:
+    if glass.name == "VACUUM":  # below 1 and rising by right: air is the reference
+        return []
+    wavelengths = torch.linspace(*glass.wavelength_range, 400, dtype=torch.float64)
+    n = refractive_index(glass, wavelengths)
+    wrong = ((n[1:] > n[:-1]) | (n[1:] < 1.0)).tolist()
+    stretches: list[list[float]] = []
+    for i, (start, end) in enumerate(pairwise(wavelengths.tolist())):
+        if wrong[i] and i and wrong[i - 1]:
+            stretches[-1][1] = end
+        elif wrong[i]:
+            stretches.append([start, end])
+    listed = ", ".join(f"{start:.2f}-{end:.2f} um" for start, end in stretches)
+    return [f"caution: n rises with wavelength or is below 1 at {listed}"] if stretches else []
 
 
 def alternatives(row: dict[str, str], rows: list[dict[str, str]]) -> list[str]:

@@ -1,0 +1,450 @@
+"""Catalogs: the shipped figures against their listings, the AGF reader and writer, finding a glass by its name."""
+
+import math
+import os
+import random
+import re
+import subprocess
+import sys
+import warnings
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from raytrace import catalog as catalogs
+from raytrace.agf import format_agf, parse_agf
+from raytrace.catalog import (
+    SHIPPED,
+    AmbiguousGlass,
+    Catalog,
+    CatalogError,
+    CatalogWarning,
+    UnknownGlass,
+    aliases,
+    find_glass,
+    missing_catalogs,
+    nearest_names,
+    read_agf,
+    shipped_catalog,
+    shipped_folder,
+    write_agf,
+)
+from raytrace.glass import AGF_FORMULAS, constant, index, listing_error, refractive_index
+
+#: Glasses of which their catalog lists no nd and Vd (infrared materials, and crystals that are opaque at the d line,
+#: were entered as nd = 1, Vd = 0), so that there is nothing to compare with. No listing that exists is inconsistent.
+UNLISTED = {
+    "INFRARED": "AGCL AMTIR1 AMTIR3 CDSE CDTE GAAS GERMANIUM GE_LONG GE_OLD IRG100 KRS5 NACL SILICON TI_1173 ZBLA "
+    "ZBLAN ZNSE ZNS_IR",
+    "MISC": "CDS CR39",
+    "BIREFRINGENT": "AGASS3-E AGASS3 AGGAS2-E AGGAS2 AGGASE2-E AGGASE2 CDGEAS2-E CDGEAS2 CDS CDS-E CDSE CDSE-E CUGAS2 "
+    "CUGAS2-E LIO3-E LIO3 TAS TAS-E TE TE-E YVO4 YVO4-E ZNGEP2-E ZNGEP2",
+    "LIGHTPATH": "BD1 BD2",
+    "RPO": "IG2 IG4 IG5 IG6",
+    "UMICORE": "GASIR2 GASIR1",
+    "ISUZU": "IIR-SF1",
+}
+#: Glasses whose listed range is wider than their polynomial holds: n rises with wavelength, or falls below 1, near an
+#: end of it. The figures are the source's own; the comment of each in its catalog warns where.
+RANGE_TOO_WIDE = {
+    "MISC": "COC",
+    "TOPAS": "5013LS-01 5013X16 6015S-04",
+    "ARTON": "DX4900 F5023 F4520 D4532 D4531F D4540",
+    "RPO": "EKPC IG2 IG4 IG6",
+}
+COUNTS = {
+    "SCHOTT": 357, "OHARA": 417, "HOYA": 404, "CDGM": 326, "HIKARI": 371, "SUMITA": 160, "LZOS": 54, "CORNING": 95,
+    "INFRARED": 47, "MISC": 23, "HERAEUS": 5, "TOPAS": 3, "ZEON": 1, "ARTON": 6, "LIGHTPATH": 11, "RPO": 43,
+    "UMICORE": 2, "ISUZU": 1, "ARCHER": 15, "RAD_HARD": 7, "BIREFRINGENT": 62,
+}  # fmt: skip
+
+SMALL = """CC A catalog for tests: Prüfgläser
+! a note on statuses
+NM ONE 2 517642.251 1.516800 64.17 0 1 1
+GC the first; alternatives: TWO, THREE
+ED 7.1 8.3 2.51 -0.0009 0
+CD 1.03961212E+000 6.00069867E-003 2.31792344E-001 2.00179144E-002 1.01046945E+000
+1.03560653E+002 0 0 0 0
+TD 1.86E-006 1.31E-008 -1.37E-011 4.34E-007 6.27E-010 1.70E-001 2.0E+001
+OD 1.0 2.0 - 1.0 2.3 _
+LD 3.00000000E-001 2.50000000E+000
+IT 3.00E-001 5.0E-002 2.5E+001
+IT 5.00E-001 9.98E-001 2.5E+001
+
+NM Two 1 620603 1.620409 60.280874 0 2 -1
+CD 2.592001 -0.01540969 0.0102268 0.001581559 -0.0001877149 1.012515e-05 0 0 0 0
+LD 0.4 0.7
+"""
+
+
+@pytest.fixture(autouse=True)
+def no_catalogs_from_the_environment(monkeypatch):
+    monkeypatch.delenv(catalogs.ENVIRONMENT, raising=False)
+
+
+@pytest.fixture
+def small(tmp_path):
+    path = tmp_path / "small.agf"
+    path.write_text(SMALL, encoding="utf-8")
+    return path
+
+
+# -- the shipped catalogs ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_shipped_glass_has_its_listed_figures(name):
+    """n_d within 2e-5 and V_d within 0.1 of the listing, which makers round to 5 or 6 and to 1 or 2 decimals."""
+    catalog = shipped_catalog(name)
+    assert len(catalog.glasses) == COUNTS[name]
+    unlisted = UNLISTED.get(name, "").split()
+    for listed, glass in catalog.glasses.items():
+        error = listing_error(glass)
+        if listed in unlisted:
+            assert math.isnan(error[0]), f"{listed} has a listing now: take it off UNLISTED"
+        elif glass.abbe_listed == 0.0:  # N15 of MISC: one index at every wavelength
+            assert glass.coefficients.tolist()[1:] == [0.0, 0.0]
+            assert error == (0.0, 0.0)
+        else:
+            assert abs(error[0]) <= 2e-5, (listed, error)
+            assert abs(error[1]) <= 0.1, (listed, error)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_shipped_glass_disperses_normally_in_all_of_its_range(name):
+    """A transparent medium has n ≥ 1 that falls with wavelength, from one end of its range to the other."""
+    for listed, glass in shipped_catalog(name).glasses.items():
+        wavelengths = torch.linspace(*glass.wavelength_range, 400, dtype=torch.float64)
+        n = refractive_index(glass, wavelengths)
+        assert (n > 0.5).all()
+        assert (n < 7.0).all()  # tellurium, the highest, reaches 6.4
+        assert glass.catalog == name
+        assert "sources agree" in glass.comment
+        if listed == "VACUUM":  # relative to air: just below 1, and rising to it
+            assert ((n > 0.9997) & (n < 0.99974)).all()
+            continue
+        normal = bool((n >= 1.0).all() and (n[1:] <= n[:-1]).all())
+        assert normal == (listed not in RANGE_TOO_WIDE.get(name, "").split()), listed
+        assert normal == ("caution: n rises" not in glass.comment), listed
+
+
+def test_the_files_shipped_are_those_searched():
+    assert {path.stem for path in shipped_folder().glob("*.AGF")} == set(SHIPPED) == set(COUNTS)
+
+
+@pytest.mark.parametrize(("name", "n"), [("SK2", 1.6110909192), ("SK16", 1.6239670970), ("F5", 1.6089032455)])
+def test_the_glasses_of_the_double_gauss_at_530_nm(name, n):
+    glass = find_glass(name, catalogs=["SCHOTT"])
+    assert glass.catalog == "SCHOTT"
+    assert index(glass, 0.530).item() == pytest.approx(n, abs=1e-9)  # an independent calculation, ten decimals
+
+
+def test_obsolete_glasses_are_shipped_and_name_present_day_ones():
+    for name in ("SK2", "SK16", "BK7", "F15"):
+        assert find_glass(name, catalogs=["SCHOTT"]).status == "obsolete"
+    assert find_glass("SK16", catalogs=["SCHOTT"]).alternatives == ("N-SK16",)
+
+
+def test_no_catalog_has_names_that_differ_in_case_alone():
+    for name in SHIPPED:
+        listed = list(shipped_catalog(name).glasses)
+        assert len({entry.upper() for entry in listed}) == len(listed)
+
+
+# -- finding a glass --------------------------------------------------------------------------------------------------
+
+
+def test_catalogs_are_searched_in_the_order_of_the_lens_file():
+    assert find_glass("SK16", catalogs=["HIKARI", "SCHOTT"]).catalog == "HIKARI"
+    assert find_glass("SK16", catalogs=["NO_SUCH", "SCHOTT", "HIKARI"]).catalog == "SCHOTT"
+    assert find_glass("N-BK7", catalogs=["HIKARI"]).catalog == "SCHOTT"  # not in its own: the others, and it says so
+    assert find_glass("SK16", catalogs=["nikon"]).catalog == "HIKARI"
+
+
+def test_a_name_of_two_glasses_is_reported_unless_the_lens_file_decides():
+    with pytest.warns(AmbiguousGlass, match=r"lens\.csv:3: SK2 is taken from SCHOTT.*HIKARI by 3\.\de-05"):
+        assert find_glass("SK2", where="lens.csv:3").catalog == "SCHOTT"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        find_glass("SK2", catalogs=["SCHOTT"])
+        find_glass("CAF2")  # the same figures in INFRARED and MISC
+        find_glass("N-BK7")
+
+
+def test_capitals_and_small_letters_are_not_told_apart_and_the_name_stays_as_written():
+    glass = find_glass("n-bk7hti", catalogs=["SCHOTT"])
+    assert (glass.name, glass.listed_name) == ("n-bk7hti", "N-BK7HTi")
+
+
+def test_nothing_else_is_taken_for_the_name():
+    for name in ("NBK-7", "BK", "SK161", "N-SK", "N-BK7_", "", "AIR?", "[A-Z]+"):
+        with pytest.raises(UnknownGlass):
+            find_glass(name, catalogs=["SCHOTT"])
+
+
+def test_unknown_glass_says_where_what_and_what_came_near():
+    with pytest.raises(UnknownGlass) as caught:
+        find_glass("N-SK161", catalogs=["SCHOTT"], where="a.zmx:31, surface 2")
+    assert str(caught.value).startswith("a.zmx:31, surface 2: unknown glass 'N-SK161'")
+    assert "N-SK16 (SCHOTT)" in str(caught.value)
+    assert caught.value.suggestions[0] == ("N-SK16", "SCHOTT")
+    assert "--catalog" in str(caught.value)
+
+
+def test_nearest_names_ignore_hyphens():
+    assert nearest_names("SBSL7")[0] == ("S-BSL7", "OHARA")
+    assert nearest_names("§§§§§§§§") == ()
+
+
+def test_aliases_are_the_same_glass_and_hide_no_name():
+    for name, alias in aliases().items():
+        assert len(alias.reason) > 10
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            glass = find_glass(name)
+        assert (glass.name, glass.listed_name, glass.catalog) == (name, alias.glass, alias.catalog)
+        assert all(shipped_catalog(shipped).find(name) is None for shipped in SHIPPED)
+
+
+def test_a_glass_comes_before_its_alias(tmp_path, small):
+    own = tmp_path / "own.agf"
+    own.write_text(SMALL.replace("NM ONE", "NM NBK7"))
+    assert find_glass("NBK7", user=[own]).catalog == "OWN"
+    assert find_glass("NBK7", user=[small]).catalog == "SCHOTT"
+
+
+def test_user_catalogs_go_first_in_their_order(tmp_path, small, monkeypatch):
+    other = tmp_path / "other.agf"
+    other.write_text(SMALL.replace("NM ONE", "NM N-BK7").replace("NM Two", "NM ONE"))
+    assert find_glass("ONE", user=[small]).catalog == "SMALL"
+    assert find_glass("ONE", user=[other, small]).catalog == "OTHER"
+    assert find_glass("N-BK7", catalogs=["SCHOTT"], user=[small, other]).catalog == "OTHER"
+    monkeypatch.setenv(catalogs.ENVIRONMENT, os.pathsep.join([str(other), "", str(small)]))
+    assert find_glass("one").catalog == "OTHER"
+    assert find_glass("ONE", user=[small]).catalog == "SMALL"
+    with pytest.raises(UnknownGlass, match=r"N-BK7 \(OTHER\)"):
+        find_glass("N-BK77")
+    assert missing_catalogs(["SCHOTT", "Small", "LACROIX"]) == ("LACROIX",)
+
+
+def test_a_user_catalog_that_cannot_be_read_is_an_error(tmp_path, monkeypatch):
+    with pytest.raises(CatalogError, match=r"none\.agf: cannot be read"):
+        find_glass("N-BK7", user=[tmp_path / "none.agf"])
+    monkeypatch.setenv(catalogs.ENVIRONMENT, str(tmp_path))
+    with pytest.raises(CatalogError, match="cannot be read"):
+        find_glass("N-BK7")
+
+
+def test_a_changed_user_catalog_is_read_again(small):
+    assert find_glass("ONE", user=[small]).nd_listed == 1.5168
+    small.write_text(SMALL.replace("1.516800", "1.5168001"))
+    assert find_glass("ONE", user=[small]).nd_listed == 1.5168001
+
+
+def test_one_catalog_is_parsed_for_a_glass_it_holds():
+    """`raytrace info` on a lens of one maker must not wait for twenty catalogs."""
+    script = (
+        "from raytrace import catalog, agf\n"
+        "found = []; read = catalog.read_agf\n"
+        "catalog.read_agf = lambda path: found.append(path.stem) or read(path)\n"
+        "catalog.find_glass('SK16', catalogs=['SCHOTT', 'OHARA']); print(found)"
+    )
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "['SCHOTT']"
+
+
+# -- reading and writing AGF ------------------------------------------------------------------------------------------
+
+
+def test_every_record_is_read(small):
+    catalog = read_agf(small)
+    one, two = catalog.glasses.values()
+    assert (catalog.name, catalog.comments) == ("SMALL", ("A catalog for tests: Prüfgläser",))
+    assert (one.name, one.formula, one.catalog, one.status) == ("ONE", "sellmeier_1", "SMALL", "preferred")
+    assert one.coefficients.tolist() == [1.03961212, 6.00069867e-3, 0.231792344, 2.00179144e-2, 1.01046945, 103.560653]
+    assert one.coefficients.dtype == torch.float64
+    assert (one.nd_listed, one.abbe_listed, one.wavelength_range) == (1.5168, 64.17, (0.3, 2.5))
+    assert one.alternatives == ("TWO", "THREE")
+    assert one.comment.startswith("the first")
+    assert dict(one.records[:3]) == {
+        "ED": (7.1, 8.3, 2.51, -0.0009, 0.0),
+        "TD": (1.86e-6, 1.31e-8, -1.37e-11, 4.34e-7, 6.27e-10, 0.17, 20.0),
+        "OD": (1.0, 2.0, -1.0, 1.0, 2.3, -1.0),
+    }
+    assert one.records[3:] == (("IT", (0.3, 0.05, 25.0)), ("IT", (0.5, 0.998, 25.0)))
+    assert (two.name, two.formula, two.status, two.records) == ("Two", "schott", "obsolete", ())
+
+
+ENCODINGS = {
+    "utf-8": "utf-8",
+    "utf-8 with mark": "utf-8-sig",
+    "utf-16 with mark": "utf-16",
+    "utf-16-le without mark": "utf-16-le",
+    "utf-16-be without mark": "utf-16-be",
+    "latin-1": "latin-1",
+}
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS.values(), ids=ENCODINGS)
+@pytest.mark.parametrize("line_end", ["\n", "\r\n", "\r"], ids=["lf", "crlf", "cr"])
+def test_encodings_and_line_ends(tmp_path, encoding, line_end):
+    path = tmp_path / "small.agf"
+    path.write_bytes(SMALL.replace("\n", line_end).encode(encoding))
+    catalog = read_agf(path)
+    assert catalog.comments == ("A catalog for tests: Prüfgläser",)
+    assert catalog.glasses["ONE"].coefficients[-1] == 103.560653
+    assert len(catalog.glasses) == 2
+
+
+def same(one, other):
+    return (
+        all(getattr(one, field) == getattr(other, field) for field in ("name", "formula", "catalog", "status"))
+        and (one.nd_listed, one.abbe_listed, one.wavelength_range, one.alternatives, one.comment, one.records)
+        == (
+            other.nd_listed,
+            other.abbe_listed,
+            other.wavelength_range,
+            other.alternatives,
+            other.comment,
+            other.records,
+        )
+        and torch.equal(one.coefficients, other.coefficients)
+    )
+
+
+@pytest.mark.parametrize("name", ["SCHOTT", "HIKARI", "BIREFRINGENT", "MISC"])
+def test_what_is_written_reads_back_bit_for_bit(tmp_path, name):
+    original = shipped_catalog(name)
+    write_agf(original, tmp_path / f"{name}.AGF")
+    again = read_agf(tmp_path / f"{name}.AGF")
+    assert list(again.glasses) == list(original.glasses)
+    assert all(same(again.glasses[listed], glass) for listed, glass in original.glasses.items())
+    assert [path.name for path in tmp_path.iterdir()] == [f"{name}.AGF"]
+
+
+def test_shipped_files_are_plain_agf():
+    """Another program finds a header, known keywords, ten coefficients, and a listing for every name."""
+    for path in shipped_folder().glob("*.AGF"):
+        lines = path.read_bytes().decode("ascii").split("\n")
+        assert lines[0].startswith("CC ")
+        assert {line.split(" ")[0] for line in lines[:-1]} <= {"CC", "NM", "GC", "ED", "CD", "TD", "OD", "LD"}
+        for line in lines:
+            if line.startswith("NM"):
+                assert re.fullmatch(r"NM \S+ \d+ \d{6} \S+ \S+ 0 (-1|[0-4]) -1", line)
+                assert int(line.split()[2]) in AGF_FORMULAS
+            if line.startswith("CD"):
+                assert len(line.split()) == 11
+
+
+def test_what_agf_cannot_hold_is_not_written(tmp_path):
+    with pytest.raises(ValueError, match="cannot be written"):
+        write_agf(Catalog("X", {"A": constant(1.5, "A")}), tmp_path / "x.agf")
+    with pytest.raises(ValueError, match="cannot be written"):
+        write_agf(Catalog("X", {"A B": shipped_catalog("SCHOTT").glasses["BK7"]}), tmp_path / "x.agf")
+    assert list(tmp_path.iterdir()) == []
+
+
+BAD = {
+    "empty": ("", r"bad\.agf:1: found no glass"),
+    "another file": ("<!DOCTYPE html>\n<html>\n", r"bad\.agf:1: found no glass, expected an AGF catalog"),
+    "cut off in the numbers": (SMALL[: SMALL.index("E-002 1.0104")], r"bad\.agf:6: found 4 coefficients for ONE, .*6"),
+    "cut off before the range": (SMALL[: SMALL.index("TD")], r"bad\.agf:6: found ONE without a LD record.*cut off"),
+    "cut off in a name": (SMALL[: SMALL.index(" 620603")], r"bad\.agf:14: found NM Two 1, expected NM name formula"),
+    "no coefficients": (SMALL.replace("CD 2.59", "XX 2.59"), r"bad\.agf:16: found Two without a CD record"),
+    "a lost name": (SMALL.replace("NM Two", "NN Two"), r"bad\.agf:15: found a second CD record for ONE.*NM line"),
+    "a word for a number": (SMALL.replace("-0.01540969", "about0"), r"bad\.agf:15: found 'about0', expected a finite"),
+    "not a number": (SMALL.replace("-0.01540969", "nan"), r"bad\.agf:15: found 'nan'"),
+    "infinite": (SMALL.replace("-0.01540969", "1e999"), r"bad\.agf:15: found '1e999'"),
+    "a decimal comma": (SMALL.replace("1.620409", "1,620409"), r"bad\.agf:14: found '1,620409'.*with a point"),
+    "a formula of no manual": (SMALL.replace("NM Two 1 ", "NM Two 14 "), r"bad\.agf:14: found dispersion formula 14"),
+    "half a formula": (SMALL.replace("NM Two 1 ", "NM Two 1.5 "), r"bad\.agf:14: found dispersion formula 1\.5"),
+    "a range upside down": (SMALL.replace("LD 0.4 0.7", "LD 0.7 0.4"), r"bad\.agf:16: found LD 0\.7 0\.4 for Two"),
+    "a range of one end": (SMALL.replace("LD 0.4 0.7", "LD 0.4"), r"bad\.agf:16: found LD 0\.4"),
+    "a record of no glass": ("CC x\nCD 1 2 3\n" + SMALL, r"bad\.agf:2: found a CD record before any glass"),
+}
+
+
+@pytest.mark.filterwarnings("ignore::raytrace.catalog.CatalogWarning")
+@pytest.mark.parametrize(("text", "message"), BAD.values(), ids=BAD)
+def test_a_bad_file_gives_one_clear_error(tmp_path, text, message):
+    path = tmp_path / "bad.agf"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(CatalogError, match=message):
+        read_agf(path)
+
+
+def test_binary_and_damaged_files(tmp_path):
+    path = tmp_path / "bad.agf"
+    path.write_bytes(b"NM A\nPK\x03\x04" + bytes(range(256)) * 9)
+    with pytest.raises(CatalogError, match=r"bad\.agf:2: found binary data \(byte 0x03\)"):
+        read_agf(path)
+    path.write_bytes(SMALL.encode("utf-16")[:501])
+    with pytest.raises(CatalogError, match=r"damaged UTF-16 text.*cut off"):
+        read_agf(path)
+
+
+def test_a_file_too_large_is_refused_before_it_is_read(tmp_path):
+    path = tmp_path / "huge.agf"
+    with path.open("wb") as file:
+        file.truncate(200 * 2**20)  # a sparse file: no disk is used
+    with pytest.raises(CatalogError, match="larger than 64 MB"):
+        read_agf(path)
+
+
+def test_what_is_left_aside_is_said(tmp_path):
+    path = tmp_path / "odd.agf"
+    path.write_text(SMALL + "QX 1 2 3\n")
+    with pytest.warns(CatalogWarning, match=r"odd\.agf: left aside lines that begin with 'QX' \(line 17\)"):
+        assert len(read_agf(path).glasses) == 2
+    path.write_text(SMALL.replace("NM Two", "NM ONE"))
+    with pytest.warns(CatalogWarning, match=r"odd\.agf:14: ONE is defined again; the first"):
+        assert read_agf(path).glasses["ONE"].nd_listed == 1.5168
+
+
+def test_a_range_of_zeros_is_no_range():
+    assert parse_agf(SMALL.replace("LD 0.4 0.7", "LD 0 0"), "x.agf").glasses["Two"].wavelength_range is None
+
+
+def mutate(content: bytes, seed: int) -> bytes:
+    """A few edits of the kind that damage files: bytes changed, cut out, doubled, lines swapped, the end lost."""
+    draw = random.Random(seed)
+    changed = bytearray(content)
+    for _ in range(draw.randint(1, 6)):
+        at, length = draw.randrange(len(changed) + 1), draw.randint(1, 40)
+        kind = draw.randrange(6)
+        if kind == 0:
+            changed[at : at + 1] = bytes([draw.randrange(256)])
+        elif kind == 1:
+            del changed[at : at + length]
+        elif kind == 2:
+            changed[at:at] = changed[at : at + length]
+        elif kind == 3:
+            changed[at:at] = draw.choice([b"\n", b"\0", b" nan ", b"1e400", b"\xff\xfe", b"NM ", b"CD ", b"-", b"\t"])
+        elif kind == 4:
+            lines = changed.split(b"\n")
+            draw.shuffle(lines)
+            changed = bytearray(b"\n".join(lines[: draw.randint(1, len(lines))]))
+        else:
+            del changed[at:]
+    return bytes(changed)
+
+
+@given(st.integers(0, 2**32), st.sampled_from(["utf-8", "utf-16", "latin-1"]))
+@settings(max_examples=1500, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_damaged_file_is_a_catalog_or_a_catalog_error(tmp_path, seed, encoding):
+    path = tmp_path / "damaged.agf"
+    path.write_bytes(mutate(SMALL.encode(encoding), seed))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CatalogWarning)
+        try:
+            catalog = read_agf(path)
+        except CatalogError:
+            return
+    assert catalog.glasses
+    for glass in catalog.glasses.values():
+        assert torch.isfinite(glass.coefficients).all()
+        assert glass.wavelength_range is None or 0 < glass.wavelength_range[0] < glass.wavelength_range[1]
+    again = parse_agf(format_agf(catalog), path)
+    assert all(same(again.glasses[name], glass) for name, glass in catalog.glasses.items())
