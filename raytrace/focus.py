@@ -6,8 +6,9 @@ each spot's own centroid is a parabola in s, so nothing is retraced:
     s = -Σ W cov(x, m) / Σ W var(m)
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
+import scipy.optimize
 import torch
 from torch import Tensor
 
@@ -81,3 +82,42 @@ def _points_and_slopes(rays: Rays) -> tuple[Tensor, Tensor]:
     """Hits (2, ...) mm and slopes (L, M)/N (2, ...), zero for lost rays."""
     slopes = safe_divide(rays.direction[:2], rays.direction[2].expand_as(rays.direction[:2]))
     return torch.where(rays.valid, rays.position[:2], 0.0), torch.where(rays.valid, slopes, 0.0)
+
+
+def focus_of_merit(merit: Callable[[Tensor], Tensor], start: Tensor, *, step: float = 0.1, tolerance: float = 1e-10):
+    """Sensor distance (scalar, mm) that minimises any differentiable merit of it, found by its gradient.
+
+    merit: sensor distance (scalar, mm) -> scalar, smooth near its minimum; start: mm, where the search begins, within
+    the basin of the minimum; step: mm, the first step of the search for a bracket; tolerance: mm.
+    The slope is bracketed and its zero found by Brent's method (scipy); one Newton step then attaches the implicit
+    derivative ds/dp = -∂²M/∂s∂p / ∂²M/∂s², so the result is differentiable once in all that the merit depends on.
+    Raises ValueError if the merit has no minimum within 2²⁰ steps.
+    """
+
+    def slope(s: Tensor, *, create_graph: bool = False) -> Tensor:
+        s = s if s.requires_grad else s.detach().requires_grad_()
+        return torch.autograd.grad(merit(s), s, create_graph=create_graph)[0]
+
+    def slope_at(s: float) -> float:
+        return float(slope(start.new_tensor(s)))
+
+    first = float(start)
+    here = slope_at(first)
+    if here != 0:
+        direction = -step if here > 0 else step
+        for doubling in range(20):
+            last = first + direction * 2**doubling
+            if slope_at(last) * here <= 0:
+                break
+        else:
+            raise ValueError(f"the merit has no minimum within {abs(last - first):g} mm of sensor distance {first:g}")
+        low, high = sorted((first, last))
+        first = scipy.optimize.brentq(slope_at, low, high, xtol=tolerance, rtol=8.9e-16)
+    s = start.new_tensor(first).requires_grad_()
+    gradient = slope(s, create_graph=True)
+    if not gradient.requires_grad:
+        return s.detach()
+    (bend,) = torch.autograd.grad(gradient, s, retain_graph=True)
+    if float(bend) <= 0:
+        return s.detach()
+    return s.detach() - (gradient - gradient.detach()) / bend.detach()

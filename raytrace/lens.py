@@ -94,3 +94,30 @@ def _with_thickness(lens: Lens, number: int, thickness: Tensor) -> Lens:
     thickness = torch.as_tensor(thickness, dtype=surfaces[number].thickness.dtype, device=lens.wavelengths.device)
     surfaces[number] = dataclasses.replace(surfaces[number], thickness=thickness)
     return dataclasses.replace(lens, surfaces=tuple(surfaces))
+
+
+def check(lens: Lens) -> None:
+    """Refuse a lens that cannot be traced as a whole. Raises ValueError saying what was found and what was expected."""
+    last = len(lens.surfaces) - 1
+    if last < 2:
+        raise ValueError(f"{last + 1} surfaces found; expected at least the object, one surface and the image")
+    if not 1 <= lens.stop < last:
+        raise ValueError(f"the stop is surface {lens.stop}; expected one from 1 to {last - 1}")
+    if not bool((lens.wavelengths > 0).all()) or not bool(torch.isfinite(lens.wavelengths).all()):
+        raise ValueError(f"wavelengths {lens.wavelengths.tolist()}: expected numbers above 0, in µm")
+    if not 0 <= lens.primary_wavelength < len(lens.wavelengths):
+        raise ValueError(f"primary wavelength {lens.primary_wavelength + 1} of {len(lens.wavelengths)}")
+    if not float(lens.aperture.value) > 0:
+        raise ValueError(f"aperture {lens.aperture.kind} {float(lens.aperture.value):g}: expected a number above 0")
+    for number, surface in enumerate(lens.surfaces[1:], 1):
+        if not bool(torch.isfinite(surface.thickness)):
+            raise ValueError(f"surface {number} has thickness {float(surface.thickness)}; only the object's may be inf")
+    at_infinity = bool(torch.isinf(lens.surfaces[0].thickness))
+    if at_infinity and lens.fields.kind == "object_height":
+        raise ValueError("fields are object heights but the object is at infinity: give angles, or an object distance")
+    if at_infinity and lens.fields.telecentric:
+        raise ValueError("object space is telecentric but the object is at infinity: give an object distance")
+    if at_infinity and lens.aperture.kind in ("object_na", "object_cone_angle"):
+        raise ValueError(f"aperture {lens.aperture.kind} needs an object at a finite distance")
+    if lens.fields.kind == "angle" and bool((torch.hypot(lens.fields.x, lens.fields.y) >= 90).any()):
+        raise ValueError("field angles reach 90 degrees: rays start from the plane of the entrance pupil")

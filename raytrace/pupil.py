@@ -79,6 +79,13 @@ def fan(
     return _equal(np.stack([line, zero] if axis == "x" else [zero, line]), dtype, device)
 
 
+def with_rim(points: Tensor, weights: Tensor, arms: int = 72) -> tuple[Tensor, Tensor]:
+    """The same rule with points of weight 0 on the rim: they count for a largest radius, not for a mean."""
+    angle = np.arange(arms) * (2 * math.pi / arms)
+    rim = points.new_tensor(np.stack([np.cos(angle), np.sin(angle)]))
+    return torch.cat([points, rim], 1), torch.cat([weights, weights.new_zeros(arms)])
+
+
 def _disc(uniform: Tensor, dtype: torch.dtype, device: torch.device | None) -> tuple[Tensor, Tensor]:
     radius, angle = torch.sqrt(uniform[:, 0]), 2 * math.pi * uniform[:, 1]
     return _equal(torch.stack([radius * torch.cos(angle), radius * torch.sin(angle)]).numpy(), dtype, device)

@@ -22,7 +22,8 @@ class Crossing:
     """What happened to rays at one surface.
 
     rays: Rays behind the surface, in its vertex frame.
-    missed, totally_reflected, clipped: (...) bool, the ray was lost here for that reason.
+    missed, totally_reflected: (...) bool, the ray ends here for that reason; also one vignetted before, which goes on.
+    clipped: (...) bool, the ray was vignetted here, and not lost before.
     """
 
     rays: Rays
@@ -84,7 +85,6 @@ def cross(surface: Surface, rays: Rays, gap: Tensor | None, side: int, n1: Tenso
         passes, survives = torch.ones_like(met), met
     clear = inside(surface, hit)
     valid = rays.valid & survives
-    lost_here = rays.valid & met & ~passes
     clipped = torch.zeros_like(valid) if clear is None else valid & ~clear
     axis = torch.zeros_like(direction)
     axis[2] = 1.0
@@ -94,7 +94,7 @@ def cross(surface: Surface, rays: Rays, gap: Tensor | None, side: int, n1: Tenso
         valid=valid & ~clipped,
         opl=opl if opl is None else torch.where(survives, opl, 0.0),
     )
-    return Crossing(after, rays.valid & ~met, lost_here, clipped)
+    return Crossing(after, ~met, met & ~passes, clipped)
 
 
 def _shift(position: Tensor, gap: Tensor) -> Tensor:

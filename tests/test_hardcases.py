@@ -128,7 +128,8 @@ class Scene:
             reasons = ("miss", crossing.missed), ("tir", crossing.totally_reflected), ("vignetted", crossing.clipped)
             for reason, lost in reasons:
                 for i in lost.nonzero().flatten().tolist():
-                    status[i], fail_surface[i] = reason, k
+                    if status[i] == "ok":
+                        status[i], fail_surface[i] = reason, k
         last = walk[-1].rays
         values = (*last.position, *last.direction, last.opl + origin)
         return {

@@ -1,0 +1,108 @@
+"""The command `raytrace`: parse, call the library once, print or save.
+
+`main(argv)` runs any command in-process and returns its exit code. A command's module, and torch with it, is imported
+only when the command runs, so that `raytrace --help` answers at once.
+"""
+
+import argparse
+import importlib
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+
+from raytrace.cli import options
+
+DESCRIPTION = "A sequential, differentiable ray tracer: read a lens file, trace it, focus it, plot it."
+
+EXAMPLES = """\
+start here:
+  raytrace info lenses/double_gauss.zmx
+  raytrace focus lenses/double_gauss.zmx --object-distance 25000 --plot focus.png
+  raytrace glass N-BK7 --wavelength 0.5876
+
+LENS is a lens file (.zmx, or a prescription table .csv, .tsv, .txt) or the name of a shipped lens, as double_gauss.
+Lengths are mm, wavelengths µm, angles degrees. `raytrace COMMAND --help` teaches each command by example.
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The whole command line, without importing any command."""
+    parser = argparse.ArgumentParser(
+        prog="raytrace", description=DESCRIPTION, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--version", action="version", version=f"raytrace {_version()}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for command in options.COMMANDS:
+        child = commands.add_parser(
+            command.name,
+            help=command.summary,
+            description=command.description,
+            epilog=command.examples,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        command.add_arguments(child)
+        child.set_defaults(run=command.run)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command line; returns 0, or what went wrong: 1 bad input, 2 bad usage, 130 interrupted.
+
+    Results go to stdout; progress, warnings and errors to stderr, one line each.
+    """
+    try:
+        arguments = build_parser().parse_args(argv)
+    except SystemExit as stop:  # argparse printed its help or its usage error
+        return stop.code if isinstance(stop.code, int) else 2
+    module, function = arguments.run.rsplit(".", 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        warnings.showwarning = _show_warning
+        try:
+            getattr(importlib.import_module(f"raytrace.cli.{module}"), function)(arguments)
+        except KeyboardInterrupt:
+            return _fail("interrupted", 130)
+        except BrokenPipeError:
+            # The reader of our output left, as `| head` does; keep Python from complaining once more at exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
+        except Exception as error:
+            if os.environ.get("RAYTRACE_TRACEBACK"):
+                raise
+            if isinstance(error, (ValueError, LookupError, OSError)) and not isinstance(error, KeyError | IndexError):
+                return _fail(_one_line(error), 1)
+            kind = type(error).__name__
+            return _fail(
+                f"{kind}: {_one_line(error)} (a defect of raytrace; RAYTRACE_TRACEBACK=1 shows where, please report)", 1
+            )
+    return 0
+
+
+def script() -> None:
+    """The console script: `main` on the arguments of the process."""
+    sys.exit(main())
+
+
+def _fail(message: str, code: int) -> int:
+    print(f"raytrace: error: {message}", file=sys.stderr)
+    return code
+
+
+def _one_line(error: BaseException) -> str:
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
+    print(f"raytrace: warning: {_one_line(message)}", file=sys.stderr)
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("raytrace")
+    except PackageNotFoundError:
+        return "(not installed)"

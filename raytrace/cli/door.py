@@ -1,0 +1,148 @@
+"""The door of every command: open the lens, set the conditions asked for, refuse what cannot be traced."""
+
+import argparse
+import dataclasses
+import json
+import math
+import os
+import secrets
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from raytrace.formats import LensFileError, read_lens
+from raytrace.glass import check_wavelengths
+from raytrace.lens import Lens, SystemAperture, check, with_object_distance, with_sensor_distance
+from raytrace.resources import shipped
+
+
+class CommandError(ValueError):
+    """Arguments that are well formed but cannot be carried out together."""
+
+
+def find_lens(name: str) -> Path:
+    """The file of that name, else the shipped lens of that name (with or without lenses/ and .zmx)."""
+    path = Path(name)
+    if path.exists():
+        return path
+    folder = shipped("lenses")
+    if path.parent in (Path(), Path("lenses")):
+        for candidate in (folder / path.name, folder / f"{path.name}.zmx"):
+            if path.name and candidate.is_file():
+                return candidate
+    names = ", ".join(sorted({lens.stem for lens in folder.glob("*.zmx")}))
+    raise CommandError(f"{name}: no such lens file; the shipped lenses are {names}")
+
+
+def open_lens(arguments: argparse.Namespace) -> Lens:
+    """Read the lens and set the conditions that the arguments name."""
+    path = find_lens(arguments.lens)
+    lens = read_lens(path, catalogs=catalogs(arguments))
+    wavelengths = getattr(arguments, "wavelength", None)
+    if wavelengths:
+        lens = dataclasses.replace(
+            lens,
+            wavelengths=lens.wavelengths.new_tensor(wavelengths),
+            wavelength_weights=lens.wavelengths.new_ones(len(wavelengths)),
+            primary_wavelength=0,
+        )
+    if getattr(arguments, "f_number", None):
+        lens = _with_aperture(lens, "image_f_number", arguments.f_number)
+    if getattr(arguments, "entrance_pupil_diameter", None):
+        lens = _with_aperture(lens, "entrance_pupil_diameter", arguments.entrance_pupil_diameter)
+    distance = getattr(arguments, "object_distance", None)
+    if isinstance(distance, float):
+        lens = with_object_distance(lens, distance)
+    if getattr(arguments, "sensor_distance", None) is not None:
+        lens = with_sensor_distance(lens, arguments.sensor_distance)
+    refuse_untraceable(lens, str(path))
+    return lens
+
+
+def refuse_untraceable(lens: Lens, path: str) -> None:
+    """Raise for a lens that makes no sense as a whole; warn of glasses used outside their range."""
+    try:
+        check(lens)
+    except ValueError as error:
+        raise CommandError(f"{path}: {error}") from error
+    seen = set()
+    for number, surface in enumerate(lens.surfaces[:-1]):
+        key = (surface.glass.name, surface.glass.catalog)
+        if surface.glass.formula != "constant" and key not in seen:
+            seen.add(key)
+            check_wavelengths(surface.glass, lens.wavelengths, where=f"{path}, surface {number}")
+
+
+def catalogs(arguments: argparse.Namespace) -> tuple[Path, ...]:
+    """The glass catalogs of --catalog; a missing one is refused here."""
+    paths = tuple(Path(name) for name in arguments.catalog)
+    for path in paths:
+        if not path.is_file():
+            raise CommandError(f"{path}: no such glass catalog; expected an .agf file after --catalog")
+    return paths
+
+
+def field_points(lens: Lens, arguments: argparse.Namespace, *, on_axis: bool = False) -> Tensor:
+    """(2, F) field points: those of --field along y, else the axis alone or the lens's own."""
+    given = getattr(arguments, "field", None)
+    if given:
+        y = lens.fields.y.new_tensor(given)
+        return torch.stack([torch.zeros_like(y), y])
+    if on_axis:
+        return lens.fields.y.new_zeros(2, 1)
+    return torch.stack([lens.fields.x, lens.fields.y])
+
+
+def ray_aiming(arguments: argparse.Namespace) -> bool | None:
+    """--ray-aiming as the library takes it: None leaves it to the file."""
+    return {"file": None, "on": True, "off": False}[arguments.ray_aiming]
+
+
+def primary(lens: Lens) -> Tensor:
+    """The primary wavelength, µm."""
+    return lens.wavelengths[lens.primary_wavelength]
+
+
+def number(value) -> float | None:
+    """A number for JSON; null for what is undefined, infinite or not there."""
+    if value is None:
+        return None
+    value = float(value)
+    return value + 0.0 if math.isfinite(value) else None  # + 0.0 makes -0 a 0
+
+
+def numbers(values: Tensor) -> list:
+    """A tensor as nested lists of numbers for JSON."""
+    return [number(entry) if entry.dim() == 0 else numbers(entry) for entry in values.detach()]
+
+
+def print_json(document: dict) -> None:
+    """Write one JSON document to standard output."""
+    print(json.dumps(document, indent=2, allow_nan=False))
+
+
+def say(message: str) -> None:
+    """One line for people, beside the results: to standard error."""
+    print(f"raytrace: {message}", file=sys.stderr)
+
+
+def write_atomically(path: str | os.PathLike, write: Callable[[Path], None]) -> None:
+    """Call `write` on a temporary file beside `path`, then rename it; nothing is left if `write` fails."""
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp{path.suffix}")
+    try:
+        write(temporary)
+        os.replace(temporary, path)
+    except BaseException as error:
+        temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and not isinstance(error, LensFileError):
+            raise CommandError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise
+
+
+def _with_aperture(lens: Lens, kind: str, value: float) -> Lens:
+    number = torch.as_tensor(value, dtype=lens.aperture.value.dtype)
+    return dataclasses.replace(lens, aperture=SystemAperture(kind, number))

@@ -1,0 +1,163 @@
+"""`raytrace info`, `check`, `convert` and `layout`."""
+
+import argparse
+import warnings
+from pathlib import Path
+
+import torch
+
+from raytrace.cli.door import (
+    catalogs,
+    field_points,
+    find_lens,
+    number,
+    numbers,
+    open_lens,
+    print_json,
+    say,
+)
+from raytrace.formats import LensFileWarning, read_lens_with_report, write_lens
+from raytrace.lens import FIELD_UNITS, Lens
+from raytrace.paraxial import first_order, vertex_curvature
+from raytrace.trace import media
+
+#: Lines of `raytrace info`: words, entry of FirstOrder, unit.
+FIRST_ORDER_LINES = (
+    ("effective focal length", "effective_focal_length", "mm"),
+    ("back focal distance", "back_focal_distance", "mm, from the last surface before the image"),
+    ("front focal distance", "front_focal_distance", "mm, from surface 1"),
+    ("F/#", "f_number", "focal length / entrance pupil diameter"),
+    ("working F/#", "working_f_number", "1/(2 n' u')"),
+    ("entrance pupil position", "entrance_pupil_position", "mm, from surface 1"),
+    ("entrance pupil diameter", "entrance_pupil_diameter", "mm"),
+    ("exit pupil position", "exit_pupil_position", "mm, from the image"),
+    ("exit pupil diameter", "exit_pupil_diameter", "mm"),
+    ("paraxial image distance", "paraxial_image_distance", "mm, from the last surface before the image"),
+    ("magnification", "magnification", ""),
+    ("object NA", "object_na", ""),
+    ("image NA", "image_na", ""),
+    ("Petzval radius", "petzval_radius", "mm"),
+)
+
+
+def info(arguments: argparse.Namespace) -> None:
+    """First-order data and prescription."""
+    lens = open_lens(arguments)
+    if arguments.json:
+        print_json(info_document(lens))
+    else:
+        print(info_text(lens, arguments.lens))
+
+
+def info_document(lens: Lens) -> dict:
+    """What `raytrace info --json` writes."""
+    data = first_order(lens)
+    indices = media(lens, lens.wavelengths)
+    return {
+        "name": lens.name,
+        **{name: number(getattr(data, name)) for _, name, _ in FIRST_ORDER_LINES},
+        "wavelengths": numbers(lens.wavelengths),
+        "wavelength_weights": numbers(lens.wavelength_weights),
+        "primary_wavelength": lens.primary_wavelength,
+        "field_type": lens.fields.kind,
+        "field_unit": FIELD_UNITS[lens.fields.kind],
+        "fields": [
+            {"x": number(x), "y": number(y), "weight": number(weight)}
+            for x, y, weight in zip(lens.fields.x, lens.fields.y, lens.fields.weight, strict=True)
+        ],
+        "aperture": {"kind": lens.aperture.kind, "value": number(lens.aperture.value)},
+        "stop_surface": lens.stop,
+        "surfaces": [
+            {
+                "surface": k,
+                "curvature": number(0.0 if surface.curvature is None else surface.curvature),
+                "conic": number(0.0 if surface.conic is None else surface.conic),
+                "coefficients": [] if surface.coefficients is None else numbers(surface.coefficients),
+                "thickness": number(surface.thickness),
+                "glass": surface.glass.name or None,
+                "indices": numbers(indices[k].expand_as(lens.wavelengths)),
+                "semi_diameter": number(surface.semi_diameter),
+                "comment": surface.comment,
+            }
+            for k, surface in enumerate(lens.surfaces)
+        ],
+    }
+
+
+def info_text(lens: Lens, title: str) -> str:
+    """What `raytrace info` prints."""
+    data = first_order(lens)
+    lines = [f"{title}: {lens.name}" if lens.name else title, ""]
+    for words, name, unit in FIRST_ORDER_LINES:
+        lines.append(f"  {words:<24} {float(getattr(data, name)) + 0.0:>16.9g}  {unit}".rstrip())
+    unit = FIELD_UNITS[lens.fields.kind]
+    points = ", ".join(f"({x:g}, {y:g})" for x, y in zip(lens.fields.x.tolist(), lens.fields.y.tolist(), strict=True))
+    shown = [
+        f"{w:g}" + ("*" if i == lens.primary_wavelength and len(lens.wavelengths) > 1 else "")
+        for i, w in enumerate(lens.wavelengths.tolist())
+    ]
+    lines += [
+        f"  {'wavelengths':<24} {', '.join(shown)} µm" + ("  (* primary)" if len(shown) > 1 else ""),
+        f"  {'fields':<24} {points} {unit}, {lens.fields.kind.replace('_', ' ')}",
+        "",
+        f"  {'surface':>7} {'radius':>13} {'thickness':>12} {'glass':<12} {'index':>9} {'semi-dia.':>10}  note",
+    ]
+    indices = media(lens, lens.wavelengths[lens.primary_wavelength])
+    for k, surface in enumerate(lens.surfaces):
+        curvature = float(vertex_curvature(surface)) if surface.curvature is None else float(surface.curvature)
+        radius = "inf" if curvature == 0 else f"{1 / curvature:.6g}"
+        size = "" if surface.semi_diameter is None else f"{surface.semi_diameter:.5g}"
+        lines.append(
+            f"  {k:>7} {radius:>13} {float(surface.thickness):>12.7g} {surface.glass.name:<12} "
+            f"{float(indices[k]):>9.6f} {size:>10}  {_remarks(lens, k)}".rstrip()
+        )
+    return "\n".join(lines)
+
+
+def _remarks(lens: Lens, k: int) -> str:
+    surface = lens.surfaces[k]
+    parts = {0: ["object"], lens.stop: ["stop"], len(lens.surfaces) - 1: ["image"]}.get(k, [])
+    if surface.conic is not None:
+        parts.append(f"conic {float(surface.conic):g}")
+    if surface.coefficients is not None:
+        parts.append("even asphere")
+    parts += [f"{a.shape} {'obscuration' if a.obscures else 'aperture'}" for a in surface.apertures]
+    return ", ".join(dict.fromkeys(filter(None, [*parts, surface.comment])))
+
+
+def check(arguments: argparse.Namespace) -> None:
+    """The import report."""
+    path = find_lens(arguments.lens)
+    lens, report = read_lens_with_report(path, catalogs=catalogs(arguments), strict=arguments.strict)
+    if arguments.json:
+        print_json({**report.to_dict(), "surfaces": len(lens.surfaces), "stop_surface": lens.stop})
+    else:
+        print(report)
+
+
+def convert(arguments: argparse.Namespace) -> None:
+    """Read one format, write another."""
+    path, chosen = find_lens(arguments.lens), catalogs(arguments)
+    lens, report = read_lens_with_report(path, catalogs=chosen, strict=arguments.strict)
+    for warning in report.warnings:
+        warnings.warn(warning, LensFileWarning, stacklevel=1)
+    write_lens(lens, arguments.output, catalogs=chosen)
+    if arguments.json:
+        print_json({"input": str(path), "output": arguments.output, "surfaces": len(lens.surfaces)})
+    else:
+        print(f"{arguments.output}: {len(lens.surfaces)} surfaces from {path}")
+
+
+def layout(arguments: argparse.Namespace) -> None:
+    """The cross section with rays."""
+    from raytrace import plot
+
+    lens = open_lens(arguments)
+    output = arguments.output or f"{Path(arguments.lens).stem}_layout.png"
+    fields = field_points(lens, arguments)
+    figure = plot.layout(lens, fields=fields)
+    plot.save(figure, output)
+    if arguments.json:
+        print_json({"output": output, "fields": [numbers(point) for point in torch.unbind(fields, 1)]})
+    else:
+        say(f"layout written to {output}")

@@ -1,0 +1,273 @@
+"""`raytrace spot`, `focus` and `trace`."""
+
+import argparse
+import sys
+
+import torch
+from torch import Tensor
+
+from raytrace import pupil
+from raytrace.cli import ray_table
+from raytrace.cli.door import (
+    CommandError,
+    field_points,
+    number,
+    numbers,
+    open_lens,
+    primary,
+    print_json,
+    ray_aiming,
+    say,
+    write_atomically,
+)
+from raytrace.focus import focus as best_focus
+from raytrace.focus import focus_of_merit, image_rays
+from raytrace.formats import write_lens
+from raytrace.launch import launch
+from raytrace.lens import FIELD_UNITS, Lens, with_object_distance, with_sensor_distance
+from raytrace.numerics import safe_sqrt
+from raytrace.paraxial import first_order, paraxial_image_distance
+from raytrace.spot import Spot, spot_of_points
+from raytrace.spot import spot as spot_of
+from raytrace.trace import media, steps
+
+_RINGS = 12
+_DEFAULT_SIZE = {"gauss": _RINGS, "hexapolar": _RINGS, "square": 32, "sobol": 1024, "random": 1024}
+
+
+def pupil_points(arguments: argparse.Namespace) -> tuple[Tensor, Tensor]:
+    """Points and weights of the sampling asked for."""
+    size = arguments.size or _DEFAULT_SIZE[arguments.sampling]
+    if arguments.sampling in ("sobol", "random"):
+        return pupil.SAMPLINGS[arguments.sampling](size, seed=arguments.seed)
+    return pupil.SAMPLINGS[arguments.sampling](size)
+
+
+def spot(arguments: argparse.Namespace) -> None:
+    """Spot of every field and wavelength on the sensor."""
+    lens = open_lens(arguments)
+    fields = field_points(lens, arguments)
+    # The rim carries no weight: it shows in the geometric radius, which Gaussian nodes inside the pupil miss.
+    points, weights = pupil.with_rim(*pupil_points(arguments))
+    rays = launch(lens, points, fields=fields, ray_aiming=ray_aiming(arguments))
+    launched = rays.valid
+    vignetted = torch.zeros_like(launched)
+    for crossing in steps(lens.surfaces[1:], rays, indices=media(lens, lens.wavelengths[:, None])):
+        rays, vignetted = crossing.rays, vignetted | crossing.clipped
+    if not bool(launched.all()):
+        say(f"warning: {int((~launched).sum())} of {launched.numel()} rays found no way to their point of the stop")
+    spots = spot_of(rays, weights)
+    if arguments.plot:
+        from raytrace import plot
+
+        plot.save(plot.spot_diagram(lens, fields=fields), arguments.plot)
+        say(f"spot diagram written to {arguments.plot}")
+    if arguments.json:
+        print_json(_spot_document(lens, fields, spots, vignetted))
+        return
+    unit = FIELD_UNITS[lens.fields.kind]
+    print(f"{'field':>10} {'wavelength':>11} {'centroid x':>13} {'centroid y':>13} {'RMS':>10} {'GEO':>10} {'rays':>7}")
+    print(f"{unit:>10} {'µm':>11} {'mm':>13} {'mm':>13} {'µm':>10} {'µm':>10} {'lost':>7}")
+    for f in range(fields.shape[1]):
+        for w, wavelength in enumerate(lens.wavelengths.tolist()):
+            x, y = spots.centroid[:, f, w].tolist()
+            rms, geometric = 1000 * float(spots.rms_radius[f, w]), 1000 * float(spots.geometric_radius[f, w])
+            lost = rays.valid.shape[-1] - int(spots.rays[f, w])
+            print(
+                f"{_field_label(fields[:, f]):>10} {wavelength:>11g} {x:>13.7f} {y:>13.7f} {rms:>10.4f} "
+                f"{geometric:>10.4f} {lost:>7}"
+            )
+        if len(lens.wavelengths) > 1:
+            whole = polychromatic(lens, spots, weights, f)
+            rms, geometric = 1000 * float(whole.rms_radius), 1000 * float(whole.geometric_radius)
+            x, y = whole.centroid.tolist()
+            print(f"{'':>10} {'all':>11} {x:>13.7f} {y:>13.7f} {rms:>10.4f} {geometric:>10.4f}")
+
+
+def polychromatic(lens: Lens, spots: Spot, weights: Tensor, field: int) -> Spot:
+    """The spot of one field over all wavelengths, by their weights."""
+    wavelength_weights = lens.wavelength_weights / lens.wavelength_weights.sum()
+    joint = (wavelength_weights[:, None] * weights).flatten()
+    return spot_of_points(spots.points[:, field].flatten(1), spots.valid[field].flatten(), joint)
+
+
+def _spot_document(lens: Lens, fields: Tensor, spots: Spot, vignetted: Tensor) -> dict:
+    results = [
+        {
+            "field": numbers(fields[:, f]),
+            "wavelength": wavelength,
+            "centroid": numbers(spots.centroid[:, f, w]) if int(spots.rays[f, w]) else [None, None],
+            "rms_radius": number(spots.rms_radius[f, w]) if int(spots.rays[f, w]) else None,
+            "geometric_radius": number(spots.geometric_radius[f, w]) if int(spots.rays[f, w]) else None,
+            "rays": int(spots.rays[f, w]),
+            "vignetted": int(vignetted[f, w].sum()),
+            "launched": spots.valid.shape[-1],
+        }
+        for f in range(fields.shape[1])
+        for w, wavelength in enumerate(lens.wavelengths.tolist())
+    ]
+    return {"field_type": lens.fields.kind, "field_unit": FIELD_UNITS[lens.fields.kind], "results": results}
+
+
+def _field_label(field: Tensor) -> str:
+    x, y = field.tolist()
+    return f"{y:g}" if x == 0 else f"{x:g},{y:g}"
+
+
+def focus(arguments: argparse.Namespace) -> None:
+    """Best sensor distance, before and after."""
+    lens = open_lens(arguments)
+    distances = arguments.object_distance or [float(lens.surfaces[0].thickness)]
+    fields = field_points(lens, arguments, on_axis=True)
+    wavelengths = lens.wavelengths if arguments.wavelength else primary(lens)[None]
+    points, weights = pupil_points(arguments)
+    _check_weights(arguments, distances, fields, wavelengths)
+    rule = {
+        "object_distances": distances,
+        "distance_weights": arguments.distance_weights,
+        "fields": fields,
+        "wavelengths": wavelengths,
+        "field_weights": _optional(arguments.field_weights),
+        "wavelength_weights": _optional(arguments.wavelength_weights),
+    }
+    before = lens.surfaces[-2].thickness
+    paraxial = paraxial_image_distance(lens, before.new_tensor(distances))
+    if not bool(torch.isfinite(paraxial).all()):
+        raise CommandError(f"{arguments.lens}: the lens is afocal for this object distance; there is no focus to find")
+    rms = best_focus(lens, points, weights, **rule)
+    after = {"rms": rms, "paraxial": paraxial.mean()}.get(arguments.criterion)
+    if after is None:
+        after = focus_of_merit(lambda s: _mean_distance(lens, s, points, weights, rule), rms).detach()
+    result = {
+        "object_distance": number(distances[0]) if len(distances) == 1 else [number(d) for d in distances],
+        "sensor_before": number(before),
+        "sensor_paraxial": number(paraxial[0]) if len(distances) == 1 else numbers(paraxial),
+        "sensor_rms": number(rms),
+        "sensor_after": number(after),
+        "rms_before": _rms(lens, before, points, weights, rule),
+        "rms_after": _rms(lens, after, points, weights, rule),
+    }
+    if result["rms_after"] is None:
+        raise CommandError(f"{arguments.lens}: no ray reaches the image; `raytrace trace` says where they are lost")
+    focused = with_sensor_distance(lens, after)
+    if arguments.plot:
+        from raytrace import plot
+
+        figure = plot.focus_report(lens, focused, object_distances=distances, fields=fields, wavelengths=wavelengths)
+        plot.save(figure, arguments.plot)
+    if arguments.output:
+        write_lens(_as_in_file(focused, arguments), arguments.output)
+    if arguments.json:
+        print_json(result)
+    else:
+        _print_focus(lens, arguments, distances, fields, wavelengths, paraxial, result, points, weights, rule)
+    for path in filter(None, (arguments.plot, arguments.output)):
+        say(f"written: {path}")
+
+
+def _as_in_file(focused: Lens, arguments: argparse.Namespace) -> Lens:
+    """The lens as the file has it, with the new sensor distance: a trial object distance is not part of the lens."""
+    from raytrace.cli.door import catalogs, find_lens
+    from raytrace.formats import read_lens
+
+    original = read_lens(find_lens(arguments.lens), catalogs=catalogs(arguments))
+    return with_sensor_distance(original, focused.surfaces[-2].thickness)
+
+
+def _rms(lens: Lens, sensor: Tensor, points: Tensor, weights: Tensor, rule: dict) -> float | None:
+    """Root of the weighted mean of the mean square radii over distances, fields and wavelengths, mm."""
+    square = _average(lens, sensor, points, rule, lambda rays: spot_of(rays, weights).mean_square_radius)
+    return None if square is None else number(safe_sqrt(square))
+
+
+def _mean_distance(lens: Lens, sensor: Tensor, points: Tensor, weights: Tensor, rule: dict) -> Tensor:
+    """Weighted mean distance of the hits from their centroid, mm."""
+
+    def merit(rays):
+        found = spot_of(rays, weights)
+        offset = rays.position[:2] - found.centroid[..., None]
+        distance = torch.where(rays.valid, safe_sqrt(offset[0] ** 2 + offset[1] ** 2), 0.0)
+        return (weights * distance).sum(-1) / torch.where(rays.valid, weights, 0.0).sum(-1).clamp_min(1e-300)
+
+    return _average(lens, sensor, points, rule, merit)
+
+
+def _average(lens: Lens, sensor: Tensor, points: Tensor, rule: dict, merit) -> Tensor | None:
+    """Mean of a merit (F, W) over distances × fields × wavelengths by the rule's weights; None if no ray arrives."""
+    total = share = 0.0
+    distance_weights = rule["distance_weights"] or [1.0] * len(rule["object_distances"])
+    for distance, distance_weight in zip(rule["object_distances"], distance_weights, strict=True):
+        trial = with_sensor_distance(with_object_distance(lens, distance), sensor)
+        rays = image_rays(trial, points, fields=rule["fields"], wavelengths=rule["wavelengths"])
+        portion = rays.valid.any(-1).to(rays.position.dtype) * distance_weight
+        portion = portion if rule["field_weights"] is None else portion * rule["field_weights"][:, None]
+        portion = portion if rule["wavelength_weights"] is None else portion * rule["wavelength_weights"]
+        total, share = total + (portion * merit(rays)).sum(), share + portion.sum()
+    return total / share if float(share) > 0 else None
+
+
+def _print_focus(lens, arguments, distances, fields, wavelengths, paraxial, result, points, weights, rule) -> None:
+    data = first_order(lens, primary(lens))
+    print(f"{arguments.lens}: {lens.name}" if lens.name else arguments.lens)
+    print(
+        f"  effective focal length {float(data.effective_focal_length):.6f} mm, F/{float(data.f_number):.4g}, ", end=""
+    )
+    print(f"back focal distance {float(data.back_focal_distance):.6f} mm")
+    place = float(data.entrance_pupil_position)
+    print(f"  entrance pupil {float(data.entrance_pupil_diameter):.5g} mm across, {place:.5g} mm from surface 1")
+    shown = ", ".join("infinity" if d == float("inf") else f"{d:g} mm" for d in distances)
+    unit = FIELD_UNITS[lens.fields.kind]
+    at = ", ".join(_field_label(field) for field in fields.unbind(1))
+    colours = ", ".join(f"{w:g}" for w in wavelengths.tolist())
+    print(f"  object at {shown}; field {at} {unit}; {colours} µm; criterion {arguments.criterion}\n")
+    rows = [("before", result["sensor_before"]), ("after", result["sensor_after"])]
+    rows += [
+        (
+            f"paraxial image of {'infinity' if d == float('inf') else f'{d:g} mm'}"
+            if len(distances) > 1
+            else "paraxial",
+            p,
+        )
+        for d, p in zip(distances, paraxial.tolist(), strict=True)
+    ]
+    rows.append(("best RMS", result["sensor_rms"]))
+    print(f"  {'':<28} {'sensor distance':>18} {'RMS spot radius':>18}")
+    for words, sensor in rows:
+        rms = _rms(lens, paraxial.new_tensor(sensor), points, weights, rule)
+        print(f"  {words:<28} {sensor:>15.6f} mm {'no rays' if rms is None else f'{1000 * rms:>15.4f} µm'}")
+
+
+def _check_weights(arguments, distances, fields, wavelengths) -> None:
+    for name, given, count in (
+        ("--distance-weights", arguments.distance_weights, len(distances)),
+        ("--field-weights", arguments.field_weights, fields.shape[1]),
+        ("--wavelength-weights", arguments.wavelength_weights, len(wavelengths)),
+    ):
+        if given is not None and len(given) != count:
+            raise CommandError(f"{name}: {len(given)} given, expected {count}, one for each")
+
+
+def _optional(values: list[float] | None) -> Tensor | None:
+    return None if values is None else torch.tensor(values, dtype=torch.float64)
+
+
+def trace(arguments: argparse.Namespace) -> None:
+    """Rays of a table, or the chief and marginal rays of the fields, surface by surface."""
+    lens = open_lens(arguments)
+    if arguments.rays:
+        batches, total = ray_table.read(arguments.rays, float(primary(lens)))
+    else:
+        batches, total = ray_table.chief_and_marginal(lens, ray_aiming(arguments))
+    fates = ray_table.Fates()
+    if arguments.json:
+        rows = [row for batch in batches for row in ray_table.rows(ray_table.traced(lens, batch, fates))]
+        print_json({"rays": total, "results": rows, "lost": fates.counts()})
+    elif arguments.output:
+        write_atomically(
+            arguments.output, lambda path: ray_table.write(path, lens, batches, total, fates, progress=True)
+        )
+        say(f"{total} rays written to {arguments.output}")
+    else:
+        ray_table.write(sys.stdout, lens, batches, total, fates, progress=False)
+    for line in fates.lines():
+        say(line)

@@ -1,0 +1,157 @@
+"""Tables of rays: read the rays of `raytrace trace --rays`, write what became of them at every surface."""
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+import pandas
+import torch
+from tqdm import tqdm
+
+from raytrace.cli.door import CommandError
+from raytrace.launch import launch
+from raytrace.lens import Lens
+from raytrace.rays import Rays
+from raytrace.trace import axial_path, media, start, steps
+
+COLUMNS = ("x", "y", "z", "l", "m", "n")
+OUTPUT = ("ray", "surface", *COLUMNS, "opl", "status")
+_BATCH = 50_000
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Rays (3, P) in front of surface 1 with their wavelengths (P,) µm, and the number of the first."""
+
+    rays: Rays
+    wavelength: torch.Tensor
+    first: int
+
+
+@dataclass
+class Fates:
+    """How many rays were lost where, and why."""
+
+    lost: Counter = field(default_factory=Counter)
+
+    def counts(self) -> list[dict]:
+        return [{"surface": k, "status": status, "rays": n} for (k, status), n in sorted(self.lost.items())]
+
+    def lines(self) -> list[str]:
+        words = {"miss": "missed", "tir": "were totally reflected at", "vignetted": "were vignetted at"}
+        return [f"{n} rays {words[status]} surface {k}" for (k, status), n in sorted(self.lost.items())]
+
+
+def read(path: str, primary: float) -> tuple[Iterator[Batch], int]:
+    """Batches of the rays in a CSV file and their number. Raises CommandError naming file, line and column."""
+    try:
+        table = pandas.read_csv(path, float_precision="round_trip", skipinitialspace=True, dtype=str)
+    except FileNotFoundError:
+        raise CommandError(f"{path}: no such file; expected a table of rays with columns {','.join(COLUMNS)}") from None
+    except (pandas.errors.ParserError, pandas.errors.EmptyDataError, UnicodeDecodeError) as error:
+        raise CommandError(f"{path}: not a table of rays: {' '.join(str(error).split())}") from error
+    table.columns = [str(name).strip().lower() for name in table.columns]
+    missing = [name for name in COLUMNS if name not in table.columns]
+    if missing:
+        raise CommandError(
+            f"{path}:1: column {missing[0]!r} is missing; expected a header {','.join(COLUMNS)}[,wavelength], "
+            f"found {','.join(table.columns)}"
+        )
+    names = [*COLUMNS, *(["wavelength"] if "wavelength" in table.columns else [])]
+    values = table[names].apply(pandas.to_numeric, errors="coerce").to_numpy(dtype=np.float64).reshape(-1, len(names))
+    wrong = np.argwhere(~np.isfinite(values))
+    if len(wrong):
+        row, column = wrong[0]
+        found = table[names].iloc[row, column]
+        found = "nothing" if isinstance(found, float) else repr(found)
+        raise CommandError(f"{path}:{row + 2}: column {names[column]}: expected a finite number, found {found}")
+    pointless = np.flatnonzero((values[:, 3:6] == 0).all(1))
+    if len(pointless):
+        raise CommandError(f"{path}:{pointless[0] + 2}: the direction l,m,n is 0,0,0; expected direction cosines")
+    wavelengths = values[:, 6] if "wavelength" in table.columns else np.full(len(values), primary)
+    negative = np.flatnonzero(~(wavelengths > 0))
+    if len(negative):
+        raise CommandError(f"{path}:{negative[0] + 2}: wavelength {wavelengths[negative[0]]:g}: expected µm above 0")
+
+    def batches() -> Iterator[Batch]:
+        for first in range(0, len(values), _BATCH):
+            part = torch.from_numpy(values[first : first + _BATCH, :6].T.copy())
+            rays = start(part[:3], part[3:], torch.zeros_like(part[0]))
+            yield Batch(rays, torch.from_numpy(wavelengths[first : first + _BATCH].copy()), first)
+
+    return batches(), len(values)
+
+
+def chief_and_marginal(lens: Lens, ray_aiming: bool | None) -> tuple[list[Batch], int]:
+    """Chief, upper, lower and side ray of every field at the primary wavelength.
+
+    Their path counts from the wavefront of the object point that passes the vertex of surface 1.
+    """
+    pupil = lens.wavelengths.new_tensor([[0.0, 0.0, 0.0, 1.0], [0.0, 1.0, -1.0, 0.0]])
+    wavelength = lens.wavelengths[lens.primary_wavelength][None]
+    rays = launch(lens, pupil, wavelengths=wavelength, ray_aiming=ray_aiming)
+    count = rays.valid.numel()
+    flat = Rays(rays.position.reshape(3, -1), rays.direction.reshape(3, -1), rays.valid.flatten(), rays.opl.flatten())
+    return [Batch(flat, wavelength.expand(count), 0)], count
+
+
+def traced(lens: Lens, batch: Batch, fates: Fates) -> pandas.DataFrame:
+    """One row per ray and surface that the ray reaches, or at which it is lost; columns OUTPUT."""
+    surfaces, indices = lens.surfaces[1:], media(lens, batch.wavelength)
+    count = len(batch.wavelength)
+    ended = torch.zeros(count, dtype=torch.bool)
+    vignetted = torch.zeros(count, dtype=torch.bool)
+    frames = []
+    for k, crossing in enumerate(steps(surfaces, batch.rays, indices=indices), 1):
+        vignetted = vignetted | crossing.clipped
+        stopped = crossing.missed | crossing.totally_reflected
+        status = np.full(count, "ok", dtype=object)
+        status[vignetted.numpy()] = "vignetted"
+        status[crossing.missed.numpy()] = "miss"
+        status[crossing.totally_reflected.numpy()] = "tir"
+        opl = crossing.rays.opl + axial_path(surfaces[:k], indices[: k + 1])
+        values = torch.stack([*crossing.rays.position, *crossing.rays.direction, opl])
+        values = torch.where(stopped, math.nan, values)
+        shown = ~ended
+        frame = pandas.DataFrame(values[:, shown].T.numpy(), columns=[*COLUMNS, "opl"])
+        frame.insert(0, "ray", batch.first + torch.arange(count)[shown].numpy())
+        frame.insert(1, "surface", k)
+        frame["status"] = status[shown.numpy()]
+        frames.append(frame)
+        for name, mask in (
+            ("miss", crossing.missed),
+            ("tir", crossing.totally_reflected),
+            ("vignetted", crossing.clipped),
+        ):
+            if bool(mask.any()):
+                fates.lost[k, name] += int(mask.sum())
+        ended = ended | stopped
+    return pandas.concat(frames).sort_values(["ray", "surface"], kind="stable", ignore_index=True)
+
+
+def rows(table: pandas.DataFrame) -> list[dict]:
+    """The table as JSON rows, null where a coordinate is empty."""
+    return [
+        {name: None if isinstance(entry, float) and math.isnan(entry) else entry for name, entry in row.items()}
+        for row in table.to_dict("records")
+    ]
+
+
+def write(
+    target: Path | IO[str], lens: Lens, batches: Iterable[Batch], total: int, fates: Fates, *, progress: bool
+) -> None:
+    """Write the traced batches as CSV; every float as the shortest text that reads back the same."""
+    header = True
+    hide = not (progress and total > _BATCH)
+    with tqdm(total=total, unit="ray", unit_scale=True, disable=hide) as bar:
+        for batch in batches:
+            table = traced(lens, batch, fates)
+            table.to_csv(target, mode="w" if header else "a", header=header, index=False)
+            header = False
+            bar.update(len(batch.wavelength))
+    if header:
+        pandas.DataFrame(columns=list(OUTPUT)).to_csv(target, index=False)
