@@ -26,6 +26,7 @@ import torch
 from torch import Tensor
 
 from raytrace.formats import table_surface, table_system
+from raytrace.formats.finite import refuse_overflow
 from raytrace.formats.media import report_missing_catalogs
 from raytrace.formats.report import Draft, ImportReport
 from raytrace.formats.source import LensFileError, Place, integer, is_infinite, is_number, number, shown
@@ -61,7 +62,7 @@ def build(table: Table, report: Draft, *, catalogs: Sequence[Path] = ()) -> Lens
     _check_image(rows, surfaces)
     stop = _stop(rows, metadata, len(surfaces), place)
     wavelengths, weights, primary = table_system.wavelengths(metadata, place, report)
-    return Lens(
+    lens = Lens(
         surfaces=tuple(surfaces),
         stop=stop,
         aperture=table_system.aperture(metadata, surfaces[stop].semi_diameter, unit, place, report),
@@ -74,6 +75,8 @@ def build(table: Table, report: Draft, *, catalogs: Sequence[Path] = ()) -> Lens
         catalogs=names,
         ray_aiming=table_system.truth(metadata, "ray aiming"),
     )
+    refuse_overflow(lens, place.file)
+    return lens
 
 
 def _unit(metadata: table_system.Metadata) -> float:

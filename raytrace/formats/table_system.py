@@ -221,10 +221,10 @@ def wavelengths(metadata: Metadata, table: Place, report: Draft) -> tuple[Tensor
 def _wavelengths(value: str, place: Place) -> list[float]:
     words = [word for word in _NUMBERS.split(value) if word]
     unit = "µm" if words and is_number(words[-1]) else (words or [""]).pop()
-    factors = {"µm": 1.0, "μm": 1.0, "um": 1.0, "micron": 1.0, "microns": 1.0, "nm": 1e-3}
-    if unit not in factors or not words or len(words) > 1000:
+    per_micron = {"µm": 1, "μm": 1, "um": 1, "micron": 1, "microns": 1, "nm": 1000}
+    if unit not in per_micron or not words or len(words) > 1000:
         raise LensFileError(f"wavelengths is {shown(value)}, expected numbers in µm (or with the unit, nm)", place)
-    found = [number(word, "wavelength", place) * factors[unit] for word in words]
+    found = [number(word, "wavelength", place) / per_micron[unit] for word in words]
     for wavelength in found:
         if not 0 < wavelength < 100:
             raise LensFileError(

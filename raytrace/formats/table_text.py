@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from raytrace.formats.report import IGNORED, READ, UNKNOWN, Draft
-from raytrace.formats.source import MAX_SURFACES, LensFileError, Place, shown
+from raytrace.formats.source import MAX_SURFACES, LensFileError, Place, is_number, shown
 from raytrace.formats.table_columns import is_header, meaning, order
 from raytrace.formats.table_system import KEYS, key_of
 
@@ -43,7 +43,8 @@ def parse(text: str, file: str, report: Draft) -> Table:
         if split is None:
             split = _header_splitter(line, place)
             if split is not None:
-                columns = header(split(line, place), place, report)
+                heading = line.replace("#", " ", 1) if line.lstrip().startswith("#") else line
+                columns = header(split(heading, place), place, report)
             elif not metadata_line(table, line, place, report):
                 _preamble(table, line, place, report)
         elif not metadata_line(table, line, place, report):
@@ -134,13 +135,14 @@ def _header_splitter(line: str, place: Place):
         if key_of(line.strip("# \t").partition(":")[0])[0]:
             return None
         line = line.replace("#", " ", 1)
+    line = line.expandtabs() if "\t" not in line.strip() else line
     for separator in "\t;,":
         if separator in line and is_header(line.replace('"', "").split(separator), place, known=0.5 + 0.5 * commented):
             return lambda text, where: _cells(text, separator, where)
     for gap in (r"\s{2,}", r"\s+"):
         spans = _spans(line, gap)
         if is_header([line[start:end] for start, end in spans], place, known=1.0):
-            return lambda text, where: _aligned(text, spans, line, where)
+            return lambda text, where, gap=gap, spans=spans: _aligned(text, gap, spans, where)
     return None
 
 
@@ -163,21 +165,20 @@ def _spans(line: str, gap: str) -> list[tuple[int, int]]:
     return spans
 
 
-def _aligned(line: str, spans: list[tuple[int, int]], header_line: str, place: Place) -> list[str]:
+def _aligned(line: str, gap: str, spans: list[tuple[int, int]], place: Place) -> list[str]:
     """Cells of a line aligned under headings: in order if each column has one, else by the heading they stand under."""
-    if line == header_line:
-        return [line[start:end].strip() for start, end in spans]
     line = line.expandtabs()
-    for gap in (r"\s{2,}", r"\s+"):
-        words = _spans(line, gap)
-        if len(words) == len(spans):
-            return [line[start:end] for start, end in words]
+    words = _spans(line, gap)
+    if len(words) == len(spans):
+        return [line[start:end].strip() for start, end in words]
     cells = [""] * len(spans)
-    for start, end in _spans(line, r"\s{2,}" if re.search(r"\S\s{2,}\S", line) else r"\s+"):
+    for start, end in words:
         overlaps = [min(end, stop) - max(start, begin) for begin, stop in spans]
-        column = max(range(len(spans)), key=lambda k: overlaps[k])
-        if cells[column]:
-            message = f"{shown(line[start:end])} stands under the same heading as {shown(cells[column])}"
-            raise LensFileError(f"{message}; separate the columns by tabs or commas", place)
-        cells[column] = line[start:end]
+        column = overlaps.index(max(overlaps))
+        word = line[start:end].strip()
+        mixed = " " in word and any("." in part and is_number(part) for part in word.split())
+        if cells[column] or mixed:
+            message = f"{shown(word)} is not under a heading of its own"
+            raise LensFileError(f"{message}; align the columns, or separate them by tabs or commas", place)
+        cells[column] = word
     return cells

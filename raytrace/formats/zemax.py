@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from raytrace.formats import zemax_surface, zemax_system
+from raytrace.formats.finite import refuse_overflow
 from raytrace.formats.media import report_missing_catalogs
 from raytrace.formats.report import Draft, ImportReport
 from raytrace.formats.source import LensFileError, UnsupportedSurface
@@ -57,6 +58,7 @@ def read(text: str, file: str, *, catalogs: Sequence[Path] = (), strict: bool = 
         catalogs=catalog_names,
         ray_aiming=zemax_system.ray_aiming(system),
     )
+    refuse_overflow(lens, file)
     zemax_system.remarks(system, found.surfaces, found.tail, report)
     return lens, report.finished(strict=strict)
 
