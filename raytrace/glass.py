@@ -118,11 +118,11 @@ def _resonance(wavelength: Tensor, pole: Tensor) -> tuple[Tensor, Tensor]:
 
 def _sellmeier(coefficients: Tensor, wavelength: Tensor) -> Tensor:
     """n² = 1 + Σ_i K_i λ²/(λ² - L_i); coefficients K_1, L_1, K_2, L_2, … (formulas Sellmeier 1, 3 and 5)."""
-    n_squared, impossible = torch.ones_like(wavelength), torch.zeros_like(wavelength, dtype=torch.bool)
-    for strength, pole in zip(coefficients[0::2].unbind(0), coefficients[1::2].unbind(0), strict=True):
-        resonance, at_pole = _resonance(wavelength, pole)
-        n_squared = n_squared + strength * resonance
-        impossible = impossible | (at_pole & (strength != 0))
+    strengths, poles = coefficients[0::2], coefficients[1::2]
+    resonances, at_pole = _resonance(wavelength, poles)
+    # Added one by one: a reduction may associate differently in batches of different shape.
+    n_squared = sum((strengths * resonances).unbind(0), 1.0)
+    impossible = (at_pole & (strengths != 0)).any(0)
     return safe_sqrt(torch.where(impossible, 0.0, n_squared))
 
 
@@ -187,7 +187,7 @@ def _sellmeier_4(coefficients: Tensor, wavelength: Tensor) -> Tensor:
 
 def _constant(coefficients: Tensor, wavelength: Tensor) -> Tensor:
     """n at every wavelength."""
-    return coefficients[0].expand(torch.broadcast_shapes(coefficients[0].shape, wavelength.shape))
+    return torch.broadcast_tensors(coefficients[0], wavelength)[0]
 
 
 #: The lines of the model-glass fit, µm, rounded as the programs that wrote the files round them.
@@ -248,19 +248,24 @@ COEFFICIENT_COUNTS = dict(zip(FORMULAS, (6, 6, 6, 5, 3, 8, 4, 4, 5, 8, 10, 8, 9,
 def refractive_index(glass: Glass, wavelength: Tensor) -> Tensor:
     """n of a glass, evaluated in float64; 0 with gradient 0 where the formula has no real, positive index.
 
-    wavelength: (...) µm; returns (...), broadcast with the trailing axes of the coefficients, in the dtype and on the
-    device of `wavelength`. No check, no warning, no host synchronisation: see the module's docstring.
+    wavelength: (...) µm; a constant index takes any number. Returns (...), broadcast with the trailing axes of the
+    coefficients, in the dtype and on the device of `wavelength`. No check, no warning, no host synchronisation: see
+    the module's docstring.
     Raises InvalidIndex for MIRROR, which has no index: light stays in the medium before it.
     """
     if glass.formula == "mirror":
         raise InvalidIndex("a mirror has no refractive index: the light stays in the medium before it")
     exact = wavelength.to(torch.float64)
     coefficients = glass.coefficients.to(device=wavelength.device, dtype=torch.float64)
-    meaningful = (exact > _SHORTEST) & (exact < _LONGEST)
-    finite = torch.isfinite(coefficients)
-    n = FORMULAS[glass.formula](torch.where(finite, coefficients, 0.0), torch.where(meaningful, exact, 1.0))
-    usable = meaningful & finite.all(0) & torch.isfinite(n) & (n > 0)
-    return torch.where(usable, n, 0.0).to(wavelength.dtype)
+    count, *batch = coefficients.shape
+    coefficients = coefficients.reshape(count, *[1] * (exact.dim() - len(batch)), *batch)
+    if glass.formula == "constant":  # air is half of all media: no formula, no wavelength
+        n = _constant(coefficients, exact)
+        return torch.where((n > 0) & (n < torch.inf), n, 0.0).to(wavelength.dtype)
+    finite = coefficients.abs() < torch.inf
+    usable = (exact > _SHORTEST) & (exact < _LONGEST) & finite.all(0)
+    n = FORMULAS[glass.formula](torch.where(finite, coefficients, 0.0), torch.where(usable, exact, 1.0))
+    return torch.where(usable & (n > 0) & (n < torch.inf), n, 0.0).to(wavelength.dtype)
 
 
 def check_wavelengths(glass: Glass, wavelengths: Tensor | Sequence[float] | float, *, where: str = "") -> None:
@@ -276,7 +281,8 @@ def check_wavelengths(glass: Glass, wavelengths: Tensor | Sequence[float] | floa
     span = glass.wavelength_range
     fitted = f"its coefficients hold from {span[0]:g} to {span[1]:g} µm" if span else "it lists no wavelength range"
     n = refractive_index(glass, wavelengths).detach()
-    missing = wavelengths.expand(n.shape)[~(n > 0)]
+    exists = (n > 0) & (wavelengths > 0) & torch.isfinite(wavelengths)
+    missing = wavelengths.expand(exists.shape)[~exists]
     if missing.numel():
         raise InvalidIndex(
             f"{place}{name} has no real refractive index at {_spell(missing)} µm (formula {glass.formula}: "
