@@ -1,0 +1,230 @@
+"""Systems that carry their exact answers, and short ways to write a lens down.
+
+Every problem states the law that makes it exact, so that a test needs no second tracer.
+"""
+
+import math
+from dataclasses import dataclass
+from decimal import Decimal, localcontext
+
+import torch
+
+from raytrace.glass import AIR, MIRROR, Glass, constant
+from raytrace.lens import Fields, Lens, SystemAperture
+from raytrace.surface import Aperture, Surface
+
+#: Lengths in mm, for tolerances that carry a unit.
+MICROMETRE = 1e-3
+NANOMETRE = 1e-6
+PICOMETRE = 1e-9
+FEMTOMETRE = 1e-12
+
+
+def scalar(number: float) -> torch.Tensor:
+    return torch.tensor(float(number), dtype=torch.float64)
+
+
+def vector(*numbers: float) -> torch.Tensor:
+    return torch.tensor(numbers, dtype=torch.float64)
+
+
+def surface(curvature=None, thickness=0.0, glass: Glass | float = AIR, *, conic=None, coefficients=None, **others) -> Surface:
+    """A surface from plain numbers (tensors pass as they are); glass may be an index."""
+
+    def tensor(x):
+        return x if x is None or isinstance(x, torch.Tensor) else torch.as_tensor(x, dtype=torch.float64)
+
+    return Surface(
+        thickness=tensor(thickness),
+        curvature=tensor(curvature),
+        conic=tensor(conic),
+        coefficients=tensor(coefficients),
+        glass=glass if isinstance(glass, Glass) else constant(glass),
+        **others,
+    )
+
+
+def fields(kind: str = "angle", y=(0.0,), x=None, **others) -> Fields:
+    y = vector(*y)
+    x = torch.zeros_like(y) if x is None else vector(*x)
+    return Fields(kind, x, y, torch.ones_like(y), **others)
+
+
+def lens(
+    surfaces,
+    *,
+    stop: int = 1,
+    object_distance=math.inf,
+    aperture=("entrance_pupil_diameter", 10.0),
+    field: Fields | None = None,
+    wavelengths=(0.55,),
+    **others,
+) -> Lens:
+    """A lens of the surfaces from number 1 to the last before the image; a plane object and image are added."""
+    kind, number = aperture
+    return Lens(
+        surfaces=(surface(None, object_distance), *surfaces, surface()),
+        stop=stop,
+        aperture=SystemAperture(kind, number if isinstance(number, torch.Tensor) else scalar(number)),
+        fields=fields() if field is None else field,
+        wavelengths=vector(*wavelengths),
+        wavelength_weights=torch.ones(len(wavelengths), dtype=torch.float64),
+        **others,
+    )
+
+
+def double_gauss(glasses=None, **others) -> Lens:
+    """The 100 mm double Gauss of the co-design comparison at 0.530 µm, media by their indices there."""
+    sk2, sk16, f5 = glasses or (constant(1.6110909192), constant(1.6239670970), constant(1.6089032455))
+    table = [
+        (0.0184661976, 8.74664, sk2),
+        (0.0065564346, 0.5, AIR),
+        (0.027815929, 14.0, sk16),
+        (0.0, 3.77696, f5),
+        (0.04490361, 14.253, AIR),
+        (None, 12.4281, AIR),
+        (-0.03893318, 3.777, f5),
+        (0.0, 10.834, sk16),
+        (-0.027041482, 0.5, AIR),
+        (0.0050912, 6.8581, sk16),
+        (-0.014892576, 58.5, AIR),
+    ]
+    options = {
+        "stop": 6,
+        "aperture": ("entrance_pupil_diameter", 33.33),
+        "field": fields("angle", (0.0, 10.0, 14.0)),
+        "wavelengths": (0.530,),
+    }
+    return lens([surface(c, t, glass) for c, t, glass in table], **{**options, **others})
+
+
+def aspheric_singlet(**others) -> Lens:
+    """An f = 35 mm plastic singlet with r², r⁴ and r⁶ terms in front and a conic behind."""
+    front = surface(0.02, 5.0, 1.53, conic=-0.4, coefficients=[2e-3, -1e-5, 2e-8], semi_diameter=9.0)
+    return lens([front, surface(-0.02, 30.0, conic=0.5)], **{"aperture": ("entrance_pupil_diameter", 8.0), **others})
+
+
+@dataclass(frozen=True)
+class Stigmatic:
+    """A system that images one point into one point without any aberration, at every aperture.
+
+    surfaces, media: as for `trace.steps`; source: (3,) mm in the frame of the first surface, or None for a plane wave
+    along +z; image: (3,) mm in the frame of the last; heights: where rays meet the first surface.
+    """
+
+    name: str
+    surfaces: tuple[Surface, ...]
+    media: tuple[float, ...]
+    source: tuple[float, float, float] | None
+    image: tuple[float, float, float]
+    heights: tuple[float, ...]
+
+
+def stigmatic_problems() -> list[Stigmatic]:
+    n = 1.5
+    focus = 50.0
+    radius = 20.0
+    heights = (0.0, 1e-6, 1.0, 4.0, 8.0)
+    return [
+        # All points of z = r²/4f lie as far from the focus as from the plane z = -f.
+        Stigmatic(
+            "parabolic mirror",
+            (surface(-0.5 / focus, -focus, MIRROR, conic=-1.0), surface()),
+            (1.0, 1.0, 1.0),
+            None,
+            (0.0, 0.0, 0.0),
+            (0.0, 1e-6, 1.0, 30.0, 99.0),
+        ),
+        # An ellipse reflects one focus into the other: vertex distances a(1 ∓ e), c = 1/(a (1 - e²)), k = -e².
+        Stigmatic(
+            "elliptic mirror",
+            (surface(-1 / (100 * (1 - 0.36)), -160.0, MIRROR, conic=-0.36), surface()),
+            (1.0, 1.0, 1.0),
+            (0.0, 0.0, -40.0),
+            (0.0, 0.0, 0.0),
+            heights,
+        ),
+        # The Cartesian oval of a point at infinity, z + n √(r² + (f - z)²) = n f: an ellipse, c = n/((n - 1) f), k = -1/n².
+        Stigmatic(
+            "elliptic front",
+            (surface(n / ((n - 1) * focus), focus, n, conic=-1 / n**2), surface()),
+            (1.0, n, n),
+            None,
+            (0.0, 0.0, 0.0),
+            heights,
+        ),
+        # Leaving the glass, n z + √(r² + (f - z)²) = f: a hyperbola, c = -1/((n - 1) f), k = -n².
+        Stigmatic(
+            "plano-hyperbolic lens",
+            (surface(None, 10.0, n), surface(-1 / ((n - 1) * focus), focus, conic=-(n**2)), surface()),
+            (1.0, n, 1.0, 1.0),
+            None,
+            (0.0, 0.0, 0.0),
+            (0.0, 1e-6, 1.0, 10.0, 20.0),
+        ),
+        # Both points finite: the oval itself, as an even asphere.
+        Stigmatic(
+            "Cartesian oval",
+            (surface(None, 40.0, n, coefficients=cartesian_oval(60.0, 40.0, n, reach=7.0)), surface()),
+            (1.0, n, n),
+            (0.0, 0.0, -60.0),
+            (0.0, 0.0, 0.0),
+            (0.0, 1e-6, 1.0, 4.0, 6.0),
+        ),
+        # Aplanatic points of a sphere of glass: R/n and n R beyond its centre, without aberration at any aperture.
+        Stigmatic(
+            "aplanatic sphere",
+            (surface(-1 / radius, 0.0), surface()),
+            (n, 1.0, 1.0),
+            (0.0, 0.0, -radius - radius / n),
+            (0.0, 0.0, -radius - radius * n),
+            (0.0, 1e-6, 1.0, 5.0, 10.0),
+        ),
+        # A sphere images its centre into itself.
+        Stigmatic(
+            "concentric sphere",
+            (surface(-1 / radius, 0.0), surface()),
+            (n, 1.0, 1.0),
+            (0.0, 0.0, -radius),
+            (0.0, 0.0, -radius),
+            (0.0, 1e-6, 1.0, 10.0, 19.0),
+        ),
+    ]
+
+
+def cartesian_oval(source: float, image: float, n: float, *, reach: float, terms: int = 16) -> list[float]:
+    """Coefficients of r², r⁴, … of the oval |O P| + n |P I| = s + n i, from s before the vertex to i behind it in n.
+
+    The oval is solved for z at `terms` Chebyshev points of r² up to reach² by bisection in 60 digits, and interpolated.
+    """
+    with localcontext() as context:
+        context.prec = 60
+        s, i, index = Decimal(source), Decimal(image), Decimal(n)
+        nodes = [Decimal((1 - math.cos(math.pi * (j + 0.5) / terms)) / 2) * Decimal(reach) ** 2 for j in range(terms)]
+        rows = [[u**j for j in range(1, terms + 1)] + [_oval_sag(s, i, index, u)] for u in nodes]
+        return [float(x) for x in _solve(rows)]
+
+
+def _oval_sag(s: Decimal, i: Decimal, n: Decimal, r_squared: Decimal) -> Decimal:
+    low, high = Decimal(0), i / 2  # the path falls as the sag grows: glass is replaced by air
+    for _ in range(190):
+        z = (low + high) / 2
+        excess = ((s + z) ** 2 + r_squared).sqrt() + n * ((i - z) ** 2 + r_squared).sqrt() - (s + n * i)
+        low, high = (z, high) if excess > 0 else (low, z)
+    return (low + high) / 2
+
+
+def _solve(rows: list[list[Decimal]]) -> list[Decimal]:
+    """Gauss-Jordan elimination of an augmented matrix."""
+    for j in range(len(rows)):
+        pivot = max(range(j, len(rows)), key=lambda k: abs(rows[k][j]))
+        rows[j], rows[pivot] = rows[pivot], rows[j]
+        rows[j] = [x / rows[j][j] for x in rows[j]]
+        for k in range(len(rows)):
+            if k != j:
+                rows[k] = [x - rows[k][j] * y for x, y in zip(rows[k], rows[j], strict=True)]
+    return [row[-1] for row in rows]
+
+
+def vignetting_aperture(radius: float) -> tuple[Aperture, ...]:
+    return (Aperture("circular", (0.0, radius)),)
