@@ -1,0 +1,12 @@
+"""Figures: cross section, spot diagram, through-focus curve and focus report, each a matplotlib Figure.
+
+This folder is the only place that imports matplotlib, and it never touches pyplot: figures need no display and leave
+nothing behind.
+"""
+
+from raytrace.plot.curve import through_focus_curve as through_focus_curve
+from raytrace.plot.layout import layout as layout
+from raytrace.plot.spots import airy_radius as airy_radius
+from raytrace.plot.spots import spot_diagram as spot_diagram
+from raytrace.plot.style import SUFFIXES as SUFFIXES
+from raytrace.plot.style import save as save

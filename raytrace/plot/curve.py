@@ -1,0 +1,152 @@
+"""Through-focus curve: RMS spot radius against sensor distance, without tracing a ray twice."""
+
+import math
+import textwrap
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from raytrace.focus import focus_moments, image_rays, through_focus
+from raytrace.lens import Lens, with_object_distance
+from raytrace.numerics import safe_divide
+from raytrace.paraxial import first_order, paraxial_image_distance
+from raytrace.plot import style
+from raytrace.plot.spots import airy_radius
+from raytrace.pupil import gauss_rings
+from raytrace.rays import Rays
+
+_SAMPLES = 401
+
+
+class FocusRays(NamedTuple):
+    """Rays (3, C, P) on the sensor, one batch for every curve, with their weights (P,) or (C, P)."""
+
+    rays: Rays
+    weights: Tensor
+
+    @property
+    def best(self) -> np.ndarray:
+        """Shifts (C,) mm of the sensor to the least RMS spot of every curve."""
+        covariance, variance = focus_moments(*self)
+        return style.array(-safe_divide(covariance, variance))
+
+    def radii(self, shifts: np.ndarray) -> np.ndarray:
+        """RMS radii (S, C) mm on the sensor moved by shifts (S,) mm."""
+        shifts = torch.as_tensor(shifts, dtype=self.weights.dtype, device=self.weights.device)
+        return style.array(through_focus(self.rays, shifts, self.weights).rms_radius)
+
+
+@style.styled
+def through_focus_curve(
+    lens: Lens,
+    *,
+    fields: Tensor | None = None,
+    wavelengths: Tensor | None = None,
+    pupil: tuple[Tensor, Tensor] | None = None,
+    by: str = "field",
+    span: tuple[float, float] | None = None,
+    object_distance: Tensor | float | None = None,
+) -> Figure:
+    """RMS spot radius against the sensor distance; minima, the paraxial focus and the present sensor are marked.
+
+    by: "field", a line for each field over all wavelengths, or "wavelength", a line for each wavelength of the first
+    field. fields: (2, F), wavelengths: (W,) µm, by default those of the lens; pupil: points (2, P), weights (P,);
+    span: first and last sensor distance in mm, by default around all that is marked; object_distance: mm.
+    """
+    if by not in ("field", "wavelength"):
+        raise ValueError(f"by = {by!r}: expected 'field' or 'wavelength'")
+    if object_distance is not None:
+        lens = with_object_distance(lens, object_distance)
+    fields = style.lens_fields(lens, fields)
+    fields = fields[:, :1] if by == "wavelength" else fields
+    bundle = focus_rays(lens, fields=fields, wavelengths=wavelengths, pupil=pupil, by=by)
+    if by == "field":
+        labels = [style.field_label(lens, field) for field in style.array(fields).T]
+        colours, title = [style.field_colour(f) for f in range(len(labels))], style.field_title(lens)
+    else:
+        values = style.array(lens.wavelengths if wavelengths is None else wavelengths)
+        labels = [f"{wavelength:.7g} µm" for wavelength in values]
+        colours, title = style.wavelength_colours(values), f"Field {style.field_label(lens, style.array(fields)[:, 0])}"
+    sensor = float(lens.surfaces[-2].thickness)
+    marks = {"paraxial focus": float(paraxial_image_distance(lens, lens.surfaces[0].thickness)), "sensor": sensor}
+    figure = style.new_figure(6.4, 4.2)
+    axes = figure.add_subplot()
+    span = focus_span(sensor + bundle.best, marks.values(), depth_of_focus(lens)) if span is None else span
+    draw_curves(axes, bundle, sensor, span, colours=colours, labels=labels)
+    draw_marks(axes, marks)
+    axes.set_title(
+        "\n".join(textwrap.wrap(lens.name, 70)) or "Lens", fontsize=11, fontweight="bold", pad=20, loc="left"
+    )
+    axes.annotate(
+        style.first_order_text(lens, first_order(lens)),
+        (0, 1), (0, 8), xycoords="axes fraction", textcoords="offset points", color=style.GREY,
+    )  # fmt: skip
+    figure.legend(title=f"{title}: least RMS radius at", title_fontsize=8, loc="outside lower center", ncols=2)
+    return figure
+
+
+def focus_rays(
+    lens: Lens, *, fields: Tensor, wavelengths: Tensor | None, pupil: tuple[Tensor, Tensor] | None, by: str = "field"
+) -> FocusRays:
+    """The rays of every curve: by "field" all wavelengths in one with their weights, by "wavelength" each by itself."""
+    dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
+    points, weights = gauss_rings(dtype=dtype, device=device) if pupil is None else pupil
+    shares = lens.wavelength_weights if wavelengths is None else torch.ones_like(wavelengths)
+    with torch.no_grad():
+        rays = image_rays(lens, points, fields=fields, wavelengths=wavelengths)
+    if by == "wavelength":
+        return FocusRays(Rays(rays.position.flatten(1, 2), rays.direction.flatten(1, 2), rays.valid.flatten(0, 1)), weights)
+    weights = (shares[:, None] * weights).flatten()
+    return FocusRays(Rays(rays.position.flatten(2), rays.direction.flatten(2), rays.valid.flatten(1)), weights)
+
+
+def depth_of_focus(lens: Lens) -> float:
+    """2 λ N² in mm, half the classical depth of focus, at the primary wavelength."""
+    number = float(first_order(lens).working_f_number)
+    return 2e-3 * float(lens.wavelengths[lens.primary_wavelength]) * number * number
+
+
+def focus_span(best, marks, depth: float) -> tuple[float, float]:
+    """First and last sensor distance in mm that show all minima and marks with room beside them."""
+    seen = [float(x) for x in (*best, *marks) if math.isfinite(x)]
+    low, high = min(seen), max(seen)
+    room = max(0.35 * (high - low), 2.5 * depth)
+    return low - room, high + room
+
+
+def draw_curves(axes: Axes, bundle: FocusRays, sensor: float, span: tuple[float, float], *, colours, labels) -> None:
+    """One line for each batch of rays, a dot at its minimum; labels carry the place and the radius of the minimum."""
+    shifts = np.linspace(span[0], span[1], _SAMPLES) - sensor
+    radii, best = 1e3 * bundle.radii(shifts), bundle.best
+    least = 1e3 * np.diagonal(bundle.radii(best))
+    alive = style.array(bundle.rays.valid.any(-1)).astype(bool)
+    for c in np.flatnonzero(alive):
+        place = f"{labels[c]}: {style.number_text(sensor + best[c], 6)} mm, {style.number_text(least[c])} µm"
+        axes.plot(sensor + shifts, radii[:, c], color=colours[c], linewidth=1.4, label=place, zorder=3)
+        if span[0] <= sensor + best[c] <= span[1]:
+            axes.plot([sensor + best[c]], [least[c]], "o", color=colours[c], markersize=4.5, markeredgecolor="white", zorder=4)
+    axes.set_xlim(*span)
+    axes.set_ylim(0, 1.03 * radii[:, alive].max() if alive.any() else 1.0)
+    axes.set_xlabel("Sensor distance from the last surface (mm)")
+    axes.set_ylabel("RMS spot radius (µm)")
+    axes.grid(color="#ececec", linewidth=0.6, zorder=0)
+    axes.set_axisbelow(True)
+
+
+def draw_marks(axes: Axes, marks: dict[str, float]) -> None:
+    """Vertical lines with their names along the top, turned so that neighbours do not meet."""
+    low, high = axes.get_xlim()
+    dashes = ((0, (1, 1.5)), (0, (5, 2)), "solid", (0, (5, 2, 1, 2)))
+    shown = {name: x for name, x in marks.items() if low <= x <= high}
+    for (name, x), dash in zip(shown.items(), dashes, strict=False):
+        axes.axvline(x, color=style.GREY, linewidth=0.9, linestyle=dash, zorder=2)
+        nearest = min((other for other in shown.values() if other != x), key=lambda o: abs(o - x), default=math.inf)
+        left = nearest > x and nearest - x < 0.06 * (high - low)
+        axes.annotate(
+            name, (x, 1.0), (-3 if left else 3, -3), xycoords=("data", "axes fraction"), textcoords="offset points",
+            rotation=90, ha="right" if left else "left", va="top", fontsize=7.5, color=style.GREY,
+        )  # fmt: skip

@@ -1,0 +1,1 @@
+"""Focus report: one page that shows what moving the sensor did."""

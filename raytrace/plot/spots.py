@@ -1,0 +1,156 @@
+"""Spot diagram: where the rays of each field meet the sensor, beside the Airy disc."""
+
+import math
+import textwrap
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle
+from torch import Tensor
+
+from raytrace.focus import image_rays
+from raytrace.lens import Lens, with_object_distance
+from raytrace.paraxial import first_order
+from raytrace.plot import style
+from raytrace.pupil import gauss_rings, hexapolar
+from raytrace.spot import Spot, spot_of_points
+
+
+def airy_radius(lens: Lens) -> Tensor:
+    """Radius in mm of the first dark ring, 1.22 λ N: λ the primary wavelength, N the paraxial working F/#."""
+    return 1.22e-3 * lens.wavelengths[lens.primary_wavelength] * first_order(lens).working_f_number
+
+
+def field_spots(
+    lens: Lens,
+    *,
+    fields: Tensor | None = None,
+    wavelengths: Tensor | None = None,
+    pupil: tuple[Tensor, Tensor] | None = None,
+) -> tuple[Spot, Spot]:
+    """Polychromatic spots (F,), and the spots (F, W) of the rays that are drawn as dots.
+
+    The RMS radius is that of the rule `pupil` (points, weights), by default Gaussian quadrature. The dots, a hexapolar
+    grid up to the rim of the pupil, have no weight in it but count for the geometric radius. Wavelengths carry the
+    lens's weights; wavelengths that are given weigh the same.
+    """
+    dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
+    points, weights = gauss_rings(dtype=dtype, device=device) if pupil is None else pupil
+    dots = hexapolar(8, dtype=dtype, device=device)[0]
+    shares = lens.wavelength_weights if wavelengths is None else torch.ones_like(wavelengths)
+    with torch.no_grad():
+        rays = image_rays(lens, torch.cat([points, dots], dim=1), fields=fields, wavelengths=wavelengths)
+        weights = torch.cat([weights, torch.zeros_like(dots[0])])
+        hits, valid = rays.position[:2], rays.valid
+        whole = spot_of_points(hits.flatten(2), valid.flatten(1), (shares[:, None] * weights).flatten())
+        drawn = points.shape[1]
+        return whole, spot_of_points(hits[..., drawn:], valid[..., drawn:])
+
+
+@style.styled
+def spot_diagram(
+    lens: Lens,
+    *,
+    fields: Tensor | None = None,
+    wavelengths: Tensor | None = None,
+    pupil: tuple[Tensor, Tensor] | None = None,
+    object_distance: Tensor | float | None = None,
+) -> Figure:
+    """Spot diagram: one panel a field, one colour and marker a wavelength, the Airy disc at the primary wavelength.
+
+    All panels have the same scale, are centred on the centroid over all wavelengths, and print the RMS and the
+    geometric radius about it. fields: (2, F) in the lens's own kind of field; wavelengths: (W,) µm; by default those
+    of the lens. pupil: points (2, P) and weights (P,) that make the RMS radius; object_distance: mm, inf allowed.
+    """
+    if object_distance is not None:
+        lens = with_object_distance(lens, object_distance)
+    whole, dots = field_spots(lens, fields=fields, wavelengths=wavelengths, pupil=pupil)
+    fields = style.array(style.lens_fields(lens, fields))
+    wavelengths = style.array(lens.wavelengths if wavelengths is None else wavelengths)
+    airy = float(airy_radius(lens))
+    half = panel_size([whole], airy)
+    columns = min(fields.shape[1], 4 if fields.shape[1] % 3 or fields.shape[1] == 12 else 3)
+    rows = math.ceil(fields.shape[1] / columns)
+    width = max(2.25 * columns, 5.6)
+    figure = style.new_figure(width, (width / columns if columns > 1 else 3.4) * 1.12 * rows + 1.05)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for f, panel in enumerate(axes):
+        if f >= fields.shape[1]:
+            panel.axis("off")
+            continue
+        draw_spot(panel, whole, dots, f, wavelengths=wavelengths, airy=airy, half=half)
+        panel.set_title(style.field_label(lens, fields[:, f]), fontweight="bold")
+    name = "\n".join(textwrap.wrap(lens.name, int(11 * width))) or "Lens"
+    figure.suptitle(name, fontsize=11, fontweight="bold")
+    figure.legend(handles=wavelength_handles(wavelengths, airy), loc="outside lower center", ncols=5, handletextpad=0.3)
+    figure.supxlabel(
+        f"{style.first_order_text(lens, first_order(lens))}\n"
+        "centred on the centroid; RMS and GEO (largest) radius about it, all wavelengths together",
+        fontsize=8,
+        color=style.GREY,
+    )
+    return figure
+
+
+def panel_size(spots: list[Spot], airy: float) -> float:
+    """Half width in mm that holds every spot and the Airy disc."""
+    largest = max(float(spot.geometric_radius.max()) for spot in spots)
+    return 1.14 * max(largest, airy if math.isfinite(airy) else 0.0, 1e-7)
+
+
+def draw_spot(
+    axes: Axes, whole: Spot, dots: Spot, number: int, *, wavelengths: np.ndarray, airy: float, half: float
+) -> None:
+    """Draw the spot of one field into square axes of ± half mm about its centroid, with its radii below."""
+    draw_dots(axes, whole, dots, number, wavelengths=wavelengths, airy=airy, half=half)
+    if int(whole.rays[number]) == 0:
+        axes.text(0, 0, "no ray reaches\nthe image", ha="center", va="center", color=style.GREY)
+        axes.set_xlabel(" \n ")
+        return
+    rms, largest = (1e3 * float(r[number]) for r in (whole.rms_radius, whole.geometric_radius))
+    axes.set_xlabel(f"RMS {style.number_text(rms)} µm\nGEO {style.number_text(largest)} µm", labelpad=4)
+
+
+def draw_dots(
+    axes: Axes, whole: Spot, dots: Spot, number: int, *, wavelengths: np.ndarray, airy: float, half: float
+) -> None:
+    """The dots, the Airy circle and the scale bar, without words."""
+    centre = style.array(whole.centroid[:, number])
+    size = 2.0 if half > 4 * airy else 2.4
+    for cross in (axes.axhline, axes.axvline):
+        cross(0, color=style.FAINT, linewidth=0.5, zorder=1)
+    for w, colour in enumerate(style.wavelength_colours(wavelengths)):
+        kept = style.array(dots.valid[number, w]).astype(bool)
+        x, y = style.array(dots.points[:, number, w])[:, kept] - centre[:, None]
+        marker = style.WAVELENGTH_MARKERS[w % len(style.WAVELENGTH_MARKERS)]
+        width = 0.0 if marker not in "+x" else 0.6
+        axes.plot(x, y, marker, color=colour, markersize=size + 2 * width, markeredgewidth=width, zorder=3 + 0.1 * w)
+    if math.isfinite(airy):
+        axes.add_patch(Circle((0, 0), airy, fill=False, edgecolor=style.INK, linewidth=0.9, zorder=4, gid="Airy"))
+    bar = style.round_length(0.62 * half)
+    style.scale_bar(axes, -0.93 * half, -0.93 * half, bar, style.length_text(bar, 1) if bar < 1 else f"{bar:g} mm")
+    axes.set_xlim(-half, half)
+    axes.set_ylim(-half, half)
+    axes.set_aspect("equal")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_visible(True)
+
+
+def wavelength_handles(wavelengths: np.ndarray, airy: float) -> list[Line2D]:
+    """What the legend says of colours and of the Airy circle."""
+    handles = [
+        Line2D([], [], linestyle="", marker=style.WAVELENGTH_MARKERS[w % len(style.WAVELENGTH_MARKERS)], color=colour,
+               markersize=4.5, label=f"{wavelength:.7g} µm")
+        for w, (wavelength, colour) in enumerate(zip(wavelengths, style.wavelength_colours(wavelengths), strict=True))
+    ]  # fmt: skip
+    if math.isfinite(airy):
+        handles.append(
+            Line2D([], [], linestyle="", marker="o", markerfacecolor="none", color=style.INK, markersize=6,
+                   label=f"Airy radius {style.micrometres(airy)}")
+        )  # fmt: skip
+    return handles

@@ -1,0 +1,209 @@
+"""How the figures look: fonts, colours, the wording of numbers; and how a figure is saved."""
+
+import functools
+import math
+import os
+import secrets
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from raytrace.lens import FIELD_UNITS, Lens
+from raytrace.paraxial import FirstOrder
+
+INK = "#262626"
+GREY = "#7a7a7a"
+FAINT = "#d0d0d0"
+
+#: Colours of the fields: Okabe and Ito's set, told apart by colour-blind readers; the first three differ most.
+FIELD_COLOURS = ("#0072B2", "#009E73", "#D55E00", "#CC79A7", "#E69F00", "#56B4E9", "#6A51A3", "#525252")
+
+#: Colours of wavelengths the eye does not see, and markers of all wavelengths, in order.
+INVISIBLE_COLOURS = ("#7a1f1f", "#525252", "#8c6d31", "#5e3c99", "#1b6f6a", "#b0578d")
+WAVELENGTH_MARKERS = ("o", "+", "x", "^", "s", "D", "v", "*")
+
+#: What `save` writes, by suffix, with the metadata that would otherwise make every file differ.
+SUFFIXES = {".png": {}, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
+
+_STYLE = {
+    "font.family": "DejaVu Sans",
+    "font.size": 8.5,
+    "axes.titlesize": 9,
+    "axes.labelsize": 8.5,
+    "axes.edgecolor": GREY,
+    "axes.labelcolor": INK,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.formatter.useoffset": False,
+    "axes.unicode_minus": True,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "text.color": INK,
+    "legend.fontsize": 8,
+    "legend.frameon": False,
+    "lines.solid_capstyle": "round",
+    "hatch.linewidth": 0.5,
+    "pdf.fonttype": 42,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "raytrace",
+    "savefig.facecolor": "white",
+}
+
+
+def styled(function: Callable) -> Callable:
+    """Run a function under the style of these figures; the reader's own settings are back when it returns."""
+
+    @functools.wraps(function)
+    def wrapper(*args, **kwargs):
+        with matplotlib.rc_context(_STYLE):
+            return function(*args, **kwargs)
+
+    return wrapper
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """A figure of width × height inches on a canvas of its own."""
+    figure = Figure(figsize=(width, height), dpi=150, layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+@styled
+def save(figure: Figure, path: str | os.PathLike, *, dpi: float = 200) -> None:
+    """Write a figure as .png, .pdf or .svg by its suffix; the file is replaced as a whole or not at all.
+
+    The same figure gives the same bytes. Raises ValueError for another suffix, OSError where nothing can be written.
+    """
+    target = Path(os.path.realpath(path))
+    metadata = SUFFIXES.get(target.suffix.lower())
+    if metadata is None:
+        found = f"the suffix {target.suffix!r}" if target.suffix else "no suffix"
+        raise ValueError(f"{path}: {found} names no format of figures; expected one of {', '.join(SUFFIXES)}")
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(6)}.tmp")
+    try:
+        with open(temporary, "xb") as file:
+            figure.savefig(file, format=target.suffix.lower()[1:], dpi=dpi, metadata=metadata)
+        os.replace(temporary, target)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def array(tensor: Tensor) -> np.ndarray:
+    """The numbers of a tensor, for drawing."""
+    return tensor.detach().to(device="cpu", dtype=torch.float64 if tensor.is_floating_point() else None).numpy()
+
+
+def lens_fields(lens: Lens, fields: Tensor | None) -> Tensor:
+    """Field points (2, F): those given, or the lens's own."""
+    return torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields
+
+
+def field_colour(number: int) -> str:
+    return FIELD_COLOURS[number % len(FIELD_COLOURS)]
+
+
+def field_label(lens: Lens, field: Sequence[float]) -> str:
+    """A field point in words: `10°`, `(3, 4)°`, `5 mm`; the x coordinate is named only where it is not 0."""
+    x, y = (float(component) + 0.0 for component in field)
+    unit = "°" if FIELD_UNITS[lens.fields.kind] == "degrees" else " mm"
+    return f"{_minus(f'{y:.6g}')}{unit}" if x == 0 else _minus(f"({x:.6g}, {y:.6g})") + unit
+
+
+def field_title(lens: Lens) -> str:
+    """What a field of this lens is."""
+    return {
+        "angle": "Field angle",
+        "object_height": "Object height",
+        "paraxial_image_height": "Paraxial image height",
+        "real_image_height": "Image height",
+    }[lens.fields.kind]
+
+
+def wavelength_colours(wavelengths: Sequence[float]) -> list[str | tuple[float, float, float]]:
+    """A colour for each wavelength in µm: the one the eye sees, dark enough for a white page, where it sees one."""
+    colours, unseen = [], 0
+    for wavelength in wavelengths:
+        if 0.39 <= wavelength <= 0.75:
+            colours.append(_spectral_colour(float(wavelength)))
+        else:
+            colours.append(INVISIBLE_COLOURS[unseen % len(INVISIBLE_COLOURS)])
+            unseen += 1
+    return colours
+
+
+def _spectral_colour(wavelength: float) -> tuple[float, float, float]:
+    """Hues by wavelength, interpolated; chosen by eye for legibility rather than for colorimetry."""
+    knots = {
+        0.39: "#5b1a9a", 0.43: "#4421b8", 0.46: "#1f3fd1", 0.49: "#0077b6", 0.51: "#008f7a", 0.53: "#0a8f3c",
+        0.555: "#3f9a12", 0.575: "#8a9400", 0.59: "#c78500", 0.61: "#dd5f00", 0.64: "#d62828", 0.75: "#8b0f14",
+    }  # fmt: skip
+    channels = np.array([to_rgb(colour) for colour in knots.values()]).T
+    return tuple(float(np.interp(wavelength, list(knots), channel)) for channel in channels)
+
+
+def length_text(length: float, digits: int = 4) -> str:
+    """A length in mm as a reader would say it: µm below 0.1 mm, m from 10 m."""
+    if math.isinf(length):
+        return "∞"
+    for limit, scale, unit in ((0.1, 1e3, "µm"), (1e4, 1.0, "mm"), (1e7, 1e-3, "m"), (math.inf, 1e-6, "km")):
+        if abs(length) < limit:
+            break
+    return f"{number_text(length * scale, digits)} {unit}"
+
+
+def number_text(value: float, digits: int = 4) -> str:
+    """A number to so many significant digits, never in exponents between 1e-4 and 1e6."""
+    if not math.isfinite(value):
+        return "∞" if math.isinf(value) else "–"
+    if value == 0 or not 1e-4 <= abs(value) < 1e6:
+        return _minus(f"{value:.{digits}g}")
+    return _minus(f"{value:.{max(digits - 1 - math.floor(math.log10(abs(value))), 0)}f}")
+
+
+def micrometres(length: float) -> str:
+    """A length in mm written in µm, four significant digits."""
+    return f"{number_text(1e3 * length)} µm"
+
+
+def first_order_text(lens: Lens, paraxial: FirstOrder) -> str:
+    """`EFL 99.51 mm · F/2.99 · object at 25.00 m`, as a subtitle."""
+    parts = []
+    focal_length = float(paraxial.effective_focal_length)
+    if math.isfinite(focal_length):
+        parts += [f"EFL {length_text(focal_length)}", f"F/{number_text(float(paraxial.f_number), 3)}"]
+    distance = float(lens.surfaces[0].thickness)
+    if math.isinf(distance):
+        parts.append("object at infinity")
+    else:
+        parts += [f"object at {length_text(distance)}", f"working F/{number_text(float(paraxial.working_f_number), 3)}"]
+    return "  ·  ".join(parts)
+
+
+def round_length(length: float) -> float:
+    """The largest of 1, 2, 5 × 10^n that is not above a length."""
+    decade = 10.0 ** math.floor(math.log10(length))
+    return max(step for step in (decade, 2 * decade, 5 * decade) if step <= length * (1 + 1e-9))
+
+
+def scale_bar(axes: Axes, x: float, y: float, length: float, text: str) -> None:
+    """A bar of a length in data units that starts at (x, y), its length written above it."""
+    axes.plot([x, x + length], [y, y], color=INK, linewidth=1.6, solid_capstyle="butt", clip_on=False, zorder=6)
+    axes.annotate(
+        text, (x + length / 2, y), (0, 2.5), textcoords="offset points", ha="center", va="bottom", fontsize=7.5, zorder=6
+    )
+
+
+def _minus(text: str) -> str:
+    return text.replace("-", "−")
