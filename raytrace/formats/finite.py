@@ -22,4 +22,4 @@ def refuse_overflow(lens: Lens, file: str) -> None:
 
 
 def _finite(number: torch.Tensor | float) -> bool:
-    return bool(torch.isfinite(torch.as_tensor(number)).all())
+    return bool(torch.isfinite(torch.as_tensor(number, dtype=torch.float64)).all())

@@ -54,7 +54,7 @@ def build(row: Row, unit: float, catalogs: tuple[str, ...], user: Sequence[Path]
         coefficients=_coefficients(row, unit),
         glass=_glass(row, catalogs, user, report),
         semi_diameter=_semi_diameter(row, unit),
-        apertures=tuple(_aperture(text, unit, place) for text in cells.get("apertures", "").split("+") if text.strip()),
+        apertures=tuple(_aperture(text, unit, place) for text in _several(cells.get("apertures", ""))),
         comment=cells.get("comment") or ("" if is_number(cells.get("label", "0")) else cells["label"]),
     )
 
@@ -148,6 +148,11 @@ def _by_figures(name: str, figures: str, place: Place, report: Draft) -> Glass:
         return AIR
     report.glass(place.surface, name, f"constant index {nd!r}" if vd == dpgf == 0 else f"model glass {figures}")
     return constant(nd, name) if vd == dpgf == 0 else model_glass(nd, vd, dpgf, name=name)
+
+
+def _several(text: str) -> list[str]:
+    """The apertures of a cell, joined by a plus between blanks."""
+    return [part for part in re.split(r"\s\+\s", text) if part.strip()]
 
 
 def _aperture(text: str, unit: float, place: Place) -> Aperture:

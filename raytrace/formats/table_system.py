@@ -19,6 +19,7 @@
 
 import difflib
 import re
+from decimal import Decimal
 
 import torch
 from torch import Tensor
@@ -221,16 +222,22 @@ def wavelengths(metadata: Metadata, table: Place, report: Draft) -> tuple[Tensor
 def _wavelengths(value: str, place: Place) -> list[float]:
     words = [word for word in _NUMBERS.split(value) if word]
     unit = "µm" if words and is_number(words[-1]) else (words or [""]).pop()
-    per_micron = {"µm": 1, "μm": 1, "um": 1, "micron": 1, "microns": 1, "nm": 1000}
-    if unit not in per_micron or not words or len(words) > 1000:
+    powers = {"µm": 0, "μm": 0, "um": 0, "micron": 0, "microns": 0, "nm": -3}
+    if unit not in powers or not words or len(words) > 1000:
         raise LensFileError(f"wavelengths is {shown(value)}, expected numbers in µm (or with the unit, nm)", place)
-    found = [number(word, "wavelength", place) / per_micron[unit] for word in words]
+    found = [_decimal(word, powers[unit], place) for word in words]
     for wavelength in found:
         if not 0 < wavelength < 100:
             raise LensFileError(
                 f"a wavelength of {wavelength:g} µm, expected 0 to 100 µm; in nm write '587.6 nm'", place
             )
     return found
+
+
+def _decimal(word: str, power: int, place: Place) -> float:
+    """A number times a power of ten, rounded once: 486.1 nm is 0.4861 µm."""
+    found = number(word, "wavelength", place)
+    return float(Decimal(repr(found)).scaleb(power))
 
 
 def _tensor(values: float | list[float]) -> Tensor:

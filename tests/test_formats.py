@@ -1,0 +1,368 @@
+"""Round trips, damaged files, and the doors of reading and writing."""
+
+import dataclasses
+import os
+import random
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from raytrace.catalog import UnknownGlass
+from raytrace.formats import FORMATS, LensFileError, LensFileWarning, read_lens, read_lens_with_report, write_lens
+from raytrace.formats.frame import lens_from_frame, to_frame
+from raytrace.formats.source import MAX_BYTES, Place, decode
+from raytrace.glass import constant, model_glass
+from raytrace.lens import Lens, SystemAperture
+from raytrace.surface import Aperture
+
+ROOT = Path(__file__).parents[1]
+OWN = sorted(path for path in (ROOT / "lenses").iterdir() if path.suffix in FORMATS)
+CORPUS = sorted((ROOT.parent / "shared" / "corpus" / "zmx").glob("*.[zZ][mM][xX]"))
+SUFFIXES = tuple(FORMATS)
+
+
+def number(value: float) -> torch.Tensor:
+    return torch.tensor(value, dtype=torch.float64)
+
+
+def leaves(value, path=""):
+    """Every number and text of a lens with its name; numbers as their bytes."""
+    if isinstance(value, torch.Tensor):
+        return [(path, tuple(value.shape), value.double().numpy().tobytes())]
+    if dataclasses.is_dataclass(value):
+        return [leaf for f in dataclasses.fields(value) for leaf in leaves(getattr(value, f.name), f"{path}.{f.name}")]
+    if isinstance(value, tuple):
+        return [leaf for k, part in enumerate(value) for leaf in leaves(part, f"{path}[{k}]")]
+    return [(path, value)]
+
+
+def readable(path: Path) -> Lens | None:
+    try:
+        return read_lens_with_report(path)[0]
+    except (LensFileError, UnknownGlass):
+        return None
+
+
+def double_gauss() -> Lens:
+    return read_lens(ROOT / "lenses" / "double_gauss.zmx")
+
+
+def change(lens: Lens, surface: int, **changes) -> Lens:
+    surfaces = list(lens.surfaces)
+    surfaces[surface] = dataclasses.replace(surfaces[surface], **changes)
+    return dataclasses.replace(lens, surfaces=tuple(surfaces))
+
+
+# -- round trips ------------------------------------------------------------------------------------------------------
+
+
+def test_the_double_gauss_is_that_of_the_publication_in_both_files():
+    zmx, csv = double_gauss(), read_lens(ROOT / "lenses" / "double_gauss.csv", strict=True)
+    assert leaves(zmx) == leaves(csv)
+    curvatures = [0.0 if s.curvature is None else float(s.curvature) for s in zmx.surfaces[1:-1]]
+    assert curvatures == [
+        *(0.0184661976, 0.0065564346, 0.027815929, 0.0, 0.04490361, 0.0),
+        *(-0.03893318, 0.0, -0.027041482, 0.0050912, -0.014892576),
+    ]
+    thicknesses = [8.74664, 0.5, 14.0, 3.77696, 14.253, 12.4281, 3.777, 10.834, 0.5, 6.8581, 58.5, 0.0]
+    assert [float(s.thickness) for s in zmx.surfaces] == [float("inf"), *thicknesses]
+    names = ["SK2", "", "SK16", "F5", "", "", "F5", "SK16", "", "SK16", ""]
+    assert [s.glass.name for s in zmx.surfaces[1:-1]] == names
+    assert zmx.surfaces[6].semi_diameter == 10.229
+    assert (zmx.stop, float(zmx.aperture.value), zmx.wavelengths.tolist()) == (6, 33.33, [0.53])
+    assert zmx.fields.y.tolist() == [0.0, 10.0, 14.0]
+
+
+@pytest.mark.parametrize("path", OWN, ids=lambda path: path.name)
+def test_own_lenses_are_read_without_a_warning(path):
+    assert read_lens_with_report(path, strict=True)[1].warnings == ()
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("path", OWN, ids=lambda path: path.name)
+def test_every_number_comes_back_bit_for_bit(path, suffix, tmp_path):
+    lens = read_lens(path)
+    write_lens(lens, tmp_path / f"lens{suffix}")
+    assert leaves(read_lens(tmp_path / f"lens{suffix}", strict=True)) == leaves(lens)
+
+
+@pytest.mark.skipif(not CORPUS, reason="the corpus of real files is not at hand")
+@pytest.mark.parametrize("path", CORPUS, ids=lambda path: path.name)
+def test_real_files_come_back_bit_for_bit(path, tmp_path):
+    lens = readable(path)
+    if lens is None:
+        pytest.skip("refused by name")
+    for suffix in SUFFIXES:
+        write_lens(lens, tmp_path / f"lens{suffix}")
+        assert leaves(read_lens(tmp_path / f"lens{suffix}")) == leaves(lens)
+
+
+@pytest.mark.parametrize("path", OWN, ids=lambda path: path.name)
+def test_pandas_brings_every_number_back(path):
+    lens = read_lens(path)
+    assert leaves(lens_from_frame(to_frame(lens), strict=True)) == leaves(lens)
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False, width=64).map(lambda x: x + 0.0)
+positive = st.floats(min_value=5e-324, max_value=1e300)
+
+
+@settings(max_examples=100, deadline=None)
+@given(curvature=finite, conic=finite, thickness=finite, terms=st.lists(finite, min_size=1, max_size=8), size=positive)
+@pytest.mark.parametrize("suffix", [".zmx", ".csv"])
+def test_any_64_bit_number_survives(suffix, curvature, conic, thickness, terms, size):
+    lens = change(
+        double_gauss(),
+        3,
+        curvature=number(curvature) if curvature else None,
+        conic=number(conic) if conic else None,
+        thickness=number(thickness),
+        coefficients=number(terms),
+        semi_diameter=size,
+        apertures=(Aperture("elliptic", (size, size), True, (conic, curvature)),),
+    )
+    lens = dataclasses.replace(lens, aperture=SystemAperture("object_na", number(size)))
+    written = FORMATS[suffix].write(lens, "lens")
+    assert leaves(FORMATS[suffix].read(decode(written, Place("lens")), "lens")[0]) == leaves(lens)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_media_that_are_in_no_catalog_come_back(suffix, tmp_path):
+    for glass in (
+        constant(1.333),
+        constant(1.333, "WATER"),
+        model_glass(1.6, 40.0, 0.01),
+        model_glass(1.5, 60, name="X1"),
+    ):
+        lens = change(double_gauss(), 2, glass=glass)
+        write_lens(lens, tmp_path / f"lens{suffix}")
+        assert leaves(read_lens(tmp_path / f"lens{suffix}")) == leaves(lens)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_texts_of_any_language_come_back(suffix, tmp_path):
+    lens = change(double_gauss(), 2, comment='Fläche, "zwei"; 表面')
+    lens = dataclasses.replace(lens, name="Größe #1: λ", notes=("x" * 431, "a, b; c: d,", "# e"))
+    write_lens(lens, tmp_path / f"lens{suffix}")
+    again = read_lens(tmp_path / f"lens{suffix}")
+    assert (again.name, again.surfaces[2].comment) == (lens.name, lens.surfaces[2].comment)
+    assert again.notes == lens.notes
+
+
+# -- what cannot be written -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "suffix", "message"),
+    [
+        ({"thickness": number(float("nan"))}, ".zmx", "thickness is nan"),
+        ({"thickness": number(float("inf"))}, ".csv", "thickness is inf"),
+        ({"curvature": number([0.1, 0.2])}, ".zmx", "a file holds one lens"),
+        ({"coefficients": number([[0.1, 0.2]])}, ".csv", "a file holds one lens"),
+        ({"coefficients": number([1e-9] * 9)}, ".zmx", "EVENASPH has 8"),
+        ({"comment": "two\nlines"}, ".csv", "line break"),
+        ({"glass": constant(1.5, "two words")}, ".zmx", "one word"),
+        ({"apertures": (Aperture("circular", (0.0, 1.0)),) * 2}, ".zmx", "has one"),
+    ],
+)
+def test_what_a_format_cannot_hold_is_refused(changes, suffix, message, tmp_path):
+    with pytest.raises(LensFileError, match=message) as caught:
+        write_lens(change(double_gauss(), 3, **changes), tmp_path / f"lens{suffix}")
+    assert caught.value.surface == 3
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_glass_that_is_not_the_listed_one_is_refused(tmp_path):
+    lens = double_gauss()
+    glass = lens.surfaces[3].glass
+    changed = dataclasses.replace(glass, coefficients=glass.coefficients * 1.001)
+    with pytest.raises(LensFileError, match="not those of its catalog"):
+        write_lens(change(lens, 3, glass=changed), tmp_path / "lens.zmx")
+
+
+def test_more_terms_and_apertures_fit_into_a_table(tmp_path):
+    lens = change(
+        double_gauss(), 3, coefficients=number([1e-9] * 12), apertures=(Aperture("circular", (0.0, 1.0)),) * 2
+    )
+    write_lens(lens, tmp_path / "lens.csv")
+    assert leaves(read_lens(tmp_path / "lens.csv")) == leaves(lens)
+
+
+def test_float32_lenses_are_written_exactly(tmp_path):
+    lens = change(double_gauss(), 1, thickness=torch.tensor(0.1, dtype=torch.float32))
+    write_lens(lens, tmp_path / "lens.zmx")
+    assert float(read_lens(tmp_path / "lens.zmx").surfaces[1].thickness) == float(torch.tensor(0.1))
+
+
+def test_writing_replaces_the_file_as_a_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "lens.zmx"
+    write_lens(double_gauss(), path)
+    before = path.read_bytes()
+    with pytest.raises(LensFileError):
+        write_lens(change(double_gauss(), 3, thickness=number(float("nan"))), path)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["lens.zmx"]
+    with pytest.raises(LensFileError, match="cannot be written"):
+        write_lens(double_gauss(), tmp_path / "no such folder" / "lens.zmx")
+
+
+# -- the door ---------------------------------------------------------------------------------------------------------
+
+
+def test_suffixes_and_paths_that_are_no_lens_files(tmp_path):
+    with pytest.raises(LensFileError, match=r"'\.pdf' names no format.*\.zmx"):
+        read_lens(tmp_path / "lens.pdf")
+    with pytest.raises(LensFileError, match="no suffix"):
+        write_lens(double_gauss(), tmp_path / "lens")
+    with pytest.raises(LensFileError, match="cannot be read: No such file"):
+        read_lens(tmp_path / "lens.zmx")
+    (tmp_path / "folder.zmx").mkdir()
+    with pytest.raises(LensFileError, match="not a regular file"):
+        read_lens(tmp_path / "folder.zmx")
+    with pytest.raises(LensFileError):
+        read_lens(tmp_path / "zero\0byte.zmx")
+
+
+def test_a_fifo_is_refused_and_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe.zmx")
+    with pytest.raises(LensFileError, match="not a regular file"):
+        read_lens(tmp_path / "pipe.zmx")
+
+
+def test_a_file_of_200_mb_is_refused_unread(tmp_path):
+    path = tmp_path / "large.zmx"
+    with open(path, "wb") as file:
+        file.truncate(200_000_000)
+    with pytest.raises(LensFileError, match="200 MB"):
+        read_lens(path)
+    assert MAX_BYTES < 200_000_000
+
+
+@pytest.mark.parametrize("suffix", [".zmx", ".csv"])
+def test_10000_surfaces_are_refused_with_the_line(suffix, tmp_path):
+    path = tmp_path / f"many{suffix}"
+    surfaces = "".join(f"SURF {k}\n  CURV 0\n  DISZ 1\n" for k in range(10_000))
+    rows = "radius,thickness\n" + "50,1\n" * 10_000
+    path.write_text(surfaces if suffix == ".zmx" else rows)
+    with pytest.raises(LensFileError, match="more than 1000 surfaces") as caught:
+        read_lens(path)
+    assert caught.value.line is not None
+
+
+def test_what_is_accepted_but_lossy_is_warned_of_once(tmp_path):
+    path = tmp_path / "lens.csv"
+    path.write_text("surface,radius,thickness\nstop,,3\nimage,,\n")
+    with pytest.warns(LensFileWarning, match="no wavelengths"):
+        read_lens(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_lens_with_report(path)
+
+
+# -- damaged files ----------------------------------------------------------------------------------------------------
+
+_NUMBERS = "nan inf -inf INFINITY 1e999 1e308 -1e308 1e-320 0 -1 1 2 24 99 12345678901234567890 1_0 ١ 1,5 -0.0 10,20"
+_NAMES = '___BLANK MIRROR AIR 517642 STANDARD EVENASPH COORDBRK SURF STOP IN M METER 1.5/ = ( ) # : nm + é \x00 " ""'
+_WORDS = [*_NUMBERS.split(" "), *_NAMES.split(" ")]
+
+
+def damaged(content: bytes, source: random.Random) -> bytes:
+    """A file with bytes, lines or words changed, lost, doubled or moved."""
+    for _ in range(source.choice([1, 1, 1, 2, 3, 8])):
+        kind = source.randrange(9)
+        position = source.randrange(len(content) + 1)
+        noise = source.randbytes(source.randrange(1, 9))
+        if kind == 0:
+            content = content[:position] + noise[:1] + content[position + 1 :]
+        elif kind == 1:
+            content = content[:position]
+        elif kind == 2:
+            content = content[:position] + noise + content[position:]
+        else:
+            content = _edited(content, kind, source)
+    return content
+
+
+def _edited(content: bytes, kind: int, source: random.Random) -> bytes:
+    encoding = "utf-16" if content[:2] == b"\xff\xfe" else "latin-1"
+    lines = content.decode(encoding, "replace").split("\n")
+    at, other = source.randrange(len(lines)), source.randrange(len(lines))
+    if kind == 3:
+        del lines[at]
+    elif kind == 4:
+        lines.insert(other, lines[at])
+    elif kind == 5:
+        lines[at], lines[other] = lines[other], lines[at]
+    else:
+        separator = source.choice([" ", ",", "\t"])
+        words = lines[at].split(separator)
+        words[source.randrange(len(words))] = source.choice(_WORDS)
+        lines[at] = separator.join([*words, source.choice(_WORDS)] if kind == 8 else words)
+    return "\n".join(lines).encode(encoding, "replace")
+
+
+def one_line(error: Exception) -> None:
+    assert "\n" not in str(error)
+
+
+def read_damaged(path: Path, content: bytes) -> None:
+    """A lens of finite numbers that can be written and read again, or one of the two errors, in one line."""
+    form = FORMATS[path.suffix.lower()]
+    try:
+        lens, report = form.read(decode(content, Place(path.name)), path.name)
+    except (LensFileError, UnknownGlass) as error:
+        return one_line(error)
+    assert str(report)
+    numbers = [
+        leaf for surface in lens.surfaces for leaf in leaves(dataclasses.replace(surface, thickness=number(0.0)))
+    ]
+    assert all(
+        torch.isfinite(torch.frombuffer(bytearray(leaf[2]), dtype=torch.float64)).all() for leaf in numbers if leaf[2:]
+    )
+    try:
+        written = form.write(lens, path.name)
+    except LensFileError as error:  # a text that no file can hold
+        return one_line(error)
+    again = form.read(decode(written, Place(path.name)), path.name)[0]
+    assert leaves(again.surfaces) == leaves(lens.surfaces)
+    return None
+
+
+_ORIGINALS = [(path, path.read_bytes()) for path in (*OWN, *CORPUS)]
+
+
+@settings(max_examples=1500, deadline=None)
+@given(seed=st.integers(0, 2**63), which=st.integers(0, len(_ORIGINALS) - 1))
+def test_damaged_files_give_a_lens_or_a_clear_error(seed, which):
+    path, content = _ORIGINALS[which]
+    read_damaged(path, damaged(content, random.Random(seed)))
+
+
+@pytest.mark.slow
+@settings(max_examples=100_000, deadline=None)
+@given(seed=st.integers(0, 2**63), which=st.integers(0, len(_ORIGINALS) - 1))
+def test_very_many_damaged_files_give_a_lens_or_a_clear_error(seed, which):
+    path, content = _ORIGINALS[which]
+    read_damaged(path, damaged(content, random.Random(seed)))
+
+
+@settings(max_examples=300, deadline=None)
+@given(content=st.binary(max_size=400), suffix=st.sampled_from(SUFFIXES))
+def test_any_bytes_give_a_lens_or_a_clear_error(content, suffix):
+    read_damaged(Path(f"lens{suffix}"), content)
+
+
+@pytest.mark.parametrize("path", OWN[:2], ids=lambda path: path.name)
+def test_a_file_cut_off_anywhere_is_no_shorter_lens(path):
+    content = path.read_bytes()
+    lens = read_lens(path)
+    for end in range(0, len(content), 7):
+        try:
+            cut = FORMATS[path.suffix].read(decode(content[:end], Place(path.name)), path.name)[0]
+        except (LensFileError, UnknownGlass):
+            continue
+        assert len(cut.surfaces) == len(lens.surfaces)
