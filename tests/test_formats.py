@@ -263,6 +263,29 @@ def test_what_is_accepted_but_lossy_is_warned_of_once(tmp_path):
         read_lens_with_report(path)
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "  DISZ " + "1" * 99_000 + "x",
+        "  GLAS " + "N" * 99_000,
+        "# fields: angle " + "(1 2) " * 9_000 + "x",
+        "# aperture: f" + "/" * 99_000,
+        "# note " + "," * 99_000 + "x",
+        "# " + "a" * 99_000 + ": 1",
+        "1 " * 49_000,
+        "x" * 100_001,
+        "\n" * 200_001,
+    ],
+    ids=lambda line: line[:12].strip() or "lines",
+)
+@pytest.mark.parametrize("name", ["double_gauss.zmx", "double_gauss.csv"])
+def test_long_lines_do_not_hang(line, name):
+    first, _, rest = (ROOT / "lenses" / name).read_text().partition("\n")
+    end = rest.index("\n", rest.index("SURF 1")) if name.endswith("zmx") else 0
+    content = "\n".join([first, rest[:end], line, rest[end:]]).encode()
+    read_damaged(Path(name), content)
+
+
 # -- damaged files ----------------------------------------------------------------------------------------------------
 
 _NUMBERS = "nan inf -inf INFINITY 1e999 1e308 -1e308 1e-320 0 -1 1 2 24 99 12345678901234567890 1_0 ١ 1,5 -0.0 10,20"

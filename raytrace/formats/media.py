@@ -6,12 +6,17 @@ from pathlib import Path
 
 from raytrace.catalog import AmbiguousGlass, find_glass, missing_catalogs
 from raytrace.formats.report import Draft
-from raytrace.formats.source import Place
+from raytrace.formats.source import LensFileError, Place, shown
 from raytrace.glass import Glass
+
+#: More characters than the name of any glass has.
+_LONGEST = 80
 
 
 def listed_glass(name: str, *, catalogs: Sequence[str], user: Sequence[Path], place: Place, report: Draft) -> Glass:
     """The glass of a name, as `find_glass` finds it; raises UnknownGlass naming the place."""
+    if len(name) > _LONGEST:
+        raise LensFileError(f"the glass {shown(name)} has {len(name)} characters; no glass has such a name", place)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         glass = find_glass(name, catalogs=catalogs, user=user, where=str(place))

@@ -12,6 +12,13 @@ MAX_BYTES = 16 * 2**20
 #: More surfaces than any sequential lens has; a file with more is damaged or not a lens.
 MAX_SURFACES = 1000
 
+#: Longer files, and longer lines, are no lens files; the limits keep every reader quick on them.
+MAX_LINES = 200_000
+MAX_LINE = 100_000
+
+#: More characters than any number needs.
+_DIGITS = 400
+
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d{1,4})?", re.ASCII)
 _INFINITE = re.compile(r"[+-]?(inf|infinity|infinite|∞|1\.#inf)", re.ASCII | re.IGNORECASE)
 _NOT_TEXT = re.compile(r"[\x00-\x08\x0e-\x1f\ufffd]")
@@ -88,7 +95,12 @@ def decode(content: bytes, place: Place) -> str:
         line = text.count("\n", 0, found.start()) + 1
         message = f"holds the character U+{ord(found[0]):04X}: binary, or of an unknown encoding; save it as UTF-8"
         raise LensFileError(message, place._replace(line=line))
-    return text.replace("\r\n", "\n").replace("\r", "\n")
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
+    lines = text.split("\n")
+    if len(lines) > MAX_LINES or max(map(len, lines)) > MAX_LINE:
+        found = f"{len(lines)} lines, the longest of {max(map(len, lines))} characters"
+        raise LensFileError(f"{found}; more than any lens file ({MAX_LINES}, {MAX_LINE})", place)
+    return text
 
 
 def _encoding(content: bytes) -> str:
@@ -109,7 +121,7 @@ def _encoding(content: bytes) -> str:
 
 def number(text: str, what: str, place: Place) -> float:
     """A finite decimal number, Fortran's D exponent included. Raises LensFileError for anything else."""
-    if not _NUMBER.fullmatch(text):
+    if len(text) > _DIGITS or not _NUMBER.fullmatch(text):
         raise LensFileError(f"{what} is {shown(text)}, expected a finite number", place)
     result = float(text.replace("D", "E").replace("d", "e"))
     if result in (float("inf"), float("-inf")):
@@ -127,7 +139,9 @@ def integer(text: str, what: str, place: Place) -> int:
 
 def is_number(text: str) -> bool:
     """True if `number` would accept the text."""
-    return bool(_NUMBER.fullmatch(text)) and abs(float(re.sub("[dD]", "e", text))) != float("inf")
+    if len(text) > _DIGITS or not _NUMBER.fullmatch(text):
+        return False
+    return abs(float(re.sub("[dD]", "e", text))) != float("inf")
 
 
 def is_infinite(text: str) -> bool:

@@ -173,7 +173,7 @@ def _field_points(value: str, place: Place) -> tuple[str, list[tuple[float, floa
     kind = next((kind for kind in kinds if text.lower().startswith(kind.replace("_", " "))), None)
     rest = text[len(kind) :].strip() if kind else text
     kind = kind or "angle"
-    pairs = re.fullmatch(r"(\s*\([^()]*\)\s*[,;]?)+", rest)
+    pairs = re.fullmatch(r"(?:\([^()]*\)[\s,;]*)+", rest)
     points = []
     for word in re.findall(r"\(([^()]*)\)", rest) if pairs else _NUMBERS.split(rest):
         if not word.strip():

@@ -88,7 +88,9 @@ def add_row(table: Table, columns: Sequence[str | None], cells: Sequence[str], p
 
 def metadata_line(table: Table, line: str, place: Place, report: Draft) -> bool:
     """Take a line '# key: value', or a comment '# text', which becomes a note."""
-    content = re.sub(r"([,;]{2,}|\s)+$", "", line.strip())  # a spreadsheet pads lines with separators
+    content = line.strip()
+    bare = content.rstrip(",;\t ")
+    content = bare if len(content) - len(bare) > 1 else content  # a spreadsheet pads lines with separators
     if content.startswith('"') and content.endswith('"') and len(content) > 1:
         content = content[1:-1].replace('""', '"').strip()  # and quotes them
     if not content.startswith("#"):
