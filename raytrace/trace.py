@@ -144,13 +144,19 @@ def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:
     does not change is the same tensor, which tells `cross` that nothing bends.
     """
     dtype = lens.surfaces[-2].thickness.dtype
-    found: list[tuple[object, Tensor]] = []
+    indices: list[Tensor] = []
+    medium = None
     for surface in lens.surfaces:
-        if found and (surface.is_mirror or surface.glass is found[-1][0]):
-            found.append(found[-1])
+        if medium is None or not (surface.is_mirror or _same_medium(surface.glass, medium)):
+            medium = surface.glass
+            indices.append(glass.refractive_index(medium, wavelength).to(dtype))
         else:
-            found.append((surface.glass, glass.refractive_index(surface.glass, wavelength).to(dtype)))
-    return [index for _, index in found]
+            indices.append(indices[-1])
+    return indices
+
+
+def _same_medium(a: glass.Glass, b: glass.Glass) -> bool:
+    return a is b or (a.formula == b.formula and a.coefficients is b.coefficients)
 
 
 def trace(lens: Lens, rays: Rays, wavelength: Tensor) -> Rays:

@@ -1,6 +1,8 @@
 """Values: frozen dataclasses of tensors that `torch.func` and `torch.utils._pytree` can walk."""
 
 import dataclasses
+import types
+import typing
 
 import torch
 from torch.utils import _pytree as pytree
@@ -16,11 +18,12 @@ def value(cls: type) -> type:
     tensors) and no validation on construction (it would break `vmap`): wrong input is refused at the doors.
     """
     cls = dataclasses.dataclass(frozen=True, eq=False, slots=True)(cls)
-    names = tuple(field.name for field in dataclasses.fields(cls))
+    fields = dataclasses.fields(cls)
+    numeric = {field.name for field in fields if _holds_numbers(field.type)}
 
     def flatten(instance):
-        items = [(name, getattr(instance, name)) for name in names]
-        children = {name: item for name, item in items if _is_child(item)}
+        items = [(field.name, getattr(instance, field.name)) for field in fields]
+        children = {name: item for name, item in items if name in numeric and item is not None}
         structure = tuple((name, item) for name, item in items if name not in children)
         return list(children.values()), (tuple(children), structure)
 
@@ -33,18 +36,27 @@ def value(cls: type) -> type:
     return cls
 
 
-def _is_child(item: object) -> bool:
-    if isinstance(item, tuple):
-        return bool(item) and all(type(entry) in _VALUE_TYPES for entry in item)
-    return isinstance(item, torch.Tensor) or type(item) in _VALUE_TYPES
+def _holds_numbers(annotation: object) -> bool:
+    """Whether a field of this type holds a tensor, a value or a tuple of values (or None in their place)."""
+    if typing.get_origin(annotation) is tuple:
+        return typing.get_args(annotation)[0] in _VALUE_TYPES
+    if isinstance(annotation, types.UnionType):
+        return any(_holds_numbers(member) for member in typing.get_args(annotation))
+    return annotation is torch.Tensor or annotation in _VALUE_TYPES
 
 
 def to(instance, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None):
-    """The same value with every floating-point tensor in it converted to `dtype` and moved to `device`."""
+    """The same value with every floating-point tensor in it converted to `dtype` and moved to `device`.
+
+    A tensor that stands in several places (the coefficients of air, say) stays one tensor.
+    """
+    converted: dict[int, torch.Tensor] = {}
 
     def convert(leaf):
         if not isinstance(leaf, torch.Tensor):
             return leaf
-        return leaf.to(device=device, dtype=dtype if leaf.is_floating_point() else None)
+        if id(leaf) not in converted:
+            converted[id(leaf)] = leaf.to(device=device, dtype=dtype if leaf.is_floating_point() else None)
+        return converted[id(leaf)]
 
     return pytree.tree_map(convert, instance)

@@ -9,13 +9,23 @@ import gzip
 import json
 import math
 import os
+import warnings
 from decimal import Decimal, getcontext
 from pathlib import Path
 
 import pytest
 import torch
 
-from raytrace.glass import AIR, MIRROR, constant
+from raytrace.glass import (
+    AIR,
+    MIRROR,
+    InvalidIndex,
+    OutOfRange,
+    check_wavelengths,
+    constant,
+    refractive_index,
+    sellmeier,
+)
 from raytrace.launch import rays_from_infinity, rays_from_point
 from raytrace.numerics import dot, unit
 from raytrace.rays import Rays
@@ -235,3 +245,31 @@ def check_opd(case, result, scene, dtype):
     W = (W - W[opd["chief"]]) / opd["wavelength_mm"]
     for i, expected in enumerate(opd["W_waves"]):
         assert error(W[i].item(), expected) <= OPD_WAVES[dtype], i
+
+
+@pytest.mark.parametrize("case", of_kind("index"))
+def test_index(case):
+    """Sellmeier index and its gradient inside and outside the range of the glass, next to poles, n² ≤ 0 and n < 1."""
+    data, expected = case["data"], case["expected"]
+    B = torch.tensor(data["B"], dtype=torch.float64, requires_grad=True)
+    C = torch.tensor(data["C"], dtype=torch.float64, requires_grad=True)
+    wavelength = torch.tensor(data["wavelength_um"], dtype=torch.float64, requires_grad=True)
+    glass = sellmeier(B, C, data["glass"], wavelength_range=tuple(data["range_um"]))
+    n = refractive_index(glass, wavelength)
+    n.backward()
+    gradients = {"wavelength": wavelength.grad.item()}
+    gradients |= {f"B{j}": B.grad[j].item() for j in range(3)} | {f"C{j}": C.grad[j].item() for j in range(3)}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        if expected["status"] == "invalid":
+            with pytest.raises(InvalidIndex, match=data["glass"]):
+                check_wavelengths(glass, wavelength)
+            assert n.item() == 0.0
+            assert all(gradient == 0.0 for gradient in gradients.values())
+            return
+        check_wavelengths(glass, wavelength)
+    assert any(issubclass(entry.category, OutOfRange) for entry in caught) == (not expected["in_range"])
+    assert error(n.item(), expected["n"]) <= VALUE_SCORE * ROUNDING[torch.float64] * float(expected["n"])
+    for name, value in expected["grad"].items():
+        allowed = GRADIENT_SCORE * ROUNDING[torch.float64] * abs(float(value))
+        assert error(gradients[name], value) <= allowed, name

@@ -49,7 +49,7 @@ class Fates:
 def read(path: str, primary: float) -> tuple[Iterator[Batch], int]:
     """Batches of the rays in a CSV file and their number. Raises CommandError naming file, line and column."""
     try:
-        table = pandas.read_csv(path, float_precision="round_trip", skipinitialspace=True, dtype=str)
+        table = pandas.read_csv(path, skipinitialspace=True, dtype=str)
     except FileNotFoundError:
         raise CommandError(f"{path}: no such file; expected a table of rays with columns {','.join(COLUMNS)}") from None
     except (pandas.errors.ParserError, pandas.errors.EmptyDataError, UnicodeDecodeError) as error:
@@ -62,12 +62,12 @@ def read(path: str, primary: float) -> tuple[Iterator[Batch], int]:
             f"found {','.join(table.columns)}"
         )
     names = [*COLUMNS, *(["wavelength"] if "wavelength" in table.columns else [])]
-    values = table[names].apply(pandas.to_numeric, errors="coerce").to_numpy(dtype=np.float64).reshape(-1, len(names))
+    values = np.stack([_floats(table[name]) for name in names], axis=1).reshape(-1, len(names))
     wrong = np.argwhere(~np.isfinite(values))
     if len(wrong):
         row, column = wrong[0]
         found = table[names].iloc[row, column]
-        found = "nothing" if isinstance(found, float) else repr(found)
+        found = repr(found) if isinstance(found, str) else "nothing"
         raise CommandError(f"{path}:{row + 2}: column {names[column]}: expected a finite number, found {found}")
     pointless = np.flatnonzero((values[:, 3:6] == 0).all(1))
     if len(pointless):
@@ -84,6 +84,21 @@ def read(path: str, primary: float) -> tuple[Iterator[Batch], int]:
             yield Batch(rays, torch.from_numpy(wavelengths[first : first + _BATCH].copy()), first)
 
     return batches(), len(values)
+
+
+def _floats(column: pandas.Series) -> np.ndarray:
+    """The column as float64, every text read to the nearest double; nan where it is no number."""
+    try:
+        return column.to_numpy(dtype=np.float64, na_value=np.nan)
+    except ValueError:
+        return np.array([_float(entry) for entry in column])
+
+
+def _float(entry: object) -> float:
+    try:
+        return float(entry)
+    except (TypeError, ValueError):
+        return math.nan
 
 
 def chief_and_marginal(lens: Lens, ray_aiming: bool | None) -> tuple[list[Batch], int]:
