@@ -48,7 +48,8 @@ def refract(direction: Tensor, normal: Tensor, norm_squared: Tensor, n1: Tensor,
     passes = b_squared > 0
     b = safe_sqrt(b_squared)
     along_normal = torch.where(cosine < 0, -D, D) / torch.where(passes, a + b, 1.0)
-    refracted = (n1 * direction + along_normal * normal) / n2
+    # An index of 0 is a medium without a real index: nothing passes into it.
+    refracted = (n1 * direction + along_normal * normal) / torch.where(n2 > 0, n2, 1.0)
     return _renormalise(refracted), passes
 
 

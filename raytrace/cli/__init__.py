@@ -26,9 +26,17 @@ Lengths are mm, wavelengths µm, angles degrees. `raytrace COMMAND --help` teach
 """
 
 
+class _Parser(argparse.ArgumentParser):
+    """argparse, with its usage errors in one line like every other error."""
+
+    def error(self, message: str):
+        print(f"raytrace: error: {message}; see `{self.prog} --help`", file=sys.stderr)
+        raise SystemExit(2)
+
+
 def build_parser() -> argparse.ArgumentParser:
     """The whole command line, without importing any command."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="raytrace", description=DESCRIPTION, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--version", action="version", version=f"raytrace {_version()}")
@@ -72,6 +80,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                 raise
             if isinstance(error, (ValueError, LookupError, OSError)) and not isinstance(error, KeyError | IndexError):
                 return _fail(_one_line(error), 1)
+            if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
+                return _fail("not enough memory for this many rays; ask for fewer (--size, --rays)", 1)
             kind = type(error).__name__
             return _fail(
                 f"{kind}: {_one_line(error)} (a defect of raytrace; RAYTRACE_TRACEBACK=1 shows where, please report)", 1

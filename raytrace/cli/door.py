@@ -26,6 +26,8 @@ class CommandError(ValueError):
 def find_lens(name: str) -> Path:
     """The file of that name, else the shipped lens of that name (with or without lenses/ and .zmx)."""
     path = Path(name)
+    if path.is_dir():
+        raise CommandError(f"{name}: is a directory; expected a lens file")
     if path.exists():
         return path
     folder = shipped("lenses")
@@ -68,12 +70,17 @@ def refuse_untraceable(lens: Lens, path: str) -> None:
         check(lens)
     except ValueError as error:
         raise CommandError(f"{path}: {error}") from error
+    check_glasses(lens, lens.wavelengths, path)
+
+
+def check_glasses(lens: Lens, wavelengths: Tensor, path: str) -> None:
+    """Raise for a wavelength (W,) µm at which a glass of the lens has no index; warn of those outside its range."""
     seen = set()
     for number, surface in enumerate(lens.surfaces[:-1]):
         key = (surface.glass.name, surface.glass.catalog)
         if surface.glass.formula != "constant" and key not in seen:
             seen.add(key)
-            check_wavelengths(surface.glass, lens.wavelengths, where=f"{path}, surface {number}")
+            check_wavelengths(surface.glass, wavelengths, where=f"{path}, surface {number}")
 
 
 def catalogs(arguments: argparse.Namespace) -> tuple[Path, ...]:
@@ -89,6 +96,12 @@ def field_points(lens: Lens, arguments: argparse.Namespace, *, on_axis: bool = F
     """(2, F) field points: those of --field along y, else the axis alone or the lens's own."""
     given = getattr(arguments, "field", None)
     if given:
+        for angle in given:
+            if lens.fields.kind == "angle" and abs(angle) >= 90:
+                raise CommandError(
+                    f"--field {angle:g}: a field angle is below 90 degrees, for rays start from the plane "
+                    "of the entrance pupil"
+                )
         y = lens.fields.y.new_tensor(given)
         return torch.stack([torch.zeros_like(y), y])
     if on_axis:
@@ -131,7 +144,9 @@ def say(message: str) -> None:
 
 def write_atomically(path: str | os.PathLike, write: Callable[[Path], None]) -> None:
     """Call `write` on a temporary file beside `path`, then rename it; nothing is left if `write` fails."""
-    path = Path(path)
+    path = Path(os.path.realpath(path))  # a link is written through, not replaced
+    if path.exists() and not path.is_file():
+        raise CommandError(f"{path}: is not a regular file; give the name of a file to write")
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp{path.suffix}")
     try:
         write(temporary)

@@ -14,6 +14,7 @@ from raytrace.cli.door import (
     numbers,
     open_lens,
     print_json,
+    refuse_untraceable,
     say,
 )
 from raytrace.formats import LensFileWarning, read_lens_with_report, write_lens
@@ -129,6 +130,7 @@ def check(arguments: argparse.Namespace) -> None:
     """The import report."""
     path = find_lens(arguments.lens)
     lens, report = read_lens_with_report(path, catalogs=catalogs(arguments), strict=arguments.strict)
+    refuse_untraceable(lens, str(path))
     if arguments.json:
         print_json({**report.to_dict(), "surfaces": len(lens.surfaces), "stop_surface": lens.stop})
     else:
@@ -150,9 +152,9 @@ def convert(arguments: argparse.Namespace) -> None:
 
 def layout(arguments: argparse.Namespace) -> None:
     """The cross section with rays."""
+    lens = open_lens(arguments)
     from raytrace import plot
 
-    lens = open_lens(arguments)
     output = arguments.output or f"{Path(arguments.lens).stem}_layout.png"
     fields = field_points(lens, arguments)
     figure = plot.layout(lens, fields=fields)

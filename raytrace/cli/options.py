@@ -52,11 +52,29 @@ def count(text: str) -> int:
     return number
 
 
+def seed_number(text: str) -> int:
+    """A whole number that seeds a generator: 0 to 2⁶³ - 1."""
+    try:
+        number = int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
+    if not 0 <= number < 2**63:
+        raise argparse.ArgumentTypeError(f"{text!r} is not from 0 to 2**63 - 1")
+    return number
+
+
+def file_name(text: str) -> str:
+    """The name of a file; an empty one is refused."""
+    if not text:
+        raise argparse.ArgumentTypeError("the name of the file is empty")
+    return text
+
+
 def _number(text: str) -> float:
     try:
         number = float(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number (LENS goes before the options)") from None
     if number != number:
         raise argparse.ArgumentTypeError("nan is not a number to work with")
     return number
@@ -64,7 +82,7 @@ def _number(text: str) -> float:
 
 def lens(parser: argparse.ArgumentParser) -> None:
     """LENS, --catalog, --json."""
-    parser.add_argument("lens", metavar="LENS", help="lens file, or the name of a shipped lens")
+    parser.add_argument("lens", metavar="LENS", type=file_name, help="lens file, or the name of a shipped lens")
     catalog(parser)
     json(parser)
 
@@ -73,6 +91,7 @@ def catalog(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--catalog",
         metavar="FILE",
+        type=file_name,
         action="append",
         default=[],
         help="glass catalog (.agf) to search first; may be repeated; also the environment variable RAYTRACE_CATALOGS",
@@ -138,7 +157,7 @@ def sampling(parser: argparse.ArgumentParser, *, rings: int) -> None:
         type=count,
         help=f"rings (gauss, hexapolar; default {rings}), points across (square) or points (sobol, random)",
     )
-    parser.add_argument("--seed", metavar="N", type=int, default=0, help="seed of sobol and random (default 0)")
+    parser.add_argument("--seed", metavar="N", type=seed_number, default=0, help="seed of sobol and random (default 0)")
 
 
 def ray_aiming(parser: argparse.ArgumentParser) -> None:
@@ -151,11 +170,11 @@ def ray_aiming(parser: argparse.ArgumentParser) -> None:
 
 
 def plot(parser: argparse.ArgumentParser, what: str) -> None:
-    parser.add_argument("--plot", metavar="FILE", help=f"save {what} as .png, .pdf or .svg")
+    parser.add_argument("--plot", metavar="FILE", type=file_name, help=f"save {what} as .png, .pdf or .svg")
 
 
 def output(parser: argparse.ArgumentParser, what: str) -> None:
-    parser.add_argument("-o", "--output", metavar="FILE", help=what)
+    parser.add_argument("-o", "--output", metavar="FILE", type=file_name, help=what)
 
 
 def _info(parser):
@@ -169,8 +188,8 @@ def _check(parser):
 
 
 def _convert(parser):
-    parser.add_argument("lens", metavar="IN", help="lens file, or the name of a shipped lens")
-    parser.add_argument("output", metavar="OUT", help="lens file to write: .zmx, .csv, .tsv or .txt")
+    parser.add_argument("lens", metavar="IN", type=file_name, help="lens file, or the name of a shipped lens")
+    parser.add_argument("output", metavar="OUT", type=file_name, help="lens file to write: .zmx, .csv, .tsv or .txt")
     catalog(parser)
     json(parser)
     parser.add_argument("--strict", action="store_true", help="fail on anything unknown or assumed in IN")
@@ -225,6 +244,7 @@ def _trace(parser):
     parser.add_argument(
         "--rays",
         metavar="CSV",
+        type=file_name,
         help="rays to trace: columns x,y,z,l,m,n in the frame of surface 1, optional wavelength; "
         "by default the chief and marginal rays of every field",
     )

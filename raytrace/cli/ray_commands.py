@@ -21,7 +21,7 @@ from raytrace.cli.door import (
     write_atomically,
 )
 from raytrace.focus import focus as best_focus
-from raytrace.focus import focus_of_merit, image_rays
+from raytrace.focus import focus_moments, focus_of_merit, image_rays
 from raytrace.formats import write_lens
 from raytrace.launch import launch
 from raytrace.lens import FIELD_UNITS, Lens, with_object_distance, with_sensor_distance
@@ -134,8 +134,12 @@ def focus(arguments: argparse.Namespace) -> None:
     paraxial = paraxial_image_distance(lens, before.new_tensor(distances))
     if not bool(torch.isfinite(paraxial).all()):
         raise CommandError(f"{arguments.lens}: the lens is afocal for this object distance; there is no focus to find")
+    arrived = _refuse_without_focus(arguments, lens, points, rule)
+    if arrived < 1:
+        say(f"warning: {1 - arrived:.2%} of the rays are lost; the focus is of the rest")
     rms = best_focus(lens, points, weights, **rule)
-    after = {"rms": rms, "paraxial": paraxial.mean()}.get(arguments.criterion)
+    shares = paraxial.new_tensor(arguments.distance_weights or [1.0] * len(distances))
+    after = {"rms": rms, "paraxial": (shares * paraxial).sum() / shares.sum()}.get(arguments.criterion)
     if after is None:
         after = focus_of_merit(lambda s: _mean_distance(lens, s, points, weights, rule), rms).detach()
     result = {
@@ -147,8 +151,6 @@ def focus(arguments: argparse.Namespace) -> None:
         "rms_before": _rms(lens, before, points, weights, rule),
         "rms_after": _rms(lens, after, points, weights, rule),
     }
-    if result["rms_after"] is None:
-        raise CommandError(f"{arguments.lens}: no ray reaches the image; `raytrace trace` says where they are lost")
     focused = with_sensor_distance(lens, after)
     if arguments.plot:
         from raytrace import plot
@@ -163,6 +165,23 @@ def focus(arguments: argparse.Namespace) -> None:
         _print_focus(lens, arguments, distances, fields, wavelengths, paraxial, result, points, weights, rule)
     for path in filter(None, (arguments.plot, arguments.output)):
         say(f"written: {path}")
+
+
+def _refuse_without_focus(arguments: argparse.Namespace, lens: Lens, points: Tensor, rule: dict) -> float:
+    """The fraction of rays that reach the image. Raises CommandError if too few do, or all are parallel."""
+    valid, variance = [], 0.0
+    for distance in rule["object_distances"]:
+        rays = image_rays(
+            with_object_distance(lens, distance), points, fields=rule["fields"], wavelengths=rule["wavelengths"]
+        )
+        valid.append(rays.valid.double().mean())
+        variance += float(focus_moments(rays)[1].sum())
+    arrived = float(torch.stack(valid).mean())
+    if arrived == 0:
+        raise CommandError(f"{arguments.lens}: no ray reaches the image; `raytrace trace` says where they are lost")
+    if variance == 0:
+        raise CommandError(f"{arguments.lens}: one ray, or parallel rays, have no focus; ask for more rays (--size)")
+    return arrived
 
 
 def _as_in_file(focused: Lens, arguments: argparse.Namespace) -> Lens:
@@ -254,19 +273,22 @@ def _optional(values: list[float] | None) -> Tensor | None:
 def trace(arguments: argparse.Namespace) -> None:
     """Rays of a table, or the chief and marginal rays of the fields, surface by surface."""
     lens = open_lens(arguments)
-    if arguments.rays:
-        batches, total = ray_table.read(arguments.rays, float(primary(lens)))
+    if arguments.rays is not None:
+        batches, total = ray_table.read(arguments.rays, lens)
     else:
         batches, total = ray_table.chief_and_marginal(lens, ray_aiming(arguments))
     fates = ray_table.Fates()
-    if arguments.json:
-        rows = [row for batch in batches for row in ray_table.rows(ray_table.traced(lens, batch, fates))]
-        print_json({"rays": total, "results": rows, "lost": fates.counts()})
-    elif arguments.output:
+    if arguments.output:
         write_atomically(
             arguments.output, lambda path: ray_table.write(path, lens, batches, total, fates, progress=True)
         )
-        say(f"{total} rays written to {arguments.output}")
+        if arguments.json:
+            print_json({"rays": total, "output": arguments.output, "lost": fates.counts()})
+        else:
+            say(f"{total} rays written to {arguments.output}")
+    elif arguments.json:
+        rows = [row for batch in batches for row in ray_table.rows(ray_table.traced(lens, batch, fates))]
+        print_json({"rays": total, "results": rows, "lost": fates.counts()})
     else:
         ray_table.write(sys.stdout, lens, batches, total, fates, progress=False)
     for line in fates.lines():

@@ -1,6 +1,7 @@
 """Tables of rays: read the rays of `raytrace trace --rays`, write what became of them at every surface."""
 
 import math
+import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -12,7 +13,7 @@ import pandas
 import torch
 from tqdm import tqdm
 
-from raytrace.cli.door import CommandError
+from raytrace.cli.door import CommandError, check_glasses, primary
 from raytrace.launch import launch
 from raytrace.lens import Lens
 from raytrace.rays import Rays
@@ -46,15 +47,24 @@ class Fates:
         return [f"{n} rays {words[status]} surface {k}" for (k, status), n in sorted(self.lost.items())]
 
 
-def read(path: str, primary: float) -> tuple[Iterator[Batch], int]:
-    """Batches of the rays in a CSV file and their number. Raises CommandError naming file, line and column."""
+def read(path: str, lens: Lens) -> tuple[Iterator[Batch], int]:
+    """Batches of the rays in a CSV file and their number. Raises CommandError naming file, line and column.
+
+    A ray without a wavelength has the primary one of the lens.
+    """
     try:
-        table = pandas.read_csv(path, skipinitialspace=True, dtype=str)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pandas.errors.ParserWarning)  # a row longer than the header
+            table = pandas.read_csv(path, skipinitialspace=True, dtype=str, index_col=False, skip_blank_lines=False)
     except FileNotFoundError:
         raise CommandError(f"{path}: no such file; expected a table of rays with columns {','.join(COLUMNS)}") from None
-    except (pandas.errors.ParserError, pandas.errors.EmptyDataError, UnicodeDecodeError) as error:
-        raise CommandError(f"{path}: not a table of rays: {' '.join(str(error).split())}") from error
+    except (pandas.errors.ParserError, pandas.errors.ParserWarning) as error:
+        raise CommandError(f"{path}: a row has more entries than the header: {_words(error)}") from error
+    except (pandas.errors.EmptyDataError, UnicodeDecodeError) as error:
+        raise CommandError(f"{path}: not a table of rays: {_words(error)}") from error
     table.columns = [str(name).strip().lower() for name in table.columns]
+    table = table.dropna(how="all")  # blank lines; the index still counts them
+    lines = table.index.to_numpy() + 2
     missing = [name for name in COLUMNS if name not in table.columns]
     if missing:
         raise CommandError(
@@ -68,14 +78,16 @@ def read(path: str, primary: float) -> tuple[Iterator[Batch], int]:
         row, column = wrong[0]
         found = table[names].iloc[row, column]
         found = repr(found) if isinstance(found, str) else "nothing"
-        raise CommandError(f"{path}:{row + 2}: column {names[column]}: expected a finite number, found {found}")
+        raise CommandError(f"{path}:{lines[row]}: column {names[column]}: expected a finite number, found {found}")
     pointless = np.flatnonzero((values[:, 3:6] == 0).all(1))
     if len(pointless):
-        raise CommandError(f"{path}:{pointless[0] + 2}: the direction l,m,n is 0,0,0; expected direction cosines")
-    wavelengths = values[:, 6] if "wavelength" in table.columns else np.full(len(values), primary)
+        raise CommandError(f"{path}:{lines[pointless[0]]}: the direction l,m,n is 0,0,0; expected direction cosines")
+    wavelengths = values[:, 6] if "wavelength" in table.columns else np.full(len(values), float(primary(lens)))
     negative = np.flatnonzero(~(wavelengths > 0))
     if len(negative):
-        raise CommandError(f"{path}:{negative[0] + 2}: wavelength {wavelengths[negative[0]]:g}: expected µm above 0")
+        raise CommandError(f"{path}:{lines[negative[0]]}: wavelength {wavelengths[negative[0]]:g}: expected µm above 0")
+
+    check_glasses(lens, torch.from_numpy(np.unique(wavelengths)), path)
 
     def batches() -> Iterator[Batch]:
         for first in range(0, len(values), _BATCH):
@@ -84,6 +96,10 @@ def read(path: str, primary: float) -> tuple[Iterator[Batch], int]:
             yield Batch(rays, torch.from_numpy(wavelengths[first : first + _BATCH].copy()), first)
 
     return batches(), len(values)
+
+
+def _words(error: Exception) -> str:
+    return " ".join(str(error).split())
 
 
 def _floats(column: pandas.Series) -> np.ndarray:
@@ -142,8 +158,8 @@ def traced(lens: Lens, batch: Batch, fates: Fates) -> pandas.DataFrame:
             ("tir", crossing.totally_reflected),
             ("vignetted", crossing.clipped),
         ):
-            if bool(mask.any()):
-                fates.lost[k, name] += int(mask.sum())
+            if bool((mask & ~ended).any()):
+                fates.lost[k, name] += int((mask & ~ended).sum())
         ended = ended | stopped
     return pandas.concat(frames).sort_values(["ray", "surface"], kind="stable", ignore_index=True)
 

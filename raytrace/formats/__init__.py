@@ -68,13 +68,15 @@ def _format(path: Path) -> Format:
     form = FORMATS.get(path.suffix.lower())
     if form is None:
         known = ", ".join(FORMATS)
-        found = f"the suffix {path.suffix!r}" if path.suffix else "no suffix"
-        raise LensFileError(f"{found} names no format of lens files; expected one of {known}", Place(str(path)))
+        found = f"the suffix {path.suffix!r} names no format" if path.suffix else "has no suffix to name its format"
+        raise LensFileError(f"{found} of lens files; expected one of {known}", Place(str(path)))
     return form
 
 
 def _replace(path: Path, content: bytes) -> None:
     target = Path(os.path.realpath(path))
+    if target.exists() and not target.is_file():
+        raise LensFileError("is not a regular file; give the name of a file to write", Place(str(path)))
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(6)}.tmp")
     try:
         with open(temporary, "xb") as file:
