@@ -6,6 +6,7 @@ nothing behind.
 
 from raytrace.plot.curve import through_focus_curve as through_focus_curve
 from raytrace.plot.layout import layout as layout
+from raytrace.plot.report import focus_report as focus_report
 from raytrace.plot.spots import airy_radius as airy_radius
 from raytrace.plot.spots import spot_diagram as spot_diagram
 from raytrace.plot.style import SUFFIXES as SUFFIXES

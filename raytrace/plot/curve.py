@@ -15,7 +15,7 @@ from raytrace.lens import Lens, with_object_distance
 from raytrace.numerics import safe_divide
 from raytrace.paraxial import first_order, paraxial_image_distance
 from raytrace.plot import style
-from raytrace.plot.spots import airy_radius
+from raytrace.plot.spots import shares_of
 from raytrace.pupil import gauss_rings
 from raytrace.rays import Rays
 
@@ -46,6 +46,7 @@ def through_focus_curve(
     *,
     fields: Tensor | None = None,
     wavelengths: Tensor | None = None,
+    wavelength_weights: Tensor | None = None,
     pupil: tuple[Tensor, Tensor] | None = None,
     by: str = "field",
     span: tuple[float, float] | None = None,
@@ -54,8 +55,9 @@ def through_focus_curve(
     """RMS spot radius against the sensor distance; minima, the paraxial focus and the present sensor are marked.
 
     by: "field", a line for each field over all wavelengths, or "wavelength", a line for each wavelength of the first
-    field. fields: (2, F), wavelengths: (W,) µm, by default those of the lens; pupil: points (2, P), weights (P,);
-    span: first and last sensor distance in mm, by default around all that is marked; object_distance: mm.
+    field. fields: (2, F), wavelengths: (W,) µm, by default those of the lens, and their weights (W,) (equal for
+    wavelengths that are given); pupil: points (2, P), weights (P,); span: first and last sensor distance in mm, by default around all that is
+    marked; object_distance: mm from surface 1, inf allowed.
     """
     if by not in ("field", "wavelength"):
         raise ValueError(f"by = {by!r}: expected 'field' or 'wavelength'")
@@ -63,20 +65,21 @@ def through_focus_curve(
         lens = with_object_distance(lens, object_distance)
     fields = style.lens_fields(lens, fields)
     fields = fields[:, :1] if by == "wavelength" else fields
-    bundle = focus_rays(lens, fields=fields, wavelengths=wavelengths, pupil=pupil, by=by)
+    rule = {"wavelengths": wavelengths, "wavelength_weights": wavelength_weights, "pupil": pupil}
+    bundle = focus_rays(lens, fields=fields, by=by, **rule)
     if by == "field":
         labels = [style.field_label(lens, field) for field in style.array(fields).T]
         colours, title = [style.field_colour(f) for f in range(len(labels))], style.field_title(lens)
     else:
         values = style.array(lens.wavelengths if wavelengths is None else wavelengths)
-        labels = [f"{wavelength:.7g} µm" for wavelength in values]
+        labels = [f"{wavelength:.4g} µm" for wavelength in values]
         colours, title = style.wavelength_colours(values), f"Field {style.field_label(lens, style.array(fields)[:, 0])}"
     sensor = float(lens.surfaces[-2].thickness)
     marks = {"paraxial focus": float(paraxial_image_distance(lens, lens.surfaces[0].thickness)), "sensor": sensor}
-    figure = style.new_figure(6.4, 4.2)
+    figure = style.new_figure(7.0, 4.4)
     axes = figure.add_subplot()
-    span = focus_span(sensor + bundle.best, marks.values(), depth_of_focus(lens)) if span is None else span
-    draw_curves(axes, bundle, sensor, span, colours=colours, labels=labels)
+    span = focus_span(lens, bundle, sensor, marks.values()) if span is None else span
+    draw_curves(axes, bundle, sensor, span, labels=labels, colours=colours)
     draw_marks(axes, marks)
     axes.set_title(
         "\n".join(textwrap.wrap(lens.name, 70)) or "Lens", fontsize=11, fontweight="bold", pad=20, loc="left"
@@ -85,50 +88,66 @@ def through_focus_curve(
         style.first_order_text(lens, first_order(lens)),
         (0, 1), (0, 8), xycoords="axes fraction", textcoords="offset points", color=style.GREY,
     )  # fmt: skip
-    figure.legend(title=f"{title}: least RMS radius at", title_fontsize=8, loc="outside lower center", ncols=2)
+    figure.legend(title=f"{title}: least RMS radius at", title_fontsize=8, loc="outside lower center", ncols=3)
     return figure
 
 
 def focus_rays(
-    lens: Lens, *, fields: Tensor, wavelengths: Tensor | None, pupil: tuple[Tensor, Tensor] | None, by: str = "field"
+    lens: Lens,
+    *,
+    fields: Tensor,
+    wavelengths: Tensor | None,
+    wavelength_weights: Tensor | None,
+    pupil: tuple[Tensor, Tensor] | None,
+    by: str = "field",
 ) -> FocusRays:
     """The rays of every curve: by "field" all wavelengths in one with their weights, by "wavelength" each by itself."""
     dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
     points, weights = gauss_rings(dtype=dtype, device=device) if pupil is None else pupil
-    shares = lens.wavelength_weights if wavelengths is None else torch.ones_like(wavelengths)
+    shares = shares_of(lens, wavelengths, wavelength_weights)
     with torch.no_grad():
         rays = image_rays(lens, points, fields=fields, wavelengths=wavelengths)
     if by == "wavelength":
-        return FocusRays(Rays(rays.position.flatten(1, 2), rays.direction.flatten(1, 2), rays.valid.flatten(0, 1)), weights)
+        return FocusRays(
+            Rays(rays.position.flatten(1, 2), rays.direction.flatten(1, 2), rays.valid.flatten(0, 1)), weights
+        )
     weights = (shares[:, None] * weights).flatten()
     return FocusRays(Rays(rays.position.flatten(2), rays.direction.flatten(2), rays.valid.flatten(1)), weights)
 
 
-def depth_of_focus(lens: Lens) -> float:
-    """2 λ N² in mm, half the classical depth of focus, at the primary wavelength."""
+def focus_span(lens: Lens, bundle: FocusRays, sensor: float, marks) -> tuple[float, float]:
+    """First and last sensor distance in mm: all minima and marks, and room for the curves to rise beside them.
+
+    A perfect cone moved by s has the RMS radius s/(√8 N); the room makes that twice the least RMS radius, or five
+    times the classical depth of focus 2 λ N² where the spot is smaller than the Airy disc.
+    """
+    best = bundle.best
+    least = np.diagonal(bundle.radii(best))
     number = float(first_order(lens).working_f_number)
-    return 2e-3 * float(lens.wavelengths[lens.primary_wavelength]) * number * number
+    number = number if math.isfinite(number) else 0.0
+    blur = max(2 * math.sqrt(8) * number * least.min(), 1e-2 * float(lens.wavelengths.min()) * number**2)
+    seen = [x for x in (*(sensor + best), sensor, *marks) if math.isfinite(x)]
+    room = max(0.2 * (max(seen) - min(seen)), blur, 1e-6)
+    return min(seen) - room, max(seen) + room
 
 
-def focus_span(best, marks, depth: float) -> tuple[float, float]:
-    """First and last sensor distance in mm that show all minima and marks with room beside them."""
-    seen = [float(x) for x in (*best, *marks) if math.isfinite(x)]
-    low, high = min(seen), max(seen)
-    room = max(0.35 * (high - low), 2.5 * depth)
-    return low - room, high + room
-
-
-def draw_curves(axes: Axes, bundle: FocusRays, sensor: float, span: tuple[float, float], *, colours, labels) -> None:
+def draw_curves(
+    axes: Axes, bundle: FocusRays, sensor: float, span: tuple[float, float], *, labels, colours=None
+) -> None:
     """One line for each batch of rays, a dot at its minimum; labels carry the place and the radius of the minimum."""
+    colours = [style.field_colour(c) for c in range(len(labels))] if colours is None else colours
     shifts = np.linspace(span[0], span[1], _SAMPLES) - sensor
     radii, best = 1e3 * bundle.radii(shifts), bundle.best
     least = 1e3 * np.diagonal(bundle.radii(best))
     alive = style.array(bundle.rays.valid.any(-1)).astype(bool)
     for c in np.flatnonzero(alive):
         place = f"{labels[c]}: {style.number_text(sensor + best[c], 6)} mm, {style.number_text(least[c])} µm"
-        axes.plot(sensor + shifts, radii[:, c], color=colours[c], linewidth=1.4, label=place, zorder=3)
+        width = max(2.4 - 0.5 * c, 1.2)  # so that curves that coincide all show
+        axes.plot(sensor + shifts, radii[:, c], color=colours[c], linewidth=width, label=place, zorder=3)
         if span[0] <= sensor + best[c] <= span[1]:
-            axes.plot([sensor + best[c]], [least[c]], "o", color=colours[c], markersize=4.5, markeredgecolor="white", zorder=4)
+            axes.plot(
+                [sensor + best[c]], [least[c]], "o", color=colours[c], markersize=4.5, markeredgecolor="white", zorder=4
+            )
     axes.set_xlim(*span)
     axes.set_ylim(0, 1.03 * radii[:, alive].max() if alive.any() else 1.0)
     axes.set_xlabel("Sensor distance from the last surface (mm)")

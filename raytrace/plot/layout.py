@@ -45,14 +45,14 @@ def layout(
     axes = figure.add_subplot()
     draw_layout(axes, lens, fields=fields, wavelength=wavelength, rays=rays)
     (z0, z1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
-    figure.set_size_inches(8.0, min(max(7.8 * (y1 - y0) / (z1 - z0), 1.2), 6.5) + 1.0)
-    name = "\n".join(textwrap.wrap(lens.name, 90)) or "Lens"
-    axes.set_title(f"{name}\n", fontsize=11, fontweight="bold", linespacing=1.3)
-    axes.annotate(
-        style.first_order_text(lens, first_order(lens)),
-        (0.5, 1.0), (0, 7), xycoords="axes fraction", textcoords="offset points", ha="center", color=style.GREY,
-    )  # fmt: skip
-    labels = [style.field_label(lens, field) for field in zip(*style.array(style.lens_fields(lens, fields)), strict=True)]
+    shape = (y1 - y0) / (z1 - z0)
+    width = min(max(6.0 / shape, 5.5), 8.0)
+    figure.set_size_inches(width, min(max(0.98 * width * shape, 1.2), 6.0) + 1.1)
+    figure.suptitle("\n".join(textwrap.wrap(lens.name, int(11 * width))) or "Lens", fontsize=11, fontweight="bold")
+    axes.set_title(style.first_order_text(lens, first_order(lens)), fontsize=8.5, color=style.GREY, pad=4)
+    labels = [
+        style.field_label(lens, field) for field in zip(*style.array(style.lens_fields(lens, fields)), strict=True)
+    ]
     handles = [Line2D([], [], color=style.field_colour(f), label=label) for f, label in enumerate(labels)]
     figure.legend(
         handles=[Line2D([], [], linestyle="", label=style.field_title(lens)), *handles],
@@ -93,8 +93,10 @@ def draw_layout(
         half = _draw_sensor(axes, lens, z, radii, paths)
         if near:
             _draw_object(axes, lens, z, paths)
-    height = max([*radii[1:-1], half, *_ray_heights(paths, start)])
-    _frame(axes, (min(first, start), last), height)
+    largest = max(radii[1:-1])
+    low, high = _ray_heights(paths)
+    stop = radii[lens.stop] + 0.18 * largest
+    _frame(axes, (min(first, start), last), (min(low, -largest, -half, -stop), max(high, largest, half, stop)))
 
 
 def _draw_glass(axes: Axes, lens: Lens, z: np.ndarray, radii: list[float], indices: list[float]) -> None:
@@ -126,7 +128,7 @@ def _draw_mirrors(axes: Axes, lens: Lens, z: np.ndarray, radii: list[float], pat
         hole = min(max(hole, outline.hole_radius(k, z, radii[k], paths)), 0.95 * radii[k])
         y = np.linspace(hole, radii[k], 121)
         face = z[k] + outline.depth(surface, y)
-        back = face + side * 0.07 * radii[k]
+        back = face + side * max(0.07 * radii[k], 0.025 * max(radii[1:-1]))
         if hole == 0.0:
             y, face, back = (np.concatenate([part[:0:-1], part]) for part in (y, face, back))
             y[: len(y) // 2] *= -1
@@ -137,7 +139,7 @@ def _draw_mirrors(axes: Axes, lens: Lens, z: np.ndarray, radii: list[float], pat
 
 
 def _draw_apertures(axes: Axes, lens: Lens, z: np.ndarray, radii: list[float]) -> None:
-    """Obscurations as solid bars along their surface, apertures as bars from their rim outwards."""
+    """Obscurations as grey bars along their surface, apertures as bars from their rim outwards."""
     outward = 0.12 * max(radii[1:])
     for k, surface in enumerate(lens.surfaces[1:-1], start=1):
         for aperture in surface.apertures:
@@ -156,7 +158,7 @@ def _draw_apertures(axes: Axes, lens: Lens, z: np.ndarray, radii: list[float]) -
             for low, high in bars:
                 y = centre + np.linspace(low, high, 41)
                 depth = outline.depth(surface, np.minimum(np.abs(y), 0.9999 * outline.edge_radius(surface)))
-                axes.plot(z[k] + depth, y, color=style.INK, linewidth=2.2, solid_capstyle="butt", zorder=5)
+                axes.plot(z[k] + depth, y, color="#8c8c8c", linewidth=2.4, solid_capstyle="butt", zorder=1.5)
 
 
 def _draw_stop(axes: Axes, lens: Lens, z: np.ndarray, radii: list[float]) -> None:
@@ -178,7 +180,9 @@ def _draw_rays(axes: Axes, paths, colours) -> None:
             if path.status == "ok":
                 axes.plot(path.z, path.y, color=colour, linewidth=0.75, alpha=0.95, zorder=4, gid="ray")
                 continue
-            axes.plot(path.z, path.y, color=colour, linewidth=0.6, alpha=0.5, linestyle=(0, (4, 2)), zorder=4, gid="lost ray")
+            axes.plot(
+                path.z, path.y, color=colour, linewidth=0.6, alpha=0.5, linestyle=(0, (4, 2)), zorder=4, gid="lost ray"
+            )
             if path.status in ("miss", "tir"):
                 axes.plot(path.z[-1:], path.y[-1:], "x", color=colour, markersize=4, markeredgewidth=0.9, zorder=7)
 
@@ -186,9 +190,13 @@ def _draw_rays(axes: Axes, paths, colours) -> None:
 def _draw_sensor(axes: Axes, lens: Lens, z: np.ndarray, radii: list[float], paths) -> float:
     """The image surface, as far as the rays need it; returns its half height in mm."""
     hits = [abs(path.y[-1]) for field in paths for path in field if path.status == "ok"]
-    half = min(max([1.06 * max(hits, default=0.0), 0.05 * max(radii[1:-1])]), 0.9999 * outline.edge_radius(lens.surfaces[-1]))
+    half = min(
+        max([1.06 * max(hits, default=0.0), 0.05 * max(radii[1:-1])]), 0.9999 * outline.edge_radius(lens.surfaces[-1])
+    )
     y = np.linspace(-half, half, 81)
-    axes.plot(z[-1] + outline.depth(lens.surfaces[-1], np.abs(y)), y, color=style.INK, linewidth=1.8, zorder=5, gid="sensor")
+    axes.plot(
+        z[-1] + outline.depth(lens.surfaces[-1], np.abs(y)), y, color=style.INK, linewidth=1.8, zorder=5, gid="sensor"
+    )
     return half
 
 
@@ -200,21 +208,22 @@ def _draw_object(axes: Axes, lens: Lens, z: np.ndarray, paths) -> None:
         axes.plot(z[0] + outline.depth(lens.surfaces[0], np.abs(y)), y, color=style.INK, linewidth=1.0, zorder=3)
 
 
-def _ray_heights(paths, start: float) -> list[float]:
-    return [float(np.abs(path.y).max()) for field in paths for path in field if path.status in ("ok", "vignetted")]
+def _ray_heights(paths) -> tuple[float, float]:
+    """Lowest and highest y in mm of rays that do not run astray."""
+    y = [path.y for field in paths for path in field if path.status in ("ok", "vignetted")]
+    return (float(np.concatenate(y).min()), float(np.concatenate(y).max())) if y else (0.0, 0.0)
 
 
-def _frame(axes: Axes, extent: tuple[float, float], height: float) -> None:
-    """Axis, limits and scale bar."""
+def _frame(axes: Axes, extent: tuple[float, float], heights: tuple[float, float]) -> None:
+    """Optical axis, limits and scale bar."""
     length = extent[1] - extent[0]
-    margin = 0.03 * length
+    margin = 0.025 * length
     low, high = extent[0] - margin, extent[1] + margin
     axes.plot([low, high], [0, 0], color=style.GREY, linewidth=0.6, linestyle=(0, (10, 3, 2, 3)), zorder=1)
     bar = style.round_length(0.2 * length)
-    below = 1.06 * height + 0.045 * length
-    scale_bar_at = high - margin - bar, -below
-    style.scale_bar(axes, *scale_bar_at, bar, style.length_text(bar, 1))
+    bottom = heights[0] - 0.05 * length
+    style.scale_bar(axes, high - margin - bar, bottom, bar, style.round_text(bar))
     axes.set_aspect("equal")
     axes.set_xlim(low, high)
-    axes.set_ylim(-below - 0.02 * length, 1.06 * height)
+    axes.set_ylim(bottom - 0.015 * length, heights[1] + 0.01 * length)
     axes.axis("off")

@@ -96,7 +96,12 @@ def drawn_radii(lens: Lens, wavelength: Tensor, fields: Tensor) -> list[float]:
 
 
 def element(
-    front: Surface, back: Surface, z_front: float, z_back: float, radii: tuple[float, float], cemented: tuple[bool, bool]
+    front: Surface,
+    back: Surface,
+    z_front: float,
+    z_back: float,
+    radii: tuple[float, float],
+    cemented: tuple[bool, bool],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Outline (z, y) of the glass between two surfaces, each drawn to its own radius.
 
@@ -136,7 +141,9 @@ def ray_paths(lens: Lens, pupil: Tensor, *, fields: Tensor, wavelength: Tensor, 
     fate = [[("miss", 0)] * pupil.shape[1] for _ in range(fields.shape[1])]
     ends: dict[tuple[int, int], np.ndarray] = {}
     for k, crossing in enumerate(steps(lens.surfaces[1:], rays, indices=indices), start=1):
-        arrival = rays.position if gap is None else rays.position - torch.stack([0 * gap, 0 * gap, gap])[:, None, None, None]
+        arrival = (
+            rays.position if gap is None else rays.position - torch.stack([0 * gap, 0 * gap, gap])[:, None, None, None]
+        )
         hit, _ = intersect(lens.surfaces[k], arrival, rays.direction)
         at_plane = arrival - rays.direction * (arrival[2] / rays.direction[2])
         here = array(torch.where(crossing.missed, at_plane, hit))[1:, :, 0, :] + np.array([0.0, z[k]])[:, None, None]
@@ -151,7 +158,9 @@ def ray_paths(lens: Lens, pupil: Tensor, *, fields: Tensor, wavelength: Tensor, 
         corners.append(here)
     for f, p in np.argwhere(array(alive)[:, 0]):
         fate[f][p] = ("ok", len(lens.surfaces) - 1)
-    bends = [k for k in range(1, len(lens.surfaces) - 1) if lens.surfaces[k].is_mirror or indices[k] is not indices[k - 1]]
+    bends = [
+        k for k in range(1, len(lens.surfaces) - 1) if lens.surfaces[k].is_mirror or indices[k] is not indices[k - 1]
+    ]
     paths = []
     for f, row in enumerate(fate):
         paths.append([])

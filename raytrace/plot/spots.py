@@ -2,6 +2,7 @@
 
 import math
 import textwrap
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -29,18 +30,19 @@ def field_spots(
     *,
     fields: Tensor | None = None,
     wavelengths: Tensor | None = None,
+    wavelength_weights: Tensor | None = None,
     pupil: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Spot, Spot]:
     """Polychromatic spots (F,), and the spots (F, W) of the rays that are drawn as dots.
 
     The RMS radius is that of the rule `pupil` (points, weights), by default Gaussian quadrature. The dots, a hexapolar
-    grid up to the rim of the pupil, have no weight in it but count for the geometric radius. Wavelengths carry the
-    lens's weights; wavelengths that are given weigh the same.
+    grid up to the rim of the pupil, have no weight in it but count for the geometric radius. Weights as in
+    `shares_of`.
     """
     dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
     points, weights = gauss_rings(dtype=dtype, device=device) if pupil is None else pupil
     dots = hexapolar(8, dtype=dtype, device=device)[0]
-    shares = lens.wavelength_weights if wavelengths is None else torch.ones_like(wavelengths)
+    shares = shares_of(lens, wavelengths, wavelength_weights)
     with torch.no_grad():
         rays = image_rays(lens, torch.cat([points, dots], dim=1), fields=fields, wavelengths=wavelengths)
         weights = torch.cat([weights, torch.zeros_like(dots[0])])
@@ -50,12 +52,20 @@ def field_spots(
         return whole, spot_of_points(hits[..., drawn:], valid[..., drawn:])
 
 
+def shares_of(lens: Lens, wavelengths: Tensor | None, weights: Tensor | None) -> Tensor:
+    """Weights (W,) of wavelengths: those given, else the lens's for its own wavelengths and equal ones for others."""
+    if weights is not None:
+        return weights.to(lens.wavelengths)
+    return lens.wavelength_weights if wavelengths is None else torch.ones_like(wavelengths)
+
+
 @style.styled
 def spot_diagram(
     lens: Lens,
     *,
     fields: Tensor | None = None,
     wavelengths: Tensor | None = None,
+    wavelength_weights: Tensor | None = None,
     pupil: tuple[Tensor, Tensor] | None = None,
     object_distance: Tensor | float | None = None,
 ) -> Figure:
@@ -63,15 +73,16 @@ def spot_diagram(
 
     All panels have the same scale, are centred on the centroid over all wavelengths, and print the RMS and the
     geometric radius about it. fields: (2, F) in the lens's own kind of field; wavelengths: (W,) µm; by default those
-    of the lens. pupil: points (2, P) and weights (P,) that make the RMS radius; object_distance: mm, inf allowed.
+    of the lens; wavelength_weights: (W,), by default the lens's, equal for wavelengths that are given. pupil: points (2, P) and weights (P,) that make the RMS radius; object_distance: mm, inf allowed.
     """
     if object_distance is not None:
         lens = with_object_distance(lens, object_distance)
-    whole, dots = field_spots(lens, fields=fields, wavelengths=wavelengths, pupil=pupil)
+    rule = {"wavelengths": wavelengths, "wavelength_weights": wavelength_weights, "pupil": pupil}
+    whole, dots = field_spots(lens, fields=fields, **rule)
     fields = style.array(style.lens_fields(lens, fields))
     wavelengths = style.array(lens.wavelengths if wavelengths is None else wavelengths)
     airy = float(airy_radius(lens))
-    half = panel_size([whole], airy)
+    half = panel_size(style.array(whole.geometric_radius), airy)
     columns = min(fields.shape[1], 4 if fields.shape[1] % 3 or fields.shape[1] == 12 else 3)
     rows = math.ceil(fields.shape[1] / columns)
     width = max(2.25 * columns, 5.6)
@@ -82,23 +93,22 @@ def spot_diagram(
             panel.axis("off")
             continue
         draw_spot(panel, whole, dots, f, wavelengths=wavelengths, airy=airy, half=half)
-        panel.set_title(style.field_label(lens, fields[:, f]), fontweight="bold")
+        panel.set_title(f"{style.field_title(lens)} {style.field_label(lens, fields[:, f])}")
     name = "\n".join(textwrap.wrap(lens.name, int(11 * width))) or "Lens"
     figure.suptitle(name, fontsize=11, fontweight="bold")
-    figure.legend(handles=wavelength_handles(wavelengths, airy), loc="outside lower center", ncols=5, handletextpad=0.3)
-    figure.supxlabel(
-        f"{style.first_order_text(lens, first_order(lens))}\n"
+    legend = figure.legend(
+        handles=wavelength_handles(wavelengths, airy),
+        title=f"{style.first_order_text(lens, first_order(lens))}\n"
         "centred on the centroid; RMS and GEO (largest) radius about it, all wavelengths together",
-        fontsize=8,
-        color=style.GREY,
-    )
+        loc="outside lower center", ncols=6, handletextpad=0.3, title_fontproperties={"size": 8}, alignment="center",
+    )  # fmt: skip
+    legend.get_title().set(color=style.GREY, multialignment="center")
     return figure
 
 
-def panel_size(spots: list[Spot], airy: float) -> float:
-    """Half width in mm that holds every spot and the Airy disc."""
-    largest = max(float(spot.geometric_radius.max()) for spot in spots)
-    return 1.14 * max(largest, airy if math.isfinite(airy) else 0.0, 1e-7)
+def panel_size(radii: Sequence[float], airy: float) -> float:
+    """Half width in mm that holds spots of these geometric radii and the Airy disc."""
+    return 1.14 * max(*radii, airy if math.isfinite(airy) else 0.0, 1e-7)
 
 
 def draw_spot(
@@ -126,12 +136,12 @@ def draw_dots(
         kept = style.array(dots.valid[number, w]).astype(bool)
         x, y = style.array(dots.points[:, number, w])[:, kept] - centre[:, None]
         marker = style.WAVELENGTH_MARKERS[w % len(style.WAVELENGTH_MARKERS)]
-        width = 0.0 if marker not in "+x" else 0.6
+        width = 0.0 if marker not in "+x" else 0.5
         axes.plot(x, y, marker, color=colour, markersize=size + 2 * width, markeredgewidth=width, zorder=3 + 0.1 * w)
     if math.isfinite(airy):
         axes.add_patch(Circle((0, 0), airy, fill=False, edgecolor=style.INK, linewidth=0.9, zorder=4, gid="Airy"))
     bar = style.round_length(0.62 * half)
-    style.scale_bar(axes, -0.93 * half, -0.93 * half, bar, style.length_text(bar, 1) if bar < 1 else f"{bar:g} mm")
+    style.scale_bar(axes, -0.93 * half, -0.93 * half, bar, style.round_text(bar))
     axes.set_xlim(-half, half)
     axes.set_ylim(-half, half)
     axes.set_aspect("equal")
@@ -145,7 +155,7 @@ def wavelength_handles(wavelengths: np.ndarray, airy: float) -> list[Line2D]:
     """What the legend says of colours and of the Airy circle."""
     handles = [
         Line2D([], [], linestyle="", marker=style.WAVELENGTH_MARKERS[w % len(style.WAVELENGTH_MARKERS)], color=colour,
-               markersize=4.5, label=f"{wavelength:.7g} µm")
+               markersize=4.5, label=f"{wavelength:.4g} µm")
         for w, (wavelength, colour) in enumerate(zip(wavelengths, style.wavelength_colours(wavelengths), strict=True))
     ]  # fmt: skip
     if math.isfinite(airy):

@@ -75,6 +75,7 @@ def styled(function: Callable) -> Callable:
 def new_figure(width: float, height: float) -> Figure:
     """A figure of width × height inches on a canvas of its own."""
     figure = Figure(figsize=(width, height), dpi=150, layout="constrained", facecolor="white")
+    figure.get_layout_engine().set(w_pad=0.07, h_pad=0.07)
     FigureCanvasAgg(figure)
     return figure
 
@@ -169,7 +170,8 @@ def number_text(value: float, digits: int = 4) -> str:
         return "∞" if math.isinf(value) else "–"
     if value == 0 or not 1e-4 <= abs(value) < 1e6:
         return _minus(f"{value:.{digits}g}")
-    return _minus(f"{value:.{max(digits - 1 - math.floor(math.log10(abs(value))), 0)}f}")
+    rounded = abs(float(f"{value:.{digits - 1}e}"))  # 99.9999 is 100.0, not 100.00
+    return _minus(f"{value:.{max(digits - 1 - math.floor(math.log10(rounded)), 0)}f}")
 
 
 def micrometres(length: float) -> str:
@@ -197,11 +199,24 @@ def round_length(length: float) -> float:
     return max(step for step in (decade, 2 * decade, 5 * decade) if step <= length * (1 + 1e-9))
 
 
+def round_text(length: float) -> str:
+    """A round length in mm, without zeros behind the point: `50 µm`, `20 mm`, `1 m`."""
+    scale, unit = (1e3, "µm") if length < 0.9 else (1.0, "mm") if length < 900 else (1e-3, "m")
+    return f"{length * scale:.6g} {unit}"
+
+
 def scale_bar(axes: Axes, x: float, y: float, length: float, text: str) -> None:
     """A bar of a length in data units that starts at (x, y), its length written above it."""
     axes.plot([x, x + length], [y, y], color=INK, linewidth=1.6, solid_capstyle="butt", clip_on=False, zorder=6)
     axes.annotate(
-        text, (x + length / 2, y), (0, 2.5), textcoords="offset points", ha="center", va="bottom", fontsize=7.5, zorder=6
+        text,
+        (x + length / 2, y),
+        (0, 2.5),
+        textcoords="offset points",
+        ha="center",
+        va="bottom",
+        fontsize=7.5,
+        zorder=6,
     )
 
 
