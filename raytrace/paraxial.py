@@ -18,8 +18,8 @@ from raytrace.value import value
 class FirstOrder:
     """First-order data of a lens at its primary wavelength or at those asked for; every entry (...), mm.
 
-    power: -ω′/y₁ in 1/mm, n′/EFL with the signed index of image space.
-    effective_focal_length: -y₁/u′ in image space, signed.
+    power: -ω′/y₁ in 1/mm.
+    effective_focal_length: -y₁/u′ in image space, u′ taken along the light: positive for a concave mirror.
     back_focal_distance: from the last surface before the image to the rear focal point.
     front_focal_distance: from surface 1 to the front focal point.
     entrance_pupil_position: from surface 1; entrance_pupil_diameter > 0.
@@ -92,7 +92,7 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
     n = signed(surfaces, media(lens, wavelength)[:-1])
     n_object, n_image = n[0], n[-1]
     A, B, C, D = system_matrix(surfaces, n)
-    focal_length = -n_image / C
+    focal_length = -n_image.abs() / C
 
     # The stop seen from the front (transfer to its vertex) and from the back.
     before, behind = surfaces[: lens.stop - 1], surfaces[lens.stop - 1 :]
