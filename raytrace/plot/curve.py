@@ -55,9 +55,9 @@ def through_focus_curve(
     """RMS spot radius against the sensor distance; minima, the paraxial focus and the present sensor are marked.
 
     by: "field", a line for each field over all wavelengths, or "wavelength", a line for each wavelength of the first
-    field. fields: (2, F), wavelengths: (W,) µm, by default those of the lens, and their weights (W,) (equal for
-    wavelengths that are given); pupil: points (2, P), weights (P,); span: first and last sensor distance in mm, by default around all that is
-    marked; object_distance: mm from surface 1, inf allowed.
+    field. fields: (2, F), wavelengths: (W,) µm, by default those of the lens; wavelength_weights: (W,), by default the
+    lens's, equal for wavelengths that are given; pupil: points (2, P), weights (P,); span: first and last sensor
+    distance in mm, by default around all that is marked; object_distance: mm from surface 1, inf allowed.
     """
     if by not in ("field", "wavelength"):
         raise ValueError(f"by = {by!r}: expected 'field' or 'wavelength'")
@@ -88,7 +88,8 @@ def through_focus_curve(
         style.first_order_text(lens, first_order(lens)),
         (0, 1), (0, 8), xycoords="axes fraction", textcoords="offset points", color=style.GREY,
     )  # fmt: skip
-    figure.legend(title=f"{title}: least RMS radius at", title_fontsize=8, loc="outside lower center", ncols=3)
+    columns = 3 if max(map(len, labels)) < 6 else 2
+    figure.legend(title=f"{title}: least RMS radius at", title_fontsize=8, loc="outside lower center", ncols=columns)
     return figure
 
 
@@ -141,8 +142,8 @@ def draw_curves(
     least = 1e3 * np.diagonal(bundle.radii(best))
     alive = style.array(bundle.rays.valid.any(-1)).astype(bool)
     for c in np.flatnonzero(alive):
-        place = f"{labels[c]}: {style.number_text(sensor + best[c], 6)} mm, {style.number_text(least[c])} µm"
-        width = max(2.4 - 0.5 * c, 1.2)  # so that curves that coincide all show
+        place = f"{labels[c]}: {sensor + best[c]:.4f} mm, {style.number_text(least[c])} µm"
+        width = max(1.9 - 0.3 * c, 1.0)  # so that curves that coincide all show
         axes.plot(sensor + shifts, radii[:, c], color=colours[c], linewidth=width, label=place, zorder=3)
         if span[0] <= sensor + best[c] <= span[1]:
             axes.plot(

@@ -222,7 +222,7 @@ def _frame(axes: Axes, extent: tuple[float, float], heights: tuple[float, float]
     axes.plot([low, high], [0, 0], color=style.GREY, linewidth=0.6, linestyle=(0, (10, 3, 2, 3)), zorder=1)
     bar = style.round_length(0.2 * length)
     bottom = heights[0] - 0.05 * length
-    style.scale_bar(axes, high - margin - bar, bottom, bar, style.round_text(bar))
+    style.scale_bar(axes, high - margin - bar, bottom, bar)
     axes.set_aspect("equal")
     axes.set_xlim(low, high)
     axes.set_ylim(bottom - 0.015 * length, heights[1] + 0.01 * length)

@@ -19,6 +19,7 @@ from raytrace.rays import Rays
 
 _MOST_SPOTS = 5  # columns of spots that stay legible
 _DASHES = {"sensor before": (0, (6, 2.5)), "sensor after": "solid", "paraxial focus": (0, (1, 1.6))}
+_INSET = 0.395  # of a panel's width
 _MAGNIFY = 4.0  # where the spot after is smaller than its panel by more than this, an enlargement is set into it
 
 
@@ -60,10 +61,13 @@ def focus_report(
     axes = top.add_subplot()
     drawn = with_object_distance(lens_after, distances[0])
     draw_layout(axes, drawn, fields=fields, wavelength=wavelengths[0], rays=11 if fields.shape[1] == 1 else 7)
-    axes.set_title(style.first_order_text(drawn, first_order(drawn)), fontsize=8.5, color=style.GREY)
+    top.suptitle(style.first_order_text(drawn, first_order(drawn)), fontsize=8.5, color=style.GREY)
 
     _draw_focus(left.add_subplot(), lens_before, lens_after, distances, labels, rule)
-    left.legend(loc="outside lower center", ncols=1 if columns == 1 else 2)
+    left.legend(
+        loc="outside lower center", ncols=1 if columns == 1 else 2, fontsize=7.5, handlelength=1.8, columnspacing=1.2,
+        title=None if len(labels) == 1 else "least RMS radius of every curve", title_fontsize=7.5,
+    )  # fmt: skip
     _draw_spots(right, lens_before, lens_after, distances, labels, rule)
     return figure
 
@@ -73,7 +77,7 @@ def _labels(lens: Lens, distances: list[float], fields: Tensor) -> list[str]:
     points = [style.field_label(lens, point) for point in style.array(fields).T]
     if len(distances) == 1:
         return points
-    objects = [f"object {style.length_text(distance, 3)}" for distance in distances]
+    objects = [style.object_text(distance) for distance in distances]
     return [place if len(points) == 1 else f"{place}, {point}" for place in objects for point in points]
 
 
@@ -96,7 +100,7 @@ def _draw_focus(axes: Axes, before: Lens, after: Lens, distances: list[float], l
     draw_curves(axes, bundle, sensor, span, labels=["least RMS"] if alone else labels)
     for name, place in marks.items():
         radius = f", {style.micrometres(float(bundle.radii(np.array([place - sensor]))[0, 0]))}" if alone else ""
-        text = f"{name}: {style.number_text(place, 6)} mm{radius}"
+        text = f"{name}: {place:.4f} mm{radius}"
         axes.axvline(place, color=style.GREY, linewidth=1.0, linestyle=_DASHES[name], label=text, zorder=2)
     if "paraxial focus" not in marks:
         each = len(labels) // len(distances)
@@ -126,12 +130,14 @@ def _draw_spots(page, before: Lens, after: Lens, distances: list[float], labels:
             else:
                 panel.set_ylabel(f"Spots {when}" if column == 0 else "", fontweight="bold")
                 if row == 0:
-                    panel.set_title(labels[column].replace(", ", "\n"), color=style.field_colour(column), fontsize=8.5)
+                    label = labels[column] if len(distances) == 1 else f"object at {labels[column]}"
+                    panel.set_title(label.replace(", ", "\n", 1), color=style.field_colour(column), fontsize=8.5)
             size = panel_size([float(whole.geometric_radius[f])], airy)
             if int(whole.rays[f]) and half > _MAGNIFY * size:
-                inset = panel.inset_axes((0.52, 0.52, 0.46, 0.46), zorder=8)
+                inset = panel.inset_axes((0.985 - _INSET, 0.985 - _INSET, _INSET, _INSET), zorder=8)
                 draw_dots(inset, whole, dots, f, half=size, **look)
                 inset.set_facecolor("#fbfbfb")
+                inset.set_xlabel(f"{style.number_text(_INSET * half / size, 2)}×", fontsize=7, labelpad=1)
     page.legend(handles=wavelength_handles(wavelengths, airy), loc="outside lower center", ncols=2, handletextpad=0.3)
     if count < len(labels):
         page.supxlabel(f"the first {count} of {len(labels)} spots", fontsize=8, color=style.GREY)

@@ -36,8 +36,7 @@ def field_spots(
     """Polychromatic spots (F,), and the spots (F, W) of the rays that are drawn as dots.
 
     The RMS radius is that of the rule `pupil` (points, weights), by default Gaussian quadrature. The dots, a hexapolar
-    grid up to the rim of the pupil, have no weight in it but count for the geometric radius. Weights as in
-    `shares_of`.
+    grid up to the rim of the pupil, have no weight in it but count for the geometric radius.
     """
     dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
     points, weights = gauss_rings(dtype=dtype, device=device) if pupil is None else pupil
@@ -72,8 +71,9 @@ def spot_diagram(
     """Spot diagram: one panel a field, one colour and marker a wavelength, the Airy disc at the primary wavelength.
 
     All panels have the same scale, are centred on the centroid over all wavelengths, and print the RMS and the
-    geometric radius about it. fields: (2, F) in the lens's own kind of field; wavelengths: (W,) µm; by default those
-    of the lens; wavelength_weights: (W,), by default the lens's, equal for wavelengths that are given. pupil: points (2, P) and weights (P,) that make the RMS radius; object_distance: mm, inf allowed.
+    geometric radius about it. fields: (2, F) in the lens's own kind of field; wavelengths: (W,) µm; both by default
+    those of the lens. wavelength_weights: (W,), by default the lens's, equal for wavelengths that are given.
+    pupil: points (2, P) and weights (P,) that make the RMS radius; object_distance: mm from surface 1, inf allowed.
     """
     if object_distance is not None:
         lens = with_object_distance(lens, object_distance)
@@ -116,6 +116,8 @@ def draw_spot(
 ) -> None:
     """Draw the spot of one field into square axes of ± half mm about its centroid, with its radii below."""
     draw_dots(axes, whole, dots, number, wavelengths=wavelengths, airy=airy, half=half)
+    bar = style.round_length(0.62 * half)
+    style.scale_bar(axes, -0.93 * half, -0.93 * half, bar, align="left")
     if int(whole.rays[number]) == 0:
         axes.text(0, 0, "no ray reaches\nthe image", ha="center", va="center", color=style.GREY)
         axes.set_xlabel(" \n ")
@@ -127,7 +129,7 @@ def draw_spot(
 def draw_dots(
     axes: Axes, whole: Spot, dots: Spot, number: int, *, wavelengths: np.ndarray, airy: float, half: float
 ) -> None:
-    """The dots, the Airy circle and the scale bar, without words."""
+    """The dots and the Airy circle, without words."""
     centre = style.array(whole.centroid[:, number])
     size = 2.0 if half > 4 * airy else 2.4
     for cross in (axes.axhline, axes.axvline):
@@ -140,8 +142,6 @@ def draw_dots(
         axes.plot(x, y, marker, color=colour, markersize=size + 2 * width, markeredgewidth=width, zorder=3 + 0.1 * w)
     if math.isfinite(airy):
         axes.add_patch(Circle((0, 0), airy, fill=False, edgecolor=style.INK, linewidth=0.9, zorder=4, gid="Airy"))
-    bar = style.round_length(0.62 * half)
-    style.scale_bar(axes, -0.93 * half, -0.93 * half, bar, style.round_text(bar))
     axes.set_xlim(-half, half)
     axes.set_ylim(-half, half)
     axes.set_aspect("equal")

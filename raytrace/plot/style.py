@@ -155,13 +155,19 @@ def _spectral_colour(wavelength: float) -> tuple[float, float, float]:
 
 
 def length_text(length: float, digits: int = 4) -> str:
-    """A length in mm as a reader would say it: µm below 0.1 mm, m from 10 m."""
+    """A length in mm as a reader would say it: µm below 0.1 mm, m from 10 m, km from 10 km."""
     if math.isinf(length):
         return "∞"
-    for limit, scale, unit in ((0.1, 1e3, "µm"), (1e4, 1.0, "mm"), (1e7, 1e-3, "m"), (math.inf, 1e-6, "km")):
-        if abs(length) < limit:
-            break
+    scales = ((0.1, 1e3, "µm"), (1e4, 1.0, "mm"), (1e7, 1e-3, "m"), (math.inf, 1e-6, "km"))
+    scale, unit = next((scale, unit) for limit, scale, unit in scales if abs(length) < limit)
     return f"{number_text(length * scale, digits)} {unit}"
+
+
+def object_text(distance: float) -> str:
+    """An object distance in mm, as it was given: `25 m`, `400 mm`, `infinity`."""
+    if math.isinf(distance):
+        return "infinity"
+    return _minus(f"{distance / 1000:.6g} m" if abs(distance) >= 1e4 else f"{distance:.6g} mm")
 
 
 def number_text(value: float, digits: int = 4) -> str:
@@ -185,11 +191,10 @@ def first_order_text(lens: Lens, paraxial: FirstOrder) -> str:
     focal_length = float(paraxial.effective_focal_length)
     if math.isfinite(focal_length):
         parts += [f"EFL {length_text(focal_length)}", f"F/{number_text(float(paraxial.f_number), 3)}"]
-    distance = float(lens.surfaces[0].thickness)
-    if math.isinf(distance):
-        parts.append("object at infinity")
-    else:
-        parts += [f"object at {length_text(distance)}", f"working F/{number_text(float(paraxial.working_f_number), 3)}"]
+    distance, working = float(lens.surfaces[0].thickness), float(paraxial.working_f_number)
+    parts.append(f"object at {object_text(distance)}")
+    if math.isfinite(distance) and math.isfinite(working):
+        parts.append(f"working F/{number_text(working, 3)}")
     return "  ·  ".join(parts)
 
 
@@ -205,18 +210,12 @@ def round_text(length: float) -> str:
     return f"{length * scale:.6g} {unit}"
 
 
-def scale_bar(axes: Axes, x: float, y: float, length: float, text: str) -> None:
-    """A bar of a length in data units that starts at (x, y), its length written above it."""
+def scale_bar(axes: Axes, x: float, y: float, length: float, align: str = "center") -> None:
+    """A bar of a length in mm that starts at (x, y), its length written above it: centred, or from its "left"."""
     axes.plot([x, x + length], [y, y], color=INK, linewidth=1.6, solid_capstyle="butt", clip_on=False, zorder=6)
+    place = (x if align == "left" else x + length / 2, y)
     axes.annotate(
-        text,
-        (x + length / 2, y),
-        (0, 2.5),
-        textcoords="offset points",
-        ha="center",
-        va="bottom",
-        fontsize=7.5,
-        zorder=6,
+        round_text(length), place, (0, 2.5), textcoords="offset points", ha=align, va="bottom", fontsize=7.5, zorder=6
     )
 
 
