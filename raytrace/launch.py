@@ -108,20 +108,30 @@ def rays_from_infinity(direction: Tensor, aim: Tensor, *, index: Tensor) -> Rays
     return start(aim, direction, index * dot(aim, unit(direction)))
 
 
+def is_at_infinity(lens: Lens) -> bool:
+    """Whether the object, or every object of a batch, is at infinity. Raises ValueError for a batch that mixes."""
+    infinite = torch.isinf(lens.surfaces[0].thickness.detach())
+    if bool(infinite.all()):
+        return True
+    if bool(infinite.any()):
+        raise ValueError("object distances mix infinity and finite ones in one batch: trace them in two")
+    return False
+
+
 def object_field(lens: Lens, field: Tensor, paraxial: FirstOrder, *, ray_aiming: bool = False) -> Tensor:
     """Field points (2, ...) as slopes (tan θx, tan θy) for an object at infinity, else as object heights in mm."""
     distance, kind = lens.surfaces[0].thickness, lens.fields.kind
-    at_infinity = bool(torch.isinf(distance.detach()))
+    at_infinity = is_at_infinity(lens)
     if kind == "angle":
         slope = torch.tan(torch.deg2rad(field))
-        return slope if at_infinity else -slope * (distance + paraxial.entrance_pupil_position)
+        return slope if at_infinity else _scaled(slope, -(distance + paraxial.entrance_pupil_position))
     if kind == "object_height":
         if at_infinity:
             raise ValueError("fields are object heights but the object is at infinity: give angles, or a distance")
         return field
     index = glass.refractive_index(lens.surfaces[0].glass, lens.wavelengths[lens.primary_wavelength])
     scale = paraxial.power / index if at_infinity else 1 / paraxial.magnification
-    estimate = scale * field
+    estimate = _scaled(field, scale)
     if kind == "paraxial_image_height":
         return estimate
     return _field_of_real_height(lens, field, estimate, paraxial)
@@ -141,8 +151,8 @@ def aim_at_stop(lens: Lens, through: Callable[..., Rays], pupil: Tensor, wavelen
         rays = trace_surfaces(surfaces, through(pupil, fraction), indices=indices)
         return rays.position[:2] / radius, (rays.direction[2] != 1.0) | (rays.position[:2] != 0).any(0)
 
-    field_shape = torch.broadcast_shapes(at_stop(pupil, 1.0)[0].shape, pupil.shape)
-    target = pupil.expand(field_shape)
+    batch = torch.broadcast_shapes(at_stop(pupil, 1.0)[0].shape[1:], pupil.shape[1:])
+    target = torch.stack([p.expand(batch) for p in pupil])
     guess = target.detach().clone()
     for stage in range(1, _AIMING_STAGES + 1):
         fraction = stage / _AIMING_STAGES
@@ -156,7 +166,7 @@ def aim_at_stop(lens: Lens, through: Callable[..., Rays], pupil: Tensor, wavelen
     tolerance = _AIMING_TOLERANCE if pupil.dtype == torch.float64 else 1e-4
     found = (error.abs() <= tolerance).all(0) & at_stop(guess, 1.0)[1]
     attached = guess - _solve(jacobian, at_stop(guess, 1.0)[0] - target)
-    return torch.where(found, attached, pupil.expand(field_shape)), found
+    return torch.where(found, attached, target), found
 
 
 def stop_radius(lens: Lens) -> Tensor:
@@ -175,7 +185,7 @@ def stop_radius(lens: Lens) -> Tensor:
 def _through_entrance_pupil(lens: Lens, field: Tensor, pupil: Tensor, paraxial: FirstOrder, index: Tensor) -> Rays:
     """Rays from a slope or object height (2, ...) to the paraxial entrance pupil at fractions (2, ...)."""
     distance = lens.surfaces[0].thickness
-    at_infinity = bool(torch.isinf(distance.detach()))
+    at_infinity = is_at_infinity(lens)
     radius, depth = 0.5 * paraxial.entrance_pupil_diameter, paraxial.entrance_pupil_position
     if lens.fields.telecentric:
         # The pupil is at infinity: cones of equal rays about a chief ray parallel to the axis.
@@ -183,7 +193,9 @@ def _through_entrance_pupil(lens: Lens, field: Tensor, pupil: Tensor, paraxial: 
         aim_x, aim_y = field[0] + radius * pupil[0], field[1] + radius * pupil[1]
     else:
         aim_x, aim_y = radius * pupil[0], radius * pupil[1]
-    x, y, aim_x, aim_y, depth, index = torch.broadcast_tensors(field[0], field[1], aim_x, aim_y, depth, index)
+    x, y, aim_x, aim_y, depth, index, distance = torch.broadcast_tensors(
+        field[0], field[1], aim_x, aim_y, depth, index, distance
+    )
     aim = torch.stack([aim_x, aim_y, depth])
     if at_infinity:
         return rays_from_infinity(torch.stack([x, y, torch.ones_like(x)]), aim, index=index)
@@ -209,7 +221,7 @@ def _field_of_real_height(lens: Lens, height: Tensor, estimate: Tensor, paraxial
     wanted = dot_2(height, height)
 
     def image_height(scale: Tensor) -> Tensor:
-        rays = _through_entrance_pupil(lens, scale * estimate, torch.zeros_like(height), paraxial, index)
+        rays = _through_entrance_pupil(lens, _scaled(estimate, scale), torch.zeros_like(height), paraxial, index)
         return safe_divide(dot_2(trace(lens, rays, wavelength).position[:2], height), wanted)
 
     scale = torch.ones_like(wanted.detach())
@@ -218,7 +230,12 @@ def _field_of_real_height(lens: Lens, height: Tensor, estimate: Tensor, paraxial
         scale = (scale - safe_divide(reached - 1, slope)).detach()
     _, slope = torch.func.jvp(image_height, (scale,), (torch.ones_like(scale),))
     scale = scale - safe_divide(image_height(scale) - 1, slope.detach())
-    return torch.where(wanted > 0, scale, 1.0) * estimate
+    return _scaled(estimate, torch.where(wanted > 0, scale, 1.0))
+
+
+def _scaled(field: Tensor, factor: Tensor) -> Tensor:
+    """field (2, ...) times factor (...): the batch axes broadcast behind the component axis."""
+    return torch.stack([component * factor for component in field])
 
 
 def dot_2(a: Tensor, b: Tensor) -> Tensor:
