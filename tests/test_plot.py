@@ -251,7 +251,8 @@ def test_panels_share_one_scale_and_are_centred_on_the_centroid():
         farthest = max(
             np.hypot(line.get_xdata(), line.get_ydata()).max() for line in axes.lines if len(line.get_xdata()) > 100
         )
-        assert farthest == pytest.approx(float(whole.geometric_radius[f]), rel=1e-3)
+        # Off the axis a node of the quadrature may lie farther out than every dot: coarser rings, other angles.
+        assert 0.98 * float(whole.geometric_radius[f]) < farthest <= float(whole.geometric_radius[f]) * (1 + 1e-12)
 
 
 def test_a_field_that_no_ray_survives_says_so(double_gauss):
@@ -337,9 +338,8 @@ def test_focus_report_takes_several_objects_and_fields(double_gauss):
     ("suffix", "start"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml"), ("PNG", b"\x89PNG")]
 )
 def test_save_writes_the_format_of_the_suffix_and_the_same_bytes_again(double_gauss, tmp_path, suffix, start):
-    figure = plot.layout(double_gauss, rays=3)
     for name in ("a", "b"):
-        plot.save(figure, tmp_path / f"{name}.{suffix}", dpi=60)
+        plot.save(plot.layout(double_gauss, rays=3), tmp_path / f"{name}.{suffix}", dpi=60)
     first, second = ((tmp_path / f"{name}.{suffix}").read_bytes() for name in ("a", "b"))
     assert first.startswith(start)
     assert first == second
@@ -374,12 +374,12 @@ def test_a_failing_save_leaves_the_old_file_and_nothing_else(tmp_path, monkeypat
 def test_figures_touch_neither_pyplot_nor_the_settings_of_the_reader():
     script = (
         "import sys, matplotlib\n"
-        "before = dict(matplotlib.rcParams)\n"
+        "before = dict(dict.items(matplotlib.rcParams))  # raw: looking up the backend would load pyplot\n"
         "from raytrace import plot\n"
         "from raytrace.formats import read_lens\n"
         f"plot.layout(read_lens({str(LENSES / 'singlet.zmx')!r}), rays=3)\n"
         "assert 'matplotlib.pyplot' not in sys.modules\n"
-        "assert dict(matplotlib.rcParams) == before\n"
+        "assert dict(dict.items(matplotlib.rcParams)) == before\n"
     )
     subprocess.run([sys.executable, "-W", "ignore", "-c", script], check=True, cwd=LENSES.parent)
 

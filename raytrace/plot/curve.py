@@ -61,6 +61,7 @@ def through_focus_curve(
     """
     if by not in ("field", "wavelength"):
         raise ValueError(f"by = {by!r}: expected 'field' or 'wavelength'")
+    lens = style.detached(lens)
     if object_distance is not None:
         lens = with_object_distance(lens, object_distance)
     fields = style.lens_fields(lens, fields)
@@ -89,7 +90,11 @@ def through_focus_curve(
         (0, 1), (0, 8), xycoords="axes fraction", textcoords="offset points", color=style.GREY,
     )  # fmt: skip
     columns = 3 if max(map(len, labels)) < 6 else 2
-    figure.legend(title=f"{title}: least RMS radius at", title_fontsize=8, loc="outside lower center", ncols=columns)
+    if bool(bundle.rays.valid.any()):
+        heading = f"{title}: least RMS radius at"
+        figure.legend(title=heading, title_fontsize=8, loc="outside lower center", ncols=columns)
+    else:
+        axes.text(0.5, 0.5, "no ray reaches the image", transform=axes.transAxes, ha="center", color=style.GREY)
     return figure
 
 

@@ -39,6 +39,7 @@ def layout(
     by default that of the lens. Lost rays are drawn faint and dashed up to where they are lost, with a cross where
     a surface is missed or reflects totally. Raises ValueError for a lens with an infinite thickness inside.
     """
+    lens = style.detached(lens)
     if object_distance is not None:
         lens = with_object_distance(lens, object_distance)
     figure = style.new_figure(8.0, 4.0)

@@ -2,6 +2,7 @@
 
 import textwrap
 from collections.abc import Sequence
+from numbers import Number
 
 import numpy as np
 import torch
@@ -41,9 +42,13 @@ def focus_report(
     wavelengths: (W,) µm, by default the primary one, with weights (W,), by default equal; pupil: points (2, P),
     weights (P,). Every object distance and field is a curve and a pair of spots.
     """
+    lens_before, lens_after = style.detached(lens_before), style.detached(lens_after)
     lens = lens_before
     distances = [lens.surfaces[0].thickness] if object_distances is None else object_distances
-    distances = torch.as_tensor(distances, dtype=torch.float64).reshape(-1).tolist()
+    distances = [distances] if isinstance(distances, Number) else distances
+    distances = [
+        float(distance) for distance in (distances.reshape(-1) if isinstance(distances, Tensor) else distances)
+    ]
     fields = torch.zeros_like(style.lens_fields(lens, None)[:, :1]) if fields is None else fields
     wavelengths = lens.wavelengths[lens.primary_wavelength].reshape(1) if wavelengths is None else wavelengths
     labels = _labels(lens, distances, fields)

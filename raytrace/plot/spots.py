@@ -75,6 +75,7 @@ def spot_diagram(
     those of the lens. wavelength_weights: (W,), by default the lens's, equal for wavelengths that are given.
     pupil: points (2, P) and weights (P,) that make the RMS radius; object_distance: mm from surface 1, inf allowed.
     """
+    lens = style.detached(lens)
     if object_distance is not None:
         lens = with_object_distance(lens, object_distance)
     rule = {"wavelengths": wavelengths, "wavelength_weights": wavelength_weights, "pupil": pupil}

@@ -15,6 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from raytrace.lens import FIELD_UNITS, Lens
 from raytrace.paraxial import FirstOrder
@@ -84,7 +85,8 @@ def new_figure(width: float, height: float) -> Figure:
 def save(figure: Figure, path: str | os.PathLike, *, dpi: float = 200) -> None:
     """Write a figure as .png, .pdf or .svg by its suffix; the file is replaced as a whole or not at all.
 
-    The same figure gives the same bytes. Raises ValueError for another suffix, OSError where nothing can be written.
+    The same figure, built again, gives the same bytes. Raises ValueError for another suffix, OSError where nothing can
+    be written.
     """
     target = Path(os.path.realpath(path))
     metadata = SUFFIXES.get(target.suffix.lower())
@@ -99,6 +101,11 @@ def save(figure: Figure, path: str | os.PathLike, *, dpi: float = 200) -> None:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+def detached(lens: Lens) -> Lens:
+    """The lens as plain numbers: a figure needs no gradients."""
+    return pytree.tree_map(lambda leaf: leaf.detach() if isinstance(leaf, Tensor) else leaf, lens)
 
 
 def array(tensor: Tensor) -> np.ndarray:
@@ -215,8 +222,9 @@ def scale_bar(axes: Axes, x: float, y: float, length: float, align: str = "cente
     axes.plot([x, x + length], [y, y], color=INK, linewidth=1.6, solid_capstyle="butt", clip_on=False, zorder=6)
     place = (x if align == "left" else x + length / 2, y)
     axes.annotate(
-        round_text(length), place, (0, 2.5), textcoords="offset points", ha=align, va="bottom", fontsize=7.5, zorder=6
-    )
+        round_text(length), place, (0, 3), textcoords="offset points", ha=align, va="bottom", fontsize=7.5, zorder=6,
+        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.6},
+    )  # fmt: skip
 
 
 def _minus(text: str) -> str:
