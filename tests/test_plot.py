@@ -80,6 +80,13 @@ def test_drawn_rays_end_where_the_traced_rays_end(double_gauss):
     np.testing.assert_allclose(heights, traced.numpy(), atol=NANOMETRE)
 
 
+def test_a_stop_behind_the_first_vertex_does_not_fold_the_rays():
+    # The stop of this lens lies inside its first element and is written before it, with a negative thickness.
+    for path in (path for field in fans(shipped("phone")) for path in field):
+        assert 1 not in path.corners
+        assert (np.diff(path.z) > 0).all()
+
+
 def test_the_glass_of_the_figure_is_bounded_by_the_sag(double_gauss):
     figure = plot.layout(double_gauss)
     z = outline.vertices(double_gauss)

@@ -159,7 +159,9 @@ def ray_paths(lens: Lens, pupil: Tensor, *, fields: Tensor, wavelength: Tensor, 
     for f, p in np.argwhere(array(alive)[:, 0]):
         fate[f][p] = ("ok", len(lens.surfaces) - 1)
     bends = [
-        k for k in range(1, len(lens.surfaces) - 1) if lens.surfaces[k].is_mirror or indices[k] is not indices[k - 1]
+        k
+        for k in range(1, len(lens.surfaces) - 1)
+        if lens.surfaces[k].is_mirror or not torch.equal(indices[k], indices[k - 1])
     ]
     paths = []
     for f, row in enumerate(fate):

@@ -104,8 +104,13 @@ def save(figure: Figure, path: str | os.PathLike, *, dpi: float = 200) -> None:
 
 
 def detached(lens: Lens) -> Lens:
-    """The lens as plain numbers: a figure needs no gradients."""
-    return pytree.tree_map(lambda leaf: leaf.detach() if isinstance(leaf, Tensor) else leaf, lens)
+    """The lens as plain numbers: a figure needs no gradients. Tensors that were one (a medium's) stay one."""
+    seen: dict[int, Tensor] = {}
+
+    def plain(leaf):
+        return seen.setdefault(id(leaf), leaf.detach()) if isinstance(leaf, Tensor) else leaf
+
+    return pytree.tree_map(plain, lens)
 
 
 def array(tensor: Tensor) -> np.ndarray:
