@@ -283,7 +283,7 @@ def test_curve_passes_through_the_spot_of_the_moved_sensor_and_its_minimum_is_th
     best = float(focus(lens, points, weights, fields=axis))
     lowest = curve.get_xdata()[np.argmin(curve.get_ydata())]
     assert abs(lowest - best) < 2 * np.diff(curve.get_xdata())[0]
-    assert "57.6620 mm, 7.075 µm" in words(figure)  # the figures of the task's independent calculation
+    assert "57.6620 mm, 7.075 µm" in words(figure)  # as an independent calculation has it
     moved = with_sensor_distance(lens, curve.get_xdata()[17])
     rays = image_rays(moved, points, fields=axis)
     radius = spot_of_points(rays.position[:2], rays.valid, weights).rms_radius
