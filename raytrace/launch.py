@@ -16,10 +16,9 @@ from raytrace.numerics import dot, safe_divide, unit
 from raytrace.paraxial import FirstOrder, first_order
 from raytrace.rays import Rays
 from raytrace.surface import sag
-from raytrace.trace import media, start, trace, trace_surfaces
+from raytrace.trace import media, start, steps, trace, trace_surfaces
 
-_AIMING_STAGES = 4  # field fractions 1/4 … 1, each started from the solution before it
-_AIMING_STEPS = 6  # Newton steps at each stage
+_AIMING_STAGES = ((0.25, 2), (0.5, 2), (0.75, 2), (1.0, 7))  # fraction of the field, Newton steps
 _AIMING_TOLERANCE = 1e-7  # of the stop radius, in float64
 
 
@@ -140,32 +139,35 @@ def object_field(lens: Lens, field: Tensor, paraxial: FirstOrder, *, ray_aiming:
 def aim_at_stop(lens: Lens, through: Callable[..., Rays], pupil: Tensor, wavelength: Tensor) -> tuple[Tensor, Tensor]:
     """Entrance pupil points (2, ...) whose rays pass the stop at `pupil` times its radius; and whether found (...).
 
-    through(pupil, fraction): rays of the field scaled by `fraction`. Newton's method by forward-mode derivatives,
+    through(pupil, fraction): rays of the field scaled by `fraction`. Newton's method,
     followed from the axis to the full field; the last step is attached, so first derivatives are exact.
     """
     surfaces = lens.surfaces[1 : lens.stop + 1]
     indices = media(lens, wavelength)[: lens.stop + 1]
     radius = stop_radius(lens)
 
-    def at_stop(pupil: Tensor, fraction: float) -> tuple[Tensor, Tensor]:
-        rays = trace_surfaces(surfaces, through(pupil, fraction), indices=indices)
-        return rays.position[:2] / radius, (rays.direction[2] != 1.0) | (rays.position[:2] != 0).any(0)
+    def at_stop(pupil: Tensor, fraction: float = 1.0) -> tuple[Tensor, Tensor]:
+        rays = through(pupil, fraction)
+        arrives = rays.valid
+        for crossing in steps(surfaces, rays, indices=indices):
+            rays, arrives = crossing.rays, arrives & ~(crossing.missed | crossing.totally_reflected)
+        return rays.position[:2] / radius, arrives
 
-    batch = torch.broadcast_shapes(at_stop(pupil, 1.0)[0].shape[1:], pupil.shape[1:])
+    batch = torch.broadcast_shapes(at_stop(pupil)[0].shape[1:], pupil.shape[1:])
     target = torch.stack([p.expand(batch) for p in pupil])
     guess = target.detach().clone()
-    for stage in range(1, _AIMING_STAGES + 1):
-        fraction = stage / _AIMING_STAGES
-        for _ in range(_AIMING_STEPS):
+    for fraction, count in _AIMING_STAGES:
+        for _ in range(count):
             error, jacobian = _error_and_jacobian(lambda q, f=fraction: at_stop(q, f)[0], guess, target.detach())
             step = _solve(jacobian, error)
             # Half the pupil at most in one step: a full step from a bad start can leave the lens for good.
             length = torch.linalg.vector_norm(step, dim=0)
             guess = guess - step * (0.5 / length.clamp_min(0.5))
-    error, jacobian = _error_and_jacobian(lambda q: at_stop(q, 1.0)[0], guess, target.detach())
+    error, jacobian = _error_and_jacobian(lambda q: at_stop(q)[0], guess, target.detach())
+    reached, arrives = at_stop(guess)
     tolerance = _AIMING_TOLERANCE if pupil.dtype == torch.float64 else 1e-4
-    found = (error.abs() <= tolerance).all(0) & at_stop(guess, 1.0)[1]
-    attached = guess - _solve(jacobian, at_stop(guess, 1.0)[0] - target)
+    found = (error.abs() <= tolerance).all(0) & arrives
+    attached = guess - _solve(jacobian, reached - target)
     return torch.where(found, attached, target), found
 
 
@@ -226,10 +228,10 @@ def _field_of_real_height(lens: Lens, height: Tensor, estimate: Tensor, paraxial
 
     scale = torch.ones_like(wanted.detach())
     for _ in range(12):
-        reached, slope = torch.func.jvp(image_height, (scale,), (torch.ones_like(scale),))
+        reached, slope = _value_and_slope(image_height, scale)
         scale = (scale - safe_divide(reached - 1, slope)).detach()
-    _, slope = torch.func.jvp(image_height, (scale,), (torch.ones_like(scale),))
-    scale = scale - safe_divide(image_height(scale) - 1, slope.detach())
+    _, slope = _value_and_slope(image_height, scale)
+    scale = scale - safe_divide(image_height(scale) - 1, slope)
     return _scaled(estimate, torch.where(wanted > 0, scale, 1.0))
 
 
@@ -243,23 +245,27 @@ def dot_2(a: Tensor, b: Tensor) -> Tensor:
     return a[0] * b[0] + a[1] * b[1]
 
 
+def _value_and_slope(function: Callable[[Tensor], Tensor], point: Tensor) -> tuple[Tensor, Tensor]:
+    """f(p) and f'(p) of a function that acts on each entry alone, outside the graph."""
+    value, pull = torch.func.vjp(function, point)
+    return value.detach(), pull(torch.ones_like(value))[0].detach()
+
+
 def _error_and_jacobian(function: Callable[[Tensor], Tensor], point: Tensor, target: Tensor):
-    """f(p) - target (2, ...) and the rows (∂f/∂p_x, ∂f/∂p_y) of each ray's own Jacobian, outside the graph."""
-    tangents = torch.zeros_like(point), torch.zeros_like(point)
-    tangents[0][0], tangents[1][1] = 1.0, 1.0
-    with torch.no_grad():
-        value, by_x = torch.func.jvp(function, (point,), (tangents[0],))
-        _, by_y = torch.func.jvp(function, (point,), (tangents[1],))
-    return value - target, (by_x, by_y)
+    """f(p) - target (2, ...) and the rows ∂f_x/∂p, ∂f_y/∂p (2, ...) of each ray's own Jacobian, outside the graph."""
+    value, pull = torch.func.vjp(function, point)
+    x, y = torch.zeros_like(value), torch.zeros_like(value)
+    x[0], y[1] = 1.0, 1.0
+    return (value - target).detach(), (pull(x)[0].detach(), pull(y)[0].detach())
 
 
 def _solve(jacobian: tuple[Tensor, Tensor], error: Tensor) -> Tensor:
     """Solve the 2 × 2 systems by Cramer's rule; 0 where singular."""
-    by_x, by_y = jacobian
-    determinant = by_x[0] * by_y[1] - by_y[0] * by_x[1]
+    of_x, of_y = jacobian
+    determinant = of_x[0] * of_y[1] - of_x[1] * of_y[0]
     return torch.stack(
         [
-            safe_divide(error[0] * by_y[1] - by_y[0] * error[1], determinant),
-            safe_divide(by_x[0] * error[1] - error[0] * by_x[1], determinant),
+            safe_divide(error[0] * of_y[1] - of_x[1] * error[1], determinant),
+            safe_divide(of_x[0] * error[1] - error[0] * of_y[0], determinant),
         ]
     )
