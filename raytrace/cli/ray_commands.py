@@ -60,7 +60,7 @@ def spot(arguments: argparse.Namespace) -> None:
     if arguments.plot:
         from raytrace import plot
 
-        plot.save(plot.spot_diagram(lens, fields=fields), arguments.plot)
+        plot.save(plot.spot_diagram(lens, fields=fields, pupil=(points, weights)), arguments.plot)
         say(f"spot diagram written to {arguments.plot}")
     if arguments.json:
         print_json(_spot_document(lens, fields, spots, vignetted))
@@ -155,7 +155,15 @@ def focus(arguments: argparse.Namespace) -> None:
     if arguments.plot:
         from raytrace import plot
 
-        figure = plot.focus_report(lens, focused, object_distances=distances, fields=fields, wavelengths=wavelengths)
+        figure = plot.focus_report(
+            lens,
+            focused,
+            object_distances=distances,
+            fields=fields,
+            wavelengths=wavelengths,
+            wavelength_weights=rule["wavelength_weights"],
+            pupil=(points, weights),
+        )
         plot.save(figure, arguments.plot)
     if arguments.output:
         write_lens(_as_in_file(focused, arguments), arguments.output)
