@@ -1,9 +1,52 @@
-"""Wavefront: optical path to the reference sphere, without ever subtracting two long paths."""
+"""Wavefront: optical path to the reference sphere, without ever subtracting two long paths.
 
+A longer path is a positive OPD: light with OPD growing towards +y lands towards +y.
+"""
+
+import torch
 from torch import Tensor
 
-from raytrace.numerics import dot, safe_sqrt
+from raytrace import zernike
+from raytrace.glass import refractive_index
+from raytrace.launch import rays_of_field, vignette
+from raytrace.lens import with_object_distance
+from raytrace.numerics import dot, safe_divide, safe_sqrt
+from raytrace.paraxial import first_order
+from raytrace.psf.scene import Scene
 from raytrace.rays import Rays
+from raytrace.trace import trace
+from raytrace.value import value
+
+
+@value
+class Wavefront:
+    """OPD over the pupil of every object distance, field and wavelength of a scene.
+
+    opd: (D, F, W, P) mm of optical path against the chief ray's; 0 where no ray arrives.
+    direction: (3, D, F, W, P) unit vectors from the reference sphere to its centre; L and M are the coordinates of the
+        diffraction integral.
+    energy: (D, F, W, P) share of the entrance pupil's light that each ray carries to the sensor; 0 if lost.
+    landing: (2, D, F, W, P) mm, where rays meet the sensor, from the centre.
+    valid: (D, F, W, P) bool; usable: also rays that were only vignetted, whose numbers mean something still.
+    pupil: (2, P) or (2, D, F, W, P) fractions of the entrance pupil before vignetting factors, Zernike's coordinates.
+    weights: of the pupil points, mean over the disc.
+    centre: (3, D, F, W) mm on the sensor, the chief ray's point; radius: (D, F, W) mm of the sphere, from the exit pupil
+        to the image, inf for a telecentric lens and negative for an exit pupil behind the image.
+    wavelength: (W,) µm; index: (W,) of the image space.
+    """
+
+    opd: Tensor
+    direction: Tensor
+    energy: Tensor
+    landing: Tensor
+    valid: Tensor
+    usable: Tensor
+    pupil: Tensor
+    weights: Tensor
+    centre: Tensor
+    radius: Tensor
+    wavelength: Tensor
+    index: Tensor
 
 
 def path_to_reference_sphere(rays: Rays, centre: Tensor, radius: Tensor, index: Tensor) -> Tensor:
@@ -20,3 +63,136 @@ def path_to_reference_sphere(rays: Rays, centre: Tensor, radius: Tensor, index: 
     e_squared = dot(across, across)
     sagitta = e_squared / (radius * (1 + safe_sqrt(1 - e_squared / (radius * radius))))
     return rays.opl + index * (sagitta - along)
+
+
+def towards_centre(rays: Rays, centre: Tensor, radius: Tensor) -> Tensor:
+    """Unit vectors (3, ...) from where rays cross the reference sphere to its centre, (Q - q)/R.
+
+    s = √(1 - e²/R²) d - e/R: the ray's own direction for R = inf. Arguments as for `path_to_reference_sphere`.
+    """
+    offset = rays.position - centre
+    across = (offset - dot(offset, rays.direction) * rays.direction) / radius
+    return safe_sqrt(1 - dot(across, across)) * rays.direction - across
+
+
+def wavefront(scene: Scene, pupil: Tensor, weights: Tensor | None = None) -> Wavefront:
+    """The wavefront of a scene at pupil points, on the sphere about the chief ray's point of the sensor.
+
+    pupil: (2, P), or (2, D, F, W, P) where every kernel has its own points (axes of length 1 broadcast);
+    weights: (P,) or (D, F, W, P), shares of the disc's area, equal by default. Every share carries equal light.
+    The chief ray goes through the centre of the (vignetted) pupil, blocked or not; where it cannot be traced, the mean
+    of the rays that arrive takes its place.
+    """
+    weights = torch.full_like(pupil[0], 1.0) / pupil.shape[-1] if weights is None else weights
+    with_chief = torch.cat([torch.zeros_like(pupil[..., :1]), pupil], -1)
+    rays = _rays_on_sensor(scene, with_chief)
+    usable = rays.valid | (rays.position != 0).any(0) | (rays.direction[:2] != 0).any(0)
+    usable = torch.cat([usable[..., :1] | (with_chief[..., :1] == 0).all(0) & _on_axis(scene), usable[..., 1:]], -1)
+
+    def at_chief(quantity: Tensor) -> Tensor:
+        """The chief ray's value, or the mean where there is no chief ray; keeps the axis of rays."""
+        others = torch.where(rays.valid, quantity, 0.0).sum(-1, keepdim=True)
+        mean = safe_divide(others, rays.valid.sum(-1, keepdim=True).to(quantity.dtype))
+        return torch.where(usable[..., :1], quantity[..., :1], mean)
+
+    centre = at_chief(rays.position)
+    radius = _reference_radius(scene, centre)
+    index = refractive_index(scene.lens.surfaces[-2].glass, scene.wavelengths).to(pupil.dtype)
+    path = path_to_reference_sphere(rays, centre, radius, index[:, None])
+    opd = torch.where(rays.valid, path - at_chief(path), 0.0)
+    direction = towards_centre(rays, centre, radius)
+    landing = torch.where(usable, rays.position[:2] - centre[:2], 0.0)
+    energy = torch.where(rays.valid[..., 1:], weights * _open_area(scene), 0.0)
+    return Wavefront(
+        opd=opd[..., 1:],
+        direction=direction[..., 1:],
+        energy=energy,
+        landing=landing[..., 1:],
+        valid=rays.valid[..., 1:],
+        usable=usable[..., 1:],
+        pupil=pupil,
+        weights=weights,
+        centre=centre[..., 0],
+        radius=radius[..., 0],
+        wavelength=scene.wavelengths,
+        index=index,
+    )
+
+
+def mean_opd(wavefront: Wavefront) -> Tensor:
+    """Mean OPD (D, F, W) in mm over the light that arrives."""
+    return (_share(wavefront) * wavefront.opd).sum(-1)
+
+
+def rms(wavefront: Wavefront) -> Tensor:
+    """RMS of the OPD about its mean (D, F, W), mm; 0 with gradient 0 where no light arrives."""
+    centred = torch.where(wavefront.valid, wavefront.opd - mean_opd(wavefront)[..., None], 0.0)
+    return safe_sqrt((_share(wavefront) * centred * centred).sum(-1))
+
+
+def peak_to_valley(wavefront: Wavefront) -> Tensor:
+    """Largest less smallest OPD (D, F, W), mm, over the rays that arrive; 0 where none does."""
+    highest = torch.where(wavefront.valid, wavefront.opd, -torch.inf).amax(-1)
+    lowest = torch.where(wavefront.valid, wavefront.opd, torch.inf).amin(-1)
+    return torch.where(wavefront.valid.any(-1), highest - lowest, 0.0)
+
+
+def zernike_coefficients(wavefront: Wavefront, count: int = 37) -> Tensor:
+    """Noll coefficients 1 … count (D, F, W, count) in mm RMS, fitted to the rays that arrive.
+
+    Raises ValueError where fewer rays than coefficients arrive.
+    """
+    return zernike.fit(wavefront.opd, _noll_basis(wavefront, count), wavefront.energy)
+
+
+def without(wavefront: Wavefront, count: int) -> Tensor:
+    """OPD (D, F, W, P) in mm less its best Noll terms 1 … count: 1 piston, 3 also tilt, 4 also focus."""
+    basis = _noll_basis(wavefront, count)
+    fitted = zernike.fit(wavefront.opd, basis, wavefront.energy) @ basis
+    return torch.where(wavefront.valid, wavefront.opd - fitted, 0.0)
+
+
+def _noll_basis(wavefront: Wavefront, count: int) -> Tensor:
+    if wavefront.pupil.dim() != 2:
+        raise ValueError("Zernike fits need one set of pupil points for all fields, a pupil of shape (2, P)")
+    return zernike.polynomials([zernike.noll(j) for j in range(1, count + 1)], *wavefront.pupil)
+
+
+def _share(wavefront: Wavefront) -> Tensor:
+    return safe_divide(wavefront.energy, wavefront.energy.sum(-1, keepdim=True))
+
+
+def _rays_on_sensor(scene: Scene, pupil: Tensor) -> Rays:
+    """Rays (3, D, F, W, P) of pupil points (2, P) or (2, D, F, W, P), on the sensor."""
+    lens = with_object_distance(scene.lens, scene.lens.surfaces[0].thickness[..., None])
+    field, wavelength = scene.fields[:, :, None, None], scene.wavelengths[:, None]
+    rays = rays_of_field(lens, field, vignette(lens, field, pupil), wavelength=wavelength)
+    rays = trace(lens, rays, wavelength)
+    batch = *scene.shape, pupil.shape[-1]
+    return Rays(
+        rays.position.expand(3, *batch), rays.direction.expand(3, *batch), rays.valid.expand(batch), rays.opl.expand(batch)
+    )
+
+
+def _on_axis(scene: Scene) -> Tensor:
+    """(F, 1, 1): a chief ray along the axis has the numbers of a lost ray, and means them."""
+    return (scene.fields == 0).all(0)[:, None, None]
+
+
+def _reference_radius(scene: Scene, centre: Tensor) -> Tensor:
+    """Signed distance (D, F, W, 1) in mm from the centre of the paraxial exit pupil to the image point."""
+    position = first_order(scene.lens).exit_pupil_position
+    # A pupil at infinity has no finite derivative, and the intensity does not depend on the sphere that is chosen.
+    position = position if bool(torch.isfinite(position).all()) else position.detach()
+    side = -1 if sum(surface.is_mirror for surface in scene.lens.surfaces[1:-1]) % 2 else 1
+    depth = (-side * position)[..., None]
+    x, y, z = centre / depth
+    return (depth * torch.sqrt(x * x + y * y + (1 + side * z) ** 2)).expand(*centre.shape[1:])
+
+
+def _open_area(scene: Scene) -> Tensor:
+    """Share (F, 1, 1) of the pupil's area that vignetting factors leave: (1 - VCX)(1 - VCY)."""
+    corners = scene.fields.new_tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    x, y = vignette(scene.lens, scene.fields[:, :, None, None], corners)
+    ax, ay, bx, by = x[..., 1] - x[..., 0], y[..., 1] - y[..., 0], x[..., 2] - x[..., 0], y[..., 2] - y[..., 0]
+    return (ax * by - ay * bx).abs()[..., None]

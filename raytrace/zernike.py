@@ -1,0 +1,109 @@
+"""Zernike polynomials on the unit disc: indices, values, gradients and least-squares fits.
+
+    Z(x, y) = √((2 - δ_m0)(n + 1)) R_n^|m|(r) · {cos mθ, m ≥ 0;  sin |m|θ, m < 0},   θ from the x axis
+
+Normalised so that the mean of Z² over the disc is 1 (Noll, JOSA 66, 207, 1976): a coefficient is the RMS it adds.
+`norm` turns a coefficient into that of the unnormalised polynomial, which is 1 at the edge (fringe reports).
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+Order = tuple[int, int]
+
+
+def noll(j: int) -> Order:
+    """(n, m) of Noll's j = 1, 2, …: piston, tilt x, tilt y, focus, astigmatism sin, cos, coma y, x, …"""
+    _at_least(j, 1, "Noll")
+    n = math.isqrt(8 * j - 7) - 1 >> 1
+    k = j - n * (n + 1) // 2
+    m = 2 * (k // 2) if n % 2 == 0 else 2 * ((k - 1) // 2) + 1
+    return n, m if j % 2 == 0 else -m
+
+
+def ansi(j: int) -> Order:
+    """(n, m) of the ANSI Z80.28 index j = (n (n + 2) + m)/2 = 0, 1, …"""
+    _at_least(j, 0, "ANSI")
+    n = (math.isqrt(8 * j + 1) - 1) // 2
+    return n, 2 * j - n * (n + 2)
+
+
+def fringe(j: int) -> Order:
+    """(n, m) of the fringe (University of Arizona) index j = (1 + (n + |m|)/2)² - 2|m| + [m < 0] = 1, 2, …"""
+    _at_least(j, 1, "fringe")
+    d = math.isqrt(j - 1) + 1
+    m = (d * d - j + 1) // 2
+    return 2 * (d - 1) - m, -m if (d * d - j) % 2 else m
+
+
+def norm(n: int, m: int) -> float:
+    """√((2 - δ_m0)(n + 1)), the largest value that Z takes on the edge."""
+    return math.sqrt((n + 1) * (1 if m == 0 else 2))
+
+
+def polynomials(orders: Sequence[Order], x: Tensor, y: Tensor) -> Tensor:
+    """Z (J, ...) of orders (n, m) at points (...) of the unit disc.
+
+    r^|m| e^{i|m|θ} = (x + iy)^|m| and R_n^m(r)/r^m = P_k^(0, m)(2 r² - 1), k = (n - |m|)/2, by the three-term recurrence
+    of the Jacobi polynomials (DLMF 18.9.2): no digits lost at high orders, no angle, finite derivatives at the centre.
+    """
+    t = 2 * (x * x + y * y) - 1
+    harmonics, radial = {0: (torch.ones_like(x), torch.zeros_like(x))}, {}
+    result = []
+    for n, m in orders:
+        k, size = divmod(n - abs(m), 2)[0], abs(m)
+        if n < size or (n - size) % 2:
+            raise ValueError(f"no Zernike polynomial has n = {n}, m = {m}: n - |m| must be even and not negative")
+        for i in range(len(harmonics), size + 1):
+            c, s = harmonics[i - 1]
+            harmonics[i] = c * x - s * y, c * y + s * x
+        _jacobi(radial, size, k, t)
+        result.append(norm(n, m) * radial[size][k] * harmonics[size][0 if m >= 0 else 1])
+    return torch.stack(result)
+
+
+def gradients(orders: Sequence[Order], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """∂Z/∂x and ∂Z/∂y, each (J, ...), at points (...)."""
+    zero, one = torch.zeros_like(x), torch.ones_like(x)
+
+    def values(x: Tensor, y: Tensor) -> Tensor:
+        return polynomials(orders, x, y)
+
+    return tuple(torch.func.jvp(values, (x, y), tangent)[1] for tangent in ((one, zero), (zero, one)))
+
+
+def fit(values: Tensor, basis: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Coefficients c (..., J) that minimise Σ_p w_p (values_p - Σ_j c_j basis_jp)², by QR.
+
+    values: (..., P); basis: (J, P), as `polynomials` gives it; weights: (P,) or (..., P), not negative, 1 by default.
+    Raises ValueError if a fit has fewer points of positive weight than coefficients.
+    """
+    weights = torch.ones_like(values) if weights is None else weights.expand(values.shape)
+    points = int((weights > 0).sum(-1).min())
+    if points < len(basis):
+        raise ValueError(f"{points} points of positive weight cannot fit {len(basis)} coefficients")
+    root = torch.sqrt(torch.where(weights > 0, weights, 1.0))
+    root = torch.where(weights > 0, root, 0.0)
+    q, r = torch.linalg.qr(root[..., None] * basis.T)
+    right = q.transpose(-1, -2) @ (root * torch.where(weights > 0, values, 0.0))[..., None]
+    return torch.linalg.solve_triangular(r, right, upper=True)[..., 0]
+
+
+def _jacobi(known: dict[int, list[Tensor]], m: int, k: int, t: Tensor) -> None:
+    """Extend known[m] up to P_k^(0, m)(t)."""
+    found = known.setdefault(m, [torch.ones_like(t)])
+    for i in range(len(found), k + 1):
+        if i == 1:
+            found.append(0.5 * ((m + 2) * t - m))
+            continue
+        a = 2 * i + m
+        ahead = (a - 1) * (a * (a - 2) * t - m * m) * found[-1] - 2 * (i - 1) * (i + m - 1) * a * found[-2]
+        found.append(ahead / (2 * i * (i + m) * (a - 2)))
+
+
+def _at_least(j: int, first: int, name: str) -> None:
+    if j < first:
+        raise ValueError(f"{name} index {j}: the first is {first}")
