@@ -1,0 +1,38 @@
+"""Files: those that travel with the package, and how every file is written."""
+
+import errno
+import os
+import secrets
+from collections.abc import Callable
+from pathlib import Path
+from typing import BinaryIO
+
+
+def shipped(folder: str) -> Path:
+    """The folder `glass_catalogs` or `lenses`: inside an installed package, beside it in a checkout."""
+    package = Path(__file__).resolve().parent
+    installed = package / folder
+    return installed if installed.is_dir() else package.parent / folder
+
+
+def write_atomically(path: str | os.PathLike, write: Callable[[BinaryIO], None]) -> None:
+    """Replace a file as a whole or not at all: `write` fills a temporary file beside it, which is then renamed.
+
+    A link is written through. Raises OSError naming `path` where it cannot be written, or is no regular file; what
+    `write` raises passes through. Nothing is left behind.
+    """
+    target = Path(os.path.realpath(path))
+    if target.exists() and not target.is_file():
+        raise OSError(errno.EINVAL, "is not a regular file; give the name of a file to write", str(path))
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(6)}.tmp")
+    try:
+        with open(temporary, "xb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, target)
+    except BaseException as error:
+        temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename in (str(temporary), temporary):
+            raise OSError(error.errno, f"cannot be written: {error.strerror}", str(path)) from error
+        raise
