@@ -30,8 +30,8 @@ class Wavefront:
     valid: (D, F, W, P) bool; usable: also rays that were only vignetted, whose numbers mean something still.
     pupil: (2, P) or (2, D, F, W, P) fractions of the entrance pupil before vignetting factors, Zernike's coordinates.
     weights: of the pupil points, mean over the disc.
-    centre: (3, D, F, W) mm on the sensor, the chief ray's point; radius: (D, F, W) mm of the sphere, from the exit pupil
-        to the image, inf for a telecentric lens and negative for an exit pupil behind the image.
+    centre: (3, D, F, W) mm on the sensor, the chief ray's point; radius: (D, F, W) mm of the sphere, from the exit
+        pupil to the image, inf for a telecentric lens and negative for an exit pupil behind the image.
     wavelength: (W,) µm; index: (W,) of the image space.
     """
 
@@ -85,7 +85,7 @@ def wavefront(scene: Scene, pupil: Tensor, weights: Tensor | None = None) -> Wav
     """
     weights = torch.full_like(pupil[0], 1.0) / pupil.shape[-1] if weights is None else weights
     with_chief = torch.cat([torch.zeros_like(pupil[..., :1]), pupil], -1)
-    rays = _rays_on_sensor(scene, with_chief)
+    rays = rays_on_sensor(scene, with_chief)
     usable = rays.valid | (rays.position != 0).any(0) | (rays.direction[:2] != 0).any(0)
     usable = torch.cat([usable[..., :1] | (with_chief[..., :1] == 0).all(0) & _on_axis(scene), usable[..., 1:]], -1)
 
@@ -162,7 +162,7 @@ def _share(wavefront: Wavefront) -> Tensor:
     return safe_divide(wavefront.energy, wavefront.energy.sum(-1, keepdim=True))
 
 
-def _rays_on_sensor(scene: Scene, pupil: Tensor) -> Rays:
+def rays_on_sensor(scene: Scene, pupil: Tensor) -> Rays:
     """Rays (3, D, F, W, P) of pupil points (2, P) or (2, D, F, W, P), on the sensor."""
     lens = with_object_distance(scene.lens, scene.lens.surfaces[0].thickness[..., None])
     field, wavelength = scene.fields[:, :, None, None], scene.wavelengths[:, None]
@@ -170,7 +170,10 @@ def _rays_on_sensor(scene: Scene, pupil: Tensor) -> Rays:
     rays = trace(lens, rays, wavelength)
     batch = *scene.shape, pupil.shape[-1]
     return Rays(
-        rays.position.expand(3, *batch), rays.direction.expand(3, *batch), rays.valid.expand(batch), rays.opl.expand(batch)
+        rays.position.expand(3, *batch),
+        rays.direction.expand(3, *batch),
+        rays.valid.expand(batch),
+        rays.opl.expand(batch),
     )
 
 

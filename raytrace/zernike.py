@@ -47,8 +47,9 @@ def norm(n: int, m: int) -> float:
 def polynomials(orders: Sequence[Order], x: Tensor, y: Tensor) -> Tensor:
     """Z (J, ...) of orders (n, m) at points (...) of the unit disc.
 
-    r^|m| e^{i|m|θ} = (x + iy)^|m| and R_n^m(r)/r^m = P_k^(0, m)(2 r² - 1), k = (n - |m|)/2, by the three-term recurrence
-    of the Jacobi polynomials (DLMF 18.9.2): no digits lost at high orders, no angle, finite derivatives at the centre.
+    r^|m| e^{i|m|θ} = (x + iy)^|m| and R_n^m(r)/r^m = P_k^(0, m)(2 r² - 1), k = (n - |m|)/2, by the three-term
+    recurrence of the Jacobi polynomials (DLMF 18.9.2): no digits lost at high orders, no angle, finite
+    derivatives at the centre.
     """
     t = 2 * (x * x + y * y) - 1
     harmonics, radial = {0: (torch.ones_like(x), torch.zeros_like(x))}, {}

@@ -1,0 +1,196 @@
+"""Fourier model: the diffraction PSF of an ideal lens out of focus, with Zernike aberrations if asked for.
+
+    PSF(x) = |F{A exp(iψ r²/R²)}|²,   ψ = (πR²/λ) (n/z_o + n'/z_i - φ)
+
+from the lens's own first-order data: power φ and principal planes at every wavelength, R the entrance pupil's radius
+(Goodman, Introduction to Fourier Optics, §6.4). The field of light through a pupil of unit energy is
+
+    U(x) = √π a ∫ exp(iΨ(p)) exp(-2πi a p·x) dp/π,   a = n' R/(λ z_i) cycles per mm,
+
+so that the integral of |U|² over the sensor is 1 (Parseval).
+"""
+
+import itertools
+import math
+
+import torch
+from torch import Tensor
+
+from raytrace import zernike as polynomials
+from raytrace.grid import Grid
+from raytrace.launch import is_at_infinity, object_field
+from raytrace.numerics import safe_divide, safe_sqrt
+from raytrace.paraxial import first_order, signed, system_matrix
+from raytrace.psf.dft import disc_rule, integrate, nodes_per_pixel, phasor, rings_and_arms, sub_pixels, to_grid
+from raytrace.psf.scene import Kernels, Scene
+from raytrace.pupil import gauss_rings, with_rim
+from raytrace.trace import media
+from raytrace.value import value
+
+_MOST_POINTS = 400_000  # pupil points of one kernel; beyond, the phase is refused
+
+
+@value
+class Paraxial:
+    """What the Fourier model knows of a lens; every entry (D, F, W).
+
+    defocus: ψ at the edge of the pupil, radians; frequency: a, cycles per mm at the edge of the pupil;
+    chief: (2, D, F, W) mm, where the paraxial chief ray meets the sensor.
+    """
+
+    defocus: Tensor
+    frequency: Tensor
+    chief: Tensor
+
+
+def kernels(scene: Scene, grid: Grid, *, order: int = 0, zernike: Tensor | None = None) -> Kernels:
+    """Kernels of the Fourier model about the paraxial chief ray.
+
+    zernike: Noll coefficients from 1 on, (J,) or (J, D, F, W) with axes of length 1 to broadcast, mm RMS of path.
+    order: each one adds pupil points and pixel nodes; two successive ones estimate the error.
+    centroid and covariance are those of the geometric limit: the second moment of a hard-edged diffraction pattern
+    does not exist. Raises ValueError where the window or the blur would need too many pupil points.
+    """
+    lens, shape = paraxial(scene), scene.shape
+    waves = _aberrations(scene, zernike)
+    centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))) - lens.chief
+    nodes = nodes_per_pixel(float(grid.pitch), 2 * float(lens.frequency.detach().abs().max()), order)
+    x, y, weight = sub_pixels(Grid(grid.pitch, grid.rows, grid.columns, centre), nodes)
+    pixels = []
+    for place in itertools.product(*map(range, shape)):
+        own = None if waves is None else waves[(slice(None), *place)]
+        intensity = _intensity(x[place], y[place], lens.defocus[place], lens.frequency[place], own, order=order)
+        pixels.append(integrate(intensity, weight, grid.pitch))
+    centroid, covariance = _moments(lens, waves)
+    return Kernels(torch.stack(pixels).unflatten(0, shape), grid, lens.chief + centroid, covariance, rays=0)
+
+
+def paraxial(scene: Scene) -> Paraxial:
+    """Defocus, edge frequency and chief ray of the paraxial lens, at every wavelength's own index."""
+    lens, wavelengths, shape = scene.lens, scene.wavelengths, scene.shape
+    primary, coloured = first_order(lens), first_order(lens, wavelengths)
+    surfaces = lens.surfaces[1:-1]
+    n = signed(surfaces, media(lens, wavelengths)[:-1])
+    distance, sensor = lens.surfaces[0].thickness, lens.surfaces[-2].thickness
+    z_o = distance + coloured.front_principal_plane
+    z_i = sensor - coloured.rear_principal_plane
+    radius = 0.5 * primary.entrance_pupil_diameter
+    waves = 1e3 * radius / wavelengths  # R/λ
+    defocus = math.pi * waves * radius * (n[0] / z_o + n[-1] / z_i - coloured.power)
+    # The chief ray from the centre of the entrance pupil, with the slope of the field.
+    pupil = primary.entrance_pupil_position
+    field = object_field(lens, scene.fields[:, :, None], primary)
+    slope = field if is_at_infinity(lens) else -field / (distance + pupil)
+    A, B, C, D = system_matrix(surfaces, n)
+    height, omega = -pupil * slope, n[0] * slope
+    chief = A * height + B * omega + sensor / n[-1] * (C * height + D * omega)
+    return Paraxial(defocus.expand(shape), (waves * n[-1] / z_i).expand(shape), chief.expand(2, *shape))
+
+
+def bessel_j0(x: Tensor) -> Tensor:
+    """J₀ with its derivatives (those of torch.special detach silently)."""
+    return _J0.apply(x)
+
+
+def _intensity(x: Tensor, y: Tensor, defocus: Tensor, frequency: Tensor, waves: Tensor | None, *, order: int) -> Tensor:
+    """|U|² (Y, X) per mm² at x (X,), y (Y,) mm from the chief ray, with Noll coefficients in waves (J,) or None.
+
+    Without them the pupil is symmetric and its rings are integrals in closed form: Σ_r w_r e^{iψ r²} J₀(2π a r ρ).
+    """
+    reach = math.hypot(float(x.detach().abs().max()), float(y.detach().abs().max()))
+    phase = 2 * math.pi * abs(float(frequency)) * reach + 2 * abs(float(defocus))
+    if waves is None:
+        rings, _ = rings_and_arms(phase, order)
+        radius, weights = _rings(rings, like=x)
+        spectrum = weights * phasor(defocus * radius * radius / (2 * math.pi))
+        distance = safe_sqrt(y[:, None] ** 2 + x**2)
+        J0 = bessel_j0(2 * math.pi * frequency * distance[..., None] * radius)
+        real, imaginary = J0 @ spectrum.real, J0 @ spectrum.imag
+        return math.pi * frequency**2 * (real * real + imaginary * imaginary)
+    phase += _steepest(waves)
+    points, weights = disc_rule(phase, order, most=_MOST_POINTS, what="the Fourier model", like=x)
+    path = waves @ _noll(len(waves), points) + defocus * (points**2).sum(0) / (2 * math.pi)
+    U = to_grid(weights * phasor(path), -points[0], -points[1], x, y, 1 / frequency)
+    return math.pi * frequency**2 * (U.real**2 + U.imag**2)
+
+
+def _aberrations(scene: Scene, zernike: Tensor | None) -> Tensor | None:
+    """Noll coefficients (J, D, F, W) in waves."""
+    if zernike is None:
+        return None
+    zernike = zernike.reshape(len(zernike), *(zernike.shape[1:] or (1, 1, 1)))
+    return (1e3 * zernike / scene.wavelengths).expand(-1, *scene.shape)
+
+
+def _moments(lens: Paraxial, waves: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Centroid (2, D, F, W) from the chief ray and covariance (3, D, F, W), mm and mm², of the geometric limit.
+
+    Light of path W(p) waves lands at x = ∇W/a: a disc of radius |ψ|/(π a), variance radius²/4 on each axis.
+    """
+    if waves is None:
+        variance = 0.25 * (lens.defocus / (math.pi * lens.frequency)) ** 2
+        return torch.zeros_like(lens.chief), torch.stack([variance, torch.zeros_like(variance), variance])
+    points, weights = gauss_rings(16, dtype=waves.dtype, device=waves.device)
+    slopes = polynomials.gradients(_orders(len(waves)), *points)
+    x, y = (
+        (torch.einsum("j...,jp->...p", waves, g) + (lens.defocus / math.pi)[..., None] * p) / lens.frequency[..., None]
+        for g, p in zip(slopes, points, strict=True)
+    )
+    mean_x, mean_y = (x @ weights, y @ weights)
+    x, y = x - mean_x[..., None], y - mean_y[..., None]
+    return torch.stack([mean_x, mean_y]), torch.stack([(x * x) @ weights, (x * y) @ weights, (y * y) @ weights])
+
+
+def _orders(count: int) -> list[tuple[int, int]]:
+    return [polynomials.noll(j) for j in range(1, count + 1)]
+
+
+def _noll(count: int, points: Tensor) -> Tensor:
+    return polynomials.polynomials(_orders(count), *points)
+
+
+def _steepest(waves: Tensor) -> float:
+    """Largest slope of the aberrations in radians per pupil radius, on the rim and inside."""
+    points, _ = with_rim(*gauss_rings(8, dtype=waves.dtype, device=waves.device))
+    by_x, by_y = (waves.detach() @ g for g in polynomials.gradients(_orders(len(waves)), *points))
+    return 2 * math.pi * float(torch.hypot(by_x, by_y).max())
+
+
+def _rings(count: int, *, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Radii and weights (sum 1) of Gauss rings."""
+    points, weights = gauss_rings(count, 1, dtype=like.dtype, device=like.device)
+    return torch.hypot(*points), weights
+
+
+class _J0(torch.autograd.Function):
+    """J₀' = -J₁."""
+
+    @staticmethod
+    def forward(x):
+        return torch.special.bessel_j0(x)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx, gradient):
+        return -gradient * _J1.apply(*ctx.saved_tensors)
+
+
+class _J1(torch.autograd.Function):
+    """J₁' = J₀ - J₁/x, 1/2 at 0."""
+
+    @staticmethod
+    def forward(x):
+        return torch.special.bessel_j1(x)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx, gradient):
+        (x,) = ctx.saved_tensors
+        quotient = torch.where(x == 0, 0.5, safe_divide(_J1.apply(x), x))
+        return gradient * (_J0.apply(x) - quotient)
