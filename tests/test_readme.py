@@ -1,0 +1,97 @@
+"""README.md keeps its word: its commands are the ones that run, its examples work, its links and pictures exist."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from raytrace.cli import main
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def first_block(heading: str) -> list[str]:
+    """The lines of the first ```sh block under a heading."""
+    section = re.split(r"^## ", README, flags=re.M)
+    (text,) = [part for part in section if part.startswith(heading + "\n")]
+    return re.search(r"^```sh\n(.*?)^```", text, re.M | re.S)[1].strip().splitlines()
+
+
+def examples() -> list[str]:
+    """Every `raytrace …` of the README's shell blocks, without comments and without the installation before it."""
+    found = []
+    for block in re.findall(r"^```(?:sh|bash|console)\n(.*?)^```", README, re.M | re.S):
+        for line in block.replace("\\\n", " ").splitlines():
+            for part in re.split(r"&&|;|\|", line.split(" #")[0].removeprefix("$ ")):
+                words = shlex.split(part)
+                if words and Path(words[0]).name == "raytrace":
+                    found.append(shlex.join(words[1:]))
+    return found
+
+
+def test_command_one_installs_and_focuses():
+    (line,) = first_block("Install and run")
+    parts = [shlex.split(part) for part in line.split("&&")]
+    assert any(words[1:3] == ["install", "."] for words in parts)
+    assert Path(parts[-1][0]).name == "raytrace"
+    wanted = ["focus", "lenses/double_gauss.zmx", "--object-distance", "25000", "--plot", "focus.png"]
+    assert parts[-1][1:] == wanted
+
+
+def test_command_two_installs_and_tests():
+    text = "\n".join(first_block("Install and test"))
+    assert ".[test]" in text
+    assert re.search(r"(^|[/\s])pytest$", text)
+
+
+def test_continuous_integration_runs_command_two_then_ruff():
+    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    lines = [line.strip() for line in script.splitlines()]
+    command_two = first_block("Install and test")
+    start = lines.index(command_two[0])
+    assert lines[start : start + len(command_two)] == command_two
+    after = "\n".join(lines[start + len(command_two) :])
+    assert "ruff check" in after
+    assert "ruff format --check" in after
+    assert sum("pytest" in line and not line.startswith("#") for line in lines) == 1
+    assert (ROOT / ".ci" / "run").stat().st_mode & 0o111
+
+
+def test_extras_that_the_readme_installs_exist():
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    extras = set(re.findall(r"\.\[(\w+)\]", README))
+    assert "test" in extras
+    for extra in extras:
+        assert re.search(rf"^{extra} = \[", project, re.M)
+    assert 'raytrace = "raytrace.cli:script"' in project
+
+
+@pytest.mark.parametrize("line", examples())
+def test_examples_run(line, tmp_path, monkeypatch, capsys):
+    (tmp_path / "lenses").symlink_to(ROOT / "lenses")
+    monkeypatch.chdir(tmp_path)
+    assert main(shlex.split(line)) == 0, capsys.readouterr().err
+    words = shlex.split(line)
+    for option in ("-o", "--plot"):
+        if option in words:
+            assert Path(words[words.index(option) + 1]).stat().st_size > 0
+
+
+def test_every_command_is_shown():
+    from raytrace.cli.options import COMMANDS
+
+    shown = {line.split()[0] for line in examples()}
+    assert {command.name for command in COMMANDS} <= shown
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_and_pictures_exist(page):
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+    targets = re.findall(r"\]\(<?([^)>\s]+)", text) + re.findall(r"(?:src|href)=\"([^\"]+)\"", text)
+    for target in targets:
+        if re.match(r"[a-z]+:|#", target):
+            continue
+        assert (page.parent / target.split("#")[0]).exists(), f"{page.name}: {target}"
