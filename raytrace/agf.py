@@ -2,9 +2,7 @@
 
 import codecs
 import math
-import os
 import re
-import tempfile
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,6 +12,7 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
+from raytrace.files import write_atomically
 from raytrace.glass import AGF_FORMULAS, COEFFICIENT_COUNTS, Glass
 
 _STATUSES = {0: "standard", 1: "preferred", 2: "obsolete", 3: "special", 4: "melt"}
@@ -253,17 +252,8 @@ def write_agf(catalog: Catalog, path: str | Path) -> None:
 
     Raises ValueError for a glass that the format cannot hold (its formula, or a blank in its name).
     """
-    path = Path(path)
     content = format_agf(catalog).encode()
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        Path(temporary).chmod(0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    write_atomically(path, lambda file: file.write(content))
 
 
 def format_agf(catalog: Catalog) -> str:

@@ -30,6 +30,7 @@ from raytrace.agf import CatalogWarning as CatalogWarning
 from raytrace.agf import read_agf as read_agf
 from raytrace.agf import read_text
 from raytrace.agf import write_agf as write_agf
+from raytrace.files import shipped
 from raytrace.glass import Glass, refractive_index
 
 #: Shipped catalogs in the order they are searched: the makers by how often lens files name them, then collections,
@@ -139,11 +140,10 @@ def user_catalogs(user: Sequence[str | Path] = ()) -> tuple[Path, ...]:
 
 def shipped_folder() -> Path:
     """The folder of the shipped catalogs: inside the installed package, or beside it in a checkout."""
-    package = Path(__file__).resolve().parent
-    for folder in (package / "glass_catalogs", package.parent / "glass_catalogs"):
-        if (folder / f"{SHIPPED[0]}.AGF").is_file():
-            return folder
-    raise CatalogError(f"{package / 'glass_catalogs'}: no glass catalogs here; reinstall raytrace")
+    folder = shipped("glass_catalogs")
+    if not (folder / f"{SHIPPED[0]}.AGF").is_file():
+        raise CatalogError(f"{folder}: no glass catalogs here; reinstall raytrace")
+    return folder
 
 
 def shipped_catalog(name: str) -> Catalog:

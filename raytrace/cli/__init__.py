@@ -106,7 +106,9 @@ def _one_line(error: BaseException) -> str:
 
 
 def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
-    print(f"raytrace: warning: {_one_line(message)}", file=sys.stderr)
+    """Warnings of this package, one line each; those of libraries speak to programmers and are left out."""
+    if category.__module__.startswith("raytrace"):
+        print(f"raytrace: warning: {_one_line(message)}", file=sys.stderr)
 
 
 def _version() -> str:

@@ -4,19 +4,16 @@ import argparse
 import dataclasses
 import json
 import math
-import os
-import secrets
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from raytrace.formats import LensFileError, read_lens
+from raytrace.files import shipped
+from raytrace.formats import read_lens
 from raytrace.glass import check_wavelengths
 from raytrace.lens import Lens, SystemAperture, check, with_object_distance, with_sensor_distance
-from raytrace.resources import shipped
 
 
 class CommandError(ValueError):
@@ -140,22 +137,6 @@ def print_json(document: dict) -> None:
 def say(message: str) -> None:
     """One line for people, beside the results: to standard error."""
     print(f"raytrace: {message}", file=sys.stderr)
-
-
-def write_atomically(path: str | os.PathLike, write: Callable[[Path], None]) -> None:
-    """Call `write` on a temporary file beside `path`, then rename it; nothing is left if `write` fails."""
-    path = Path(os.path.realpath(path))  # a link is written through, not replaced
-    if path.exists() and not path.is_file():
-        raise CommandError(f"{path}: is not a regular file; give the name of a file to write")
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp{path.suffix}")
-    try:
-        write(temporary)
-        os.replace(temporary, path)
-    except BaseException as error:
-        temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError) and not isinstance(error, LensFileError):
-            raise CommandError(f"{path}: cannot be written: {error.strerror or error}") from error
-        raise
 
 
 def _with_aperture(lens: Lens, kind: str, value: float) -> Lens:

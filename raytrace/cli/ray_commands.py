@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+import warnings
 
 import torch
 from torch import Tensor
@@ -10,7 +11,9 @@ from raytrace import pupil
 from raytrace.cli import ray_table
 from raytrace.cli.door import (
     CommandError,
+    catalogs,
     field_points,
+    find_lens,
     number,
     numbers,
     open_lens,
@@ -18,11 +21,11 @@ from raytrace.cli.door import (
     print_json,
     ray_aiming,
     say,
-    write_atomically,
 )
+from raytrace.files import write_atomically
 from raytrace.focus import focus as best_focus
 from raytrace.focus import focus_moments, focus_of_merit, image_rays
-from raytrace.formats import write_lens
+from raytrace.formats import read_lens, write_lens
 from raytrace.launch import launch
 from raytrace.lens import FIELD_UNITS, Lens, with_object_distance, with_sensor_distance
 from raytrace.numerics import safe_sqrt
@@ -194,10 +197,9 @@ def _refuse_without_focus(arguments: argparse.Namespace, lens: Lens, points: Ten
 
 def _as_in_file(focused: Lens, arguments: argparse.Namespace) -> Lens:
     """The lens as the file has it, with the new sensor distance: a trial object distance is not part of the lens."""
-    from raytrace.cli.door import catalogs, find_lens
-    from raytrace.formats import read_lens
-
-    original = read_lens(find_lens(arguments.lens), catalogs=catalogs(arguments))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # said when the file was read first
+        original = read_lens(find_lens(arguments.lens), catalogs=catalogs(arguments))
     return with_sensor_distance(original, focused.surfaces[-2].thickness)
 
 
@@ -284,20 +286,23 @@ def trace(arguments: argparse.Namespace) -> None:
     if arguments.rays is not None:
         batches, total = ray_table.read(arguments.rays, lens)
     else:
-        batches, total = ray_table.chief_and_marginal(lens, ray_aiming(arguments))
+        batches, total, unaimed = ray_table.chief_and_marginal(lens, ray_aiming(arguments))
+        if unaimed:
+            say(f"warning: {unaimed} rays found no way to their point of the stop and are left out")
     fates = ray_table.Fates()
     if arguments.output:
-        write_atomically(
-            arguments.output, lambda path: ray_table.write(path, lens, batches, total, fates, progress=True)
-        )
+
+        def write(file):
+            ray_table.write_csv(lambda text: file.write(text.encode()), lens, batches, total, fates, progress=True)
+
+        write_atomically(arguments.output, write)
         if arguments.json:
             print_json({"rays": total, "output": arguments.output, "lost": fates.counts()})
         else:
             say(f"{total} rays written to {arguments.output}")
     elif arguments.json:
-        rows = [row for batch in batches for row in ray_table.rows(ray_table.traced(lens, batch, fates))]
-        print_json({"rays": total, "results": rows, "lost": fates.counts()})
+        ray_table.write_json(sys.stdout.write, lens, batches, total, fates)
     else:
-        ray_table.write(sys.stdout, lens, batches, total, fates, progress=False)
+        ray_table.write_csv(sys.stdout.write, lens, batches, total, fates, progress=False)
     for line in fates.lines():
         say(line)

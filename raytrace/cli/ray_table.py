@@ -1,12 +1,11 @@
 """Tables of rays: read the rays of `raytrace trace --rays`, write what became of them at every surface."""
 
+import json
 import math
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import IO
 
 import numpy as np
 import pandas
@@ -21,7 +20,7 @@ from raytrace.trace import axial_path, media, start, steps
 
 COLUMNS = ("x", "y", "z", "l", "m", "n")
 OUTPUT = ("ray", "surface", *COLUMNS, "opl", "status")
-_BATCH = 50_000
+_BATCH = 20_000
 
 
 @dataclass(frozen=True)
@@ -117,17 +116,19 @@ def _float(entry: object) -> float:
         return math.nan
 
 
-def chief_and_marginal(lens: Lens, ray_aiming: bool | None) -> tuple[list[Batch], int]:
-    """Chief, upper, lower and side ray of every field at the primary wavelength.
+def chief_and_marginal(lens: Lens, ray_aiming: bool | None) -> tuple[list[Batch], int, int]:
+    """Chief, upper, lower and side ray of every field at the primary wavelength; how many, and how many not aimed.
 
     Their path counts from the wavefront of the object point that passes the vertex of surface 1.
     """
     pupil = lens.wavelengths.new_tensor([[0.0, 0.0, 0.0, 1.0], [0.0, 1.0, -1.0, 0.0]])
     wavelength = lens.wavelengths[lens.primary_wavelength][None]
     rays = launch(lens, pupil, wavelengths=wavelength, ray_aiming=ray_aiming)
-    count = rays.valid.numel()
-    flat = Rays(rays.position.reshape(3, -1), rays.direction.reshape(3, -1), rays.valid.flatten(), rays.opl.flatten())
-    return [Batch(flat, wavelength.expand(count), 0)], count
+    found = rays.valid.flatten()
+    position, direction = rays.position.reshape(3, -1)[:, found], rays.direction.reshape(3, -1)[:, found]
+    count = int(found.sum())
+    kept = Rays(position, direction, found[found], rays.opl.flatten()[found])
+    return [Batch(kept, wavelength.expand(count), 0)], count, len(found) - count
 
 
 def traced(lens: Lens, batch: Batch, fates: Fates) -> pandas.DataFrame:
@@ -164,25 +165,28 @@ def traced(lens: Lens, batch: Batch, fates: Fates) -> pandas.DataFrame:
     return pandas.concat(frames).sort_values(["ray", "surface"], kind="stable", ignore_index=True)
 
 
-def rows(table: pandas.DataFrame) -> list[dict]:
-    """The table as JSON rows, null where a coordinate is empty."""
-    return [
-        {name: None if isinstance(entry, float) and math.isnan(entry) else entry for name, entry in row.items()}
-        for row in table.to_dict("records")
-    ]
+def write_json(put: Callable[[str], object], lens: Lens, batches: Iterable[Batch], total: int, fates: Fates) -> None:
+    """Write one JSON document batch by batch: {"rays", "results": [row, …], "lost"}; null for an empty coordinate."""
+    put(f'{{"rays": {total}, "results": [')
+    separator = "\n"
+    for batch in batches:
+        rows = traced(lens, batch, fates).to_dict("records")
+        put(separator + ",\n".join(json.dumps(_without_nan(row)) for row in rows))
+        separator = ",\n"
+    put(f'\n], "lost": {json.dumps(fates.counts())}}}\n')
 
 
-def write(
-    target: Path | IO[str], lens: Lens, batches: Iterable[Batch], total: int, fates: Fates, *, progress: bool
+def _without_nan(row: dict) -> dict:
+    return {name: None if isinstance(entry, float) and math.isnan(entry) else entry for name, entry in row.items()}
+
+
+def write_csv(
+    put: Callable[[str], object], lens: Lens, batches: Iterable[Batch], total: int, fates: Fates, *, progress: bool
 ) -> None:
     """Write the traced batches as CSV; every float as the shortest text that reads back the same."""
-    header = True
+    put(",".join(OUTPUT) + "\n")
     hide = not (progress and total > _BATCH)
     with tqdm(total=total, unit="ray", unit_scale=True, disable=hide) as bar:
         for batch in batches:
-            table = traced(lens, batch, fates)
-            table.to_csv(target, mode="w" if header else "a", header=header, index=False)
-            header = False
+            put(traced(lens, batch, fates).to_csv(header=False, index=False))
             bar.update(len(batch.wavelength))
-    if header:
-        pandas.DataFrame(columns=list(OUTPUT)).to_csv(target, index=False)

@@ -1,12 +1,12 @@
 """Lens files: the suffix of a file names its format; reading gives a Lens, writing brings every number back exactly."""
 
 import os
-import secrets
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from raytrace.files import write_atomically
 from raytrace.formats import table, table_write, zemax, zemax_write
 from raytrace.formats.report import ImportReport as ImportReport
 from raytrace.formats.source import LensFileError as LensFileError
@@ -61,7 +61,11 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
     hold and where the file cannot be written.
     """
     path = Path(path)
-    _replace(path, _format(path).write(lens, str(path), catalogs=tuple(catalogs)))
+    content = _format(path).write(lens, str(path), catalogs=tuple(catalogs))
+    try:
+        write_atomically(path, lambda file: file.write(content))
+    except OSError as error:
+        raise LensFileError(error.strerror or str(error), Place(str(path))) from error
 
 
 def _format(path: Path) -> Format:
@@ -71,22 +75,3 @@ def _format(path: Path) -> Format:
         found = f"the suffix {path.suffix!r} names no format" if path.suffix else "has no suffix to name its format"
         raise LensFileError(f"{found} of lens files; expected one of {known}", Place(str(path)))
     return form
-
-
-def _replace(path: Path, content: bytes) -> None:
-    target = Path(os.path.realpath(path))
-    if target.exists() and not target.is_file():
-        raise LensFileError("is not a regular file; give the name of a file to write", Place(str(path)))
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(6)}.tmp")
-    try:
-        with open(temporary, "xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, target)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise LensFileError(f"cannot be written: {error.strerror or error}", Place(str(path))) from error
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise

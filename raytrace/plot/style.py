@@ -3,7 +3,6 @@
 import functools
 import math
 import os
-import secrets
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
+from raytrace.files import write_atomically
 from raytrace.lens import FIELD_UNITS, Lens
 from raytrace.paraxial import FirstOrder
 
@@ -88,19 +88,11 @@ def save(figure: Figure, path: str | os.PathLike, *, dpi: float = 200) -> None:
     The same figure, built again, gives the same bytes. Raises ValueError for another suffix, OSError where nothing can
     be written.
     """
-    target = Path(os.path.realpath(path))
-    metadata = SUFFIXES.get(target.suffix.lower())
-    if metadata is None:
-        found = f"the suffix {target.suffix!r}" if target.suffix else "no suffix"
+    suffix = Path(path).suffix.lower()
+    if suffix not in SUFFIXES:
+        found = f"the suffix {Path(path).suffix!r}" if suffix else "no suffix"
         raise ValueError(f"{path}: {found} names no format of figures; expected one of {', '.join(SUFFIXES)}")
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(6)}.tmp")
-    try:
-        with open(temporary, "xb") as file:
-            figure.savefig(file, format=target.suffix.lower()[1:], dpi=dpi, metadata=metadata)
-        os.replace(temporary, target)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    write_atomically(path, lambda file: figure.savefig(file, format=suffix[1:], dpi=dpi, metadata=SUFFIXES[suffix]))
 
 
 def detached(lens: Lens) -> Lens:
