@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from raytrace.grid import Grid, centres
+from raytrace.numerics import safe_divide, safe_sqrt
 from raytrace.pupil import gauss_rings
 
 
@@ -80,6 +81,28 @@ def to_grid(field: Tensor, L: Tensor, M: Tensor, x: Tensor, y: Tensor, wavelengt
     return along_y @ (field[..., :, None] * along_x)
 
 
+def to_grid_mirrored(field: Tensor, L: Tensor, M: Tensor, x: Tensor, y: Tensor, wavelength: Tensor) -> Tensor:
+    """The same sum over waves in pairs (L, M) and (-L, M) of equal field, of which one is given: half a real product."""
+    turns = L[..., :, None] * (x[..., None, :] / wavelength[..., None, None])
+    cosine = 2 * torch.cos(2 * math.pi * _fraction(turns))
+    along_y = phasor(y[..., :, None] * (M[..., None, :] / wavelength[..., None, None])) * field[..., None, :]
+    return torch.complex(along_y.real @ cosine, along_y.imag @ cosine)
+
+
+def rings_to_grid(field: Tensor, sine: Tensor, x: Tensor, y: Tensor, wavelength: Tensor) -> Tensor:
+    """U(y, x) = Σ_j field_j J₀(2π s_j ρ/λ), (..., Y, X): cones of waves (..., J) about the axis, s their sine."""
+    distance = safe_sqrt(y[..., :, None] ** 2 + x[..., None, :] ** 2)
+    argument = distance[..., None] * (2 * math.pi * sine / wavelength[..., None])[..., None, None, :]
+    J0 = bessel_j0(argument).flatten(-3, -2)
+    U = torch.complex(*(J0 @ part[..., None] for part in (field.real, field.imag)))
+    return U[..., 0].unflatten(-1, distance.shape[-2:])
+
+
+def bessel_j0(x: Tensor) -> Tensor:
+    """J₀ with its derivatives (those of torch.special detach silently)."""
+    return _J0.apply(x)
+
+
 def rings_and_arms(phase: float, order: int) -> tuple[int, int]:
     """Gauss rings and arms that integrate waves whose phase varies by `phase` radians along a pupil radius.
 
@@ -105,7 +128,7 @@ def disc_rule(phase: float, order: int, *, most: int, what: str, like: Tensor) -
 
 def nodes_per_pixel(pitch: float, cutoff: float, order: int) -> int:
     """Gauss-Legendre nodes across a pixel for an intensity with spatial frequencies up to `cutoff` in 1/mm."""
-    return math.ceil(0.5 * math.pi * cutoff * pitch / 2) + 2 + order
+    return math.ceil(0.5 * math.pi * cutoff * pitch / 2) + 4 + order
 
 
 def sub_pixels(grid: Grid, nodes: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -124,3 +147,37 @@ def integrate(intensity: Tensor, weight: Tensor, pitch: Tensor) -> Tensor:
 
 def _fraction(waves: Tensor) -> Tensor:
     return waves - torch.round(waves.detach())
+
+
+class _J0(torch.autograd.Function):
+    """J₀' = -J₁."""
+
+    @staticmethod
+    def forward(x):
+        return torch.special.bessel_j0(x)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx, gradient):
+        return -gradient * _J1.apply(*ctx.saved_tensors)
+
+
+class _J1(torch.autograd.Function):
+    """J₁' = J₀ - J₁/x, 1/2 at 0."""
+
+    @staticmethod
+    def forward(x):
+        return torch.special.bessel_j1(x)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.save_for_backward(*inputs)
+
+    @staticmethod
+    def backward(ctx, gradient):
+        (x,) = ctx.saved_tensors
+        quotient = torch.where(x == 0, 0.5, safe_divide(_J1.apply(x), x))
+        return gradient * (_J0.apply(x) - quotient)

@@ -15,7 +15,17 @@ from torch import Tensor
 from raytrace import zernike
 from raytrace.grid import Grid
 from raytrace.numerics import safe_divide, safe_sqrt
-from raytrace.psf.dft import disc_rule, integrate, nodes_per_pixel, phasor, rings_and_arms, sub_pixels, to_grid
+from raytrace.psf.dft import (
+    disc_rule,
+    integrate,
+    nodes_per_pixel,
+    phasor,
+    rings_and_arms,
+    rings_to_grid,
+    sub_pixels,
+    to_grid,
+    to_grid_mirrored,
+)
 from raytrace.psf.scene import Kernels, Scene
 from raytrace.pupil import gauss_rings
 from raytrace.value import value
@@ -32,10 +42,12 @@ class Waves:
     """Plane waves that meet at the sensor: (D, F, W, P) of one field, ready to be summed.
 
     amplitude: √(E Ω), 0 where no light comes; wavefront: its OPD, directions and centre.
+    symmetry: "round": each ray stands for its ring; "mirror": for itself and its image in x; "none".
     """
 
     amplitude: Tensor
     wavefront: Wavefront
+    symmetry: str
 
 
 def kernels(scene: Scene, grid: Grid, *, order: int = 0) -> Kernels:
@@ -57,18 +69,24 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0) -> Kernels:
 def waves(scene: Scene, reach: Tensor | float, *, order: int = 0) -> Waves:
     """Waves of one field, sampled for points up to `reach` mm from the chief ray's point.
 
-    The rays are Gauss rings over the pupil; where it is vignetted, over the clear part of every arm.
+    The rays are Gauss rings over the pupil; where it is vignetted, over the clear part of every arm. One arm is enough
+    on the axis of a round lens, half the arms for a field in the y-z plane.
     """
-    probe = wavefront(scene, *gauss_rings(*_PROBE, dtype=scene.wavelengths.dtype, device=scene.wavelengths.device))
-    directions = _direction_map(probe)
-    rule = disc_rule(phase_along_radius(probe, reach), order, most=_MOST_RAYS, what="the wave model", like=probe.opd)
-    pupil, weights = rule
-    rim = _clear_arms(scene, probe, rings_and_arms(phase_along_radius(probe, reach), order)[1])
-    if rim is not None:
-        pupil, weights = _between(*rim, *rule)
+    probe, symmetry = _probe(scene), _symmetry(scene)
+    phase = phase_along_radius(probe, reach)
+    rings, arms = rings_and_arms(phase, order)
+    if symmetry == "round":
+        arms, rule = 1, gauss_rings(rings, 1, dtype=probe.opd.dtype, device=probe.opd.device)
+    else:
+        rule = disc_rule(phase, order, most=_MOST_RAYS, what="the wave model", like=probe.opd)
+    clear = _clear_arms(scene, arms, like=probe.opd)
+    pupil, weights = rule if clear is None else _between(*clear, *rule)
+    if symmetry == "mirror":
+        right = rule[0][0] > 0
+        pupil, weights = pupil[..., right], 2 * weights[..., right]
     front = wavefront(scene, pupil, weights)
-    solid = math.pi * weights * _jacobian(directions, pupil)
-    return Waves(safe_sqrt(front.energy * solid), front)
+    solid = math.pi * weights * _jacobian(_direction_map(probe), pupil)
+    return Waves(safe_sqrt(front.energy * solid), front, symmetry)
 
 
 def amplitude(waves: Waves, x: Tensor, y: Tensor) -> Tensor:
@@ -77,14 +95,20 @@ def amplitude(waves: Waves, x: Tensor, y: Tensor) -> Tensor:
     wavelength = 1e-3 * front.wavelength
     L, M, _ = front.direction
     field = waves.amplitude * phasor(front.opd / wavelength[:, None])
-    U = to_grid(field, L, M, x, y, (wavelength / front.index).expand(field.shape[:-1]))
-    return (front.index / wavelength)[:, None, None] * U
+    inside = (wavelength / front.index).expand(field.shape[:-1])
+    if waves.symmetry == "round":
+        U = rings_to_grid(field, safe_sqrt(L * L + M * M), x, y, inside)
+    elif waves.symmetry == "mirror":
+        U = to_grid_mirrored(0.5 * field, L, M, x, y, inside)
+    else:
+        U = to_grid(field, L, M, x, y, inside)
+    return U / inside[..., None, None]
 
 
 def strehl(scene: Scene, *, order: int = 0) -> Tensor:
     """Strehl ratio (D, F, W): the largest intensity on the sensor over Σ² of the same amplitudes without aberrations.
 
-    The best point of the sensor plane is searched without gradient (to first order the value does not depend on it);
+    The best point of the sensor plane, within 4 λ/NA of the centroid, is searched without gradient (to first order the value does not depend on it);
     0 where no light arrives.
     """
     ratios = [_strehl(_one_field(scene, f), order) for f in range(scene.shape[1])]
@@ -105,7 +129,7 @@ def phase_along_radius(probe: Wavefront, reach: Tensor | float) -> float:
 
 def _field_kernels(scene: Scene, grid: Grid, order: int) -> tuple:
     """Rays, kernel (D, 1, W, rows, columns), centroid, covariance and residual of one field."""
-    probe = wavefront(scene, *gauss_rings(*_PROBE, dtype=grid.pitch.dtype, device=grid.pitch.device))
+    probe = _probe(scene)
     centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))) - probe.centre[:2]
     local = Grid(grid.pitch, grid.rows, grid.columns, centre)
     cutoff = 2e3 * float((_half_spread(probe) * probe.index / probe.wavelength).max())
@@ -113,19 +137,44 @@ def _field_kernels(scene: Scene, grid: Grid, order: int) -> tuple:
     corner = torch.hypot(x.detach().abs().amax(-1), y.detach().abs().amax(-1)).max()
     light = waves(scene, corner, order=order)
     U = amplitude(light, x, y)
-    centroid, covariance = _moments(light.wavefront)
+    centroid, covariance = _moments(light)
     residual = _debye_residual(light.wavefront, probe, corner)
     kernel = integrate(U.real**2 + U.imag**2, weight, grid.pitch)
     return light.amplitude.shape[-1], kernel, centroid, covariance, residual
 
 
-def _moments(front: Wavefront) -> tuple[Tensor, Tensor]:
+def _probe(scene: Scene) -> Wavefront:
+    """A few hundred rays that find the blur, the map of directions and so the sampling."""
+    points, weights = gauss_rings(*_PROBE, dtype=scene.wavelengths.dtype, device=scene.wavelengths.device)
+    return wavefront(scene, points, weights)
+
+
+def _symmetry(scene: Scene) -> str:
+    """What a field of a lens has in common with its mirror images; "none" where a gradient may break it."""
+    apertures = [a for surface in scene.lens.surfaces for a in surface.apertures]
+    if scene.fields.requires_grad or scene.lens.fields.vignetting is not None or bool((scene.fields[0] != 0).any()):
+        return "none"
+    if any(a.centre[0] != 0 for a in apertures):
+        return "none"
+    if bool((scene.fields[1] != 0).any()) or any(a.centre[1] != 0 or a.shape != "circular" for a in apertures):
+        return "mirror"
+    return "round"
+
+
+def _moments(light: Waves) -> tuple[Tensor, Tensor]:
     """Centroid (2, ...) mm on the sensor and covariance (3, ...) mm² of the rays."""
+    front = light.wavefront
     share = safe_divide(front.energy, front.energy.sum(-1, keepdim=True))
     x, y = torch.where(front.valid, front.landing, 0.0)
+    if light.symmetry == "round":
+        variance, zero = 0.5 * (share * (x * x + y * y)).sum(-1), torch.zeros_like(share[..., 0])
+        return front.centre[:2], torch.stack([variance, zero, variance])
     mean_x, mean_y = (share * x).sum(-1), (share * y).sum(-1)
+    if light.symmetry == "mirror":
+        mean_x = torch.zeros_like(mean_x)
     x, y = x - mean_x[..., None], y - mean_y[..., None]
-    covariance = torch.stack([(share * x * x).sum(-1), (share * x * y).sum(-1), (share * y * y).sum(-1)])
+    xy = torch.zeros_like(mean_x) if light.symmetry == "mirror" else (share * x * y).sum(-1)
+    covariance = torch.stack([(share * x * x).sum(-1), xy, (share * y * y).sum(-1)])
     return front.centre[:2] + torch.stack([mean_x, mean_y]), covariance
 
 
@@ -167,14 +216,14 @@ def _jacobian(directions: Tensor, pupil: Tensor) -> Tensor:
     return (L_x * M_y - L_y * M_x).abs()
 
 
-def _clear_arms(scene: Scene, probe: Wavefront, arms: int) -> tuple[Tensor, Tensor] | None:
+def _clear_arms(scene: Scene, arms: int, *, like: Tensor) -> tuple[Tensor, Tensor] | None:
     """Radii (D, F, W, arms) between which light passes along each arm of a ring rule; None if everything passes.
 
     The first and the last clear point of a scan, refined by repeated division; no gradient. A gap inside (the arm of a
     spider) stays: its rays are blocked one by one.
     """
     with torch.no_grad():
-        angle = (torch.arange(arms, dtype=probe.opd.dtype, device=probe.opd.device) + 0.5) * (2 * math.pi / arms)
+        angle = (torch.arange(arms, dtype=like.dtype, device=like.device) + 0.5) * (2 * math.pi / arms)
         unit = torch.stack([torch.cos(angle), torch.sin(angle)])
 
         def clear(radii: Tensor) -> Tensor:
@@ -220,22 +269,22 @@ def _between(inner: Tensor, outer: Tensor, pupil: Tensor, weights: Tensor) -> tu
 
 
 def _strehl(scene: Scene, order: int) -> Tensor:
-    light = waves(scene, 0.0, order=order + 1)
+    probe = _probe(scene)
+    spacing = 0.25e-3 * probe.wavelength / probe.index / _half_spread(probe).clamp_min(1e-30)
+    light = waves(scene, 20 * spacing.max(), order=order + 1)
     front = light.wavefront
-    wavelength = 1e-3 * front.wavelength / front.index
-    spacing = 0.25 * wavelength / _half_spread(front).clamp_min(1e-30)
-    peak = light.amplitude.sum(-1) / wavelength
     with torch.no_grad():
-        x, y = _moments(front)[0] - front.centre[:2]
+        x, y = _moments(light)[0] - front.centre[:2]
         offsets = torch.arange(-16, 17, dtype=x.dtype, device=x.device)
         for _ in range(8):
-            grid_x, grid_y = (c[..., None] + offsets * spacing[..., None] for c in (x, y))
-            U = amplitude(light, grid_x, grid_y)
+            near_x, near_y = (c[..., None] + offsets * spacing[..., None] for c in (x, y))
+            U = amplitude(light, near_x, near_y)
             best = (U.real**2 + U.imag**2).flatten(-2).argmax(-1, keepdim=True)
-            x = torch.gather(grid_x, -1, best % len(offsets))[..., 0]
-            y = torch.gather(grid_y, -1, best // len(offsets))[..., 0]
+            x = torch.gather(near_x, -1, best % len(offsets))[..., 0]
+            y = torch.gather(near_y, -1, best // len(offsets))[..., 0]
             spacing = spacing / 8
     U = amplitude(light, x[..., None], y[..., None])[..., 0, 0]
+    peak = light.amplitude.sum(-1) / (1e-3 * front.wavelength / front.index)
     return safe_divide(U.real**2 + U.imag**2, peak**2)
 
 

@@ -19,9 +19,17 @@ from torch import Tensor
 from raytrace import zernike as polynomials
 from raytrace.grid import Grid
 from raytrace.launch import is_at_infinity, object_field
-from raytrace.numerics import safe_divide, safe_sqrt
 from raytrace.paraxial import first_order, signed, system_matrix
-from raytrace.psf.dft import disc_rule, integrate, nodes_per_pixel, phasor, rings_and_arms, sub_pixels, to_grid
+from raytrace.psf.dft import (
+    disc_rule,
+    integrate,
+    nodes_per_pixel,
+    phasor,
+    rings_and_arms,
+    rings_to_grid,
+    sub_pixels,
+    to_grid,
+)
 from raytrace.psf.scene import Kernels, Scene
 from raytrace.pupil import gauss_rings, with_rim
 from raytrace.trace import media
@@ -87,11 +95,6 @@ def paraxial(scene: Scene) -> Paraxial:
     return Paraxial(defocus.expand(shape), (waves * n[-1] / z_i).expand(shape), chief.expand(2, *shape))
 
 
-def bessel_j0(x: Tensor) -> Tensor:
-    """J₀ with its derivatives (those of torch.special detach silently)."""
-    return _J0.apply(x)
-
-
 def _intensity(x: Tensor, y: Tensor, defocus: Tensor, frequency: Tensor, waves: Tensor | None, *, order: int) -> Tensor:
     """|U|² (Y, X) per mm² at x (X,), y (Y,) mm from the chief ray, with Noll coefficients in waves (J,) or None.
 
@@ -103,10 +106,8 @@ def _intensity(x: Tensor, y: Tensor, defocus: Tensor, frequency: Tensor, waves: 
         rings, _ = rings_and_arms(phase, order)
         radius, weights = _rings(rings, like=x)
         spectrum = weights * phasor(defocus * radius * radius / (2 * math.pi))
-        distance = safe_sqrt(y[:, None] ** 2 + x**2)
-        J0 = bessel_j0(2 * math.pi * frequency * distance[..., None] * radius)
-        real, imaginary = J0 @ spectrum.real, J0 @ spectrum.imag
-        return math.pi * frequency**2 * (real * real + imaginary * imaginary)
+        U = rings_to_grid(spectrum, radius, x, y, 1 / frequency)
+        return math.pi * frequency**2 * (U.real**2 + U.imag**2)
     phase += _steepest(waves)
     points, weights = disc_rule(phase, order, most=_MOST_POINTS, what="the Fourier model", like=x)
     path = waves @ _noll(len(waves), points) + defocus * (points**2).sum(0) / (2 * math.pi)
@@ -160,37 +161,3 @@ def _rings(count: int, *, like: Tensor) -> tuple[Tensor, Tensor]:
     """Radii and weights (sum 1) of Gauss rings."""
     points, weights = gauss_rings(count, 1, dtype=like.dtype, device=like.device)
     return torch.hypot(*points), weights
-
-
-class _J0(torch.autograd.Function):
-    """J₀' = -J₁."""
-
-    @staticmethod
-    def forward(x):
-        return torch.special.bessel_j0(x)
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        ctx.save_for_backward(*inputs)
-
-    @staticmethod
-    def backward(ctx, gradient):
-        return -gradient * _J1.apply(*ctx.saved_tensors)
-
-
-class _J1(torch.autograd.Function):
-    """J₁' = J₀ - J₁/x, 1/2 at 0."""
-
-    @staticmethod
-    def forward(x):
-        return torch.special.bessel_j1(x)
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        ctx.save_for_backward(*inputs)
-
-    @staticmethod
-    def backward(ctx, gradient):
-        (x,) = ctx.saved_tensors
-        quotient = torch.where(x == 0, 0.5, safe_divide(_J1.apply(x), x))
-        return gradient * (_J0.apply(x) - quotient)
