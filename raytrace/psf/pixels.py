@@ -1,5 +1,7 @@
 """Pixels: the energy of a two-dimensional Gaussian in every pixel of a grid."""
 
+import itertools
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -90,19 +92,16 @@ def _rotated(across: tuple, along: tuple, xx: Tensor, xy: Tensor, yy: Tensor) ->
     1954), derivatives in the covariance are integrals over edges and values at corners. An edge is a density in
     one coordinate times a Φ difference in the other.
     """
-    (x0, x1, *_), (y0, y1, *_) = across, along
     det = _determinant(xx, xy, yy)
-    with_x = _edge(across[:2], along, xx, xy, det)
-    with_y = _edge(along[:2], across, yy, xy, det)
-    corners = with_x[2]
+    x, y = _edges(across, along, xx, xy, det), _edges(along, across, yy, xy, det)
     derivatives = [
-        (x0, -with_x[0][0]),
-        (x1, with_x[0][1]),
-        (y0, -with_y[0][0]),
-        (y1, with_y[0][1]),
-        (xx, 0.5 * (with_x[1][1] - with_x[1][0])),
-        (yy, 0.5 * (with_y[1][1] - with_y[1][0])),
-        (xy, corners[1] - corners[0]),
+        (across[2], x[0]),
+        (across[3], x[1]),
+        (along[2], y[0]),
+        (along[3], y[1]),
+        (xx, 0.5 * x[2]),
+        (yy, 0.5 * y[2]),
+        (xy, x[3]),
     ]
     value = _rule(*([t.detach() for t in side] for side in (across, along)), *(t.detach() for t in (xx, xy, yy, det)))
     # Σ (p - p₀) ½ (g(p) + g(p₀)) is 0 and has the first derivative g and the second derivative ∂g of P itself.
@@ -127,20 +126,35 @@ def _determinant(xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
     return (plain - plain.detach()) + ((p - q) + (dp - dq)).clamp_min(0.0)
 
 
-def _edge(edge: tuple, other: tuple, variance: Tensor, xy: Tensor, det: Tensor) -> tuple[list, list, list]:
-    """At both edges x of a pixel: ∫ p dy, ∫ ∂p/∂x dy, and p at its upper end less p at its lower end."""
+def _edges(side: tuple, other: tuple, variance: Tensor, xy: Tensor, det: Tensor) -> tuple[Tensor, ...]:
+    """E₁ - E₀, E₁ + E₀, E′₁ - E′₀ and C₁ - C₀ of the edges x₀, x₁ of a pixel.
+
+    E(x) = ∫ p dy and E′(x) = ∫ ∂p/∂x dy over an edge, C(x): p at its upper end less p at its lower end.
+    """
     lower, upper, middle, half = other
     sigma, slope = safe_sqrt(variance), safe_divide(xy, variance)
     s = safe_sqrt(safe_divide(det, variance))
-    densities, slopes, ends = [], [], []
-    for x in edge:
-        own = _density(x, sigma)
-        energy = own * _interval(lower - slope * x, upper - slope * x, middle - slope * x, half, s)
-        end = own * (_density(upper - slope * x, s) - _density(lower - slope * x, s))
-        densities.append(energy)
-        slopes.append(-(safe_divide(x, variance.expand_as(x) if x.dim() else variance) * energy) - slope * end)
-        ends.append(end)
-    return densities, slopes, ends
+    own, strip, energy, tilt, ends = [], [], [], [], []
+    for x in side[:2]:
+        shift = slope * x
+        own.append(_density(x, sigma))
+        strip.append(_interval(lower - shift, upper - shift, middle - shift, half, s))
+        ends.append(own[-1] * (_density(upper - shift, s) - _density(lower - shift, s)))
+        energy.append(own[-1] * strip[-1])
+        tilt.append(-(safe_divide(x, torch.broadcast_tensors(variance, x)[0]) * energy[-1]) - slope * ends[-1])
+    difference = 0.5 * (
+        _difference(own, side, sigma) * (strip[0] + strip[1]) + (own[0] + own[1]) * (strip[1] - strip[0])
+    )
+    return difference, energy[0] + energy[1], tilt[1] - tilt[0], ends[1] - ends[0]
+
+
+def _difference(density: list, side: tuple, sigma: Tensor) -> Tensor:
+    """Density at x₁ less that at x₀; for a narrow pixel -2 p(m) exp(-h²/2) sinh(m h), which does not cancel."""
+    m, h = (_standard(distance, sigma) for distance in side[2:])
+    narrow = (h <= 1) & ((h * m).abs() <= 1)
+    h, m = torch.where(narrow, h, 0.0), torch.where(narrow, m, 0.0)
+    stable = safe_divide(-2 * _bell(m) * torch.exp(-0.5 * h * h) * torch.sinh(m * h), sigma)
+    return torch.where(narrow, stable, density[1] - density[0])
 
 
 def _rule(across: list, along: list, xx: Tensor, xy: Tensor, yy: Tensor, det: Tensor) -> Tensor:
@@ -170,7 +184,7 @@ def _rule(across: list, along: list, xx: Tensor, xy: Tensor, yy: Tensor, det: Te
     cuts = torch.stack([torch.minimum(torch.maximum(piece - origin, a), b) for piece in pieces]).sort(0).values
     total = torch.zeros_like(a)
     nodes, weights = (total.new_tensor(t).reshape(-1, *(1,) * total.dim()) for t in (_NODES, _WEIGHTS))
-    for start, end in zip(cuts[:-1], cuts[1:], strict=True):
+    for start, end in itertools.pairwise(cuts):
         length = 0.5 * (end - start)
         u = origin + (start + (1 + nodes) * length)
         shift = rho * u
