@@ -44,7 +44,14 @@ def sag_and_derivatives(
     return S, dS, d2S
 
 
-@torch.library.custom_op("raytrace::asphere_root", mutates_args=())
+# An operator by the lower door of torch.library: `torch.library.custom_op` would load the compiler at its first call.
+torch.library.define(
+    "raytrace::asphere_root",
+    "(Tensor foot, Tensor direction, Tensor curvature, Tensor conic, Tensor coefficients, float rim)"
+    " -> (Tensor, Tensor)",
+)
+
+
 def asphere_root(
     foot: Tensor, direction: Tensor, curvature: Tensor, conic: Tensor, coefficients: Tensor, rim: float
 ) -> tuple[Tensor, Tensor]:
@@ -52,8 +59,13 @@ def asphere_root(
 
     foot, direction: (3, ...); curvature, conic: (...); coefficients: (m, ...); rim: mm, semi-diameter within which
     the first crossing is wanted (inf: the whole sag); a crossing outside the rim is taken only if there is none in it.
-    Worked in float64 also for float32 rays.
+    Worked in float64 also for float32 rays; not differentiated: hand it detached tensors.
     """
+    return torch.ops.raytrace.asphere_root(foot, direction, curvature, conic, coefficients, rim)
+
+
+@torch.library.impl("raytrace::asphere_root", "CompositeExplicitAutograd")
+def _(foot: Tensor, direction: Tensor, curvature: Tensor, conic: Tensor, coefficients: Tensor, rim: float):
     batch = torch.broadcast_shapes(
         foot.shape[1:], direction.shape[1:], curvature.shape, conic.shape, coefficients.shape[1:]
     )
@@ -78,7 +90,7 @@ def asphere_root(
     return t.reshape(batch).to(foot.dtype), good.reshape(batch).clone()
 
 
-@asphere_root.register_fake
+@torch.library.register_fake("raytrace::asphere_root")
 def _(foot, direction, curvature, conic, coefficients, rim):
     batch = torch.broadcast_shapes(
         foot.shape[1:], direction.shape[1:], curvature.shape, conic.shape, coefficients.shape[1:]
@@ -86,7 +98,7 @@ def _(foot, direction, curvature, conic, coefficients, rim):
     return foot.new_empty(batch), foot.new_empty(batch, dtype=torch.bool)
 
 
-@asphere_root.register_vmap
+@torch.library.register_vmap("raytrace::asphere_root")
 def _(info, in_dims, foot, direction, curvature, conic, coefficients, rim):
     """Move the mapped axis in front of the batch axes, and give every mapped argument the same batch rank."""
     tensors = (foot, direction, curvature, conic, coefficients)

@@ -91,6 +91,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def script() -> None:
     """The console script: `main` on the arguments of the process."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")  # a terminal without µ shows ?
     sys.exit(main())
 
 
@@ -102,6 +105,8 @@ def _fail(message: str, code: int) -> int:
 def _one_line(error: BaseException) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
+    if isinstance(error, OSError) and error.strerror:
+        return f"output: {error.strerror}"
     return " ".join(str(error).split()) or type(error).__name__
 
 

@@ -6,6 +6,7 @@ import warnings
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from raytrace import pupil
 from raytrace.cli import ray_table
@@ -30,6 +31,7 @@ from raytrace.launch import launch
 from raytrace.lens import FIELD_UNITS, Lens, with_object_distance, with_sensor_distance
 from raytrace.numerics import safe_sqrt
 from raytrace.paraxial import first_order, paraxial_image_distance
+from raytrace.rays import Rays
 from raytrace.spot import Spot, spot_of_points
 from raytrace.spot import spot as spot_of
 from raytrace.trace import media, steps
@@ -52,13 +54,9 @@ def spot(arguments: argparse.Namespace) -> None:
     fields = field_points(lens, arguments)
     # The rim carries no weight: it shows in the geometric radius, which Gaussian nodes inside the pupil miss.
     points, weights = pupil.with_rim(*pupil_points(arguments))
-    rays = launch(lens, points, fields=fields, ray_aiming=ray_aiming(arguments))
-    launched = rays.valid
-    vignetted = torch.zeros_like(launched)
-    for crossing in steps(lens.surfaces[1:], rays, indices=media(lens, lens.wavelengths[:, None])):
-        rays, vignetted = crossing.rays, vignetted | crossing.clipped
-    if not bool(launched.all()):
-        say(f"warning: {int((~launched).sum())} of {launched.numel()} rays found no way to their point of the stop")
+    rays, unaimed, vignetted = _to_sensor(lens, points, fields, ray_aiming(arguments))
+    if unaimed:
+        say(f"warning: {unaimed} of {rays.valid.numel()} rays found no way to their point of the stop")
     spots = spot_of(rays, weights)
     if arguments.plot:
         from raytrace import plot
@@ -85,6 +83,27 @@ def spot(arguments: argparse.Namespace) -> None:
             rms, geometric = 1000 * float(whole.rms_radius), 1000 * float(whole.geometric_radius)
             x, y = whole.centroid.tolist()
             print(f"{'':>10} {'all':>11} {x:>13.7f} {y:>13.7f} {rms:>10.4f} {geometric:>10.4f}")
+
+
+def _to_sensor(lens: Lens, points: Tensor, fields: Tensor, aiming: bool | None) -> tuple[Rays, int, Tensor]:
+    """Rays (3, F, W, P) on the sensor, traced field by field; how many were not aimed; which were vignetted."""
+    indices = media(lens, lens.wavelengths[:, None])
+    arrived, vignetted, unaimed = [], [], 0
+    long = points.shape[1] * len(lens.wavelengths) * fields.shape[1] * len(lens.surfaces) > 1_000_000
+    for field in tqdm(fields.unbind(1), unit="field", disable=not long):
+        rays = launch(lens, points, fields=field[:, None], ray_aiming=aiming)
+        unaimed += int((~rays.valid).sum())
+        clipped = torch.zeros_like(rays.valid)
+        for crossing in steps(lens.surfaces[1:], rays, indices=indices):
+            rays, clipped = crossing.rays, clipped | crossing.clipped
+        arrived.append(rays)
+        vignetted.append(clipped)
+    joined = Rays(
+        torch.cat([rays.position for rays in arrived], 1),
+        torch.cat([rays.direction for rays in arrived], 1),
+        torch.cat([rays.valid for rays in arrived]),
+    )
+    return joined, unaimed, torch.cat(vignetted)
 
 
 def polychromatic(lens: Lens, spots: Spot, weights: Tensor, field: int) -> Spot:
