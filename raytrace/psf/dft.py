@@ -82,7 +82,7 @@ def to_grid(field: Tensor, L: Tensor, M: Tensor, x: Tensor, y: Tensor, wavelengt
 
 
 def to_grid_mirrored(field: Tensor, L: Tensor, M: Tensor, x: Tensor, y: Tensor, wavelength: Tensor) -> Tensor:
-    """The same sum over waves in pairs (L, M) and (-L, M) of equal field, of which one is given: half a real product."""
+    """The same sum over waves in pairs (L, M) and (-L, M) of equal field, one of which is given: a real product."""
     turns = L[..., :, None] * (x[..., None, :] / wavelength[..., None, None])
     cosine = 2 * torch.cos(2 * math.pi * _fraction(turns))
     along_y = phasor(y[..., :, None] * (M[..., None, :] / wavelength[..., None, None])) * field[..., None, :]

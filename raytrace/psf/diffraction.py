@@ -7,13 +7,17 @@ directions, so that the intensity |U|² holds the transmitted light (Parseval), 
 W is the OPD on the reference sphere and (L, M) point from there to its centre (Debye's integral, Born & Wolf §8.8.1).
 """
 
+import dataclasses
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from raytrace import zernike
 from raytrace.grid import Grid
+from raytrace.launch import rays_of_field, vignette
+from raytrace.lens import with_object_distance
 from raytrace.numerics import safe_divide, safe_sqrt
 from raytrace.psf.dft import (
     disc_rule,
@@ -28,6 +32,8 @@ from raytrace.psf.dft import (
 )
 from raytrace.psf.scene import Kernels, Scene
 from raytrace.pupil import gauss_rings
+from raytrace.surface import inside
+from raytrace.trace import media, steps
 from raytrace.value import value
 from raytrace.wavefront import Wavefront, rays_on_sensor, wavefront
 
@@ -108,8 +114,8 @@ def amplitude(waves: Waves, x: Tensor, y: Tensor) -> Tensor:
 def strehl(scene: Scene, *, order: int = 0) -> Tensor:
     """Strehl ratio (D, F, W): the largest intensity on the sensor over Σ² of the same amplitudes without aberrations.
 
-    The best point of the sensor plane, within 4 λ/NA of the centroid, is searched without gradient (to first order the value does not depend on it);
-    0 where no light arrives.
+    The best point of the sensor plane, within 4 λ/NA of the centroid, is searched without gradient: to first order the
+    value does not depend on it. 0 where no light arrives.
     """
     ratios = [_strehl(_one_field(scene, f), order) for f in range(scene.shape[1])]
     return torch.cat(ratios, 1)
@@ -219,19 +225,19 @@ def _jacobian(directions: Tensor, pupil: Tensor) -> Tensor:
 def _clear_arms(scene: Scene, arms: int, *, like: Tensor) -> tuple[Tensor, Tensor] | None:
     """Radii (D, F, W, arms) between which light passes along each arm of a ring rule; None if everything passes.
 
-    The first and the last clear point of a scan, refined by repeated division; no gradient. A gap inside (the arm of a
-    spider) stays: its rays are blocked one by one.
+    The first and the last clear point of a scan, refined by repeated division. A gap inside (the arm of a spider)
+    stays: its rays are blocked one by one.
     """
+    angle = (torch.arange(arms, dtype=like.dtype, device=like.device) + 0.5) * (2 * math.pi / arms)
+    unit = torch.stack([torch.cos(angle), torch.sin(angle)])
+
+    def clear(radii: Tensor) -> Tensor:
+        """(K, D, F, W, arms) for radii (K, D, F, W, arms), or (K, 1, 1, 1, arms) for all alike."""
+        points = torch.stack([(radii * direction).movedim(0, -2).flatten(-2) for direction in unit])
+        points = points.reshape(2, -1) if radii.shape[1:4] == (1, 1, 1) else points
+        return rays_on_sensor(scene, points).valid.unflatten(-1, (len(radii), arms)).movedim(-2, 0)
+
     with torch.no_grad():
-        angle = (torch.arange(arms, dtype=like.dtype, device=like.device) + 0.5) * (2 * math.pi / arms)
-        unit = torch.stack([torch.cos(angle), torch.sin(angle)])
-
-        def clear(radii: Tensor) -> Tensor:
-            """(K, D, F, W, arms) for radii (K, 1 or D, 1 or F, 1 or W, arms)."""
-            points = torch.stack([r.movedim(0, -2).flatten(-2) for r in (radii * unit[0], radii * unit[1])])
-            points = points if radii.shape[1:-1] != (1, 1, 1) else points.reshape(2, -1)
-            return rays_on_sensor(scene, points).valid.unflatten(-1, (len(radii), arms)).movedim(-2, 0)
-
         step = torch.arange(_SCAN + 1, dtype=angle.dtype, device=angle.device) / _SCAN
         passed = clear(step[:, None, None, None, None].expand(-1, 1, 1, 1, arms))
         if bool(passed.all()):
@@ -239,13 +245,12 @@ def _clear_arms(scene: Scene, arms: int, *, like: Tensor) -> tuple[Tensor, Tenso
         first = passed.to(torch.int8).argmax(0)
         last = _SCAN - passed.flip(0).to(torch.int8).argmax(0)
         some = passed.any(0)
-        inner = _edge(clear, step[first], step[(first - 1).clamp_min(0)])
-        outer = _edge(clear, step[last], step[(last + 1).clamp_max(_SCAN)])
-        return torch.where(some, inner, 0.0), torch.where(some, outer, 0.0)
+        edges = [_edge(clear, step[i], step[(i + d).clamp(0, _SCAN)]) for i, d in ((first, -1), (last, 1))]
+    return tuple(torch.where(some, _follow_rim(scene, *edge, unit), 0.0) for edge in edges)
 
 
-def _edge(clear, passes: Tensor, blocked: Tensor) -> Tensor:
-    """The last radius (...) that passes on the way from one that does to one that does not."""
+def _edge(clear: Callable[[Tensor], Tensor], passes: Tensor, blocked: Tensor) -> tuple[Tensor, Tensor]:
+    """The last radius (...) that passes on the way from one that does to one that does not, and the next."""
     share = torch.arange(_SECTIONS + 1, dtype=passes.dtype, device=passes.device) / _SECTIONS
     for _ in range(_ZOOMS):
         radii = passes + share.reshape(-1, *(1,) * passes.dim()) * (blocked - passes)
@@ -253,7 +258,41 @@ def _edge(clear, passes: Tensor, blocked: Tensor) -> Tensor:
         passes, blocked = (
             torch.gather(radii, 0, index[None])[0] for index in (reached, (reached + 1).clamp_max(_SECTIONS))
         )
-    return passes
+    return passes, blocked
+
+
+def _follow_rim(scene: Scene, passes: Tensor, blocked: Tensor, unit: Tensor) -> Tensor:
+    """The radius `passes` with the derivatives of a rim that moves with the lens.
+
+    The ray just outside is stopped where its r² in an aperture has the value of the rim, r²(ρ, θ) = constant:
+        dρ/dθ = -(∂r²/∂θ) / (∂r²/∂ρ)
+    for circular apertures; a rim of another shape, or where rays miss a surface, stands still.
+    """
+    if not torch.is_grad_enabled():
+        return passes
+    radius = blocked.clone().requires_grad_()
+    along = _level_at_rim(scene, radius * unit[0], radius * unit[1])
+    if not along.requires_grad:
+        return passes
+    (slope,) = torch.autograd.grad(along.sum(), radius, retain_graph=True)
+    level = _level_at_rim(scene, blocked * unit[0], blocked * unit[1])
+    return passes - safe_divide(level - level.detach(), slope)
+
+
+def _level_at_rim(scene: Scene, *pupil: Tensor) -> Tensor:
+    """r² (D, F, W, P) in mm² of rays in the circular aperture that stops them; 0 for others."""
+    lens = with_object_distance(scene.lens, scene.lens.surfaces[0].thickness[..., None])
+    field, wavelength = scene.fields[:, :, None, None], scene.wavelengths[:, None]
+    rays = rays_of_field(lens, field, vignette(lens, field, torch.stack(pupil)), wavelength=wavelength)
+    level = torch.zeros_like(pupil[0])
+    walk = steps(lens.surfaces[1:], rays, indices=media(lens, wavelength))
+    for surface, crossing in zip(lens.surfaces[1:], walk, strict=True):
+        for aperture in surface.apertures:
+            stops = ~inside(dataclasses.replace(surface, apertures=(aperture,)), crossing.rays.position)
+            x, y = (crossing.rays.position[i] - aperture.centre[i] for i in (0, 1))
+            here = crossing.clipped & stops & (level == 0) & (aperture.shape == "circular")
+            level = torch.where(here, x * x + y * y, level)
+    return level
 
 
 def _between(inner: Tensor, outer: Tensor, pupil: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
