@@ -43,19 +43,20 @@ def test_airy_disc():
     """Profile within 5e-5 of the peak, first dark ring within 0.1 % of 0.6098 λ/NA."""
     lens = stigmatic()
     scale = 0.55e-3 * 50.0 / 0.5
-    profile = diffraction.kernels(scene_of(lens), grid(1e-5, (1, 1), vector(0, 0)), order=1).kernel
-    peak = profile[0, 0, 0, 0, 0] / 1e-10
+    light = diffraction.waves(scene_of(lens), 3 * scale, order=1)
+
+    def intensity(x, y):
+        U = diffraction.amplitude(light, x, y)[0, 0, 0]
+        return U.real**2 + U.imag**2
+
+    peak = intensity(vector(0.0), vector(0.0))[0, 0]
     assert abs(peak / (math.pi * 0.25**2 / (0.55e-3 * 50) ** 2) - 1) < 1e-4
-    for v in (0.5, 1.0, 2.0, 3.0, 5.0, 8.0):
-        place = vector(v / math.pi * scale * 0.6, v / math.pi * scale * 0.8)
-        found = diffraction.kernels(scene_of(lens), grid(1e-5, 1, place), order=1).kernel[0, 0, 0, 0, 0] / 1e-10
-        expected = (2 * torch.special.bessel_j1(vector(v)) / v) ** 2
-        assert abs(found / peak - expected[0]) < 5e-5
+    v = torch.linspace(0.1, 9.0, 30, dtype=torch.float64)
+    expected = (2 * torch.special.bessel_j1(v) / v) ** 2
+    assert (intensity(v / math.pi * scale, vector(0.0))[0] / peak - expected).abs().max() < 5e-5
     zero = 1.2196699 * scale
     steps = torch.linspace(0.998, 1.002, 41, dtype=torch.float64)
-    light = diffraction.waves(scene_of(lens), 1.1 * zero, order=1)
-    U = diffraction.amplitude(light, zero * steps, vector(0.0))
-    darkest = steps[(U.real**2 + U.imag**2)[0, 0, 0, 0].argmin()]
+    darkest = steps[intensity(zero * steps, vector(0.0))[0].argmin()]
     assert abs(darkest - 1) < 1e-3
 
 
@@ -226,7 +227,8 @@ def test_a_blocked_pupil_gives_zero_energy_and_no_nan():
     surfaces[6] = problems.surface(None, thickness, apertures=(Aperture("circular", (90.0, 99.0)),))
     lens = type(lens)(**{**{f: getattr(lens, f) for f in lens.__slots__}, "surfaces": tuple(surfaces)})
     for angle in (0.0, 5.0):
-        result = diffraction.kernels(scene_of(lens, angle, 25e3), grid(0.005, 3))
+        s = scene_of(lens, angle, 25e3)
+        result = diffraction.kernels(s, grid(0.005, 3, chief(s)))
         total = result.kernel.sum() + result.centroid.sum() + result.covariance.sum()
         assert result.kernel.abs().max() == 0
         (gradient,) = torch.autograd.grad(total, thickness)
@@ -270,4 +272,4 @@ def test_gradients(angle, rim):
         aperture=("entrance_pupil_diameter", 5.0),
     )
     centre = float(chief(scene_of(lens, angle))[1])
-    assert torch.autograd.gradcheck(kernel, start, eps=1e-6, atol=2e-4, rtol=2e-3)
+    assert torch.autograd.gradcheck(kernel, start, eps=1e-6, atol=2e-4, rtol=2e-3, fast_mode=True)
