@@ -1,0 +1,246 @@
+"""DRT: the energy of traced rays integrated over pixels.
+
+    E_ij = (1/π) ∬ [x(p) in pixel ij] [light passes at p] d²p,   p on the unit disc of the entrance pupil
+
+Rays are traced on lines from the centre of the pupil to its rim. Between four neighbours lies a cell of the pupil; the
+image of the cell is spread over the pixels, and cut by the apertures, in closed form (`splat_cells`). Pixel edges and
+vignetting edges are thus crossed smoothly: no blur is needed for a derivative, and none is there.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from raytrace import pupil
+from raytrace.grid import Grid
+from raytrace.launch import rays_of_field, vignette
+from raytrace.lens import with_object_distance
+from raytrace.numerics import safe_divide
+from raytrace.psf.scene import Kernels, Scene, trace_scene
+from raytrace.psf.splat import cell_energy, cell_widths, cells, clear_share, histogram, splat_cells, splat_smooth
+from raytrace.spot import spot
+from raytrace.surface import Aperture
+from raytrace.trace import media, steps
+from raytrace.value import value
+
+_LINES = (16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512)  # round the pupil, by order; half as many nodes on each
+_CHUNK = 2**17  # cells that are deposited at once: 50 MB of temporaries
+_FINEST = 4096  # cells across the pupil at most, when cells are wider than a pixel
+
+
+@value
+class Fans:
+    """Image points of rays on A lines through the pupil, N nodes each, from its centre to its rim.
+
+    points: (2, D, F, W, A, N) mm; radius: (N,) of the nodes, of the pupil.
+    clearances: one (D, F, W, A, N) for each aperture, above 0 where light passes it; no unit.
+    rays: how many were traced for each kernel.
+    """
+
+    points: Tensor
+    radius: Tensor
+    clearances: tuple[Tensor, ...]
+    rays: int
+
+
+def kernels(
+    scene: Scene,
+    grid: Grid,
+    *,
+    order: int = 4,
+    rays: int | None = None,
+    sampling: Callable[..., tuple[Tensor, Tensor]] = pupil.sobol,
+    width: float = 0.25,
+) -> Kernels:
+    """Ray-traced PSFs, differentiable in every number of the lens, the sensor distance and the grid.
+
+    order: 0 … 10; each has twice the rays of the one before, and half its error.
+    rays: instead, that many plain rays of `sampling` (`pupil.sobol`, `pupil.random`), each blurred by the kernel of
+    `splat_smooth` of half width `width` pixels; a width of 0 is the histogram, which has no derivative.
+    A kernel that no ray reaches has energy 0 and gradient 0. Vignetting factors of a field shrink the beam, and its
+    energy with it.
+    """
+    if rays is None:
+        return kernels_of_fans(scene, grid, trace_fans(scene, order))
+    return _kernels_of_points(scene, grid, rays, sampling, width)
+
+
+def trace_fans(scene: Scene, order: int) -> Fans:
+    """Trace the rays of an order; of a scene symmetric in x half the pupil, of a rotational one a single line."""
+    like = scene.lens.surfaces[-2].thickness
+    angle, radius = lines(_LINES[order], _LINES[order] // 2, like)
+    axial, mirrored = is_axial(scene), is_mirrored(scene)
+    seen = like.new_tensor([torch.pi / 2]) if axial else angle[: len(angle) // 2] if mirrored else angle
+    disc = radius * torch.stack([torch.cos(seen), torch.sin(seen)])[..., None]
+    hits, clearances = trace_clearances(scene, disc.flatten(1))
+    hits, clearances = hits.unflatten(-1, disc.shape[1:]), [c.unflatten(-1, disc.shape[1:]) for c in clearances]
+    if axial:
+        hits = turned(hits[1], angle)
+        clearances = [c.expand(hits.shape[1:]) for c in clearances]
+    elif mirrored:
+        hits = torch.cat([hits, torch.stack([-hits[0], hits[1]]).flip(-2)], -2)
+        clearances = [torch.cat([c, c.flip(-2)], -2) for c in clearances]
+    return Fans(hits, radius, tuple(clearances), disc[0].numel())
+
+
+def lines(count: int, nodes: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Angles (A,) of lines round the pupil, those of x > 0 first; and radii (N + 1,), closer towards the rim."""
+    angle = (torch.arange(count, dtype=like.dtype, device=like.device) + 0.5) * (2 * torch.pi / count) - torch.pi / 2
+    return angle, torch.linspace(0, 1, nodes + 1, dtype=like.dtype, device=like.device) ** 0.75
+
+
+def turned(height: Tensor, angle: Tensor) -> Tensor:
+    """Points (2, ..., A, N) of one meridional line of image heights (..., 1, N), turned to pupil angles (A,)."""
+    return torch.stack([height * torch.cos(angle)[:, None], height * torch.sin(angle)[:, None]])
+
+
+def trace_clearances(scene: Scene, disc: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """Hits (2, D, F, W, P) on the sensor of pupil points (2, P), and their clearances, each (D, F, W, P).
+
+    A ray that misses a surface has the clearance -1 in the last one; that one is there only if some ray does.
+    """
+    hits, crossed, met = trace_apertures(scene, disc)
+    clearances = [clearance(aperture, hit) for aperture, hit in crossed]
+    if not bool(met.all()):
+        clearances.append(torch.where(met, 1.0, -1.0).to(hits.dtype))
+        hits = torch.where(met, hits, 0.0)
+    return hits, clearances
+
+
+def trace_apertures(scene: Scene, disc: Tensor) -> tuple[Tensor, list[tuple[Aperture, Tensor]], Tensor]:
+    """Hits (2, D, F, W, P) on the sensor, on every aperture, and which rays met every surface; none is clipped."""
+    lens = with_object_distance(scene.lens, scene.lens.surfaces[0].thickness[..., None])
+    field, wavelength = scene.fields[:, :, None, None], scene.wavelengths[:, None]
+    rays = rays_of_field(lens, field, vignette(lens, field, disc), wavelength=wavelength)
+    shape = (*scene.shape, disc.shape[1])
+    crossed, met = [], rays.valid
+    for surface, crossing in zip(
+        lens.surfaces[1:], steps(lens.surfaces[1:], rays, indices=media(lens, wavelength)), strict=True
+    ):
+        met = met & ~crossing.missed & ~crossing.totally_reflected
+        hit = crossing.rays.position[:2]
+        crossed += [(aperture, hit.expand(2, *shape)) for aperture in surface.apertures]
+    return hit.expand(2, *shape), crossed, met.expand(shape)
+
+
+def clearance(aperture: Aperture, hit: Tensor) -> Tensor:
+    """How far points (2, ...) lie on the clear side of an aperture's edge: smooth there, above 0 where light passes."""
+    x, y = hit[0] - aperture.centre[0], hit[1] - aperture.centre[1]
+    a, b = aperture.extent
+    if aperture.shape == "circular":
+        # An edge at 0 or at infinity is none; distances count in the edge's own radius.
+        square = x * x + y * y
+        sides = [1 - square / (b * b)] + ([square / (a * a) - 1] if a > 0 else [])
+    elif aperture.shape == "rectangular":
+        sides = [1 - x.abs() / a, 1 - y.abs() / b]
+    else:
+        sides = [1 - (x / a) ** 2 - (y / b) ** 2]
+    within = sides[0] if len(sides) == 1 else torch.minimum(*sides)
+    return -within if aperture.obscures else within
+
+
+def kernels_of_fans(scene: Scene, grid: Grid, fans: Fans) -> Kernels:
+    """Energy, centroid and covariance of fans; all light through the pupil is 1. Wide cells are cut linearly."""
+    fine = refined(fans, [math.ceil(width) for width in cell_widths(grid, fans.points)])
+    centroid, covariance = moments_of_fans(fans)
+    kernel = energy_of_fans(grid, fine) * beam_share(scene, fine.points)[..., None, None]
+    return Kernels(kernel, grid, centroid, covariance, fans.rays)
+
+
+def energy_of_fans(grid: Grid, fans: Fans) -> Tensor:
+    """Energy (D, F, W, rows, columns) of fans whose cells are no wider than a pixel, some lines at a time."""
+    count = fans.points.shape[-2]
+    height = max(1, _CHUNK // fans.points[0, ..., 0, :].numel())
+    if height >= count:
+        return splat_cells(grid, fans.points, fans.radius, fans.clearances)
+    kernel = 0.0
+    for first in range(0, count, height):
+        rows = torch.arange(first, min(first + height, count) + 1, device=fans.points.device) % count
+        points, *clearances = (t.index_select(-2, rows) for t in (fans.points, *fans.clearances))
+        part = splat_cells(grid, points, fans.radius, clearances, closed=False)
+        kernel = kernel + part * ((len(rows) - 1) / count)
+    return kernel
+
+
+def refined(fans: Fans, parts: Sequence[int]) -> Fans:
+    """The fans with every cell cut into so many parts across and along the lines, by linear interpolation."""
+    limits = _FINEST // fans.points.shape[-2], _FINEST // fans.points.shape[-1]
+    across, along = (max(1, min(part, limit)) for part, limit in zip(parts, limits, strict=True))
+
+    def cut(t: Tensor) -> Tensor:
+        if across > 1:
+            share = torch.arange(across, dtype=t.dtype, device=t.device)[:, None] / across
+            t = (t[..., None, :] + share * (torch.roll(t, -1, -2) - t)[..., None, :]).flatten(-3, -2)
+        return cut_line(t, along)
+
+    points, *clearances = (cut(t) for t in (fans.points, *fans.clearances))
+    return Fans(points, cut_line(fans.radius, along), tuple(clearances), fans.rays)
+
+
+def cut_line(t: Tensor, parts: int) -> Tensor:
+    """Values (..., N) at nodes and at parts - 1 places between each two."""
+    share = torch.arange(parts, dtype=t.dtype, device=t.device) / parts
+    inner = (t[..., :-1, None] + share * t.diff()[..., None]).flatten(-2)
+    return torch.cat([inner, t[..., -1:]], -1) if parts > 1 else t
+
+
+def moments_of_fans(fans: Fans) -> tuple[Tensor, Tensor]:
+    """Centroid (2, D, F, W) mm and covariance (3, D, F, W) mm² of the light of fans, no pixels and no window."""
+    reference = fans.points[..., :1, :1].detach()
+    (x, ax, bx), (y, ay, by) = (cells(t, fans.radius) for t in fans.points - reference)
+    weights = cell_energy(fans.radius, x.shape[-2]) * clear_share(fans.clearances, fans.radius)
+    weights = torch.as_tensor(weights).expand(x.shape)
+    share = safe_divide(weights, weights.sum((-2, -1), keepdim=True))
+    mean_x, mean_y = ((share * t).sum((-2, -1), keepdim=True) for t in (x, y))
+    x, y = x - mean_x, y - mean_y
+    pairs = (x * x + (ax * ax + bx * bx) / 3, x * y + (ax * ay + bx * by) / 3, y * y + (ay * ay + by * by) / 3)
+    covariance = torch.stack([(share * pair).sum((-2, -1)) for pair in pairs])
+    lit = weights.sum((-2, -1)) > 0
+    centroid = torch.stack([mean_x, mean_y])[..., 0, 0] + reference[..., 0, 0]
+    return torch.where(lit, centroid, 0.0), covariance
+
+
+def beam_share(scene: Scene, like: Tensor) -> Tensor:
+    """Area (1, F, 1) of each field's beam by its vignetting factors, 1 = the whole entrance pupil."""
+    corners = like.new_tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    x, y = vignette(scene.lens, scene.fields[:, :, None, None].to(like.dtype), corners)
+    area = (x[..., 1] - x[..., 0]) * (y[..., 2] - y[..., 0]) - (x[..., 2] - x[..., 0]) * (y[..., 1] - y[..., 0])
+    return area.abs().expand(1, scene.shape[1], 1)
+
+
+def is_mirrored(scene: Scene) -> bool:
+    """Whether the light is symmetric in x: every field in the y-z plane and no aperture or vignetting off it.
+
+    Fields to be differentiated are not: their x moves the light to one side.
+    """
+    factors = scene.lens.fields.vignetting
+    upright = factors is None or not bool((factors[0] != 0).any() | (factors[4] != 0).any())
+    centred = all(aperture.centre[0] == 0 for surface in scene.lens.surfaces for aperture in surface.apertures)
+    return upright and centred and not scene.fields.requires_grad and not bool((scene.fields[0] != 0).any())
+
+
+def is_axial(scene: Scene) -> bool:
+    """Whether the light is symmetric about the axis: no field off it, round apertures centred, round beams."""
+    factors = scene.lens.fields.vignetting
+    round_beam = factors is None or not bool((factors != 0).any())
+    if scene.fields.requires_grad or bool((scene.fields != 0).any()) or not round_beam:
+        return False
+    apertures = [aperture for surface in scene.lens.surfaces for aperture in surface.apertures]
+    return all(aperture.shape == "circular" and aperture.centre == (0.0, 0.0) for aperture in apertures)
+
+
+def _kernels_of_points(scene: Scene, grid: Grid, count: int, sampling: Callable, width: float) -> Kernels:
+    thickness = scene.lens.surfaces[-2].thickness
+    disc, weights = sampling(count, dtype=thickness.dtype, device=thickness.device)
+    traced = trace_scene(scene, disc)
+    energy = torch.where(traced.valid, weights, 0.0).expand(*scene.shape, -1)
+    points = torch.where(traced.valid, traced.position[:2], 0.0).expand(2, *scene.shape, -1)
+    kernel = splat_smooth(grid, points, energy, width=width) if width else histogram(grid, points, energy)
+    light = spot(traced, weights)
+    share = safe_divide(energy, energy.sum(-1, keepdim=True))
+    x, y = torch.where(energy > 0, points - light.centroid[..., None], 0.0)
+    covariance = torch.stack([(share * a * b).sum(-1) for a, b in ((x, x), (x, y), (y, y))])
+    kernel = kernel * beam_share(scene, points)[..., None, None]
+    return Kernels(kernel, grid, light.centroid.expand(2, *scene.shape), covariance, count)

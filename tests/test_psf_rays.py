@@ -1,0 +1,221 @@
+"""Splats and ray-traced PSFs: energy, brute force, bias of the blur, derivatives with vignetted rays."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+
+from raytrace import pupil
+from raytrace.formats import read_lens
+from raytrace.grid import Grid, grid
+from raytrace.lens import Lens, with_sensor_distance
+from raytrace.psf.rays import beam_share, kernels, trace_fans
+from raytrace.psf.scene import scene
+from raytrace.psf.splat import below_edge, histogram, splat, splat_cells, splat_smooth
+from raytrace.surface import Aperture
+
+LENSES = Path(__file__).parents[1] / "lenses"
+
+
+def number(x):
+    return torch.tensor(x, dtype=torch.float64)
+
+
+def double_gauss(stop: float | None = None) -> Lens:
+    """The double Gauss at a sensor near its focus; with a stop of another radius in mm that clips."""
+    lens = with_sensor_distance(read_lens(LENSES / "double_gauss.zmx"), number(57.8817685))
+    if stop is None:
+        return lens
+    surfaces = list(lens.surfaces)
+    surfaces[5] = dataclasses.replace(surfaces[5], apertures=(Aperture("circular", (0.0, stop)),))
+    return dataclasses.replace(lens, surfaces=tuple(surfaces))
+
+
+def scene_of(lens: Lens, field: float, distance: float = 1e4):
+    wavelength = lens.wavelengths[lens.primary_wavelength][None]
+    return scene(lens, number([[0.0], [field]]), number([distance]), wavelength)
+
+
+def window(of, pitch: float = 0.005, size: int = 21) -> Grid:
+    """A grid at the centroid of a scene, off it by a part of a pixel."""
+    centre = kernels(of, grid(pitch, 3), order=2).centroid.detach()
+    return Grid(number(pitch), size, size, centre + 0.0003)
+
+
+def distance(a: torch.Tensor, b: torch.Tensor) -> float:
+    """Relative L1."""
+    return float((a - b).detach().abs().sum() / b.detach().abs().sum())
+
+
+def test_splats_keep_the_energy_inside_and_drop_the_rest():
+    points = number([[0.0, 0.011, 1e30, float("nan"), -0.2], [0.003, -0.004, 0.0, 0.0, 0.0]])
+    weights = number([1.0, 2.0, 4.0, 8.0, 16.0])
+    for image in (
+        splat(grid(0.005, 9), points, weights),
+        splat_smooth(grid(0.005, 9), points, weights, width=0.5),
+        histogram(grid(0.005, 9), points, weights),
+    ):
+        assert float(image.sum()) == pytest.approx(3.0, abs=1e-14)
+        assert (image >= 0).all()
+
+
+def test_smooth_splat_is_the_histogram_far_from_edges_and_twice_differentiable():
+    points = number([[0.0, 0.0051], [0.0001, -0.0049]])
+    exact = histogram(grid(0.005, 5), points, number([1.0, 1.0]))
+    assert (splat_smooth(grid(0.005, 5), points, number([1.0, 1.0]), width=0.25) - exact).abs().max() < 1e-15
+    near = number([[0.0024, -0.0026, 0.0068], [0.0022, 0.0001, -0.0077]]).requires_grad_()
+
+    def image(points):
+        return splat_smooth(grid(0.005, 5), points, number([1.0, 0.5, 0.7]), width=0.5)
+
+    assert torch.autograd.gradcheck(image, near, eps=1e-9)
+    assert torch.autograd.gradgradcheck(image, near, eps=1e-9, atol=1e-3, rtol=1e-3)
+
+
+@pytest.mark.parametrize("width", [0.1, 0.25, 0.5])
+def test_bias_of_the_smooth_kernel_is_its_second_moment(width):
+    """Mean over all places in a pixel of the variance of the image: pitch²/12 of the pixel + x² + (width·pitch)²/7."""
+    places = (torch.arange(4000, dtype=torch.float64) + 0.5) / 4000 - 0.5
+    image = splat_smooth(grid(1.0, 5), torch.stack([places, 0 * places])[..., None], number([1.0]), width=width)
+    x = torch.arange(5, dtype=torch.float64) - 2
+    variance = (image.sum(-2) * (x - places[:, None]) ** 2).sum(-1).mean()
+    assert float(variance) == pytest.approx(1 / 12 + width**2 / 7, abs=1e-6)
+
+
+def test_edge_share_of_a_cell_is_its_own_integral_and_finite_without_width():
+    s = (torch.arange(2000, dtype=torch.float64) + 0.5) / 1000 - 1
+    for a, b, z in ((0.3, 0.1, 0.05), (0.1, -0.3, -0.25), (0.2, 0.2, 0.35), (0.3, 0.0, 0.1)):
+        counted = (a * s[:, None] + b * s < z).double().mean()
+        assert float(below_edge(number(z), number(a), number(b))) == pytest.approx(float(counted), abs=2e-3)
+    leaves = [number(x).requires_grad_() for x in (0.1, 0.0, 0.0)]
+    below_edge(*leaves).backward()
+    assert all(torch.isfinite(leaf.grad) for leaf in leaves)
+
+
+@pytest.mark.parametrize("field", [0.0, 10.0])
+def test_equals_brute_force_within_its_noise(field):
+    """4 million rays: √(pixels/rays) is 0.9 % for random ones; Sobol points do better."""
+    of = scene_of(double_gauss(stop=13.0), field)
+    where = window(of)
+    with torch.no_grad():
+        counted = sum(kernels(of, where, rays=2**20, sampling=sobol, width=0).kernel for sobol in seeds(4)) / 4
+        found = kernels(of, where, order=6)
+    assert distance(found.kernel, counted) < 0.01
+    assert float(found.kernel.sum()) == pytest.approx(float(counted.sum()), abs=2e-3)
+    assert float(counted.sum()) < 0.97
+
+
+def seeds(count: int):
+    return [lambda n, s=s, **like: pupil.sobol(n, seed=s, **like) for s in range(count)]
+
+
+@pytest.mark.parametrize("field", [0.0, 14.0])
+def test_error_falls_with_the_order_and_all_light_is_inside(field):
+    of = scene_of(double_gauss(), field)
+    where = window(of, size=61)
+    with torch.no_grad():
+        best = kernels(of, where, order=8)
+        errors = [distance(kernels(of, where, order=order).kernel, best.kernel) for order in (1, 3, 5)]
+    assert errors[2] < errors[1] < errors[0]
+    assert errors[2] < 0.02
+    assert float(best.kernel.sum()) == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["curvature", "thickness", "sensor", "pitch", "centre"])
+def test_derivatives_are_those_of_the_kernel_with_vignetted_rays(name):
+    lens, field = double_gauss(stop=13.0), 10.0
+    where = window(scene_of(lens, field))
+    weight = torch.randn(21, 21, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+    def merit(shift):
+        surfaces, pixels = list(lens.surfaces), where
+        if name == "curvature":
+            surfaces[3] = dataclasses.replace(surfaces[3], curvature=surfaces[3].curvature + 1e-4 * shift)
+        elif name == "thickness":
+            surfaces[2] = dataclasses.replace(surfaces[2], thickness=surfaces[2].thickness + shift)
+        elif name == "sensor":
+            surfaces[-2] = dataclasses.replace(surfaces[-2], thickness=surfaces[-2].thickness + shift)
+        elif name == "pitch":
+            pixels = Grid(where.pitch + 1e-3 * shift, 21, 21, where.centre)
+        else:
+            pixels = Grid(where.pitch, 21, 21, where.centre + 1e-2 * shift)
+        changed = dataclasses.replace(lens, surfaces=tuple(surfaces))
+        return (kernels(scene_of(changed, field), pixels, order=3).kernel * weight).sum()
+
+    at = number(0.0).requires_grad_()
+    (slope,) = torch.autograd.grad(merit(at), at)
+    step = 1e-6
+    with torch.no_grad():
+        difference = (merit(number(step)) - merit(number(-step))) / (2 * step)
+    assert float(slope) == pytest.approx(float(difference), rel=1e-3, abs=1e-3)
+    assert float(slope) != 0
+
+
+def test_vignetting_edge_has_a_derivative():
+    """d(energy)/d(thickness before a stop that clips): a histogram of rays has none."""
+    lens = double_gauss(stop=12.0)
+    gap = lens.surfaces[4].thickness.clone().requires_grad_()
+    surfaces = list(lens.surfaces)
+    surfaces[4] = dataclasses.replace(surfaces[4], thickness=gap)
+    of = scene_of(dataclasses.replace(lens, surfaces=tuple(surfaces)), 10.0)
+    energy = kernels(of, Grid(number(0.1), 61, 61, window(of).centre), order=4).kernel.sum()
+    (slope,) = torch.autograd.grad(energy, gap)
+    assert 0.1 < float(energy.detach()) < 0.95
+    assert abs(float(slope)) > 1e-4
+
+
+def test_no_light_is_zero_energy_and_zero_gradient():
+    lens = double_gauss(stop=1e-6)
+    surfaces = list(lens.surfaces)
+    surfaces[5] = dataclasses.replace(surfaces[5], apertures=(Aperture("circular", (0.0, 1.0), False, (500.0, 0.0)),))
+    sensor = number(57.0).requires_grad_()
+    of = scene_of(with_sensor_distance(dataclasses.replace(lens, surfaces=tuple(surfaces)), sensor), 10.0)
+    for options in ({"order": 1}, {"rays": 64}):
+        found = kernels(of, grid(0.005, 5), **options)
+        total = found.kernel.sum() + found.centroid.sum() + found.covariance.sum()
+        (slope,) = torch.autograd.grad(total, sensor)
+        assert float(found.kernel.detach().abs().sum()) == 0
+        assert float(slope) == 0
+
+
+def test_a_positive_field_moves_the_light_to_positive_y():
+    found = kernels(scene_of(double_gauss(), 10.0), grid(0.005, 3), order=2)
+    assert float(found.centroid[1]) > 10
+    assert abs(float(found.centroid[0])) < 1e-9
+
+
+def test_central_obscuration_takes_its_area():
+    lens = read_lens(LENSES / "hubble.zmx")
+    of = scene_of(lens, 0.05, float("inf"))
+    found = kernels(of, Grid(number(0.05), 21, 21, kernels(of, grid(0.05, 3), order=2).centroid), order=5)
+    assert float(found.kernel.sum()) == pytest.approx(1 - (396 / 1200) ** 2, abs=2e-3)
+
+
+def test_vignetting_factors_take_their_area():
+    lens = read_lens(LENSES / "double_gauss_28deg.zmx")
+    of = scene_of(lens, float(lens.fields.y[2]), float("inf"))
+    factors = lens.fields.vignetting[:, 2]
+    share = float((1 - factors[2]) * (1 - factors[3]))
+    assert share < 1
+    assert float(beam_share(of, number(0.0)).squeeze()) == pytest.approx(share, rel=1e-12)
+
+
+def test_symmetric_scenes_trace_a_line_or_half_a_pupil_and_find_the_same():
+    lens = double_gauss(stop=13.0)
+    general = dataclasses.replace(scene_of(lens, 10.0), fields=number([[0.0], [10.0]]).requires_grad_())
+    half, full = trace_fans(scene_of(lens, 10.0), 1), trace_fans(general, 1)
+    assert 2 * half.rays == full.rays
+    assert (half.points - full.points).abs().max() < 1e-12
+    axial = dataclasses.replace(scene_of(lens, 0.0), fields=number([[0.0], [0.0]]).requires_grad_())
+    line, full = trace_fans(scene_of(lens, 0.0), 1), trace_fans(axial, 1)
+    assert line.rays * 24 == full.rays
+    assert (line.points - full.points).abs().max() < 1e-12
+
+
+def test_cells_of_a_focus_smaller_than_a_pixel_are_finite():
+    points = torch.zeros(2, 8, 4, dtype=torch.float64, requires_grad=True)
+    image = splat_cells(grid(0.005, 3), points, torch.linspace(0, 1, 4, dtype=torch.float64))
+    assert float(image.detach()[1, 1]) == pytest.approx(1.0, abs=1e-14)
+    (slope,) = torch.autograd.grad(image.square().sum(), points)
+    assert torch.isfinite(slope).all()
