@@ -9,7 +9,7 @@ and sends the few rays that fail to a bracketed search. It is one opaque operato
 import torch
 from torch import Tensor
 
-from raytrace.numerics import polynomial
+from raytrace.numerics import polynomial, with_batch_axes
 
 _NEWTON_STEPS = 24
 _BISECTIONS = 64
@@ -69,12 +69,11 @@ def _(foot: Tensor, direction: Tensor, curvature: Tensor, conic: Tensor, coeffic
     batch = torch.broadcast_shapes(
         foot.shape[1:], direction.shape[1:], curvature.shape, conic.shape, coefficients.shape[1:]
     )
-    p = foot.double().expand(3, *batch).reshape(3, -1)
-    d = direction.double().expand(3, *batch).reshape(3, -1)
+    p, d = _expand(foot.double(), batch).reshape(3, -1), _expand(direction.double(), batch).reshape(3, -1)
     c, k = curvature.double().expand(batch).reshape(-1), conic.double().expand(batch).reshape(-1)
     coefficients = coefficients.double()
     # A coefficient axis without batch is kept short: `polynomial` broadcasts it.
-    a = coefficients[:, None] if coefficients.dim() == 1 else coefficients.expand(-1, *batch).flatten(1)
+    a = coefficients[:, None] if coefficients.dim() == 1 else _expand(coefficients, batch).flatten(1)
 
     t, residual_small, forward, radius = _newton(p, d, c, k, a, _start(p, d, c, k, rim))
     converged = residual_small & forward
@@ -88,6 +87,11 @@ def _(foot: Tensor, direction: Tensor, curvature: Tensor, conic: Tensor, coeffic
         good[few] = found | converged[few]
     t = torch.where(good, t, 0.0)
     return t.reshape(batch).to(foot.dtype), good.reshape(batch).clone()
+
+
+def _expand(x: Tensor, batch: torch.Size) -> Tensor:
+    """(m, ...) to (m, *batch): batch axes align from the right, the leading axis stays in front."""
+    return with_batch_axes(x, len(batch)).expand(x.shape[0], *batch)
 
 
 @torch.library.register_fake("raytrace::asphere_root")

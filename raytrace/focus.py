@@ -17,13 +17,18 @@ from raytrace.lens import Lens, with_object_distance
 from raytrace.numerics import safe_divide
 from raytrace.rays import Rays
 from raytrace.spot import Spot, spot_of_points
-from raytrace.trace import trace
+from raytrace.trace import media, trace_surfaces
 
 
 def image_rays(lens: Lens, pupil: Tensor, *, fields: Tensor | None = None, wavelengths: Tensor | None = None) -> Rays:
-    """Rays (3, F, W, P) on the sensor; arguments as for `launch`."""
+    """Rays (3, F, W, P) on the sensor, with their direction before it; arguments as for `launch`.
+
+    The sensor may touch glass: what bends rays there does not tell where they came from.
+    """
     wavelengths = lens.wavelengths if wavelengths is None else wavelengths
-    return trace(lens, launch(lens, pupil, fields=fields, wavelengths=wavelengths), wavelengths[:, None])
+    indices = media(lens, wavelengths[:, None])
+    rays = launch(lens, pupil, fields=fields, wavelengths=wavelengths)
+    return trace_surfaces(lens.surfaces[1:], rays, indices=[*indices[:-1], indices[-2]])
 
 
 def focus_moments(rays: Rays, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:

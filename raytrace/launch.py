@@ -12,13 +12,14 @@ from torch import Tensor
 
 from raytrace import glass
 from raytrace.lens import Lens
-from raytrace.numerics import dot, safe_divide, unit
+from raytrace.numerics import dot, safe_divide, safe_sqrt, unit
 from raytrace.paraxial import FirstOrder, first_order
 from raytrace.rays import Rays
 from raytrace.surface import sag
 from raytrace.trace import media, start, steps, trace, trace_surfaces
 
-_AIMING_STAGES = ((0.25, 2), (0.5, 2), (0.75, 2), (1.0, 7))  # fraction of the field, Newton steps
+_AIMING_STAGES = 1, 20  # the field in one go, and for rays that fail in 20 parts, each started from those before it
+_AIMING_STEPS = 8  # Newton steps at each stage
 _AIMING_TOLERANCE = 1e-7  # of the stop radius, in float64
 
 
@@ -78,7 +79,7 @@ def rays_of_field(
     field = object_field(lens, field, paraxial, ray_aiming=ray_aiming)
 
     def through(pupil: Tensor, fraction: float = 1.0) -> Rays:
-        return _through_entrance_pupil(lens, fraction * field, pupil, paraxial, index)
+        return _through_entrance_pupil(lens, _part_of_field(lens, field, fraction), pupil, paraxial, index)
 
     if not ray_aiming or lens.fields.telecentric:
         return through(pupil)
@@ -133,18 +134,19 @@ def object_field(lens: Lens, field: Tensor, paraxial: FirstOrder, *, ray_aiming:
     estimate = _scaled(field, scale)
     if kind == "paraxial_image_height":
         return estimate
-    return _field_of_real_height(lens, field, estimate, paraxial)
+    return _field_of_real_height(lens, field, estimate, paraxial, ray_aiming)
 
 
 def aim_at_stop(lens: Lens, through: Callable[..., Rays], pupil: Tensor, wavelength: Tensor) -> tuple[Tensor, Tensor]:
     """Entrance pupil points (2, ...) whose rays pass the stop at `pupil` times its radius; and whether found (...).
 
-    through(pupil, fraction): rays of the field scaled by `fraction`. Newton's method,
-    followed from the axis to the full field; the last step is attached, so first derivatives are exact.
+    through(pupil, fraction): rays of a fraction of the field. Newton's method, where it fails followed from the axis
+    to the full field; the last step is attached, so first derivatives are exact. The signs of the pupil are those of
+    the entrance pupil: where it is an inverted image of the stop, so are aimed and paraxial rays.
     """
     surfaces = lens.surfaces[1 : lens.stop + 1]
     indices = media(lens, wavelength)[: lens.stop + 1]
-    radius = stop_radius(lens)
+    radius = stop_radius(lens) * torch.where(_marginal_height(lens).detach() < 0, -1.0, 1.0)
 
     def at_stop(pupil: Tensor, fraction: float = 1.0) -> tuple[Tensor, Tensor]:
         rays = through(pupil, fraction)
@@ -155,33 +157,69 @@ def aim_at_stop(lens: Lens, through: Callable[..., Rays], pupil: Tensor, wavelen
 
     batch = torch.broadcast_shapes(at_stop(pupil)[0].shape[1:], pupil.shape[1:])
     target = torch.stack([p.expand(batch) for p in pupil])
-    guess = target.detach().clone()
-    for fraction, count in _AIMING_STAGES:
-        for _ in range(count):
-            error, jacobian = _error_and_jacobian(lambda q, f=fraction: at_stop(q, f)[0], guess, target.detach())
-            step = _solve(jacobian, error)
-            # Half the pupil at most in one step: a full step from a bad start can leave the lens for good.
-            length = torch.linalg.vector_norm(step, dim=0)
-            guess = guess - step * (0.5 / length.clamp_min(0.5))
-    error, jacobian = _error_and_jacobian(lambda q: at_stop(q)[0], guess, target.detach())
-    reached, arrives = at_stop(guess)
     tolerance = _AIMING_TOLERANCE if pupil.dtype == torch.float64 else 1e-4
-    found = (error.abs() <= tolerance).all(0) & arrives
-    attached = guess - _solve(jacobian, reached - target)
+    aim, found = target.detach().clone(), torch.zeros(batch, dtype=torch.bool, device=pupil.device)
+    for stages in _AIMING_STAGES:
+        followed = _follow(at_stop, target.detach(), stages)
+        error, _, arrives = _error_and_jacobian(at_stop, followed, target.detach())
+        close = (error.abs() <= tolerance).all(0) & arrives
+        aim, found = torch.where(close & ~found, followed, aim), found | close
+        if bool(found.all()):
+            break
+    _, jacobian, _ = _error_and_jacobian(at_stop, aim, target.detach())
+    attached = aim - _solve(jacobian, at_stop(aim)[0] - target)
     return torch.where(found, attached, target), found
+
+
+def _follow(at_stop: Callable, target: Tensor, stages: int) -> Tensor:
+    """Pupil points whose rays reach the target, followed from the axis to the full field in so many stages.
+
+    Each stage starts where the two before it point to, or where the last one ended if that is nearer. A Newton step
+    that loses the ray or leads away from the target is shortened, and not taken.
+    """
+    before = aim = target.clone()
+    for stage in range(1, stages + 1):
+
+        def at_stage(q: Tensor, fraction: float = stage / stages):
+            return at_stop(q, fraction)
+
+        here, ahead = (_error_and_jacobian(at_stage, start, target) for start in (aim, 2 * aim - before))
+        nearer = ahead[2] & (~here[2] | (_length(ahead[0]) < _length(here[0])))
+        before, aim = aim, torch.where(nearer, 2 * aim - before, aim)
+        size = torch.where(nearer, _length(ahead[0]), torch.where(here[2], _length(here[0]), torch.inf))
+        step = torch.where(nearer, _solve(ahead[1], ahead[0]), _solve(here[1], here[0]))
+        share = torch.ones_like(size)
+        for _ in range(_AIMING_STEPS):
+            error, jacobian, arrives = _error_and_jacobian(at_stage, aim - share * step, target)
+            better = arrives & (_length(error) < size)
+            aim = torch.where(better, aim - share * step, aim)
+            size, step = torch.where(better, _length(error), size), torch.where(better, _solve(jacobian, error), step)
+            share = torch.where(better, 1.0, share / 4)
+    return aim
+
+
+def _part_of_field(lens: Lens, field: Tensor, fraction: float) -> Tensor:
+    """A fraction of a field point (2, ...): of its angle for an object at infinity, else of its height."""
+    if fraction == 1.0 or not is_at_infinity(lens):
+        return fraction * field
+    slope = safe_sqrt(dot_2(field, field))
+    return _scaled(field, safe_divide(torch.tan(fraction * torch.atan(slope)), slope))
 
 
 def stop_radius(lens: Lens) -> Tensor:
     """Height in mm at the stop of the real axial ray through the edge of the entrance pupil, primary wavelength."""
-    if lens.aperture.kind == "float_by_stop":
-        return lens.aperture.value
+    return lens.aperture.value if lens.aperture.kind == "float_by_stop" else _marginal_height(lens).abs()
+
+
+def _marginal_height(lens: Lens) -> Tensor:
+    """The same height with its sign: negative where the entrance pupil is an inverted image of the stop."""
     wavelength = lens.wavelengths[lens.primary_wavelength]
     paraxial = first_order(lens)
     edge = lens.wavelengths.new_tensor([0.0, 1.0]).to(paraxial.entrance_pupil_diameter.dtype)
     index = glass.refractive_index(lens.surfaces[0].glass, wavelength).to(edge.dtype)
     rays = _through_entrance_pupil(lens, torch.zeros_like(edge), edge, paraxial, index)
     indices = media(lens, wavelength)[: lens.stop + 1]
-    return trace_surfaces(lens.surfaces[1 : lens.stop + 1], rays, indices=indices).position[1].abs()
+    return trace_surfaces(lens.surfaces[1 : lens.stop + 1], rays, indices=indices).position[1]
 
 
 def _through_entrance_pupil(lens: Lens, field: Tensor, pupil: Tensor, paraxial: FirstOrder, index: Tensor) -> Rays:
@@ -202,7 +240,28 @@ def _through_entrance_pupil(lens: Lens, field: Tensor, pupil: Tensor, paraxial: 
     if at_infinity:
         return rays_from_infinity(torch.stack([x, y, torch.ones_like(x)]), aim, index=index)
     z = sag(lens.surfaces[0], x * x + y * y) - distance
-    return rays_from_point(torch.stack([x, y, z]), aim, index=index)
+    return _towards_the_lens(torch.stack([x, y, z]), aim, index)
+
+
+def _towards_the_lens(point: Tensor, aim: Tensor, index: Tensor) -> Rays:
+    """Rays of an object point O through pupil points A that travel towards +z, started at the nearer of O and A.
+
+    A virtual object lies behind surface 1, and an entrance pupil may lie before the object (a stop behind the focus
+    of what is before it): then light runs from A to O on the same line. Paths count from the object, O_z < 0, or, if
+    it is virtual, to it.
+    """
+    rays = rays_from_point(point, aim, index=index)
+    backward = aim[2] < point[2]
+    virtual = point[2] > 0
+    length = index * dot(point, unit(point))
+    from_aim = torch.where(backward, torch.where(virtual, -rays.opl, -rays.opl - 2 * length), rays.opl)
+    nearer = point[2].abs() < aim[2].abs()
+    return Rays(
+        position=torch.where(rays.valid & nearer, point, rays.position),
+        direction=torch.where(rays.valid & backward, -rays.direction, rays.direction),
+        valid=rays.valid,
+        opl=torch.where(rays.valid, torch.where(nearer, torch.where(virtual, length, -length), from_aim), 0.0),
+    )
 
 
 def _telecentric_radius(lens: Lens, paraxial: FirstOrder, index: Tensor) -> Tensor:
@@ -216,14 +275,19 @@ def _telecentric_radius(lens: Lens, paraxial: FirstOrder, index: Tensor) -> Tens
     )
 
 
-def _field_of_real_height(lens: Lens, height: Tensor, estimate: Tensor, paraxial: FirstOrder) -> Tensor:
+def _field_of_real_height(lens, height: Tensor, estimate: Tensor, paraxial: FirstOrder, ray_aiming: bool) -> Tensor:
     """Scale the paraxial field (2, ...) until the real chief ray meets the image at `height` (2, ...) mm."""
     wavelength = lens.wavelengths[lens.primary_wavelength]
     index = glass.refractive_index(lens.surfaces[0].glass, wavelength).to(height.dtype)
     wanted = dot_2(height, height)
 
     def image_height(scale: Tensor) -> Tensor:
-        rays = _through_entrance_pupil(lens, _scaled(estimate, scale), torch.zeros_like(height), paraxial, index)
+        def through(pupil: Tensor, fraction: float = 1.0) -> Rays:
+            part = _part_of_field(lens, _scaled(estimate, scale), fraction)
+            return _through_entrance_pupil(lens, part, pupil, paraxial, index)
+
+        centre = torch.zeros_like(height)
+        rays = through(aim_at_stop(lens, through, centre, wavelength)[0] if ray_aiming else centre)
         return safe_divide(dot_2(trace(lens, rays, wavelength).position[:2], height), wanted)
 
     scale = torch.ones_like(wanted.detach())
@@ -252,11 +316,18 @@ def _value_and_slope(function: Callable[[Tensor], Tensor], point: Tensor) -> tup
 
 
 def _error_and_jacobian(function: Callable[[Tensor], Tensor], point: Tensor, target: Tensor):
-    """f(p) - target (2, ...) and the rows ∂f_x/∂p, ∂f_y/∂p (2, ...) of each ray's own Jacobian, outside the graph."""
-    value, pull = torch.func.vjp(function, point)
+    """f(p) - target (2, ...), the rows ∂f_x/∂p, ∂f_y/∂p (2, ...) of each ray's own Jacobian, and whether it arrives.
+
+    All outside the graph; function: p -> f(p), arrives.
+    """
+    value, pull, arrives = torch.func.vjp(function, point, has_aux=True)
     x, y = torch.zeros_like(value), torch.zeros_like(value)
     x[0], y[1] = 1.0, 1.0
-    return (value - target).detach(), (pull(x)[0].detach(), pull(y)[0].detach())
+    return (value - target).detach(), (pull(x)[0].detach(), pull(y)[0].detach()), arrives
+
+
+def _length(vector: Tensor) -> Tensor:
+    return torch.linalg.vector_norm(vector, dim=0)
 
 
 def _solve(jacobian: tuple[Tensor, Tensor], error: Tensor) -> Tensor:

@@ -25,6 +25,15 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
+def with_batch_axes(vector: Tensor, count: int) -> Tensor:
+    """The vector (3, ...) with at least `count` batch axes: axes of length 1 are put in behind its components.
+
+    Broadcasting aligns shapes from the right, so that a factor (W, 1) would meet a vector (3, P) at its components.
+    """
+    missing = count + 1 - vector.dim()
+    return vector if missing <= 0 else vector.reshape(vector.shape[0], *(1,) * missing, *vector.shape[1:])
+
+
 def unit(vector: Tensor) -> Tensor:
     """vector/|vector| over the leading axis of length 3; scaled first, so that 1e-200 and 1e200 keep their direction.
 

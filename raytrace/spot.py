@@ -46,15 +46,27 @@ def spot_of_points(points: Tensor, valid: Tensor, weights: Tensor | None = None)
     offset = torch.where(valid, points - reference, 0.0)
     mean = (share * offset).sum(-1, keepdim=True)
     centred = torch.where(valid, offset - mean, 0.0)
-    square = centred[0] ** 2 + centred[1] ** 2
-    mean_square = (share * square).sum(-1)
-    largest = square.amax(-1) if square.shape[-1] else mean_square
+    mean_square = (share * (centred[0] ** 2 + centred[1] ** 2)).sum(-1)
+    # The radii are formed in units of a power of two near the largest coordinate: squares of 1e-200 or 1e200 are none.
+    scale = _power_of_two(centred)
+    square = (centred[0] / scale) ** 2 + (centred[1] / scale) ** 2
+    scaled_mean = (share * square).sum(-1)
+    largest = square.amax(-1) if square.shape[-1] else scaled_mean
     return Spot(
         centroid=(reference + mean)[..., 0],
         mean_square_radius=mean_square,
-        rms_radius=safe_sqrt(mean_square),
-        geometric_radius=safe_sqrt(largest),
+        rms_radius=scale[..., 0] * safe_sqrt(scaled_mean),
+        geometric_radius=scale[..., 0] * safe_sqrt(largest),
         points=points,
         valid=valid,
         rays=valid.sum(-1),
     )
+
+
+def _power_of_two(vectors: Tensor) -> Tensor:
+    """The power of two above the largest entry of (2, ..., P) over the first and last axes, (..., 1); 1 if none."""
+    if not vectors.shape[-1]:
+        return vectors.new_ones((*vectors.shape[1:-1], 1))
+    largest = vectors.detach().abs().amax(0).amax(-1, keepdim=True)
+    usable = (largest > 0) & torch.isfinite(largest)
+    return torch.ldexp(torch.ones_like(largest), torch.frexp(torch.where(usable, largest, 0.5)).exponent)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from raytrace.asphere import asphere_root, sag_and_derivatives
 from raytrace.glass import AIR, Glass
-from raytrace.numerics import dot
+from raytrace.numerics import dot, with_batch_axes
 from raytrace.value import value
 
 
@@ -63,6 +63,12 @@ class Surface:
         """True if the surface has neither curvature nor aspheric terms to model."""
         return self.curvature is None and self.coefficients is None
 
+    @property
+    def batch_axes(self) -> int:
+        """How many batch axes the numbers of the shape have."""
+        scalars = [x.dim() for x in (self.curvature, self.conic) if x is not None]
+        return max([0, *scalars, 0 if self.coefficients is None else self.coefficients.dim() - 1])
+
 
 def sag(surface: Surface, radius_squared: Tensor) -> Tensor:
     """Sag z in mm at r² (...) in mm²; the radicand is clamped at 0 beyond the edge of a closed conic."""
@@ -81,6 +87,8 @@ def intersect(surface: Surface, position: Tensor, direction: Tensor) -> tuple[Te
     """
     if surface.is_plane:
         return _intersect_plane(position, direction)
+    axes = max(surface.batch_axes, position.dim() - 1, direction.dim() - 1)
+    position, direction = with_batch_axes(position, axes), with_batch_axes(direction, axes)
     # Slide to the foot of the perpendicular from the vertex, so that a far origin costs no digits (Feder 1951,
     # Spencer & Murty 1962); the slide stays in the graph.
     foot = position - dot(position, direction) * direction
@@ -130,12 +138,15 @@ def inside(surface: Surface, hit: Tensor) -> Tensor | None:
 
 
 def _intersect_plane(position: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+    # A ray along the plane misses it, and so does one that meets it further away than numbers go.
+    slope = direction[2].detach()
+    reach = position[2].detach() / torch.where(slope != 0, slope, 1.0)
+    met = (slope != 0) & torch.isfinite(reach) & torch.isfinite(reach * reach)
+    position, direction = _axial_where_lost(position, direction, met)
     x, y, z = position
     L, M, N = direction
-    met = N != 0
-    t = -z / torch.where(met, N, 1.0)
-    hit = torch.stack([x + t * L, y + t * M, torch.zeros_like(t)])
-    return torch.where(met, hit, 0.0), met
+    t = -z / N
+    return torch.stack([x + t * L, y + t * M, torch.zeros_like(t)]), met
 
 
 def _intersect_conic(surface: Surface, foot: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:

@@ -4,6 +4,7 @@ The trace is a generator. To record, draw or find where a ray was lost, consume 
 rays, hand them with the surfaces that are left.
 """
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from raytrace import glass
 from raytrace.lens import Lens
-from raytrace.numerics import dot, safe_sqrt, unit
+from raytrace.numerics import dot, safe_sqrt, unit, with_batch_axes
 from raytrace.rays import Rays
 from raytrace.surface import Surface, inside, intersect, normal
 from raytrace.value import value
@@ -48,8 +49,9 @@ def refract(direction: Tensor, normal: Tensor, norm_squared: Tensor, n1: Tensor,
     passes = b_squared > 0
     b = safe_sqrt(b_squared)
     along_normal = torch.where(cosine < 0, -D, D) / torch.where(passes, a + b, 1.0)
-    # An index of 0 is a medium without a real index: nothing passes into it.
-    refracted = (n1 * direction + along_normal * normal) / torch.where(n2 > 0, n2, 1.0)
+    # An index of 0 is a medium without a real index: nothing passes into it. n1/n2 is 1 exactly for equal indices.
+    safe_n2 = torch.where(n2 > 0, n2, 1.0)
+    refracted = (n1 / safe_n2) * direction + (along_normal / safe_n2) * normal
     return _renormalise(refracted), passes
 
 
@@ -69,6 +71,11 @@ def cross(surface: Surface, rays: Rays, gap: Tensor | None, side: int, n1: Tenso
     side: σ = ±1, the axial direction of light in the gap; n1, n2: (...) indices before and behind.
     If n2 is the same tensor as n1 the surface is a dummy and does not bend.
     """
+    axes = max(surface.batch_axes, n1.dim(), n2.dim(), 0 if gap is None else gap.dim(), len(rays.shape))
+    axes = max(axes, rays.position.dim() - 1)
+    rays = dataclasses.replace(
+        rays, position=with_batch_axes(rays.position, axes), direction=with_batch_axes(rays.direction, axes)
+    )
     direction = rays.direction
     arrival = rays.position if gap is None else _shift(rays.position, gap)
     hit, met = intersect(surface, arrival, direction)
@@ -173,7 +180,8 @@ def start(position: Tensor, direction: Tensor, opl: Tensor | None = None) -> Ray
 
     position, direction: (3, ...) mm and any unit; opl: (...) mm or None.
     """
-    position, direction = torch.broadcast_tensors(position, direction)
+    axes = max(position.dim(), direction.dim()) - 1
+    position, direction = torch.broadcast_tensors(with_batch_axes(position, axes), with_batch_axes(direction, axes))
     usable = torch.isfinite(position).all(0) & torch.isfinite(direction).all(0) & (direction != 0).any(0)
     axis = torch.zeros_like(direction)
     axis[2] = 1.0
