@@ -28,7 +28,9 @@ def vector(*numbers: float) -> torch.Tensor:
     return torch.tensor(numbers, dtype=torch.float64)
 
 
-def surface(curvature=None, thickness=0.0, glass: Glass | float = AIR, *, conic=None, coefficients=None, **others) -> Surface:
+def surface(
+    curvature=None, thickness=0.0, glass: Glass | float = AIR, *, conic=None, coefficients=None, **others
+) -> Surface:
     """A surface from plain numbers (tensors pass as they are); glass may be an index."""
 
     def tensor(x):
@@ -144,7 +146,7 @@ def stigmatic_problems() -> list[Stigmatic]:
             (0.0, 0.0, 0.0),
             heights,
         ),
-        # The Cartesian oval of a point at infinity, z + n √(r² + (f - z)²) = n f: an ellipse, c = n/((n - 1) f), k = -1/n².
+        # The oval of a point at infinity, z + n √(r² + (f - z)²) = n f: an ellipse, c = n/((n - 1) f), k = -1/n².
         Stigmatic(
             "elliptic front",
             (surface(n / ((n - 1) * focus), focus, n, conic=-1 / n**2), surface()),

@@ -43,8 +43,8 @@ FIRST_ORDER = {
 }
 PURE_NUMBERS = ("fno", "mag")
 
-#: Glasses whose shipped figures are not of the oracle's edition: (name, oracle's source) -> largest |Δn| found. There is
-#: none today: every glass of the corpus that is shipped agrees to the last digit.
+#: Glasses whose shipped figures are not of the oracle's edition: (name, oracle's source) -> largest |Δn| found. None
+#: today: every glass of the corpus that is shipped agrees to the last digit.
 OTHER_EDITIONS: dict[tuple[str, str], float] = {}
 
 
@@ -158,7 +158,9 @@ def compare_rays(lens: Lens, entry: dict, result: Comparison) -> list[str]:
             torch.tensor(ray["P"], dtype=torch.float64) * unit,
             torch.tensor(ray["D"], dtype=torch.float64),
         )
-        for number, (crossing, out) in enumerate(zip(steps(surfaces, rays, indices=indices), ray["out"], strict=True), 1):
+        for number, (crossing, out) in enumerate(
+            zip(steps(surfaces, rays, indices=indices), ray["out"], strict=True), 1
+        ):
             if out is None:
                 continue
             found = torch.cat([crossing.rays.position, crossing.rays.direction])

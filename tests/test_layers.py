@@ -69,7 +69,12 @@ FLOORS = {
 FAMILIES = {"psf": 9, "plot": 13, "bench": 14, "cli": 15}
 
 #: What only these files may import.
-RESERVED = {"matplotlib": ("plot",), "pandas": ("formats.frame", "cli", "bench"), "tqdm": ("cli", "bench"), "optiland": ("bench",)}
+RESERVED = {
+    "matplotlib": ("plot",),
+    "pandas": ("formats.frame", "cli", "bench"),
+    "tqdm": ("cli", "bench"),
+    "optiland": ("bench",),
+}
 
 
 def modules() -> dict[str, Path]:

@@ -1,0 +1,116 @@
+"""Conventions of sign, order and unit, each by the simplest scene that would show it wrong."""
+
+import math
+
+import pytest
+import torch
+from problems import double_gauss, fields, lens, surface, vector, vignetting_aperture
+
+from raytrace.glass import MIRROR, refractive_index, sellmeier
+from raytrace.launch import launch
+from raytrace.lens import check
+from raytrace.paraxial import first_order
+from raytrace.trace import media, start, steps, trace
+
+CENTRE = torch.zeros(2, 1, dtype=torch.float64)
+
+
+def chief(system, **options):
+    return trace(system, launch(system, CENTRE, **options), system.wavelengths[:, None]).position[:, :, 0, 0]
+
+
+def test_positive_field_angle_goes_up_and_images_up_for_infinity():
+    """A field of +10° is light that travels towards +y; a lens of positive focal length puts it at +y f tan θ."""
+    system = double_gauss()
+    rays = launch(system, CENTRE)
+    assert (rays.direction[1, 1:] > 0).all()
+    height = chief(system)[1]
+    assert height[1].item() == pytest.approx(99.51 * math.tan(math.radians(10)), rel=0.03)
+
+
+def test_positive_object_height_images_inverted():
+    system = double_gauss(object_distance=400.0, field=fields("object_height", (0.0, 10.0)))
+    assert first_order(system).magnification < 0
+    assert chief(system)[1, 1] < 0
+
+
+def test_field_angles_of_a_finite_object_look_the_same_way():
+    """θ is the direction of the chief ray: the object point lies on the other side."""
+    system = double_gauss(object_distance=4000.0)
+    rays = launch(system, CENTRE)
+    assert torch.atan2(rays.direction[1], rays.direction[2]).rad2deg().flatten().tolist() == pytest.approx(
+        [0.0, 10.0, 14.0], abs=1e-12
+    )
+
+
+def test_x_fields_are_x():
+    system = double_gauss(field=fields("angle", (0.0,), x=(10.0,)))
+    hit = chief(system)
+    other = chief(double_gauss(field=fields("angle", (10.0,))))
+    assert hit[0, 0].item() == pytest.approx(other[1, 0].item(), rel=1e-14)
+    assert hit[1, 0] == 0
+
+
+def test_positive_curvature_has_its_centre_behind_the_surface_and_positive_power_in_glass():
+    out = trace(
+        lens([surface(0.02, 100.0, 1.5)]),
+        start(vector(0.0, 5.0, 0.0)[:, None], vector(0.0, 0.0, 1.0)[:, None]),
+        vector(0.55),
+    )
+    assert out.direction[1] < 0
+
+
+def test_wavelengths_are_micrometres_and_short_ones_bend_more():
+    crown = sellmeier([1.03961212, 0.231792344, 1.01046945], [0.00600069867, 0.0200179144, 103.560653], name="N-BK7")
+    blue, red = refractive_index(crown, vector(0.4861327, 0.6562725))
+    assert blue.item() == pytest.approx(1.52238, abs=5e-6)
+    assert red.item() == pytest.approx(1.51432, abs=5e-6)
+
+
+def test_stop_and_surface_numbers_are_those_of_the_file():
+    system = double_gauss()
+    assert system.stop == 6
+    assert system.surfaces[system.stop].is_plane
+    assert len(system.surfaces) == 13
+
+
+def test_semi_diameter_alone_never_clips():
+    narrow = lens([surface(0.02, 5.0, 1.5, semi_diameter=1.0), surface(None, 50.0, semi_diameter=1.0)])
+    assert trace(narrow, launch(narrow, vector(0.0, 1.0).reshape(2, 1)), narrow.wavelengths[0]).valid.all()
+
+
+def test_vignetted_ray_keeps_its_coordinates_and_a_missed_one_ends():
+    system = lens([surface(0.05, 5.0, 1.5, apertures=vignetting_aperture(3.0)), surface(None, 50.0)])
+    free = lens([surface(0.05, 5.0, 1.5), surface(None, 50.0)])
+    rays = start(
+        torch.stack([vector(0, 0), vector(5, 30), vector(0, 0)]),
+        torch.stack([vector(0, 0), vector(0, 0), vector(1, 1)]),
+    )
+    crossings = list(steps(system.surfaces[1:], rays, indices=media(system, system.wavelengths[0])))
+    assert crossings[0].clipped.tolist() == [True, False]
+    assert crossings[0].missed.tolist() == [False, True]
+    last = crossings[-1].rays
+    assert not last.valid.any()
+    assert torch.equal(last.position[:, 0], trace(free, rays, free.wavelengths[0]).position[:, 0])
+    assert last.position[:, 1].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_thickness_behind_a_mirror_is_negative_and_light_comes_back():
+    system = lens([surface(None, 10.0), surface(-0.01, -50.0, MIRROR)], stop=2)
+    out = trace(system, launch(system, vector(0.0, 0.1).reshape(2, 1)), system.wavelengths[0])
+    assert out.direction[2] < 0
+    assert out.position[2] == 0
+
+
+def test_check_refuses_what_cannot_be_traced():
+    check(double_gauss())
+    for broken in (
+        double_gauss(stop=0),
+        double_gauss(stop=12),
+        double_gauss(field=fields("angle", (90.0,))),
+        double_gauss(field=fields("object_height", (1.0,))),
+        double_gauss(aperture=("object_na", 0.1)),
+        double_gauss(wavelengths=(-0.5,)),
+    ):
+        with pytest.raises(ValueError, match=r"\w"):
+            check(broken)

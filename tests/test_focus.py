@@ -1,0 +1,142 @@
+"""Focus: the closed form is the minimum found by moving the sensor and retracing, and its derivatives are exact."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from problems import double_gauss, lens, scalar, surface, vector
+
+from raytrace import pupil
+from raytrace.focus import focus, focus_moments, image_rays, through_focus
+from raytrace.glass import MIRROR
+from raytrace.lens import with_object_distance, with_sensor_distance
+from raytrace.paraxial import first_order
+from raytrace.spot import spot
+
+POINTS, WEIGHTS = pupil.gauss_rings(6)
+AXIS = torch.zeros(2, 1, dtype=torch.float64)
+
+
+def rms(system, **options):
+    """Mean square radius over fields and wavelengths of a lens as it stands, retraced."""
+    return spot(image_rays(system, POINTS, **options), WEIGHTS).mean_square_radius
+
+
+def test_double_gauss_at_25_metres_as_published():
+    system = double_gauss(object_distance=25000.0)
+    found = focus(system, POINTS, WEIGHTS, fields=AXIS)
+    assert found.item() == pytest.approx(57.66201, abs=6e-6)  # mm: half of the last digit printed
+    best = rms(with_sensor_distance(system, found), fields=AXIS).sqrt()
+    paraxial = rms(with_sensor_distance(system, 57.8817685209), fields=AXIS).sqrt()
+    assert best.item() == pytest.approx(7.075e-3, abs=0.6e-6)  # mm
+    assert paraxial.item() == pytest.approx(27.16e-3, abs=6e-6)  # mm
+
+
+@pytest.mark.parametrize("distance", [math.inf, 25000.0, 500.0])
+def test_closed_form_is_the_minimum_of_the_retraced_radius(distance):
+    system = double_gauss(object_distance=distance)
+    found = focus(system, POINTS, WEIGHTS)
+    mean = [rms(with_sensor_distance(system, found + step)).sum().item() for step in (-0.01, 0.0, 0.01)]
+    vertex = 0.01 * 0.5 * (mean[0] - mean[2]) / (mean[0] - 2 * mean[1] + mean[2])
+    # The parabola is exact; the vertex of three points has the rounding of the mean squares over their differences.
+    assert abs(vertex) <= 1e-9  # mm
+
+
+@pytest.mark.parametrize("glass", [1.0, 1.5])
+@pytest.mark.parametrize("curvature", [None, 0.0])
+def test_sensor_in_glass_is_focused_by_the_rays_in_the_glass(glass, curvature):
+    """A sensor cemented to its cover glass: the file's image surface is followed by air, which must not matter."""
+    system = lens(
+        [surface(0.02, 5.0, 1.6), surface(-0.02, 30.0), surface(curvature, 12.0, glass)],
+        aperture=("entrance_pupil_diameter", 15.0),
+    )
+    found = focus(system, POINTS, WEIGHTS)
+    mean = [rms(with_sensor_distance(system, found + step)).sum().item() for step in (-0.01, 0.0, 0.01)]
+    assert abs(0.01 * 0.5 * (mean[0] - mean[2]) / (mean[0] - 2 * mean[1] + mean[2])) <= 1e-9  # mm
+
+
+def test_behind_an_odd_number_of_mirrors():
+    """Sensor distances are negative there, and so is the one found."""
+    mirror = lens([surface(-0.01, -49.0, MIRROR)], aperture=("entrance_pupil_diameter", 5.0))
+    found = focus(mirror, POINTS, WEIGHTS, fields=AXIS)
+    assert found.item() == pytest.approx(-50.0, abs=0.02)
+    mean = [rms(with_sensor_distance(mirror, found + step), fields=AXIS).sum().item() for step in (-0.01, 0.0, 0.01)]
+    assert abs(0.01 * 0.5 * (mean[0] - mean[2]) / (mean[0] - 2 * mean[1] + mean[2])) <= 1e-9  # mm
+
+
+def test_several_distances_fields_and_weights():
+    system = double_gauss()
+    weights = {"distance_weights": [1.0, 3.0], "field_weights": vector(2.0, 0.0, 1.0)}
+    found = focus(system, POINTS, WEIGHTS, object_distances=[math.inf, 25000.0], **weights)
+
+    def merit(s):
+        total = 0.0
+        for distance, w in ((math.inf, 1.0), (25000.0, 3.0)):
+            mean_square = rms(with_sensor_distance(with_object_distance(system, distance), s))
+            total = total + w * (mean_square * weights["field_weights"][:, None]).sum()
+        return total.item()
+
+    mean = [merit(found + step) for step in (-0.01, 0.0, 0.01)]
+    assert abs(0.01 * 0.5 * (mean[0] - mean[2]) / (mean[0] - 2 * mean[1] + mean[2])) <= 1e-9  # mm
+
+
+def test_result_does_not_depend_on_where_the_sensor_stood():
+    system = double_gauss()
+    found = [focus(with_sensor_distance(system, s), POINTS, WEIGHTS).item() for s in (1.0, 58.5, 90.0)]
+    assert max(found) - min(found) <= 1e-11  # mm
+
+
+def test_through_focus_is_the_parabola_of_the_moments():
+    rays = image_rays(double_gauss(), POINTS)
+    cov, var = focus_moments(rays, WEIGHTS)
+    shifts = torch.linspace(-1, 1, 9, dtype=torch.float64)
+    spots = through_focus(rays, shifts, WEIGHTS)
+    here = spot(rays, WEIGHTS).mean_square_radius
+    expected = here + 2 * shifts[:, None, None] * cov + shifts[:, None, None] ** 2 * var
+    assert torch.allclose(spots.mean_square_radius, expected, rtol=1e-10, atol=1e-16)
+
+
+def test_perfect_lens_focuses_in_its_focus():
+    hyperbolic = lens(
+        [surface(None, 10.0, 1.5), surface(-1 / 25, 47.0, conic=-2.25)], aperture=("entrance_pupil_diameter", 30.0)
+    )
+    found = focus(hyperbolic, POINTS, WEIGHTS)
+    assert found.item() == pytest.approx(50.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("number", [1, 3, 11])
+def test_derivative_by_curvature_is_that_of_differences(number):
+    system = double_gauss(object_distance=25000.0)
+
+    def sensor(c):
+        changed = dataclasses.replace(system.surfaces[number], curvature=c)
+        surfaces = (*system.surfaces[:number], changed, *system.surfaces[number + 1 :])
+        return focus(dataclasses.replace(system, surfaces=surfaces), POINTS, WEIGHTS)
+
+    c = system.surfaces[number].curvature.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(sensor(c), c)
+    step = 1e-6
+    difference = (8 * (sensor(c + step) - sensor(c - step)) - (sensor(c + 2 * step) - sensor(c - 2 * step))) / (
+        12 * step
+    )
+    assert gradient.item() == pytest.approx(difference.item(), rel=1e-7)
+
+
+def test_derivative_by_object_distance_tends_to_newtons():
+    """ds/dD = -(f/x)² for a small pupil."""
+    system = double_gauss(aperture=("entrance_pupil_diameter", 0.1))
+    D = scalar(5000.0).requires_grad_()
+    found = focus(with_object_distance(system, D), POINTS, WEIGHTS, fields=AXIS)
+    data = first_order(with_object_distance(system, 5000.0))
+    assert torch.autograd.grad(found, D)[0].item() == pytest.approx(-(data.magnification**2).item(), rel=1e-5)
+
+
+def test_all_rays_lost_leaves_the_sensor_where_it_is():
+    blind = lens([surface(0.1, 5.0, 1.5), surface(-0.01, 40.0)], aperture=("entrance_pupil_diameter", 1000.0))
+    points = torch.tensor([[0.9, -0.9], [0.0, 0.0]], dtype=torch.float64)
+    c = blind.surfaces[1].curvature.clone().requires_grad_()
+    surfaces = (blind.surfaces[0], dataclasses.replace(blind.surfaces[1], curvature=c), *blind.surfaces[2:])
+    found = focus(dataclasses.replace(blind, surfaces=surfaces), points, torch.ones(2, dtype=torch.float64))
+    assert found.item() == 40.0
+    assert torch.autograd.grad(found, c)[0].item() == 0.0

@@ -1,0 +1,315 @@
+"""Launch: rays of every kind of field and object distance, aimed or not, meet the pupil they were given."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from problems import double_gauss, fields, lens, scalar, surface, vector
+
+from raytrace import pupil
+from raytrace.launch import launch, rays_from_infinity, rays_from_point, rays_of_field, stop_radius, vignette
+from raytrace.lens import with_object_distance
+from raytrace.paraxial import first_order
+from raytrace.trace import media, trace, trace_surfaces
+from raytrace.value import to
+
+POINTS, _ = pupil.hexapolar(2)
+CENTRE = torch.zeros(2, 1, dtype=torch.float64)
+INF = math.inf
+
+
+def at_stop(system, rays):
+    indices = media(system, system.wavelengths[:, None])[: system.stop + 1]
+    return trace_surfaces(system.surfaces[1 : system.stop + 1], rays, indices=indices)
+
+
+def aiming_error(system, rays, points=POINTS):
+    """Largest distance at the stop to where the ray was aimed, in stop radii; rays not found left out."""
+    found = at_stop(system, rays).position[:2] / stop_radius(system) - points[:, None, None]
+    return torch.where(rays.valid, found, 0.0).abs().max().item()
+
+
+def fisheye(**others):
+    """Two negative menisci before a positive group; chief rays from 75° reach the stop, the pupil wanders."""
+    elements = [
+        surface(1 / 80, 4.0, 1.6),
+        surface(1 / 22, 22.0),
+        surface(1 / 150, 3.0, 1.6),
+        surface(1 / 20, 25.0),
+        surface(1 / 40, 8.0, 1.7),
+        surface(-1 / 60, 10.0),
+        surface(None, 4.0),
+        surface(-1 / 100, 3.0, 1.75),
+        surface(1 / 30, 8.0, 1.6),
+        surface(-1 / 25, 40.0),
+    ]
+    return lens(elements, **{"stop": 7, "aperture": ("entrance_pupil_diameter", 2.0), **others})
+
+
+def relay(back: float, distance: float, **others):
+    """A stop `back` behind a lens of f = 10 mm: beyond the focus, its image lies before the object."""
+    elements = [surface(0.05, 5.0, 1.5), surface(-0.05, back), surface(None, 80.0)]
+    options = {"stop": 3, "object_distance": distance, "aperture": ("float_by_stop", 0.2)}
+    return lens(elements, **{**options, "field": fields("object_height", (0.0, 0.1)), **others})
+
+
+@pytest.mark.parametrize("distance", [INF, 1e12, 1e4, 200.0])
+def test_chief_ray_passes_the_centre_of_the_entrance_pupil_and_others_its_parts(distance):
+    system = double_gauss(object_distance=distance)
+    data = first_order(system)
+    rays = launch(system, POINTS)
+    x, y, z = rays.position
+    t = (data.entrance_pupil_position - z) / rays.direction[2]
+    hit = torch.stack([x, y]) + t * rays.direction[:2]
+    assert (hit - 0.5 * data.entrance_pupil_diameter * POINTS[:, None, None]).abs().max() <= 1e-11  # mm
+    assert (torch.linalg.vector_norm(rays.direction, dim=0) - 1).abs().max() <= 1e-15
+
+
+@pytest.mark.parametrize("distance", [1e4, 200.0, 30.0])
+def test_rays_of_a_finite_object_meet_in_their_object_point(distance):
+    system = double_gauss(object_distance=distance, field=fields("object_height", (0.0, -3.0, 20.0)))
+    rays = launch(system, POINTS)
+    t = (-distance - rays.position[2]) / rays.direction[2]
+    hit = rays.position[1] + t * rays.direction[1]
+    assert (hit - system.fields.y[:, None, None]).abs().max() <= 1e-12 * distance
+
+
+def test_path_counts_from_the_object_point():
+    """Reduced path: length from the object to the start, less the distance of the object from the vertex."""
+    point, aim = vector(1.0, -2.0, -30.0)[:, None], vector(3.0, 4.0, 2.0)[:, None]
+    rays = rays_from_point(point, aim, index=scalar(1.5))
+    expected = 1.5 * (torch.linalg.vector_norm(aim - point) - torch.linalg.vector_norm(point))
+    assert rays.opl.item() == pytest.approx(expected.item(), rel=1e-14)
+    far = rays_from_point(1e15 * vector(0.0, 0.3, -1.0)[:, None], aim, index=scalar(1.5))
+    plane = rays_from_infinity(vector(0.0, -0.3, 1.0)[:, None], aim, index=scalar(1.5))
+    assert far.opl.item() == pytest.approx(plane.opl.item(), rel=1e-13)
+
+
+def test_object_at_1e12_mm_is_one_at_infinity():
+    near, far = double_gauss(object_distance=1e12), double_gauss()
+    one, other = (trace(s, launch(s, POINTS), s.wavelengths[:, None]) for s in (near, far))
+    assert (one.position - other.position).abs().max() <= 2e-8  # mm: f²/D = 1e-8
+
+
+@pytest.mark.parametrize("aiming", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "heights", "distance"),
+    [
+        ("angle", (0.0, 10.0), INF),
+        ("angle", (0.0, 10.0), 300.0),
+        ("object_height", (0.0, 20.0), 300.0),
+        ("paraxial_image_height", (0.0, 10.0), INF),
+        ("paraxial_image_height", (0.0, 10.0), 300.0),
+        ("real_image_height", (0.0, 10.0), INF),
+        ("real_image_height", (10.0,), 300.0),
+    ],
+)
+def test_every_kind_of_field(kind, heights, distance, aiming):
+    system = double_gauss(object_distance=distance, field=fields(kind, heights))
+    rays = launch(system, CENTRE, ray_aiming=aiming)
+    assert rays.valid.all()
+    if kind == "real_image_height":
+        hit = trace(system, rays, system.wavelengths[:, None]).position[1].flatten()
+        assert hit.tolist() == pytest.approx(list(heights), abs=1e-10)  # mm
+    if kind == "angle" and not aiming:
+        assert torch.atan2(rays.direction[1], rays.direction[2]).rad2deg().flatten().tolist() == pytest.approx(
+            list(heights), abs=1e-12
+        )
+    if kind == "paraxial_image_height" and distance != INF:
+        data = first_order(system)
+        t = (-distance - rays.position[2]) / rays.direction[2]
+        object_height = rays.position[1] + t * rays.direction[1]
+        assert (data.magnification * object_height).flatten().tolist() == pytest.approx(list(heights), abs=1e-10)
+
+
+def test_paraxial_image_height_of_infinity_is_that_of_a_small_field():
+    system = double_gauss(field=fields("paraxial_image_height", (1e-4,)))
+    data = first_order(system)
+    focused = dataclasses.replace(
+        system,
+        surfaces=(
+            *system.surfaces[:-2],
+            dataclasses.replace(system.surfaces[-2], thickness=data.back_focal_distance),
+            system.surfaces[-1],
+        ),
+    )
+    hit = trace(focused, launch(focused, CENTRE), focused.wavelengths[:, None]).position[1]
+    assert hit.item() == pytest.approx(1e-4, rel=1e-8)
+
+
+@pytest.mark.parametrize("distance", [INF, 300.0])
+def test_aimed_rays_fill_the_stop_evenly(distance):
+    system = double_gauss(object_distance=distance)
+    rays = launch(system, POINTS, ray_aiming=True)
+    assert rays.valid.all()
+    assert aiming_error(system, rays) <= 1e-10  # of the stop radius
+    assert aiming_error(system, launch(system, POINTS, ray_aiming=False)) > 1e-3
+
+
+def test_the_axial_chief_ray_can_be_aimed():
+    system = double_gauss(field=fields("angle", (0.0,)))
+    assert launch(system, CENTRE, ray_aiming=True).valid.all()
+
+
+@pytest.mark.parametrize("angle", [0.0, 40.0, 60.0, 70.0, 75.0])
+def test_wide_angles_are_aimed(angle):
+    system = fisheye(field=fields("angle", (angle,)))
+    points = pupil.hexapolar(1)[0]
+    rays = launch(system, points, ray_aiming=True)
+    assert rays.valid.all()
+    assert aiming_error(system, rays, points) <= 1e-10  # of the stop radius
+
+
+def test_rays_that_no_aim_brings_to_the_stop_are_lost_and_others_are_not():
+    system = fisheye(field=fields("angle", (30.0, 89.0)))
+    c = system.surfaces[1].curvature.clone().requires_grad_()
+    first = dataclasses.replace(system.surfaces[1], curvature=c)
+    changed = dataclasses.replace(system, surfaces=(system.surfaces[0], first, *system.surfaces[2:]))
+    rays = launch(changed, CENTRE, ray_aiming=True)
+    assert rays.valid.flatten().tolist() == [True, False]
+    assert torch.isfinite(rays.position).all()
+    assert torch.isfinite(torch.autograd.grad(rays.position.sum() + rays.direction.sum() + rays.opl.sum(), c)[0])
+
+
+@pytest.mark.parametrize("aiming", [False, True])
+@pytest.mark.parametrize(("back", "distance"), [(2.0, 30.0), (30.0, 30.0), (60.0, 10.0)])
+def test_light_travels_forward_wherever_the_entrance_pupil_lies(back, distance, aiming):
+    """Before the lens, behind it, or on the far side of the object; aimed and paraxial rays agree to first order."""
+    system = relay(back, distance)
+    data = first_order(system)
+    rays = launch(system, POINTS, ray_aiming=aiming)
+    assert rays.valid.all()
+    assert (rays.direction[2] > 0).all()
+    other = launch(system, POINTS, ray_aiming=False)
+    assert (rays.direction - other.direction).abs().max() <= 0.02, data.entrance_pupil_position
+
+
+def test_entrance_pupil_before_the_object_path_is_that_of_the_object():
+    """Rays of one object point: the same path at the object, wherever they start."""
+    system = relay(60.0, 10.0)
+    rays = launch(system, POINTS)
+    t = (-10.0 - rays.position[2]) / rays.direction[2]
+    at_object = rays.opl + t
+    assert (at_object - at_object[..., :1]).abs().max() <= 1e-12  # mm
+    assert at_object[0, 0, 0].item() == pytest.approx(-10.0, abs=1e-12)
+
+
+def test_entrance_pupil_almost_at_infinity():
+    """A stop in the rear focus: telecentric by position. Chief rays are parallel to the axis to rounding."""
+    focus = first_order(lens([surface(0.05, 5.0, 1.5), surface(-0.05, 10.0)])).back_focal_distance
+    system = relay(focus, 20.0)
+    rays = launch(system, POINTS)
+    assert rays.valid.all()
+    assert (rays.direction[:2, :, 0, 0]).abs().max() <= 1e-12
+    t = (-20.0 - rays.position[2]) / rays.direction[2]
+    assert (rays.position[1] + t * rays.direction[1] - system.fields.y[:, None, None]).abs().max() <= 1e-12
+    marginal = at_stop(system, rays).position[:2] + 0.2 * POINTS[:, None, None]
+    assert marginal.abs().max() <= 0.02  # mm of 0.2: its aberration
+
+
+def test_virtual_object():
+    """Light converging to a point 60 mm behind surface 1 travels forward, towards the point."""
+    system = lens([surface(0.01, 5.0, 1.5), surface(None, 30.0)], object_distance=-60.0)
+    rays = launch(system, POINTS)
+    assert (rays.direction[2] > 0).all()
+    t = (60.0 - rays.position[2]) / rays.direction[2]
+    hit = rays.position[:2] + t * rays.direction[:2]
+    assert hit.abs().max() <= 1e-12
+    out = trace(system, rays, system.wavelengths[:, None])
+    crossing = -out.position[1] * out.direction[2] / out.direction[1]
+    image = first_order(system).paraxial_image_distance - 30.0
+    assert torch.nanmean(crossing[..., 1:]).item() == pytest.approx(image.item(), rel=0.05)
+
+
+def test_telecentric_object_space():
+    field = fields("object_height", (0.0, 1.0), telecentric=True)
+    system = relay(10.0, 20.0, aperture=("object_na", 0.05), field=field)
+    rays = launch(system, POINTS)
+    assert (rays.direction[:2, :, 0, 0] == 0).all()  # chief rays parallel to the axis
+    edge = POINTS.norm(dim=0) > 0.99
+    sine = torch.linalg.vector_norm(rays.direction[:2], dim=0)[..., edge]
+    assert (sine - 0.05).abs().max() <= 2e-5  # equal tangents, not sines, off the axis of the cone's own field point
+    assert (sine[0] - 0.05).abs().max() <= 1e-15
+
+
+class TestVignetting:
+    FACTORS = torch.tensor([[0.0, 0.1], [0.0, -0.2], [0.0, 0.3], [0.0, 0.5], [0.0, 0.0]], dtype=torch.float64)
+
+    def system(self, factors=FACTORS):
+        return double_gauss(field=fields("angle", (0.0, 14.0), vignetting=factors))
+
+    def test_pupil_is_compressed_and_shifted(self):
+        """p' = V + (1 - C) p."""
+        found = vignette(self.system(), vector(0.0, 14.0)[:, None], POINTS)
+        assert torch.allclose(found[0], 0.1 + 0.7 * POINTS[0], atol=1e-15)
+        assert torch.allclose(found[1], -0.2 + 0.5 * POINTS[1], atol=1e-15)
+
+    def test_each_field_has_its_own(self):
+        rays, plain = launch(self.system(), POINTS), launch(double_gauss(field=fields("angle", (0.0, 14.0))), POINTS)
+        assert torch.equal(rays.position[:, 0], plain.position[:, 0])
+        assert not torch.equal(rays.position[:, 1], plain.position[:, 1])
+
+    def test_a_field_in_between_is_not_vignetted(self):
+        field = vector(0.0, 7.0)[:, None]
+        one, other = launch(self.system(), POINTS, fields=field), launch(double_gauss(), POINTS, fields=field)
+        assert torch.equal(one.position, other.position)
+
+    def test_angle_turns_the_ellipse_by_van(self):
+        factors = torch.tensor([[0.0], [0.0], [0.0], [0.5], [90.0]], dtype=torch.float64)
+        system = double_gauss(field=fields("angle", (0.0,), vignetting=factors))
+        found = vignette(system, CENTRE, POINTS)
+        assert torch.allclose(found, POINTS * vector(0.5, 1.0)[:, None], atol=1e-15)
+
+
+def test_batches_broadcast_and_equal_single_rays():
+    system = double_gauss(wavelengths=(0.45, 0.53, 0.65))
+    whole = launch(system, POINTS)
+    assert whole.shape == (3, 3, 19)
+    one = rays_of_field(system, vector(0.0, 14.0), POINTS[:, 5], wavelength=system.wavelengths[1])
+    assert torch.equal(one.position, whole.position[:, 2, 1, 5])
+    assert torch.equal(one.direction, whole.direction[:, 2, 1, 5])
+
+
+def test_aiming_does_not_depend_on_neighbours():
+    system = double_gauss()
+    whole = launch(system, POINTS, ray_aiming=True)
+    alone = launch(system, POINTS[:, 7:8], fields=vector(0.0, 14.0)[:, None], ray_aiming=True)
+    assert torch.equal(alone.position[:, 0, 0, 0], whole.position[:, 2, 0, 7])
+
+
+@pytest.mark.parametrize("name", ["curvature", "thickness", "object distance", "aperture", "field"])
+@pytest.mark.parametrize("aiming", [False, True])
+def test_derivatives_of_launched_rays(name, aiming):
+    """Image points by curvature, thickness, object distance, aperture and field, aiming included: first order."""
+    base = double_gauss(object_distance=400.0, aperture=("entrance_pupil_diameter", 15.0))
+    points = vector(0.0, 0.0, 0.3, 0.9).reshape(2, 2).T.contiguous()
+
+    def image(x):
+        system = base
+        if name in ("curvature", "thickness"):
+            changed = dataclasses.replace(base.surfaces[2], **{name: getattr(base.surfaces[2], name) * x})
+            system = dataclasses.replace(base, surfaces=(*base.surfaces[:2], changed, *base.surfaces[3:]))
+        elif name == "object distance":
+            system = with_object_distance(base, 400.0 * x)
+        elif name == "aperture":
+            system = dataclasses.replace(base, aperture=dataclasses.replace(base.aperture, value=15.0 * x))
+        field = torch.stack([scalar(0.0), 8.0 * (x if name == "field" else scalar(1.0))])[:, None]
+        rays = launch(system, points, fields=field, ray_aiming=aiming)
+        return trace(system, rays, system.wavelengths[:, None]).position[:2].flatten()
+
+    x = scalar(1.0).requires_grad_()
+    found = torch.stack([torch.autograd.grad(y, x, retain_graph=True)[0] for y in image(x)])
+    step = 1e-3
+    with torch.no_grad():
+        near, far = image(x + step) - image(x - step), image(x + 2 * step) - image(x - 2 * step)
+    difference = (8 * near - far) / (12 * step)
+    assert (found - difference).abs().max() <= 1e-6 * difference.abs().max() + 1e-8
+
+
+def test_float32():
+    system = to(double_gauss(), dtype=torch.float32)
+    for aiming in (False, True):
+        rays = launch(system, POINTS.float(), ray_aiming=aiming)
+        assert rays.position.dtype == torch.float32
+        assert rays.valid.all()

@@ -1,0 +1,221 @@
+"""First order: the limit of real rays, the identities of Gaussian optics, conjugates, mirrors and pupils."""
+
+import dataclasses
+import math
+from fractions import Fraction
+from pathlib import Path
+
+import pytest
+import torch
+from problems import aspheric_singlet, double_gauss, lens, scalar, surface, vector
+
+from raytrace.formats import read_lens
+from raytrace.glass import MIRROR
+from raytrace.lens import with_object_distance
+from raytrace.paraxial import first_order, paraxial_image_distance, signed, system_matrix
+from raytrace.trace import media, start, trace, trace_surfaces
+
+INF = math.inf
+
+
+def thick_lens(**others):
+    return lens([surface(0.02, 5.0, 1.5), surface(-0.01, 95.0)], **others)
+
+
+def cassegrain(**others):
+    """A concave paraboloid and a convex hyperboloid: two mirrors, light again towards +z."""
+    primary = surface(-1 / 200, -70.0, MIRROR, conic=-1.0)
+    secondary = surface(-0.0267, 150.0, MIRROR, conic=-2.25)
+    return lens([surface(None, 100.0), primary, secondary], stop=2, **others)
+
+
+SYSTEMS = {
+    "thick lens": thick_lens(),
+    "double Gauss": double_gauss(),
+    "asphere with an r² term": aspheric_singlet(),
+    "concave mirror": lens([surface(-0.01, -50.0, MIRROR)]),
+    "convex mirror": lens([surface(0.01, -30.0, MIRROR)]),
+    "two mirrors": cassegrain(),
+    "Mangin": lens([surface(-0.01, 5.0, 1.5), surface(-0.012, -5.0, MIRROR), surface(-0.01, -40.0)]),
+    "three mirrors": lens([surface(-0.01, -20.0, MIRROR), surface(0.02, 30.0, MIRROR), surface(-0.004, -30.0, MIRROR)]),
+    "immersed image": lens([surface(0.05, 60.0, 1.5)]),
+}
+each = pytest.mark.parametrize("system", SYSTEMS.values(), ids=SYSTEMS.keys())
+
+
+@each
+@pytest.mark.parametrize("distance", [INF, 1e4, 300.0])
+def test_real_rays_near_the_axis_tend_to_the_paraxial_image(system, distance):
+    """The crossing with the axis differs from the paraxial one by O(h²); two heights give the limit."""
+    system = with_object_distance(system, distance)
+    image = first_order(system).paraxial_image_distance
+    height = vector(1e-3, 2e-3)
+    zero = torch.zeros_like(height)
+    direction = torch.stack([zero, height / distance, zero + 1])
+    indices = media(system, system.wavelengths[0])
+    indices[-1] = indices[-2]  # the image surface does not bend the rays whose crossing is sought
+    rays = start(torch.stack([zero, height, zero]), direction)
+    out = trace_surfaces(system.surfaces[1:], rays, indices=indices)
+    shift = -out.position[1] * out.direction[2] / out.direction[1]
+    crossing = system.surfaces[-2].thickness + (4 * shift[0] - shift[1]) / 3
+    assert crossing.item() == pytest.approx(image.item(), rel=1e-9, abs=1e-9)
+
+
+@each
+def test_system_matrix_has_determinant_one(system):
+    n = signed(system.surfaces[1:-1], media(system, system.wavelengths[0])[:-1])
+    A, B, C, D = system_matrix(system.surfaces[1:-1], n)
+    assert (A * D - B * C).item() == pytest.approx(1.0, abs=1e-12)
+
+
+@each
+@pytest.mark.parametrize("distance", [1e4, 300.0, 77.0])
+def test_newtons_equation_and_the_magnification(system, distance):
+    """x x′ = f f′ and m = -x′/f′ = -f/x, distances from the focal points, in signed indices."""
+    data = first_order(with_object_distance(system, distance))
+    n = signed(system.surfaces[1:-1], media(system, system.wavelengths[0])[:-1])
+    f, f_image = -n[0] / data.power, n[-1] / data.power
+    x = -distance - data.front_focal_distance
+    x_image = data.paraxial_image_distance - data.back_focal_distance
+    assert (x * x_image).item() == pytest.approx((f * f_image).item(), rel=1e-9)
+    assert data.magnification.item() == pytest.approx((-x_image / f_image).item(), rel=1e-9)
+    assert data.magnification.item() == pytest.approx((-f / x).item(), rel=1e-9)
+
+
+@each
+def test_object_distance_tends_to_infinity(system):
+    far = first_order(with_object_distance(system, 1e12))
+    infinite = first_order(with_object_distance(system, INF))
+    focal = infinite.effective_focal_length.abs().item()
+    assert far.paraxial_image_distance.item() == pytest.approx(infinite.back_focal_distance.item(), abs=focal**2 / 1e11)
+    assert infinite.magnification == 0
+
+
+@each
+def test_principal_planes_are_conjugate_at_magnification_one(system):
+    data = first_order(system)
+    conjugate = first_order(with_object_distance(system, -data.front_principal_plane))
+    if data.front_principal_plane != 0:
+        assert conjugate.paraxial_image_distance.item() == pytest.approx(data.rear_principal_plane.item(), abs=1e-8)
+        assert conjugate.magnification.item() == pytest.approx(1.0, rel=1e-9)
+
+
+@pytest.mark.parametrize("stop", range(1, 12))
+def test_pupils_are_images_of_the_stop(stop):
+    """A real ray near the axis from the entrance pupil's centre passes the stop's and the exit pupil's centre."""
+    system = double_gauss(stop=stop)
+    data = first_order(system)
+    slope = 1e-5
+    direction = torch.stack([vector(0.0), vector(slope), vector(1.0)])
+    start_point = torch.stack([vector(0.0), vector(0.0), data.entrance_pupil_position[None]])
+    rays = start(start_point, direction)
+    at_stop = trace_surfaces(
+        system.surfaces[1 : stop + 1], rays, indices=media(system, system.wavelengths[0])[: stop + 1]
+    )
+    assert abs(at_stop.position[1].item()) <= 1e-12  # mm; third order: slope³ · 100 mm
+    last = trace(system, rays, system.wavelengths[0])
+    crossing = -last.position[1] * last.direction[2] / last.direction[1]
+    assert crossing.item() == pytest.approx(data.exit_pupil_position.item(), rel=1e-6)
+    ratio = data.exit_pupil_diameter / data.entrance_pupil_diameter
+    angular = (last.direction[1] / last.direction[2]).item() / slope
+    assert ratio.item() == pytest.approx(abs(1 / angular), rel=1e-7)  # Lagrange's invariant between the pupils
+
+
+def test_thick_lens_by_hand():
+    """Rational arithmetic: φ = φ1 + φ2 - φ1 φ2 d/n."""
+    phi1, phi2, d, n = Fraction(1, 100), Fraction(1, 200), 5, Fraction(3, 2)
+    phi = phi1 + phi2 - phi1 * phi2 * d / n
+    data = first_order(thick_lens())
+    assert data.effective_focal_length.item() == pytest.approx(float(1 / phi), rel=1e-14)
+    assert data.back_focal_distance.item() == pytest.approx(float((1 - phi1 * d / n) / phi), rel=1e-14)
+    assert data.front_focal_distance.item() == pytest.approx(float(-(1 - phi2 * d / n) / phi), rel=1e-14)
+    assert data.petzval_radius.item() == pytest.approx(float(-1 / (phi1 / n + phi2 / n)), rel=1e-14)
+
+
+def test_double_gauss_as_published():
+    system = read_lens(Path(__file__).parents[1] / "lenses" / "double_gauss.zmx")
+    data = first_order(system)
+    assert data.effective_focal_length.item() == pytest.approx(99.5145515666, abs=1e-9)
+    assert data.back_focal_distance.item() == pytest.approx(57.4851290372, abs=1e-9)
+    for distance, image in ((25000.0, 57.8817685209), (10000.0, 58.4786601704)):
+        assert paraxial_image_distance(system, scalar(distance)).item() == pytest.approx(image, abs=1e-9)
+        moved = first_order(with_object_distance(system, distance))
+        assert moved.paraxial_image_distance.item() == pytest.approx(image, abs=1e-9)
+
+
+@pytest.mark.parametrize(("curvature", "focal"), [(-0.01, 50.0), (0.01, -50.0)])
+def test_mirror_signs(curvature, focal):
+    """A concave mirror (c < 0 for light towards +z) has a positive focal length and its focus before it."""
+    data = first_order(lens([surface(curvature, -50.0, MIRROR)]))
+    assert data.effective_focal_length.item() == pytest.approx(focal, rel=1e-14)
+    assert data.back_focal_distance.item() == pytest.approx(-focal, rel=1e-14)
+    assert data.petzval_radius.abs().item() == pytest.approx(50.0, rel=1e-14)
+
+
+def test_an_r2_term_bends_like_a_curvature():
+    one = first_order(lens([surface(0.02, 5.0, 1.5, coefficients=[0.005, 1e-6]), surface(None, 50.0)]))
+    other = first_order(lens([surface(0.03, 5.0, 1.5), surface(None, 50.0)]))
+    assert one.effective_focal_length.item() == pytest.approx(other.effective_focal_length.item(), rel=1e-15)
+
+
+APERTURES = {
+    "entrance_pupil_diameter": (12.0, INF),
+    "image_f_number": (8.0, INF),
+    "working_f_number": (8.0, 400.0),
+    "object_na": (0.01, 400.0),
+    "object_cone_angle": (0.6, 400.0),
+    "float_by_stop": (5.0, 400.0),
+}
+
+
+@pytest.mark.parametrize("kind", APERTURES)
+def test_every_kind_of_aperture_gives_the_beam_it_means(kind):
+    number, distance = APERTURES[kind]
+    system = double_gauss(aperture=(kind, number), object_distance=distance)
+    data = first_order(system)
+    meaning = {
+        "entrance_pupil_diameter": data.entrance_pupil_diameter,
+        "image_f_number": data.f_number,
+        "working_f_number": data.working_f_number,
+        "object_na": data.object_na,
+        "object_cone_angle": torch.rad2deg(torch.asin(data.object_na)),
+        "float_by_stop": stop_height(system, data),
+    }
+    assert meaning[kind].item() == pytest.approx(number, rel=1e-13)
+
+
+def stop_height(system, data):
+    """Height at the stop of the paraxial ray through the edge of the entrance pupil, from real rays at 1e-6 of it."""
+    n0 = 1e-6 * data.entrance_pupil_diameter / 2
+    distance = system.surfaces[0].thickness
+    point = torch.stack([vector(0.0), n0[None], data.entrance_pupil_position[None]])
+    slope = n0 / (distance + data.entrance_pupil_position)
+    rays = start(point, torch.stack([vector(0.0), slope[None], vector(1.0)]))
+    indices = media(system, system.wavelengths[0])[: system.stop + 1]
+    return 1e6 * trace_surfaces(system.surfaces[1 : system.stop + 1], rays, indices=indices).position[1].abs()
+
+
+def test_afocal_lens_has_an_infinite_focal_length_and_no_nan_elsewhere():
+    afocal = lens([surface(0.01, 0.0, 1.5), surface(None, 0.0, 1.5), surface(0.01, 10.0)])
+    data = first_order(afocal)
+    assert torch.isinf(data.effective_focal_length)
+    assert torch.isfinite(data.entrance_pupil_position)
+
+
+def test_every_entry_is_differentiable_and_per_wavelength():
+    system = double_gauss()
+    c = system.surfaces[1].curvature.clone().requires_grad_()
+
+    def numbers(c):
+        surfaces = (system.surfaces[0], surface(c, system.surfaces[1].thickness, system.surfaces[1].glass))
+        changed = double_gauss(object_distance=700.0)
+        changed = dataclasses.replace(changed, surfaces=(changed.surfaces[0], surfaces[1], *changed.surfaces[2:]))
+        data = first_order(changed)
+        return tuple(
+            torch.atleast_1d(getattr(data, f.name))
+            for f in dataclasses.fields(data)
+            if f.name != "entrance_pupil_diameter"
+        )
+
+    assert torch.autograd.gradcheck(numbers, c, eps=1e-7, atol=1e-2, rtol=1e-5)
+    assert first_order(system, vector(0.5, 0.6, 0.7)).effective_focal_length.shape == (3,)

@@ -1,0 +1,71 @@
+"""Values: frozen, walked by torch.func and pytree, moved as a whole, never compared by ==."""
+
+import dataclasses
+import pickle
+
+import pytest
+import torch
+from problems import aspheric_singlet, double_gauss, surface
+from torch.utils import _pytree as pytree
+
+from raytrace.glass import AIR
+from raytrace.lens import Lens
+from raytrace.rays import Rays
+from raytrace.trace import trace
+from raytrace.value import to
+
+
+def test_values_are_frozen_and_have_no_dict():
+    rays = Rays(torch.zeros(3, 2), torch.zeros(3, 2), torch.ones(2, dtype=torch.bool))
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        rays.valid = None
+    assert not hasattr(rays, "__dict__")
+
+
+def test_comparing_values_is_identity_and_never_raises():
+    one, other = surface(0.1), surface(0.1)
+    assert one == one
+    assert one != other
+    assert len({one, other}) == 2
+
+
+def test_tree_holds_numbers_only_and_comes_back_whole():
+    lens = aspheric_singlet(name="asphere", notes=("a", "b"))
+    leaves, structure = pytree.tree_flatten(lens)
+    assert all(isinstance(leaf, torch.Tensor) for leaf in leaves)
+    back = pytree.tree_unflatten(leaves, structure)
+    assert isinstance(back, Lens)
+    assert (back.name, back.notes, back.stop) == ("asphere", ("a", "b"), 1)
+    assert back.surfaces[1].coefficients is lens.surfaces[1].coefficients
+    assert back.surfaces[2].coefficients is None
+    assert [s.glass.formula for s in back.surfaces] == [s.glass.formula for s in lens.surfaces]
+
+
+def test_structure_of_equal_lenses_is_equal_so_that_trees_can_be_mapped_together():
+    one, other = double_gauss(), double_gauss()
+    total = pytree.tree_map(lambda a, b: a + b, one, other)
+    assert torch.equal(total.surfaces[1].curvature, 2 * one.surfaces[1].curvature)
+
+
+def test_to_float32_converts_every_floating_tensor_and_traces():
+    lens = to(aspheric_singlet(), dtype=torch.float32)
+    assert {leaf.dtype for leaf in pytree.tree_leaves(lens)} == {torch.float32}
+    rays = Rays(
+        torch.tensor([[0.0], [2.0], [0.0]]), torch.tensor([[0.0], [0.0], [1.0]]), torch.ones(1, dtype=torch.bool)
+    )
+    out = trace(lens, rays, lens.wavelengths)
+    assert out.position.dtype == out.direction.dtype == torch.float32
+    assert to(rays, dtype=torch.float64).valid.dtype == torch.bool
+    assert to(rays, dtype=torch.float64).opl is None
+
+
+def test_air_is_not_changed_by_moving_a_lens():
+    before = AIR.coefficients.dtype
+    to(double_gauss(), dtype=torch.float32)
+    assert AIR.coefficients.dtype == before
+
+
+def test_a_value_survives_pickling_between_processes():
+    """Data loaders send values to workers; a checkpoint should be a lens file all the same."""
+    lens = pickle.loads(pickle.dumps(aspheric_singlet()))
+    assert torch.equal(lens.surfaces[1].coefficients, aspheric_singlet().surfaces[1].coefficients)
