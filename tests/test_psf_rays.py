@@ -96,14 +96,14 @@ def test_edge_share_of_a_cell_is_its_own_integral_and_finite_without_width():
 @pytest.mark.parametrize("field", [0.0, 10.0])
 def test_equals_brute_force_within_its_noise(field):
     """4 million rays: √(pixels/rays) is 0.9 % for random ones; Sobol points do better."""
-    of = scene_of(double_gauss(stop=13.0), field)
+    of = scene_of(double_gauss(stop=11.5), field)
     where = window(of)
     with torch.no_grad():
         counted = sum(kernels(of, where, rays=2**20, sampling=sobol, width=0).kernel for sobol in seeds(4)) / 4
         found = kernels(of, where, order=6)
     assert distance(found.kernel, counted) < 0.01
     assert float(found.kernel.sum()) == pytest.approx(float(counted.sum()), abs=2e-3)
-    assert float(counted.sum()) < 0.97
+    assert float(counted.sum()) < 0.97  # some are vignetted
 
 
 def seeds(count: int):
@@ -124,7 +124,7 @@ def test_error_falls_with_the_order_and_all_light_is_inside(field):
 
 @pytest.mark.parametrize("name", ["curvature", "thickness", "sensor", "pitch", "centre"])
 def test_derivatives_are_those_of_the_kernel_with_vignetted_rays(name):
-    lens, field = double_gauss(stop=13.0), 10.0
+    lens, field = double_gauss(stop=11.5), 10.0
     where = window(scene_of(lens, field))
     weight = torch.randn(21, 21, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
@@ -154,7 +154,7 @@ def test_derivatives_are_those_of_the_kernel_with_vignetted_rays(name):
 
 def test_vignetting_edge_has_a_derivative():
     """d(energy)/d(thickness before a stop that clips): a histogram of rays has none."""
-    lens = double_gauss(stop=12.0)
+    lens = double_gauss(stop=11.0)
     gap = lens.surfaces[4].thickness.clone().requires_grad_()
     surfaces = list(lens.surfaces)
     surfaces[4] = dataclasses.replace(surfaces[4], thickness=gap)
@@ -202,7 +202,7 @@ def test_vignetting_factors_take_their_area():
 
 
 def test_symmetric_scenes_trace_a_line_or_half_a_pupil_and_find_the_same():
-    lens = double_gauss(stop=13.0)
+    lens = double_gauss(stop=11.5)
     general = dataclasses.replace(scene_of(lens, 10.0), fields=number([[0.0], [10.0]]).requires_grad_())
     half, full = trace_fans(scene_of(lens, 10.0), 1), trace_fans(general, 1)
     assert 2 * half.rays == full.rays

@@ -19,6 +19,7 @@ from raytrace.grid import Grid
 from raytrace.psf.rays import (
     Fans,
     beam_share,
+    cell_width,
     clearance,
     energy_of_fans,
     is_axial,
@@ -88,7 +89,8 @@ def kernels_and_reason(scene: Scene, grid: Grid, *, order: int = 3) -> tuple[Ker
             why = "a ray misses a surface or is totally reflected"
             break
         why = f"a map of degree {degree} errs by {error:.1e} pixels (edges {edge_error:.1e}), above {limit:.1e}"
-    traced = kernels_of_fans(scene, grid, trace_fans(scene, min(order + 2, 10)))
+    finer = min(order + 2, 10)
+    traced = kernels_of_fans(scene, grid, trace_fans(scene, finer), width=cell_width(finer))
     return _with_residual(traced, torch.zeros_like(traced.centroid[0])), f"{traced.rays} rays traced: {why}"
 
 
@@ -165,7 +167,7 @@ def reference(scene: Scene, grid: Grid, *, lines: int = 2048) -> Tensor:
         if float((ray_map.residual / grid.pitch).amax()) <= 1e-4 and float(ray_map.edge_residual.amax()) <= 1e-4:
             fans = fans_of_map(ray_map, lines, lines // 2)
             return energy_of_fans(grid, fans) * beam_share(scene, fans.points)[..., None, None]
-        return kernels_of_fans(scene, grid, trace_fans(scene, 10)).kernel
+        return kernels_of_fans(scene, grid, trace_fans(scene, 10), width=cell_width(4)).kernel
 
 
 def _kernels_of_map(scene: Scene, grid: Grid, ray_map: RayMap, order: int) -> Kernels:

@@ -63,7 +63,7 @@ def kernels(
     energy with it.
     """
     if rays is None:
-        return kernels_of_fans(scene, grid, trace_fans(scene, order))
+        return kernels_of_fans(scene, grid, trace_fans(scene, order), width=cell_width(order))
     return _kernels_of_points(scene, grid, rays, sampling, width)
 
 
@@ -141,9 +141,17 @@ def clearance(aperture: Aperture, hit: Tensor) -> Tensor:
     return -within if aperture.obscures else within
 
 
-def kernels_of_fans(scene: Scene, grid: Grid, fans: Fans) -> Kernels:
-    """Energy, centroid and covariance of fans; all light through the pupil is 1. Wide cells are cut linearly."""
-    fine = refined(fans, [math.ceil(width) for width in cell_widths(grid, fans.points)])
+def cell_width(order: int) -> float:
+    """Width in pixels of the cells that traced ones are cut into, at least: rays decide the error, not cells."""
+    return min(1.0, 2.0 ** (1 - order / 2))
+
+
+def kernels_of_fans(scene: Scene, grid: Grid, fans: Fans, *, width: float = 1.0) -> Kernels:
+    """Energy, centroid and covariance of fans; all light through the pupil is 1.
+
+    Cells wider than `width` pixels (at most 1) are cut, the image point running linearly between rays.
+    """
+    fine = refined(fans, [math.ceil(found / width) for found in cell_widths(grid, fans.points)])
     centroid, covariance = moments_of_fans(fans)
     kernel = energy_of_fans(grid, fine) * beam_share(scene, fine.points)[..., None, None]
     return Kernels(kernel, grid, centroid, covariance, fans.rays)
