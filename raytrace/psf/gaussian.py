@@ -23,8 +23,9 @@ def kernels(scene: Scene, grid: Grid, *, order: int) -> Kernels:
 
     Only what the scene's symmetry does not give is traced: `order` rays of one meridian if every field is on the axis
     of a rotationally symmetric lens, half the pupil if every field lies in the y–z plane of a lens symmetric about it.
-    σ of the double Gauss at 25 m: 4 rays on the axis give 1.4e-6, 5 give 7e-10; at 14°, 40 rays (order 5) give 9e-8. The energy is the transmitted fraction of the light through the whole entrance pupil, of which
-    vignetting factors leave the share (1 - VCX)(1 - VCY). Where no ray arrives it is 0, and so is every derivative.
+    σ of the double Gauss at 25 m: 4 rays on the axis give 1.4e-6, 5 give 7e-10; at 14°, 40 rays (order 5) give 9e-8.
+    The energy is the transmitted fraction of the light through the whole entrance pupil, of which vignetting factors
+    leave the share (1 - VCX)(1 - VCY). Where no ray arrives it is 0, and so is every derivative.
     residual: see `residual`.
     """
     fold = symmetry(scene)
@@ -115,7 +116,9 @@ def residual(rays: Rays, grid: Grid, shape: Tensor, order: int, fold: str) -> Te
 
     g: the Gaussian's share of every pixel, `shape`; h: that of the rays themselves, counted at 4096 points of a
     polynomial map from pupil to sensor through the same few rays (a constant matrix: nothing more is traced). A point
-    is lost if its nearest traced ray is. 2 is the most that two distributions of equal energy differ by.
+    is lost if its nearest traced ray is. Within 0.01 of the true distance on the double Gauss (0.32 at 25 m on the
+    axis, 0.59 at 14°, of 5 µm pixels); the counting itself leaves about 0.01. 2 is the most that two distributions of
+    equal energy differ by.
     """
     position, valid = _unfold(rays.position[:2].detach(), rays.valid, order, fold)
     matrix, nearest = (torch.as_tensor(t, device=position.device) for t in _ray_map(order))
@@ -143,9 +146,8 @@ def _unfold(position: Tensor, valid: Tensor, order: int, fold: str) -> tuple[Ten
     ring, arm = number // arms, number % arms
     if fold == "meridian":
         radius = position[1][..., ring]
-        return radius * (points / torch.linalg.vector_norm(points, dim=0)).reshape(2, *(1,) * (radius.dim() - 1), -1), (
-            valid[..., ring]
-        )
+        direction = (points / torch.linalg.vector_norm(points, dim=0)).reshape(2, *(1,) * (radius.dim() - 1), -1)
+        return radius * direction, valid[..., ring]
     # The mirror image of arm k about x = 0 is arm arms/2 - 1 - k.
     traced = points[0] > 0
     place = torch.cumsum(traced, 0) - 1

@@ -37,10 +37,15 @@ def gaussian_pixels(grid: Grid, centroid: Tensor, covariance: Tensor) -> Tensor:
     y, low_high = y - centroid[1][..., None], low_high - centroid[1][..., None]
     across = left_right[..., None, :-1], left_right[..., None, 1:], x[..., None, :], half
     along = low_high[..., :-1, None], low_high[..., 1:, None], y[..., :, None], half
-    variance_x, variance_y = covariance[0][..., None, None], covariance[-1][..., None, None]
+    # A σ of 1e-30 mm is a point: its derivatives would overflow.
+    smallest = 1e-60 if covariance.dtype == torch.float64 else 1e-16
+    both = (covariance[0] > smallest) & (covariance[-1] > smallest)
+    variance_x, variance_y = (
+        torch.where(t > smallest, t, 0.0)[..., None, None] for t in (covariance[0], covariance[-1])
+    )
     if len(covariance) == 2:
         return _interval(*across, safe_sqrt(variance_x)) * _interval(*along, safe_sqrt(variance_y))
-    return _rotated(across, along, variance_x, covariance[1][..., None, None], variance_y)
+    return _rotated(across, along, variance_x, torch.where(both, covariance[1], 0.0)[..., None, None], variance_y)
 
 
 def _standard(distance: Tensor, sigma: Tensor) -> Tensor:

@@ -1,0 +1,229 @@
+"""Gaussian over pixels, and the Gaussian PSF of a lens."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from problems import MICROMETRE, double_gauss, scalar, vector
+
+from raytrace.grid import Grid, grid
+from raytrace.lens import Lens, with_sensor_distance
+from raytrace.psf import gaussian
+from raytrace.psf.pixels import gaussian_pixels
+from raytrace.psf.scene import scene, trace_scene
+from raytrace.pupil import sobol
+from raytrace.surface import Aperture
+
+ROUNDING = 2.0**-53
+
+
+def pixels(mean, covariance, pitch=0.005, size=7):
+    return gaussian_pixels(grid(scalar(pitch), size), vector(*mean), vector(*covariance))
+
+
+def lens_at(sensor_distance=57.662, **others) -> Lens:
+    return with_sensor_distance(double_gauss(**others), scalar(sensor_distance))
+
+
+def scene_of(lens, field=(0.0, 0.0), distances=(25_000.0,)):
+    return scene(lens, vector(*field)[:, None], vector(*distances), vector(0.530))
+
+
+def clipped(lens: Lens, number: int, radius: float) -> Lens:
+    """The lens with a clear aperture on one surface."""
+    surfaces = list(lens.surfaces)
+    surfaces[number] = dataclasses.replace(surfaces[number], apertures=(Aperture("circular", (0.0, radius)),))
+    return dataclasses.replace(lens, surfaces=tuple(surfaces))
+
+
+#: pixel (row, column) of 8 × 8 of 2.5 µm, mean, covariance, energy, allowed error in roundings. Exact: integrals in
+#: 30-digit arithmetic, graded Gauss rules of 8,000 nodes.
+EXACT = [
+    ((3, 5), (0.0005, 0.00025), (1.40625e-05, 1.123875e-05, 9e-06), 1.85143186483561421e-46, 2000),
+    ((4, 4), (0.00075, -0.0005), (4e-06, 0.0, 7.562500000000002e-06), 0.132154945270294204, 50),
+    ((0, 0), (0.00075, -0.0005), (4e-06, 0.0, 7.562500000000002e-06), 9.584355777676869e-8, 50),
+    ((4, 4), (0.00025, 0.0), (6.25e12, 0.0, 6.25e12), 1.591549430918953423e-19, 50),
+    ((4, 4), (0.0005, 0.00025), (1.40625e-05, 7.874999999999998e-06, 9e-06), 0.107418066610374982, 50),
+]
+
+
+@pytest.mark.parametrize(("place", "mean", "covariance", "energy", "allowed"), EXACT)
+def test_energy_of_a_pixel_is_exact(place, mean, covariance, energy, allowed):
+    found = pixels(mean, covariance, pitch=0.0025, size=8)[place].item()
+    assert abs(found - energy) <= allowed * ROUNDING * energy
+
+
+@pytest.mark.parametrize("rho", [0.0, 1e-12, -0.3, 0.9, -0.9999, 1.0])
+@pytest.mark.parametrize("sigma", [1e-7, 0.002, 0.03])
+def test_a_large_grid_holds_all_the_energy(rho, sigma):
+    covariance = (sigma**2, rho * sigma * 3 * sigma, 9 * sigma**2)
+    assert pixels((0.0011, -0.0007), covariance, pitch=0.02, size=81).sum().item() == pytest.approx(1, abs=1e-13)
+
+
+def test_pixels_of_a_rotated_gaussian_mirror_with_it():
+    one, other = pixels((0.001, 0.002), (4e-6, 3e-6, 9e-6)), pixels((0.001, -0.002), (4e-6, -3e-6, 9e-6))
+    torch.testing.assert_close(one, other.flip(0), rtol=1e-13, atol=1e-300)
+    turned = pixels((0.002, 0.001), (9e-6, 3e-6, 4e-6))
+    torch.testing.assert_close(one, turned.T, rtol=1e-12, atol=1e-300)
+
+
+def test_a_vanishing_xy_is_the_product():
+    product = pixels((0.001, 0.002), (4e-6, 9e-6))
+    for xy in (0.0, 1e-20, -1e-30):
+        torch.testing.assert_close(pixels((0.001, 0.002), (4e-6, xy, 9e-6)), product, rtol=1e-12, atol=1e-300)
+
+
+def test_a_point_falls_in_one_pixel_or_halves_on_an_edge():
+    inside, edge = pixels((0.001, -0.001), (0.0, 0.0, 0.0)), pixels((0.0025, 0.0), (0.0, 0.0, 0.0))
+    assert inside[3, 3] == 1 == inside.sum()
+    assert edge[3, 3] == edge[3, 4] == 0.5
+
+
+def test_a_line_lies_where_it_is():
+    """Σ of rank 1 along the diagonal: pixels on it hold Φ differences of the line, the others nothing."""
+    found = pixels((0.0, 0.0), (2.5e-5, 2.5e-5, 2.5e-5))
+    edge = (torch.arange(8, dtype=torch.float64) - 3.5) / math.sqrt(2)
+    expected = torch.diff(0.5 * torch.erf(edge))
+    torch.testing.assert_close(found.diagonal(), expected, rtol=1e-13, atol=0)
+    assert (found - torch.diag(found.diagonal())).abs().max() <= 1e-16
+
+
+@pytest.mark.parametrize("covariance", [(4e-6, 9e-6), (4e-6, 0.0, 9e-6), (4e-6, 4e-6, 9e-6), (4e-4, -5.9e-4, 9e-4)])
+def test_derivatives_of_pixels(covariance):
+    """Derivatives in pixel units, the covariance scaled so that all numbers are about 1."""
+
+    def energy(pitch, centre, mean, covariance):
+        return 1e2 * gaussian_pixels(Grid(pitch, 3, 4, centre), mean, covariance)
+
+    unit = 1 / 0.005
+    numbers = [scalar(1.0), vector(0.1, -0.2), vector(0.3, 0.4), vector(*covariance) * unit**2]
+    numbers = [number.requires_grad_() for number in numbers]
+    assert torch.autograd.gradcheck(energy, numbers, atol=1e-6)
+    assert torch.autograd.gradgradcheck(energy, numbers, atol=1e-5)
+
+
+@pytest.mark.parametrize("covariance", [(0.0, 0.0), (0.0, 0.0, 0.0), (1e-300, 0.0, 1e-300), (1e-6, 1e-6, 1e-6)])
+def test_derivatives_of_a_degenerate_gaussian_are_finite(covariance):
+    numbers = [vector(0.001, 0.0005).requires_grad_(), vector(*covariance).requires_grad_()]
+    total = (gaussian_pixels(grid(scalar(0.005), 5), *numbers) * torch.arange(25.0).reshape(5, 5)).sum()
+    first = torch.autograd.grad(total, numbers, create_graph=True)
+    assert all(torch.isfinite(g).all() for g in first)
+    if first[0].requires_grad:
+        second = torch.autograd.grad(sum(g.sum() for g in first), numbers, allow_unused=True)
+        assert all(g is None or torch.isfinite(g).all() for g in second)
+
+
+def test_pixels_under_vmap_equal_those_of_a_batch():
+    g, mean, covariance = (
+        grid(scalar(0.005), 5),
+        vector(0.001, 0.0),
+        torch.stack([vector(4e-6, c, 9e-6) for c in (1e-6, -4e-6)]),
+    )
+    mapped = torch.func.vmap(lambda c: gaussian_pixels(g, mean, c))(covariance)
+    batch = gaussian_pixels(g, mean[:, None].expand(2, 2), covariance.T)
+    torch.testing.assert_close(mapped, batch, rtol=1e-14, atol=0)
+    jacobian = torch.func.jacfwd(lambda c: gaussian_pixels(g, mean, c))(covariance[0])
+    torch.testing.assert_close(jacobian, torch.func.jacrev(lambda c: gaussian_pixels(g, mean, c))(covariance[0]))
+
+
+def test_double_gauss_at_25_m():
+    """The published starting point: 7.075 µm RMS radius at 57.662 mm, σ of one axis is that over √2."""
+    result = gaussian.kernels(scene_of(lens_at()), grid(0.005, 21), order=4)
+    assert result.rays == 4
+    assert result.covariance[0].sqrt().item() == pytest.approx(7.075 / math.sqrt(2) * MICROMETRE, abs=5e-4 * MICROMETRE)
+    assert result.kernel.sum().item() == pytest.approx(1, abs=1e-9)
+
+
+@pytest.mark.parametrize(("order", "allowed"), [(4, 2e-6), (5, 1e-9), (6, 1e-11)])
+def test_few_rays_on_the_axis(order, allowed):
+    few, many = (gaussian.kernels(scene_of(lens_at()), grid(0.005, 5), order=n) for n in (order, 10))
+    torch.testing.assert_close(few.covariance.sqrt(), many.covariance.sqrt(), rtol=allowed, atol=0)
+
+
+def test_forty_rays_at_full_field():
+    found = scene_of(lens_at(), (0.0, 14.0))
+    few, many = (gaussian.kernels(found, grid(0.005, 5), order=n) for n in (5, 10))
+    assert few.rays == 40
+    torch.testing.assert_close(few.covariance.sqrt(), many.covariance.sqrt(), rtol=1e-6, atol=0)
+
+
+def test_symmetry_changes_nothing():
+    """Off the plane of symmetry the whole pupil is traced: a field turned about the axis turns the moments."""
+    half = gaussian.kernels(scene_of(lens_at(), (0.0, 10.0)), grid(0.005, 5), order=8)
+    slope = math.tan(math.radians(10)) / math.sqrt(2)
+    angle = math.degrees(math.atan(slope))
+    full = gaussian.kernels(scene_of(lens_at(), (angle, angle)), grid(0.005, 5), order=8)
+    xx, xy, yy = full.covariance.flatten().tolist()
+    assert half.covariance[2].item() == pytest.approx(0.5 * (xx + yy) + xy, rel=1e-9)
+    assert half.covariance[0].item() == pytest.approx(0.5 * (xx + yy) - xy, rel=1e-9)
+    on_axis = gaussian.kernels(scene_of(lens_at()), grid(0.005, 5), order=6).covariance
+    nearly = gaussian.kernels(scene_of(lens_at(), (0.0, 1e-9)), grid(0.005, 5), order=6).covariance
+    torch.testing.assert_close(on_axis[::2], nearly[::2], rtol=1e-7, atol=0)
+
+
+def test_a_positive_field_lands_at_positive_y():
+    lens = lens_at()
+    centroid = gaussian.kernels(scene_of(lens, (0.0, 14.0)), grid(0.005, 5), order=4).centroid
+    assert centroid[1].item() == pytest.approx(24.63, abs=0.05)
+    assert centroid[0].item() == 0
+
+
+def test_energy_is_the_transmitted_fraction_of_the_whole_pupil():
+    lens = clipped(lens_at(), 6, 5.0)
+    found = gaussian.kernels(scene_of(lens), grid(0.05, 41), order=8).kernel.sum().item()
+    _, weights = gaussian.fold_pupil(8, "meridian", lens.wavelengths)
+    assert 0 < found < 1
+    assert any(abs(found - part) < 1e-9 for part in weights.cumsum(0).tolist())
+    factors = torch.zeros(5, 3, dtype=torch.float64)
+    factors[2, 2], factors[3, 2] = 0.1, 0.4
+    vignetted = dataclasses.replace(lens_at(), fields=dataclasses.replace(lens_at().fields, vignetting=factors))
+    share = gaussian.pupil_share(vignetted, torch.stack([vignetted.fields.x, vignetted.fields.y]))
+    torch.testing.assert_close(share, vector(1.0, 1.0, 0.9 * 0.6))
+
+
+def test_no_ray_is_no_energy_and_no_gradient():
+    lens = clipped(lens_at(), 6, 1e-9)
+    distance = scalar(57.662).requires_grad_()
+    result = gaussian.kernels(scene_of(with_sensor_distance(lens, distance), (0.0, 14.0)), grid(0.005, 5), order=4)
+    assert (result.kernel == 0).all()
+    assert torch.isfinite(result.residual).all()
+    (slope,) = torch.autograd.grad(result.kernel.sum() + result.covariance.sum(), distance)
+    assert slope == 0
+
+
+@pytest.mark.parametrize("field", [(0.0, 0.0), (0.0, 14.0), (8.0, 8.0)])
+def test_derivatives_with_vignetted_rays(field):
+    base = clipped(lens_at(), 6, 7.0)
+    place = gaussian.kernels(scene_of(base, field), grid(0.005, 3), order=3).centroid.flatten()
+
+    def kernel(curvature, thickness, sensor_distance, pitch, shift):
+        surfaces = list(base.surfaces)
+        surfaces[3] = dataclasses.replace(surfaces[3], curvature=curvature / 10)
+        surfaces[5] = dataclasses.replace(surfaces[5], thickness=thickness)
+        lens = with_sensor_distance(dataclasses.replace(base, surfaces=tuple(surfaces)), sensor_distance)
+        pixel = Grid(pitch / 100, 2, 3, place + shift / 100)
+        return 10 * gaussian.kernels(scene_of(lens, field, (10_000.0,)), pixel, order=3).kernel
+
+    numbers = [scalar(0.27815929), scalar(14.253), scalar(57.662), scalar(2.0), vector(0.3, -0.2)]
+    numbers = [number.requires_grad_() for number in numbers]
+    rays = trace_scene(scene_of(base, field, (10_000.0,)), gaussian.fold_pupil(3, "none", base.wavelengths)[0])
+    assert 0 < rays.valid.sum() < rays.valid.numel()
+    assert torch.autograd.gradcheck(kernel, numbers, eps=1e-6, atol=1e-5, rtol=1e-4)
+    if field[1] == 14.0:
+        assert torch.autograd.gradgradcheck(kernel, numbers, eps=1e-6, atol=1e-4, rtol=1e-3, fast_mode=True)
+
+
+@pytest.mark.parametrize(("field", "distance"), [(0.0, 25_000.0), (0.0, 50_000.0), (14.0, 25_000.0)])
+def test_residual_is_the_distance_from_many_rays(field, distance):
+    """L¹ between the Gaussian and a histogram of 65,536 traced rays, which carries about 1 % noise itself."""
+    found = scene_of(lens_at(), (0.0, field), (distance,))
+    place = gaussian.kernels(found, grid(0.005, 3), order=5).centroid.flatten()
+    pixel = Grid(scalar(0.005), 21, 21, place)
+    result = gaussian.kernels(found, pixel, order=6)
+    hits = trace_scene(found, sobol(65_536)[0]).position[:2].reshape(2, -1)
+    x, y = ((hits - place[:, None]) / 0.005 + 10.5).floor().to(torch.int64)
+    kept = (x >= 0) & (x < 21) & (y >= 0) & (y < 21)
+    h = torch.bincount((y * 21 + x)[kept], minlength=441).to(torch.float64) / 65_536
+    true = (h - result.kernel.flatten()).abs().sum() / h.sum()
+    assert result.residual.item() == pytest.approx(true.item(), abs=0.02)
