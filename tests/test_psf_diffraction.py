@@ -143,22 +143,22 @@ def test_orders_converge():
 
 @pytest.mark.parametrize("angle", [0.0, 10.0])
 def test_energy_is_the_transmitted_fraction(angle):
-    """A window far wider than the blur holds all the light that is not blocked but the rings' tail, 2/(π² v) of it."""
-    s = scene_of(gauss(57.9, aperture=("entrance_pupil_diameter", 33.33)), angle, 25e3)
-    result = diffraction.kernels(s, grid(0.02, 15, chief(s)))
-    assert abs(result.kernel.sum() - 1) < 5e-3
-    lens = gauss(57.9)
+    """A window far wider than the blur holds all light that is not blocked but the rings' tail, 2/(π v) = 0.8 % of it."""
+    s = scene_of(gauss(57.9, aperture=("entrance_pupil_diameter", 12.0)), angle, 25e3)
+    result = diffraction.kernels(s, grid(0.02, 11, chief(s)))
+    assert 0 < 1 - result.kernel.sum() < 9e-3
+    lens = gauss(57.9, aperture=("entrance_pupil_diameter", 12.0))
     surfaces = list(lens.surfaces)
-    clip = Aperture("circular", (0.0, 8.0), centre=(0.0, 2.0))
+    clip = Aperture("circular", (0.0, 2.9), centre=(0.0, 0.7))
     surfaces[6] = problems.surface(None, 12.4281, apertures=(clip,))
     s = scene_of(
         type(lens)(**{**{f: getattr(lens, f) for f in lens.__slots__}, "surfaces": tuple(surfaces)}), angle, 25e3
     )
-    result = diffraction.kernels(s, grid(0.02, 15, chief(s)))
+    result = diffraction.kernels(s, grid(0.02, 11, chief(s)))
     points, weights = gauss_rings(60, 240)
     passed = wavefront(s, points, weights).energy.sum()
     assert 0.3 < passed < 0.8
-    assert abs(result.kernel.sum() - passed) < 8e-3
+    assert abs(result.kernel.sum() - passed) < 0.015
 
 
 @pytest.mark.parametrize("diameter", [6.0, 10.0])
@@ -177,16 +177,17 @@ def test_strehl_is_marechals_for_small_aberrations(diameter):
 
 
 def test_geometric_limit():
-    """Beyond 5 waves of defocus the wave's encircled energy is the rays' within 2 %."""
-    s = scene_of(gauss(58.9, aperture=("entrance_pupil_diameter", 20.0)), 0.0, 25e3)
-    result = diffraction.kernels(s, grid(0.004, 81))
-    line = (torch.arange(81, dtype=torch.float64) - 40) * 0.004
-    distance = torch.hypot(line[:, None], line)
+    """16 waves out of focus the wave's encircled energy is the rays' within 2 %; the covariance is theirs."""
+    s = scene_of(gauss(59.5, aperture=("entrance_pupil_diameter", 20.0)), 0.0, 25e3)
     front = wavefront(s, *gauss_rings(200, 4))
     rays = torch.linalg.vector_norm(front.landing[:, 0, 0, 0], dim=0)
-    for radius in (0.04, 0.06, 0.08, 0.1):
-        encircled = result.kernel[0, 0, 0][distance < radius].sum()
-        assert abs(encircled - front.energy[0, 0, 0][rays < radius].sum()) < 0.02
+    pitch = float(rays.max()) / 35
+    result = diffraction.kernels(s, grid(pitch, 81))
+    line = (torch.arange(81, dtype=torch.float64) - 40) * pitch
+    distance = torch.hypot(line[:, None], line)
+    for radius in (0.3, 0.5, 0.7, 0.8):
+        encircled = result.kernel[0, 0, 0][distance < radius * rays.max()].sum()
+        assert abs(encircled - front.energy[0, 0, 0][rays < radius * rays.max()].sum()) < 0.02
     assert abs(result.covariance[0, 0, 0, 0] - 0.5 * (front.energy[0, 0, 0] * rays**2).sum()) < 1e-9
 
 
@@ -252,7 +253,7 @@ def test_an_undersampled_wavefront_is_reported():
         fft_psf(torch.ones(8, 8, dtype=torch.float64), 0.5 * W, pad=2)
 
 
-@pytest.mark.parametrize(("angle", "rim"), [(0.0, None), (4.0, None), (0.0, 2.2), (4.0, 2.2)])
+@pytest.mark.parametrize(("angle", "rim"), [(0.0, None), (0.0, 0.9), (4.0, 0.9)])
 def test_gradients(angle, rim):
     """Curvature, sensor distance and pixel, with and without vignetted rays; a rim moves with the lens."""
     apertures = () if rim is None else (Aperture("circular", (0.0, rim)),)
@@ -263,13 +264,13 @@ def test_gradients(angle, rim):
             problems.surface(-0.01, 4.0),
             problems.surface(None, sensor, apertures=apertures),
         ]
-        lens = problems.lens(surfaces, stop=1, aperture=("entrance_pupil_diameter", 5.0))
+        lens = problems.lens(surfaces, stop=1, aperture=("entrance_pupil_diameter", 2.0))
         return diffraction.kernels(scene_of(lens, angle), grid(pitch, 3, vector(0.0, centre))).kernel
 
     start = [torch.tensor(t, dtype=torch.float64, requires_grad=True) for t in (0.02, 56.0, 0.01)]
     lens = problems.lens(
         [problems.surface(0.02, 3.0, 1.5), problems.surface(-0.01, 4.0), problems.surface(None, 56.0)],
-        aperture=("entrance_pupil_diameter", 5.0),
+        aperture=("entrance_pupil_diameter", 2.0),
     )
     centre = float(chief(scene_of(lens, angle))[1])
     assert torch.autograd.gradcheck(kernel, start, eps=1e-6, atol=2e-4, rtol=2e-3, fast_mode=True)

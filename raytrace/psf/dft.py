@@ -127,8 +127,11 @@ def disc_rule(phase: float, order: int, *, most: int, what: str, like: Tensor) -
 
 
 def nodes_per_pixel(pitch: float, cutoff: float, order: int) -> int:
-    """Gauss-Legendre nodes across a pixel for an intensity with spatial frequencies up to `cutoff` in 1/mm."""
-    return math.ceil(0.5 * math.pi * cutoff * pitch / 2) + 4 + order
+    """Gauss-Legendre nodes across a pixel for an intensity with spatial frequencies up to `cutoff` in 1/mm.
+
+    n nodes integrate exp(iat) over [-1, 1] up to J_2n(a), a = π·cutoff·pitch; little light is near the cutoff.
+    """
+    return math.ceil(0.5 * math.pi * cutoff * pitch) + 2 + order
 
 
 def sub_pixels(grid: Grid, nodes: int) -> tuple[Tensor, Tensor, Tensor]:

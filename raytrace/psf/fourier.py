@@ -87,7 +87,7 @@ def paraxial(scene: Scene) -> Paraxial:
     defocus = math.pi * waves * radius * (n[0] / z_o + n[-1] / z_i - coloured.power)
     # The chief ray from the centre of the entrance pupil, with the slope of the field.
     pupil = primary.entrance_pupil_position
-    field = object_field(lens, scene.fields[:, :, None], primary)
+    field = object_field(lens, scene.fields[:, None, :, None], primary)
     slope = field if is_at_infinity(lens) else -field / (distance + pupil)
     A, B, C, D = system_matrix(surfaces, n)
     height, omega = -pupil * slope, n[0] * slope
