@@ -101,8 +101,8 @@ def test_object_at_1e12_mm_is_one_at_infinity():
         ("object_height", (0.0, 20.0), 300.0),
         ("paraxial_image_height", (0.0, 10.0), INF),
         ("paraxial_image_height", (0.0, 10.0), 300.0),
-        ("real_image_height", (0.0, 10.0), INF),
-        ("real_image_height", (10.0,), 300.0),
+        ("real_image_height", (10.0,), INF),
+        pytest.param("real_image_height", (10.0,), 300.0, marks=pytest.mark.slow),
     ],
 )
 def test_every_kind_of_field(kind, heights, distance, aiming):
@@ -152,7 +152,7 @@ def test_the_axial_chief_ray_can_be_aimed():
     assert launch(system, CENTRE, ray_aiming=True).valid.all()
 
 
-@pytest.mark.parametrize("angle", [0.0, 40.0, 60.0, 70.0, 75.0])
+@pytest.mark.parametrize("angle", [0.0, 60.0, 75.0])
 def test_wide_angles_are_aimed(angle):
     system = fisheye(field=fields("angle", (angle,)))
     points = pupil.hexapolar(1)[0]

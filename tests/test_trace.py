@@ -98,10 +98,10 @@ def test_fresnel_plate_displaces_and_does_not_turn():
     expected = 10 * torch.tan(inner) + 5 * torch.tan(angle)
     assert (out.direction - direction).abs().max() <= 30 * ROUNDING  # N = 0.07: twice 1/N of a rounding
     # tan θ at 1.5 rad loses 20 digits' units of θ: sec² θ · θ / tan θ.
-    assert ((out.position[1] - expected) / (1 + expected)).abs().max() <= 400 * ROUNDING
+    assert ((out.position[1] - expected) / (1 + expected)).abs().max() <= 500 * ROUNDING
     path = 1.5 * 10 / torch.cos(inner) + 5 / torch.cos(angle)
     total = out.opl + axial_path(plate.surfaces[1:], media(plate, plate.wavelengths[0]))
-    assert ((total - path) / path).abs().max() <= 200 * ROUNDING
+    assert ((total - path) / path).abs().max() <= 500 * ROUNDING
 
 
 def test_ball_lens_has_its_closed_form():
