@@ -1,0 +1,148 @@
+"""`raytrace bench trace` runs end to end, and its high-precision reference agrees with the package. No timings."""
+
+import json
+from dataclasses import asdict
+
+import pytest
+import torch
+
+from raytrace.bench.measure import SAMPLE, Own, errors_of, field_rays, reference_of
+from raytrace.bench.reference import reference_surface, spot_gradient, trace_reference
+from raytrace.bench.tracers import squared_radius, variables, with_leaves
+from raytrace.cli import main
+from raytrace.files import shipped
+from raytrace.formats import read_lens
+from raytrace.glass import MIRROR, constant
+from raytrace.rays import Rays
+from raytrace.surface import Surface
+from raytrace.trace import trace, trace_surfaces
+
+TINY = ["bench", "trace", "--rays", "300", "--repeats", "1", "--no-peers", "--threads", "1"]
+
+#: Bounds on the errors of the double Gauss: nm, waves, and relative to the largest component.
+BOUNDS = {"float32": (100.0, 0.1, 1e-3), "float64": (1e-6, 1e-8, 1e-11)}
+
+
+@pytest.fixture(autouse=True)
+def threads():
+    before = torch.get_num_threads()
+    yield
+    assert torch.get_num_threads() == before, "the benchmark left another number of threads behind"
+
+
+def tensor(*numbers: float) -> torch.Tensor:
+    return torch.tensor(numbers if len(numbers) > 1 else numbers[0], dtype=torch.float64)
+
+
+def test_json_is_one_document_with_errors_beside_every_speed(capsys):
+    assert main([*TINY, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["surfaces"] == 12
+    assert document["machine"]["torch threads"] == 1
+    rows = document["rows"]
+    assert len(rows) == 8  # two dtypes, forward and forward+backward, with and without path
+    for row in rows:
+        position, path, gradient = BOUNDS[row["dtype"]]
+        assert row["tracer"] == "raytrace"
+        assert row["rays"] == 300
+        assert row["speed"] > 0
+        assert 0 < row["errors"]["position"] < position
+        assert 0 < row["errors"]["gradient"] < gradient
+        assert (row["errors"]["path"] is None) == (not row["path"])
+        assert not row["path"] or 0 < row["errors"]["path"] < path
+        assert row["ratio"] is None
+
+
+def test_report_and_figure_are_written(tmp_path, capsys):
+    report, figure = tmp_path / "bench.md", tmp_path / "bench.png"
+    assert main([*TINY, "-o", str(report), "--plot", str(figure)]) == 0
+    text = report.read_text(encoding="utf-8")
+    assert capsys.readouterr().out == text
+    assert text.count("\n| 300 |") == 8
+    assert figure.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("name", "bound"), [("double_gauss", 1e-10), ("phone", 1e-10), ("hubble", 1e-6), ("cooke_triplet", 1e-10)]
+)
+def test_package_agrees_with_the_reference(name, bound):
+    """Spheres, planes, strong aspheres, conic mirrors: positions, paths and gradients in float64.
+
+    The telescope's spot is a millionth of its focal length, and its gradient as much worse conditioned.
+    """
+    lens = read_lens(shipped("lenses") / f"{name}.zmx")
+    errors = errors_of(Own(lens, torch.float64, with_path=True), lens, field_rays(lens, SAMPLE))
+    assert errors.position < 1e-5, asdict(errors)  # nm
+    assert errors.path < 1e-7, asdict(errors)  # waves
+    assert errors.gradient < bound, asdict(errors)
+
+
+@pytest.mark.parametrize(
+    ("conic", "coefficients"),
+    [(0.0, ()), (-0.7, ()), (-1.0, ()), (-2.5, ()), (1.3, ()), (-0.5, (1e-4, -2e-6, 3e-9)), (0.0, (0.0, 5e-6))],
+)
+@pytest.mark.parametrize("is_mirror", [False, True])
+def test_one_surface_agrees_with_the_reference(conic, coefficients, is_mirror):
+    surface = Surface(
+        thickness=tensor(0.0),
+        curvature=tensor(0.04),
+        conic=tensor(conic),
+        coefficients=tensor(*coefficients) if coefficients else None,
+        glass=MIRROR if is_mirror else constant(1.6),
+    )
+    position = torch.tensor([[1.0, -4.0, 6.0], [0.5, 3.0, -6.0], [-2.0, 1.0, 0.0]], dtype=torch.float64)
+    direction = torch.tensor([[0.1, -0.2, 0.0], [0.05, 0.1, 0.3], [1.0, 1.0, 1.0]], dtype=torch.float64)
+    direction = direction / torch.linalg.vector_norm(direction, dim=0)
+    rays = Rays(position, direction, torch.ones(3, dtype=torch.bool), torch.zeros(3, dtype=torch.float64))
+    indices = [tensor(1.0), tensor(1.0 if is_mirror else 1.6)]
+    end = trace_surfaces([surface], rays, indices=indices)
+    assert bool(end.valid.all())
+    reference = [reference_surface(0.04, conic, coefficients, 0.0, float(indices[1]), is_mirror)]
+    for i in range(3):
+        exact = trace_reference(reference, 1.0, position[:, i].tolist(), direction[:, i].tolist())
+        assert end.position[:, i].tolist() == pytest.approx([float(x) for x in exact.position], rel=1e-14, abs=1e-14)
+        assert end.direction[:, i].tolist() == pytest.approx([float(x) for x in exact.direction], rel=1e-14, abs=1e-14)
+        assert float(end.opl[i]) == pytest.approx(float(exact.path), rel=1e-13)
+
+
+def test_gradient_about_a_fixed_centroid_is_that_of_the_spot():
+    lens = read_lens(shipped("lenses") / "cooke_triplet.zmx")
+    rays = field_rays(lens, 40)
+    moving, leaves = with_leaves(lens)
+    x, y, _ = trace(moving, rays, lens.wavelengths[lens.primary_wavelength]).position
+    centroid = torch.stack([x.mean(), y.mean()])
+    fixed = torch.autograd.grad(squared_radius(x, y, centroid.detach()), leaves, retain_graph=True)
+    free = torch.autograd.grad(squared_radius(x, y, centroid), leaves)
+    assert torch.allclose(torch.stack(fixed), torch.stack(free), rtol=1e-10, atol=1e-12)
+
+
+def test_reference_gradient_is_a_derivative():
+    """The reference's differences against a closed form: moving the image by dT moves a ray by dT·tan θ."""
+    lens = read_lens(shipped("lenses") / "cooke_triplet.zmx")
+    surfaces, index = reference_of(lens)
+    rays = field_rays(lens, 3)
+    starts = list(zip(rays.position.T.tolist(), rays.direction.T.tolist(), strict=True))
+    last = len(surfaces) - 2
+    assert (last + 1, "thickness") in variables(lens)
+    found = spot_gradient(surfaces, index, starts, [(last, "thickness")])[0]
+    ends = [trace_reference(surfaces, index, *start) for start in starts]
+    expected = 0.0
+    for axis in (0, 1):
+        mean = sum(end.position[axis] for end in ends) / 3
+        expected += sum(2 * (e.position[axis] - mean) * e.direction[axis] / e.direction[2] for e in ends) / 3
+    assert float(found) == pytest.approx(float(expected), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("position", "direction", "curvature", "words"),
+    [((0, 30, -5), (0, 0, 1), 0.05, "misses"), ((0, 9, 0), (0, 0.9, 0.1), -0.1, "totally reflected")],
+)
+def test_lost_reference_ray_is_an_error(position, direction, curvature, words):
+    glass = [reference_surface(curvature, index=1.0)]
+    with pytest.raises(ValueError, match=words):
+        trace_reference(glass, 1.8, position, direction)
+
+
+def test_unknown_lens_is_one_line(capsys):
+    assert main([*TINY, "--lens", "no_such_lens"]) == 1
+    assert capsys.readouterr().err.startswith("raytrace: error: no_such_lens")
