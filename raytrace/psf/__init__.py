@@ -1,0 +1,20 @@
+"""Point spread functions: five models behind one differentiable call.
+
+    psf(lens, model="gaussian", fields=…, object_distances=…, grid=grid(0.005, 21), tol=1e-3) -> Psf
+
+| model    | what it knows of the lens                                                       | module         |
+|----------|---------------------------------------------------------------------------------|----------------|
+| paraxial | focal length, principal planes, entrance pupil: a Gaussian of the defocus blur  | paraxial.py    |
+| fourier  | the same, with diffraction: a defocused (and aberrated) circular pupil          | fourier.py     |
+| gaussian | centroid and covariance of traced rays                                          | gaussian.py    |
+| drt      | all traced rays: geometric optics                                               | rays.py        |
+| wave     | the traced wavefront: diffraction with the true aberrations                     | diffraction.py |
+
+Each gives `kernels(scene, grid, …) -> Kernels`, energy integrated over pixels, 1 = all light through the entrance
+pupil. `compute.py` drives them to a tolerance; `choose.py` picks one from the scene.
+"""
+
+from raytrace.psf.compute import MODELS as MODELS
+from raytrace.psf.compute import Psf as Psf
+from raytrace.psf.compute import psf as psf
+from raytrace.psf.scene import EmptyPsf as EmptyPsf
