@@ -143,7 +143,7 @@ def test_orders_converge():
 
 @pytest.mark.parametrize("angle", [0.0, 10.0])
 def test_energy_is_the_transmitted_fraction(angle):
-    """A window far wider than the blur holds all light that is not blocked but the rings' tail, 2/(π v) = 0.8 % of it."""
+    """A window far wider than the blur holds all that is not blocked but the rings' tail, 2/(π v) = 0.8 %."""
     s = scene_of(gauss(57.9, aperture=("entrance_pupil_diameter", 12.0)), angle, 25e3)
     result = diffraction.kernels(s, grid(0.02, 11, chief(s)))
     assert 0 < 1 - result.kernel.sum() < 9e-3
