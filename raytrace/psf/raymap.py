@@ -41,7 +41,8 @@ _MOST_LINES = 8192
 _DEGREES = (6, 8, 10, 12, 14, 16, 20)
 _CHECKS = 8  # rays that are traced but not fitted
 _PIXELS = 0.1  # error of a ray in pixels that order 0 takes; each order takes half of the one before
-_DEGREES_TRIED = 3
+_CLOSE = 0.01  # pixels: a map this close is better than any number of rays that one would trace instead
+_HIGHER_DEGREES = (14, 20)  # tried where the degree of the order does not do
 
 
 @value
@@ -71,13 +72,13 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 3) -> Kernels:
 def kernels_and_reason(scene: Scene, grid: Grid, *, order: int = 3) -> tuple[Kernels, str]:
     """PSFs through the ray map, and in one line how they were found.
 
-    order: 0 … 10; each has twice the cells of the one before, half its error, and a map of higher degree, twice as
-    close. `Kernels.residual` bounds what the error of the map does to the kernel (relative L1); 0 for traced rays.
+    order: 0 … 10; each has twice the cells of the one before, half its error, and a map of higher degree.
+    `Kernels.residual` bounds what the error of the map does to the kernel (relative L1); it is 0 for traced rays.
     """
-    limit = _PIXELS * 0.5**order
+    limit = max(_PIXELS * 0.5**order, _CLOSE)
     pitch = grid.pitch.detach()
     why = ""
-    for degree in _DEGREES[min(order, len(_DEGREES) - 1) :][:_DEGREES_TRIED]:
+    for degree in _degrees(order):
         found = fit(scene, degree)
         error = float((found.residual / pitch).amax())
         edge_error = float(found.edge_residual.amax())
@@ -168,6 +169,11 @@ def reference(scene: Scene, grid: Grid, *, lines: int = 2048) -> Tensor:
             fans = fans_of_map(ray_map, lines, lines // 2)
             return energy_of_fans(grid, fans) * beam_share(scene, fans.points)[..., None, None]
         return kernels_of_fans(scene, grid, trace_fans(scene, 10), width=cell_width(4)).kernel
+
+
+def _degrees(order: int) -> list[int]:
+    first = _DEGREES[min(order, len(_DEGREES) - 1)]
+    return [first, *(degree for degree in _HIGHER_DEGREES if degree > first)]
 
 
 def _kernels_of_map(scene: Scene, grid: Grid, ray_map: RayMap, order: int) -> Kernels:

@@ -212,10 +212,16 @@ def moments_of_fans(fans: Fans) -> tuple[Tensor, Tensor]:
 
 def beam_share(scene: Scene, like: Tensor) -> Tensor:
     """Area (1, F, 1) of each field's beam by its vignetting factors, 1 = the whole entrance pupil."""
-    corners = like.new_tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    x, y = vignette(scene.lens, scene.fields[:, :, None, None].to(like.dtype), corners)
-    area = (x[..., 1] - x[..., 0]) * (y[..., 2] - y[..., 0]) - (x[..., 2] - x[..., 0]) * (y[..., 1] - y[..., 0])
+    _, along_x, along_y = _beam(scene, like)
+    area = along_x[0] * along_y[1] - along_x[1] * along_y[0]
     return area.abs().expand(1, scene.shape[1], 1)
+
+
+def _beam(scene: Scene, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Centre and half axes (2, F, 1) of the beams in the pupil, vignetting factors applied."""
+    corners = like.new_tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    centre, x, y = vignette(scene.lens, scene.fields[:, :, None, None].to(like.dtype), corners).unbind(-1)
+    return centre, x - centre, y - centre
 
 
 def is_mirrored(scene: Scene) -> bool:
@@ -223,17 +229,17 @@ def is_mirrored(scene: Scene) -> bool:
 
     Fields to be differentiated are not: their x moves the light to one side.
     """
-    factors = scene.lens.fields.vignetting
-    upright = factors is None or not bool((factors[0] != 0).any() | (factors[4] != 0).any())
+    centre, along_x, along_y = _beam(scene, scene.lens.wavelengths)
+    upright = not bool((centre[0] != 0).any() | (along_x[1] != 0).any() | (along_y[0] != 0).any())
     centred = all(aperture.centre[0] == 0 for surface in scene.lens.surfaces for aperture in surface.apertures)
     return upright and centred and not scene.fields.requires_grad and not bool((scene.fields[0] != 0).any())
 
 
 def is_axial(scene: Scene) -> bool:
     """Whether the light is symmetric about the axis: no field off it, round apertures centred, round beams."""
-    factors = scene.lens.fields.vignetting
-    round_beam = factors is None or not bool((factors != 0).any())
-    if scene.fields.requires_grad or bool((scene.fields != 0).any()) or not round_beam:
+    centre, along_x, along_y = _beam(scene, scene.lens.wavelengths)
+    round_beam = not bool((centre != 0).any() | (along_x[0] != along_y[1]).any())
+    if not is_mirrored(scene) or bool((scene.fields != 0).any()) or not round_beam:
         return False
     apertures = [aperture for surface in scene.lens.surfaces for aperture in surface.apertures]
     return all(aperture.shape == "circular" and aperture.centre == (0.0, 0.0) for aperture in apertures)
