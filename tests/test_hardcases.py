@@ -13,6 +13,9 @@ import warnings
 from decimal import Decimal, getcontext
 from pathlib import Path
 
+import hardcases_gaussian
+import hardcases_splat
+import hardcases_wave
 import pytest
 import torch
 
@@ -288,6 +291,31 @@ def test_index(case):
     for name, value in expected["grad"].items():
         allowed = GRADIENT_SCORE * ROUNDING[torch.float64] * abs(float(value))
         assert error(gradients[name], value) <= allowed, name
+
+
+@pytest.mark.parametrize("case", of_kind("spot"))
+def test_spot(case):
+    hardcases_gaussian.check_spot(case)
+
+
+@pytest.mark.parametrize("case", of_kind("gauss_pixel"))
+def test_gauss_pixel(case):
+    hardcases_gaussian.check_gauss_pixel(case)
+
+
+@pytest.mark.parametrize("case", of_kind("splat"))
+def test_splat(case):
+    hardcases_splat.check_splat(case)
+
+
+@pytest.mark.parametrize("case", of_kind("fft_psf"))
+def test_fft_psf(case):
+    hardcases_wave.check_fft_psf(case)
+
+
+@pytest.mark.parametrize("case", of_kind("huygens"))
+def test_huygens(case):
+    hardcases_wave.check_huygens(case)
 
 
 def table() -> str:

@@ -11,7 +11,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 
-from raytrace.cli import options
+from raytrace.cli.commands import COMMANDS
 
 DESCRIPTION = "A sequential, differentiable ray tracer: read a lens file, trace it, focus it, plot it."
 
@@ -41,7 +41,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"raytrace {_version()}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for command in options.COMMANDS:
+    for command in COMMANDS:
         child = commands.add_parser(
             command.name,
             help=command.summary,

@@ -1,4 +1,4 @@
-"""Figures: cross section, spot diagram, through-focus curve and focus report, each a matplotlib Figure.
+"""Figures: cross section, spot diagram, through-focus curve, focus report and PSFs, each a matplotlib Figure.
 
 This folder is the only place that imports matplotlib, and it never touches pyplot: figures need no display and leave
 nothing behind.
@@ -6,6 +6,7 @@ nothing behind.
 
 from raytrace.plot.curve import through_focus_curve as through_focus_curve
 from raytrace.plot.layout import layout as layout
+from raytrace.plot.psf import psf_grid as psf_grid
 from raytrace.plot.report import focus_report as focus_report
 from raytrace.plot.spots import airy_radius as airy_radius
 from raytrace.plot.spots import spot_diagram as spot_diagram

@@ -1,0 +1,291 @@
+"""The commands of `raytrace`: their words, their arguments, and what runs them. Imports no torch."""
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from raytrace.cli.options import (
+    aperture,
+    catalog,
+    conditions,
+    count,
+    fields,
+    file_name,
+    finite,
+    json,
+    lens,
+    output,
+    plot,
+    positive,
+    positive_finite,
+    ray_aiming,
+    sampling,
+    wavelength,
+)
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command: its words on the help page, its arguments, and the function that runs it ("module.function")."""
+
+    name: str
+    summary: str
+    description: str
+    examples: str
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    run: str
+
+
+def _info(parser):
+    lens(parser)
+    conditions(parser)
+
+
+def _check(parser):
+    lens(parser)
+    parser.add_argument("--strict", action="store_true", help="fail on anything unknown or assumed")
+
+
+def _convert(parser):
+    parser.add_argument("lens", metavar="IN", type=file_name, help="lens file, or the name of a shipped lens")
+    parser.add_argument("output", metavar="OUT", type=file_name, help="lens file to write: .zmx, .csv, .tsv or .txt")
+    catalog(parser)
+    json(parser)
+    parser.add_argument("--strict", action="store_true", help="fail on anything unknown or assumed in IN")
+
+
+def _layout(parser):
+    lens(parser)
+    conditions(parser)
+    fields(parser)
+    output(parser, "picture to write: .png, .pdf or .svg (default: LENS_layout.png in this folder)")
+
+
+def _spot(parser):
+    lens(parser)
+    conditions(parser)
+    fields(parser)
+    sampling(parser, rings=12)
+    ray_aiming(parser)
+    plot(parser, "the spot diagram")
+
+
+def _focus(parser):
+    lens(parser)
+    group = parser.add_argument_group("conditions other than the file's")
+    group.add_argument(
+        "--object-distance",
+        metavar="MM",
+        type=positive,
+        nargs="+",
+        help="from the object to the vertex of surface 1; inf allowed; several are focused together",
+    )
+    group.add_argument("--sensor-distance", metavar="MM", type=finite, help="sensor distance to start from")
+    aperture(group)
+    wavelength(group)
+    fields(parser)
+    parser.add_argument(
+        "--criterion",
+        choices=("rms", "paraxial", "mean"),
+        default="rms",
+        help="least RMS spot radius (default), paraxial image, or least mean distance from the centroid",
+    )
+    parser.add_argument("--distance-weights", metavar="W", type=positive_finite, nargs="+", help="one a distance")
+    parser.add_argument("--field-weights", metavar="W", type=positive_finite, nargs="+", help="one a field")
+    parser.add_argument("--wavelength-weights", metavar="W", type=positive_finite, nargs="+", help="one a wavelength")
+    sampling(parser, rings=12)
+    plot(parser, "the through-focus curve, the spots before and after, and the layout")
+    output(parser, "lens file to write with the new sensor distance")
+
+
+def _trace(parser):
+    lens(parser)
+    parser.add_argument(
+        "--rays",
+        metavar="CSV",
+        type=file_name,
+        help="rays to trace: columns x,y,z,l,m,n in the frame of surface 1, optional wavelength; "
+        "by default the chief and marginal rays of every field",
+    )
+    output(parser, "table to write (.csv); default: standard output")
+    conditions(parser)
+    ray_aiming(parser)
+
+
+def _psf(parser):
+    lens(parser)
+    parser.add_argument(
+        "--model",
+        choices=("auto", "paraxial", "fourier", "gaussian", "drt", "wave"),
+        default="auto",
+        help="how much of the lens the PSF knows; auto (default) climbs until the next model changes nothing",
+    )
+    group = parser.add_argument_group("conditions other than the file's")
+    group.add_argument(
+        "--object-distance",
+        metavar="MM",
+        type=positive,
+        nargs="+",
+        help="from the object to the vertex of surface 1; inf allowed; one row of kernels each",
+    )
+    group.add_argument("--sensor-distance", metavar="MM", type=finite, help="sensor distance")
+    aperture(group)
+    wavelength(group)
+    fields(parser)
+    parser.add_argument(
+        "--pixel", metavar="MM", type=positive_finite, default=0.005, help="pixel pitch (default 0.005)"
+    )
+    parser.add_argument("--size", metavar="N", type=count, default=21, help="pixels across the window (default 21)")
+    parser.add_argument(
+        "--center",
+        choices=("axis", "chief", "centroid"),
+        default="axis",
+        help="what the window is centred on: the optical axis (default), the chief ray or the centroid",
+    )
+    choice = parser.add_mutually_exclusive_group()
+    choice.add_argument("--tol", metavar="T", type=positive_finite, help="bound on the estimated error (default 0.01)")
+    choice.add_argument("--rays", metavar="N", type=count, help="rays per kernel instead of a tolerance")
+    parser.add_argument(
+        "--normalise",
+        choices=("energy", "window"),
+        default="energy",
+        help="1 = all light through the entrance pupil (default), or each window sums to 1",
+    )
+    output(parser, "arrays to write (.npz): psf[distance, field, y, x], pixel_pitch, energy, error, model")
+    plot(parser, "the kernels")
+
+
+def _glass(parser):
+    parser.add_argument("name", metavar="NAME", help="name of a glass, as in a lens file, or a six-digit MIL code")
+    catalog(parser)
+    json(parser)
+    parser.add_argument(
+        "--wavelength", metavar="UM", type=positive_finite, nargs="+", help="wavelengths in µm (default: F d C)"
+    )
+
+
+def _bench(parser):
+    parser.add_argument("what", choices=("trace",), help="what to measure")
+    json(parser)
+    parser.add_argument("--lens", default="double_gauss", metavar="LENS", help="lens to trace (default double_gauss)")
+    parser.add_argument(
+        "--rays", metavar="N", type=count, nargs="+", default=[10**3, 10**4, 10**5, 10**6], help="numbers of rays"
+    )
+    parser.add_argument("--repeats", metavar="N", type=count, default=5, help="runs of which the median is kept")
+    parser.add_argument("--threads", metavar="N", type=count, help="threads of torch")
+    parser.add_argument("--no-peers", action="store_true", help="leave out Optiland even if it is installed")
+    output(parser, "report to write (.md)")
+    plot(parser, "speed over number of rays")
+
+
+COMMANDS = (
+    Command(
+        "info",
+        "first-order data and the surfaces of a lens",
+        "Print focal lengths, pupils, magnification and the prescription of a lens.",
+        """examples:
+  raytrace info double_gauss
+  raytrace info lenses/double_gauss.zmx --object-distance 25000 --f-number 4
+  raytrace info lens.zmx --json | python3 -m json.tool""",
+        _info,
+        "lens_commands.info",
+    ),
+    Command(
+        "check",
+        "what was read from a lens file, and what was not",
+        "Print the import report: every keyword read, ignored (with the reason) or unknown, and where each glass came "
+        "from. Fails if the file cannot be read; with --strict also if anything was assumed.",
+        """examples:
+  raytrace check lens.zmx
+  raytrace check lens.zmx --strict --json""",
+        _check,
+        "lens_commands.check",
+    ),
+    Command(
+        "convert",
+        "write a lens in another format",
+        "Read a lens file and write it as the suffix of OUT says. Every number comes back bit for bit.",
+        """examples:
+  raytrace convert lenses/double_gauss.zmx double_gauss.csv
+  raytrace convert table.txt lens.zmx""",
+        _convert,
+        "lens_commands.convert",
+    ),
+    Command(
+        "layout",
+        "draw the lens with rays",
+        "Draw the cross section of a lens with the rays of its fields.",
+        """examples:
+  raytrace layout double_gauss -o layout.png
+  raytrace layout lens.zmx --field 0 14 -o layout.pdf""",
+        _layout,
+        "lens_commands.layout",
+    ),
+    Command(
+        "spot",
+        "spot sizes and the spot diagram",
+        "Trace each field and wavelength to the sensor: centroid, RMS and geometric radius about it.",
+        """examples:
+  raytrace spot double_gauss --plot spot.png
+  raytrace spot lens.zmx --object-distance 25000 --field 0 10 14 --json""",
+        _spot,
+        "ray_commands.spot",
+    ),
+    Command(
+        "focus",
+        "find the best sensor distance",
+        "Find the sensor distance of the least RMS spot (closed form, nothing is retraced), on axis and at the primary "
+        "wavelength unless told otherwise.",
+        """examples:
+  raytrace focus lenses/double_gauss.zmx --object-distance 25000 --plot focus.png
+  raytrace focus lens.zmx --object-distance 10000 25000 50000 --field 0 10 14 -o focused.zmx""",
+        _focus,
+        "ray_commands.focus",
+    ),
+    Command(
+        "trace",
+        "trace rays of a table, surface by surface",
+        "Trace rays and write one row per ray and surface: ray,surface,x,y,z,l,m,n,opl,status in each surface's own "
+        "frame, direction after the surface, opl the optical path from the given start. status: ok, miss, tir, "
+        "vignetted. A vignetted ray keeps its coordinates; a missed or totally reflected one ends with an empty row.",
+        """examples:
+  raytrace trace double_gauss
+  raytrace trace lens.zmx --rays rays.csv -o traced.csv""",
+        _trace,
+        "ray_commands.trace",
+    ),
+    Command(
+        "psf",
+        "point spread functions by five models",
+        "Compute point spread functions over object distance and field, integrated over pixels, to a tolerance. "
+        "Models: paraxial, fourier, gaussian, drt (ray-traced), wave (diffraction of the traced wavefront).",
+        """examples:
+  raytrace psf double_gauss --model gaussian --object-distance 10000 30000 --plot psf.png
+  raytrace psf double_gauss --model wave --field 14 --center chief --tol 1e-3 -o psf.npz
+  raytrace psf double_gauss --model drt --rays 256 --json""",
+        _psf,
+        "psf_commands.psf",
+    ),
+    Command(
+        "glass",
+        "look up a glass",
+        "Print index, nd, Vd, formula, range and catalog of a glass; a name that is not found gets suggestions.",
+        """examples:
+  raytrace glass N-BK7
+  raytrace glass SK16 --wavelength 0.53 --json
+  raytrace glass MYGLASS --catalog my_glasses.agf""",
+        _glass,
+        "glass_commands.glass",
+    ),
+    Command(
+        "bench",
+        "measure speed against error",
+        "Measure the trace forward and backward, in float32 and float64, against a high-precision reference; with the "
+        "extra [bench] Optiland runs beside it.",
+        """examples:
+  raytrace bench trace
+  raytrace bench trace --rays 1000 100000 -o bench.md --plot bench.png""",
+        _bench,
+        "bench_commands.bench",
+    ),
+)
