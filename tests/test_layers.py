@@ -121,12 +121,27 @@ def imports(path: Path) -> list[str]:
     return [name for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) for name in imported(node)]
 
 
+def folder_of(name: str) -> str | None:
+    """The folder whose __init__ runs before the module does."""
+    folder = name.rpartition(".")[0]
+    return folder if folder in MODULES else None
+
+
 @pytest.mark.parametrize("name", MODULES)
 def test_imports_only_from_lower_floors(name):
     for other in imports(MODULES[name]):
         assert other != "<relative>", "relative imports hide the floor: write from raytrace.x import y"
         if other in MODULES and other != name and not (family(name) and family(name) == family(other)):
             assert floor(other) < floor(name), f"{name} (floor {floor(name)}) imports {other} (floor {floor(other)})"
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_folders_of_imports_stand_on_lower_floors(name):
+    """Importing psf.scene first runs psf/__init__.py with all it imports: below that, it would go round in a circle."""
+    for other in imports(MODULES[name]):
+        folder = folder_of(other) if other in MODULES else None
+        if folder and folder != name and not name.startswith(f"{folder}."):
+            assert floor(folder) < floor(name), f"{name} ({floor(name)}) imports {other}, and with it all of {folder}"
 
 
 @pytest.mark.parametrize("folder", FAMILIES)
