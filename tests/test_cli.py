@@ -14,12 +14,12 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from raytrace.cli import main, options
+from raytrace.cli import commands, main, options
 
 ROOT = Path(__file__).parents[1]
 DOUBLE_GAUSS = ROOT / "lenses" / "double_gauss.zmx"
 TEXT = DOUBLE_GAUSS.read_text(encoding="utf-8")
-COMMANDS = [command.name for command in options.COMMANDS]
+COMMANDS = [command.name for command in commands.COMMANDS]
 NANOMETRE = 1e-6
 PICOMETRE = 1e-9
 
@@ -293,7 +293,7 @@ def test_help_teaches_by_example(run, command):
 def test_examples_of_the_help_parse():
     from raytrace.cli import build_parser
 
-    for command in options.COMMANDS:
+    for command in commands.COMMANDS:
         for line in command.examples.splitlines()[1:]:
             words = line.split("|")[0].split()
             assert words[0] == "raytrace"
