@@ -12,8 +12,8 @@ from raytrace.launch import rays_of_field, vignette
 from raytrace.lens import with_object_distance
 from raytrace.numerics import dot, safe_divide, safe_sqrt
 from raytrace.paraxial import first_order
-from raytrace.psf.scene import Scene
 from raytrace.rays import Rays
+from raytrace.scene import Scene
 from raytrace.trace import trace
 from raytrace.value import value
 

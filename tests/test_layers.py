@@ -37,7 +37,7 @@ FLOORS = {
     "spot": 6,
     # 7
     "focus": 7,
-    "psf.scene": 7,
+    "scene": 7,
     # 8
     "wavefront": 8,
     # lens files: a family of its own between the lens and the plots

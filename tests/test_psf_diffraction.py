@@ -12,8 +12,8 @@ from raytrace.grid import grid
 from raytrace.lens import with_sensor_distance
 from raytrace.psf import diffraction
 from raytrace.psf.dft import Aliased, EmptyPupil, fft_psf, huygens, phasor, to_grid, to_grid_mirrored
-from raytrace.psf.scene import scene
 from raytrace.pupil import gauss_rings
+from raytrace.scene import scene
 from raytrace.surface import Aperture
 from raytrace.wavefront import rms, wavefront, without
 

@@ -12,7 +12,7 @@ from raytrace.lens import with_sensor_distance
 from raytrace.paraxial import first_order, paraxial_image_distance
 from raytrace.psf import fourier
 from raytrace.psf.dft import bessel_j0
-from raytrace.psf.scene import scene
+from raytrace.scene import scene
 from raytrace.wavefront import wavefront
 
 WAVE = 0.53e-3  # mm

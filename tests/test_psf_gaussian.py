@@ -11,8 +11,8 @@ from raytrace.grid import Grid, grid
 from raytrace.lens import Lens, with_sensor_distance
 from raytrace.psf import gaussian
 from raytrace.psf.pixels import gaussian_pixels
-from raytrace.psf.scene import scene, trace_scene
 from raytrace.pupil import sobol
+from raytrace.scene import scene, trace_scene
 from raytrace.surface import Aperture
 
 ROUNDING = 2.0**-53

@@ -10,7 +10,7 @@ from raytrace.grid import Grid, grid
 from raytrace.lens import with_sensor_distance
 from raytrace.paraxial import paraxial_image_distance
 from raytrace.psf import paraxial
-from raytrace.psf.scene import scene
+from raytrace.scene import scene
 
 INF = math.inf
 

@@ -11,7 +11,7 @@ from raytrace.grid import Grid, grid
 from raytrace.lens import Lens, with_sensor_distance
 from raytrace.psf import rays
 from raytrace.psf.raymap import fit, kernels, kernels_and_reason, reference
-from raytrace.psf.scene import scene
+from raytrace.scene import scene
 from raytrace.surface import Aperture
 
 LENSES = Path(__file__).parents[1] / "lenses"

@@ -11,8 +11,8 @@ from raytrace.formats import read_lens
 from raytrace.grid import Grid, grid
 from raytrace.lens import Lens, with_sensor_distance
 from raytrace.psf.rays import beam_share, kernels, trace_fans
-from raytrace.psf.scene import scene
 from raytrace.psf.splat import below_edge, histogram, splat, splat_cells, splat_smooth
+from raytrace.scene import scene
 from raytrace.surface import Aperture
 
 LENSES = Path(__file__).parents[1] / "lenses"

@@ -9,8 +9,8 @@ from problems import vector
 
 from raytrace.lens import with_sensor_distance
 from raytrace.numerics import dot
-from raytrace.psf.scene import scene
 from raytrace.pupil import gauss_rings
+from raytrace.scene import scene
 from raytrace.surface import Aperture
 from raytrace.wavefront import mean_opd, peak_to_valley, rms, wavefront, without, zernike_coefficients
 

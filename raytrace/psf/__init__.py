@@ -17,4 +17,4 @@ pupil. `compute.py` drives them to a tolerance; `choose.py` picks one from the s
 from raytrace.psf.compute import MODELS as MODELS
 from raytrace.psf.compute import Psf as Psf
 from raytrace.psf.compute import psf as psf
-from raytrace.psf.scene import EmptyPsf as EmptyPsf
+from raytrace.scene import EmptyPsf as EmptyPsf

@@ -13,7 +13,7 @@ from raytrace.grid import grid as make_grid
 from raytrace.lens import Lens
 from raytrace.numerics import safe_divide
 from raytrace.psf import diffraction, fourier, gaussian, paraxial, raymap, rays
-from raytrace.psf.scene import EmptyPsf, Kernels, Scene, scene, trace_scene
+from raytrace.scene import EmptyPsf, Kernels, Scene, scene, trace_scene
 from raytrace.value import value
 
 

@@ -30,8 +30,8 @@ from raytrace.psf.dft import (
     to_grid,
     to_grid_mirrored,
 )
-from raytrace.psf.scene import Kernels, Scene
 from raytrace.pupil import gauss_rings
+from raytrace.scene import Kernels, Scene
 from raytrace.surface import inside
 from raytrace.trace import media, steps
 from raytrace.value import value

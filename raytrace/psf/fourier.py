@@ -30,8 +30,8 @@ from raytrace.psf.dft import (
     sub_pixels,
     to_grid,
 )
-from raytrace.psf.scene import Kernels, Scene
 from raytrace.pupil import gauss_rings, with_rim
+from raytrace.scene import Kernels, Scene
 from raytrace.trace import media
 from raytrace.value import value
 

@@ -11,9 +11,9 @@ from raytrace.launch import vignette
 from raytrace.lens import Lens
 from raytrace.numerics import safe_divide
 from raytrace.psf.pixels import gaussian_pixels
-from raytrace.psf.scene import Kernels, Scene, trace_scene
 from raytrace.pupil import gauss_rings, sobol
 from raytrace.rays import Rays
+from raytrace.scene import Kernels, Scene, trace_scene
 
 _MAP_POINTS = 4096  # of the ray map that the residual is computed from
 

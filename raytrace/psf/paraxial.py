@@ -8,7 +8,7 @@ from raytrace.launch import object_field
 from raytrace.numerics import safe_divide
 from raytrace.paraxial import first_order, signed, system_matrix
 from raytrace.psf.pixels import gaussian_pixels
-from raytrace.psf.scene import Kernels, Scene
+from raytrace.scene import Kernels, Scene
 from raytrace.trace import media
 
 

@@ -31,8 +31,8 @@ from raytrace.psf.rays import (
     trace_fans,
     turned,
 )
-from raytrace.psf.scene import Kernels, Scene
 from raytrace.psf.splat import cell_widths
+from raytrace.scene import Kernels, Scene
 from raytrace.surface import Aperture
 from raytrace.value import value
 

@@ -18,8 +18,8 @@ from raytrace.grid import Grid
 from raytrace.launch import rays_of_field, vignette
 from raytrace.lens import with_object_distance
 from raytrace.numerics import safe_divide
-from raytrace.psf.scene import Kernels, Scene, trace_scene
 from raytrace.psf.splat import cell_energy, cell_widths, cells, clear_share, histogram, splat_cells, splat_smooth
+from raytrace.scene import Kernels, Scene, trace_scene
 from raytrace.spot import spot
 from raytrace.surface import Aperture
 from raytrace.trace import media, steps

@@ -1,4 +1,4 @@
-"""What every PSF model is given, and what it gives back."""
+"""Scene: object distance × field × wavelength, the rays of one, and what every PSF model gives back."""
 
 import torch
 from torch import Tensor
