@@ -23,7 +23,7 @@ from raytrace.value import to
 
 SAMPLE = 24  # rays of the check against the reference
 _PIECES = (2**15, 2**16)  # numbers of rays traced at a time that are tried, beside all at once
-_TRIAL = 100_000  # at most so many rays in a trial
+_TRIAL = 400_000  # at most so many rays in a trial
 _LARGEST_GRAPH = 200_000  # rays whose graph is held at once
 
 
@@ -160,14 +160,11 @@ def measure(
     tracers = [*(Own(lens, dtype, with_path=path) for dtype in dtypes for path in (True, False)), *peers]
     torch.set_num_threads(threads)
     errors = {id(tracer): errors_of(tracer, lens, field_rays(lens, SAMPLE)) for tracer in tracers}
-    pieces: dict[tuple[int, str], int] = {}
     rows = []
     for count in sorted(counts):
         jobs = _jobs(lens, tracers, count)
         seconds: list[list[float]] = [[] for _ in jobs]
-        for number, job in enumerate(jobs):
-            size = _best_piece(job, pieces, threads)
-            jobs[number] = dataclasses.replace(job, piece=size)
+        jobs = [dataclasses.replace(job, piece=_best_piece(job, threads)) for job in jobs]
         for _ in range(repeats):
             for job, taken in zip(jobs, seconds, strict=True):
                 taken.append(_time(job, threads))
@@ -202,21 +199,17 @@ def _time(job: Job, threads: int) -> float:
     return now() - began
 
 
-def _best_piece(job: Job, known: dict[tuple[int, str], int], threads: int) -> int:
-    """How many rays at a time suit this tracer best: each is given its own best, found once at a large number."""
+def _best_piece(job: Job, threads: int) -> int:
+    """How many rays at a time suit this tracer best: each is given its own best, tried before it is measured."""
     count = job.rays.direction.shape[1]
+    whole = count if job.what == "forward" else min(count, _LARGEST_GRAPH)
     if count <= min(_PIECES):
         _time(job, threads)  # warm up
-        return count
-    key = (id(job.tracer), job.what)
-    if key not in known or count <= _TRIAL:
-        trial = dataclasses.replace(job, rays=_first(job.rays, min(count, _TRIAL)))
-        sizes = [*(size for size in _PIECES if size < count), count]
-        tried = {size: min(_time(dataclasses.replace(trial, piece=size), threads) for _ in range(2)) for size in sizes}
-        known[key] = min(tried, key=tried.get)
-    if known[key] >= min(count, _TRIAL):  # all at once was best
-        return count if job.what == "forward" else min(count, _LARGEST_GRAPH)
-    return known[key]
+        return whole
+    trial = dataclasses.replace(job, rays=_first(job.rays, min(count, _TRIAL)))
+    sizes = [*(size for size in _PIECES if size < whole), whole]
+    tried = {size: min(_time(dataclasses.replace(trial, piece=size), threads) for _ in range(2)) for size in sizes}
+    return min(tried, key=tried.get)
 
 
 def _first(rays: Rays, count: int) -> Rays:
