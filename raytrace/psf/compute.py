@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import warnings
 from collections.abc import Callable, Sequence
 
@@ -29,7 +30,7 @@ class Psf:
     grid: where the pixels lie on the sensor, centre (2,) or (2, D, F) mm.
     energy: (D, F) inside the window, of the light through the entrance pupil.
     error: (D, F) estimated relative L1 error of the kernel against the model's own limit (`gaussian`: relative error
-        of σ); nan where it was not estimated.
+        of σ); nan where it was not estimated. How far it can be believed is measured in docs/psf_error.md.
     centroid: (2, D, F) mm; covariance: (3, D, F) xx, xy, yy in mm², of the distribution before pixel integration.
     residual: (D, F) how wrong the model itself is, where it can tell, or None.
     model: its name; rays: traced for each kernel; reason: why `auto` chose the model, or a remark on convergence.
@@ -55,21 +56,24 @@ class Model:
 
     kernels: (scene, grid, order) -> Kernels; orders: from the coarsest to the finest.
     by_width: True if the error is that of σ, False if it is that of the kernel.
+    left: the error that remains behind the last change of the kernel, in units of that change; None if the rate of
+        convergence is to be measured. The constants cover 95 % of the cases of docs/psf_error.md.
     """
 
     kernels: Callable[[Scene, Grid, int], Kernels]
     orders: Sequence[int]
     by_width: bool = False
+    left: float | None = None
 
 
 MODELS: dict[str, Model] = {
     "paraxial": Model(lambda scene, grid, order: paraxial.kernels(scene, grid), (0,)),
-    "fourier": Model(lambda scene, grid, order: fourier.kernels(scene, grid, order=order), range(6)),
+    "fourier": Model(lambda scene, grid, order: fourier.kernels(scene, grid, order=order), range(6), left=0.2),
     "gaussian": Model(
         lambda scene, grid, order: gaussian.kernels(scene, grid, order=order), (2, 3, 4, 5, 6, 8, 10, 12, 16, 24), True
     ),
-    "drt": Model(lambda scene, grid, order: raymap.kernels(scene, grid, order=order), range(11)),
-    "wave": Model(lambda scene, grid, order: diffraction.kernels(scene, grid, order=order), range(6)),
+    "drt": Model(lambda scene, grid, order: raymap.kernels(scene, grid, order=order), range(11), left=1.5),
+    "wave": Model(lambda scene, grid, order: diffraction.kernels(scene, grid, order=order), range(6), left=0.2),
 }
 
 #: Models from the one that knows least to the one that knows most: the rungs of `model="auto"`.
@@ -110,6 +114,7 @@ def psf(
     weights = wavelength_weights if wavelength_weights is not None else weights
     wavelengths = lens.wavelengths if wavelengths is None else wavelengths
     weights = torch.ones_like(wavelengths) if weights is None else weights
+    _check_batch(fields, distances, wavelengths, weights)
     base = make_grid(wavelengths.new_tensor(0.005), 21) if grid is None else grid
     compute = functools.partial(
         _group, lens, model, fields, wavelengths, weights / weights.sum(), base, center, tol or 0.01, rays
@@ -138,6 +143,26 @@ def _check(model: str, center: str, normalise: str, tol: float | None, rays: int
         raise ValueError("tol and rays exclude each other: a tolerance chooses the number of rays")
     if tol is not None and not tol > 0:
         raise ValueError(f"tol {tol:g}: expected a number above 0")
+    if rays is not None and rays < 1:
+        raise ValueError(f"rays {rays}: expected a whole number above 0")
+    if rays is not None and model == "auto":
+        raise ValueError("auto chooses by a tolerance: give tol, or rays and a model that traces them")
+    if rays is not None and model in ("paraxial", "fourier"):
+        raise ValueError(f"{model} traces no rays: leave rays out")
+
+
+def _check_batch(fields: Tensor, distances: Tensor, wavelengths: Tensor, weights: Tensor) -> None:
+    if fields.dim() != 2 or len(fields) != 2 or not fields.numel():
+        raise ValueError(f"fields of shape {tuple(fields.shape)}; expected (2, F)")
+    for name, values in (("object_distances", distances), ("wavelengths", wavelengths)):
+        if values.dim() != 1 or not len(values):
+            raise ValueError(f"{name} of shape {tuple(values.shape)}; expected one axis")
+        if bool(values.isnan().any()) or bool((values == 0).any()):
+            raise ValueError(f"{name} {values.tolist()}; expected numbers other than 0 and nan")
+    if weights.shape != wavelengths.shape:
+        raise ValueError(f"{weights.numel()} wavelength_weights for {len(wavelengths)} wavelengths")
+    if bool((weights < 0).any()) or not bool(weights.sum() > 0):
+        raise ValueError(f"wavelength_weights {weights.tolist()} are below 0 or sum to 0")
 
 
 def _group(lens, model, fields, wavelengths, weights, base, center, tol, rays, distances) -> Psf:
@@ -153,38 +178,61 @@ def _group(lens, model, fields, wavelengths, weights, base, center, tol, rays, d
 
 
 def _by_tolerance(batch: Scene, pixels: Grid, weights: Tensor, model: str, tol: float) -> Psf:
-    """Climb the orders until the estimated error of the last meets the tolerance.
-
-    With δ_i the change from order i - 1 to i and r = δ_i/δ_(i-1), the error left is about δ_i r/(1 - r): a geometric
-    series. r is kept within 0.05 … 0.8, and 0.5 is taken before it is known, so that a lucky small change is not
-    believed; a floor stands for rounding.
-    """
+    """Climb the orders until the estimated error of the last meets the tolerance; see `_estimate`."""
     ladder = MODELS[model]
-    floor = 1e-12 if pixels.pitch.dtype == torch.float64 else 1e-5
     with torch.no_grad():
-        chosen, error, before, last_change = ladder.orders[0], None, None, None
+        lost = _lost_light(batch) if ladder.by_width else None
+        before, changes, error = None, [], None
         for order in ladder.orders:
             found = _polychromatic(ladder.kernels(batch, pixels, order), weights, model)
-            if len(ladder.orders) == 1:
-                error = torch.zeros_like(found.energy)
-                break
             if before is not None:
-                change = _width_change(before, found) if ladder.by_width else _kernel_change(before, found)
-                ratio = torch.full_like(change, 0.5) if last_change is None else safe_divide(change, last_change)
-                ratio = ratio.clamp(0.05, 0.8)
-                error, last_change = (change * ratio / (1 - ratio)).clamp_min(floor), change
-                if bool((error <= tol).all()):
-                    chosen = order
-                    break
-            before, chosen = found, order
-        if error is None:
-            error = torch.full_like(found.energy, torch.nan)
+                changes.append(_width_change(before, found) if ladder.by_width else _kernel_change(before, found))
+            error = _estimate(ladder, changes, order, lost, like=found.energy)
+            if bool((error <= tol).all()):
+                break
+            before = found
     reason = ""
-    if bool((error > tol).any()):
+    if not bool((error <= tol).all()):
         reason = f"{model}: the estimated error {float(error.max()):.1e} stays above the tolerance {tol:g}"
         warnings.warn(reason, NotConverged, stacklevel=4)
-    final = _polychromatic(ladder.kernels(batch, pixels, chosen), weights, model) if torch.is_grad_enabled() else found
-    return dataclasses.replace(final, error=error, reason=reason)
+    if torch.is_grad_enabled():
+        found = _polychromatic(ladder.kernels(batch, pixels, order), weights, model)
+    return dataclasses.replace(found, error=error, reason=reason)
+
+
+def _estimate(ladder: Model, changes: list[Tensor], order: int, lost: Tensor | None, *, like: Tensor) -> Tensor:
+    """Estimated error (D, F) after changes δ_1 … δ_n from one order to the next; inf while too few are known.
+
+    Cells (`drt`) halve their error with each order, waves divide it by 10 or more: the error left is a constant
+    `left` times δ_n. Gauss rings (`gaussian`) converge as fast as the lens is smooth, so the geometric series
+    δ_n ρ/(1 - ρ) is summed, ρ the largest ratio of successive changes so far: one lucky small change is not believed.
+    Rings that an edge crosses jump instead by up to half a ring's weight, π/4n of the light, or by all that is lost.
+    A floor stands for rounding.
+    """
+    if len(ladder.orders) == 1:
+        return torch.zeros_like(like)
+    floor = 1e-12 if like.dtype == torch.float64 else 1e-5
+    if not changes or (ladder.left is None and len(changes) < 2):
+        return torch.full_like(like, torch.inf)
+    if ladder.left is not None:
+        error = ladder.left * changes[-1]
+    else:
+        ratios = [safe_divide(later, earlier) for earlier, later in itertools.pairwise(changes)]
+        rho = torch.stack(ratios).amax(0).clamp(0.001, 0.9)
+        error = changes[-1] * rho / (1 - rho)
+    if lost is not None:
+        error = torch.maximum(error, torch.minimum(2 * lost, torch.full_like(lost, 0.8 / order)))
+    return error.clamp_min(floor)
+
+
+def _lost_light(batch: Scene) -> Tensor:
+    """The largest share (D, F) of the beam that is lost, over wavelengths, by rings between those of any order; 0
+    where it arrives as a whole or not at all."""
+    fold = gaussian.symmetry(batch)
+    points, share = gaussian.fold_pupil(20, fold, batch.wavelengths)
+    arrived = torch.where(trace_scene(batch, points).valid, share, 0.0).sum(-1)
+    arrived = arrived.expand(batch.shape)
+    return torch.where(arrived > 0, (1 - arrived).clamp_min(0.0), 0.0).amax(-1)
 
 
 def _by_rays(batch: Scene, pixels: Grid, weights: Tensor, model: str, count: int) -> Psf:
