@@ -18,9 +18,11 @@ _ACCEPTED_RESIDUAL = 64.0  # units of the rounding error of the terms of F
 
 
 def sag_and_derivatives(
-    u: Tensor, curvature: Tensor | None, conic: Tensor | None, coefficients: Tensor | None
+    u: Tensor, curvature: Tensor | None, conic: Tensor | None, coefficients: Tensor | None, highest: int = 2
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """S(u), dS/du, d²S/du² with u = r² (...) in mm²; beyond the edge of a closed conic its radicand is held at 0+.
+    """S(u), dS/du, d²S/du² with u = r² (...) in mm²; derivatives above the `highest` asked for stay 0.
+
+    Beyond the edge of a closed conic its radicand is held at 0+.
 
     S = c u/(1+w) + Σ_j a_j u^j,  w = √(1 - (1+k) c² u);  dS = c/2w + …;  d²S = (1+k) c³/4w³ + …
     """
@@ -31,16 +33,19 @@ def sag_and_derivatives(
         radicand = 1 - shape * c * c * u
         w = torch.sqrt(torch.where(radicand > 0, radicand, torch.finfo(u.dtype).tiny))
         S = c * u / (1 + w)
-        dS = 0.5 * c / w
-        d2S = 0.25 * shape * c**3 / w**3
+        if highest > 0:
+            dS = 0.5 * c / w
+        if highest > 1:
+            d2S = (0.25 * shape * c**3) / (w * w * w)
     if coefficients is not None:
-        order = torch.arange(1, len(coefficients) + 1, dtype=coefficients.dtype, device=coefficients.device)
-        order = order.reshape(-1, *(1,) * (coefficients.dim() - 1))
-        first = order * coefficients
-        second = (order - 1) * first
         S = S + u * polynomial(coefficients, u)
-        dS = dS + polynomial(first, u)
-        d2S = d2S + polynomial(second[1:], u)
+        if highest > 0:
+            order = torch.arange(1, len(coefficients) + 1, dtype=coefficients.dtype, device=coefficients.device)
+            order = order.reshape(-1, *(1,) * (coefficients.dim() - 1))
+            first = order * coefficients
+            dS = dS + polynomial(first, u)
+            if highest > 1:
+                d2S = d2S + polynomial(((order - 1) * first)[1:], u)
     return S, dS, d2S
 
 
@@ -140,7 +145,7 @@ def _residual(p, d, c, k, a, t):
     """F = z - S(r²), F' = dF/dt, the rounding scale of F, and r² at t."""
     x, y, z = p[0] + t * d[0], p[1] + t * d[1], p[2] + t * d[2]
     u = x * x + y * y
-    S, dS, _ = sag_and_derivatives(u, c, k, a)
+    S, dS, _ = sag_and_derivatives(u, c, k, a, 1)
     radial = x * d[0] + y * d[1]
     scale = z.abs() + (c * u).abs() + u * polynomial(a.abs(), u) + p[2].abs() + (t * d[2]).abs()
     scale = scale + 2 * dS.abs() * (u + radial.abs() * t.abs())

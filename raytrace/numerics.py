@@ -2,6 +2,7 @@
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 
 def safe_sqrt(x: Tensor) -> Tensor:
@@ -22,7 +23,17 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
     Written out, not summed over an axis: a reduction may associate differently in batches of different shape, and
     results must not depend on how rays are batched.
     """
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    ax, ay, az = a
+    bx, by, bz = b
+    return torch.addcmul(ax * bx + ay * by, az, bz)
+
+
+def differentiating() -> bool:
+    """True if derivatives may be asked for: a graph is recorded, or a forward derivative (`jvp`) is under way.
+
+    False only under `torch.no_grad()` with no forward derivative; then what serves derivatives alone is left out.
+    """
+    return torch.is_grad_enabled() or getattr(forward_ad, "_current_level", 0) >= 0
 
 
 def with_batch_axes(vector: Tensor, count: int) -> Tensor:
@@ -48,7 +59,10 @@ def unit(vector: Tensor) -> Tensor:
 
 def polynomial(coefficients: Tensor, x: Tensor) -> Tensor:
     """Σ_j coefficients[j]·x^j by Horner's rule; `coefficients`: (m, ...), broadcast against `x`."""
-    total = torch.zeros_like(x)
-    for coefficient in reversed(coefficients.unbind(0)):
-        total = total * x + coefficient
+    if len(coefficients) == 0:
+        return torch.zeros_like(x)
+    *lower, total = coefficients.unbind(0)
+    total = total.expand(torch.broadcast_shapes(total.shape, x.shape))
+    for coefficient in reversed(lower):
+        total = torch.addcmul(coefficient, total, x)
     return total

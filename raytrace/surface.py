@@ -5,12 +5,15 @@
 Every function works in the frame of the surface's vertex, components first, for any batch shape.
 """
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
 from raytrace.asphere import asphere_root, sag_and_derivatives
 from raytrace.glass import AIR, Glass
-from raytrace.numerics import dot, with_batch_axes
+from raytrace.numerics import differentiating, dot
 from raytrace.value import value
 
 
@@ -63,18 +66,12 @@ class Surface:
         """True if the surface has neither curvature nor aspheric terms to model."""
         return self.curvature is None and self.coefficients is None
 
-    @property
-    def batch_axes(self) -> int:
-        """How many batch axes the numbers of the shape have."""
-        scalars = [x.dim() for x in (self.curvature, self.conic) if x is not None]
-        return max([0, *scalars, 0 if self.coefficients is None else self.coefficients.dim() - 1])
-
 
 def sag(surface: Surface, radius_squared: Tensor) -> Tensor:
     """Sag z in mm at r² (...) in mm²; the radicand is clamped at 0 beyond the edge of a closed conic."""
     if surface.is_plane:
         return torch.zeros_like(radius_squared)
-    return sag_and_derivatives(radius_squared, surface.curvature, surface.conic, surface.coefficients)[0]
+    return sag_and_derivatives(radius_squared, surface.curvature, surface.conic, surface.coefficients, 0)[0]
 
 
 def intersect(surface: Surface, position: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
@@ -83,38 +80,54 @@ def intersect(surface: Surface, position: Tensor, direction: Tensor) -> tuple[Te
     position: (3, ...) mm, anywhere on the ray, in the frame of this surface's vertex; direction: (3, ...) unit.
     Returns the hit point (3, ...) mm and whether there is one (...). Of two crossings it is the one on the vertex
     sheet whose normal looks along the ray's own z direction. A ray that misses comes back at the vertex.
-    First and second derivatives are exact: see `_attach`.
+    First and second derivatives are exact: see `_step`.
     """
+    meeting = meet(surface, position.unbind(0), direction.unbind(0))
+    hit = torch.stack(torch.broadcast_tensors(*meeting.hit, meeting.met)[:3])
+    return torch.where(meeting.met, hit, 0.0), meeting.met
+
+
+class Meeting(NamedTuple):
+    """Rays at a surface, by components.
+
+    hit: (x, y, z) mm, each (...); where a ray misses, finite and at the vertex, or on the vertex plane of a plane.
+    cosine: (...) n·d with the normal n of `normal`, n_z > 0 at the vertex; finite where a ray misses.
+    met: (...) bool, whether there is a crossing.
+    normal: that of `normal` and its squared length where they are known already, else None.
+    """
+
+    hit: tuple[Tensor, Tensor, Tensor]
+    cosine: Tensor
+    met: Tensor
+    normal: tuple | None = None
+
+
+def meet(surface: Surface, position: Sequence[Tensor], direction: Sequence[Tensor]) -> Meeting:
+    """`intersect` by components, with the cosine that comes with it; arguments are triples of (...)."""
     if surface.is_plane:
-        return _intersect_plane(position, direction)
-    axes = max(surface.batch_axes, position.dim() - 1, direction.dim() - 1)
-    position, direction = with_batch_axes(position, axes), with_batch_axes(direction, axes)
-    # Slide to the foot of the perpendicular from the vertex, so that a far origin costs no digits (Feder 1951,
-    # Spencer & Murty 1962); the slide stays in the graph.
-    foot = position - dot(position, direction) * direction
+        return _meet_plane(position, direction)
     if surface.coefficients is not None:
-        return _intersect_asphere(surface, foot, direction)
-    return _intersect_conic(surface, foot, direction)
+        return _meet_asphere(surface, position, direction)
+    return _meet_conic(surface, position, direction)
 
 
-def normal(surface: Surface, hit: Tensor) -> tuple[Tensor, Tensor]:
-    """A normal (3, ...) at a point on the surface, not normalised, z > 0 at the vertex; and its squared length (...).
+def normal(surface: Surface, hit: Sequence[Tensor]) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor | float]:
+    """A normal at a point on the surface by components, not normalised, z > 0 at the vertex; its squared length.
 
     Conic: (-c x, -c y, 1 - (1+k) c z), squared length 1 - k c² r² on the surface (1 for a sphere): no square root.
     """
     x, y, z = hit
     if surface.is_plane:
-        one = torch.ones_like(x)
-        return torch.stack([torch.zeros_like(x), torch.zeros_like(x), one]), one
-    radius_squared = x * x + y * y
+        return (torch.zeros_like(x), torch.zeros_like(x), torch.ones_like(x)), 1.0
     if surface.coefficients is not None:
-        slope = 2 * sag_and_derivatives(radius_squared, surface.curvature, surface.conic, surface.coefficients)[1]
-        return torch.stack([-slope * x, -slope * y, torch.ones_like(x)]), 1 + slope * slope * radius_squared
+        radius_squared = x * x + y * y
+        slope = 2 * sag_and_derivatives(radius_squared, surface.curvature, surface.conic, surface.coefficients, 1)[1]
+        return (-slope * x, -slope * y, torch.ones_like(x)), 1 + slope * slope * radius_squared
     c = surface.curvature
     if surface.conic is None:
-        return torch.stack([-c * x, -c * y, 1 - c * z]), torch.ones_like(x)
+        return (-c * x, -c * y, 1 - c * z), 1.0
     k = surface.conic
-    return torch.stack([-c * x, -c * y, 1 - (1 + k) * c * z]), 1 - k * c * c * radius_squared
+    return (-c * x, -c * y, 1 - (1 + k) * c * z), 1 - k * c * c * (x * x + y * y)
 
 
 def inside(surface: Surface, hit: Tensor) -> Tensor | None:
@@ -137,106 +150,126 @@ def inside(surface: Surface, hit: Tensor) -> Tensor | None:
     return passed
 
 
-def _intersect_plane(position: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-    # A ray along the plane misses it, and so does one that meets it further away than numbers go.
-    slope = direction[2].detach()
-    reach = position[2].detach() / torch.where(slope != 0, slope, 1.0)
-    met = (slope != 0) & torch.isfinite(reach) & torch.isfinite(reach * reach)
-    position, direction = _axial_where_lost(position, direction, met)
+def _meet_plane(position, direction) -> Meeting:
     x, y, z = position
     L, M, N = direction
-    t = -z / N
-    return torch.stack([x + t * L, y + t * M, torch.zeros_like(t)]), met
+    # A ray along the plane misses it, and so does one that meets it further away than numbers go.
+    reach = z.detach() / N.detach()
+    met = reach * reach < float("inf")
+    N = torch.where(met, N, 1.0)
+    t = z / N
+    hit = torch.addcmul(x, t, L, value=-1), torch.addcmul(y, t, M, value=-1), z.new_zeros(())
+    return Meeting(hit, N, met)
 
 
-def _intersect_conic(surface: Surface, foot: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-    """F(t) = c/2 (x² + y² + (1+k) z²) - z = 0 along the ray: F' and F'' are as simple as F."""
+def _meet_conic(surface: Surface, position, direction) -> Meeting:
+    """F(t) = c/2 (x² + y² + (1+k) z²) - z = 0 along the ray: F' and F'' are as simple as F, and F' = -n·d.
+
+    In float32 the root comes from float64 and a step would only add rounding: there only its derivatives are kept.
+    """
     c = surface.curvature
-    shape = 1.0 if surface.conic is None else 1 + surface.conic
-    t, met = conic_root(foot.detach(), direction.detach(), c.detach(), _detach(shape))
-    foot, direction = _axial_where_lost(foot, direction, met)
+    shape = None if surface.conic is None else 1 + surface.conic
+    foot = _foot(position, direction)
+    t, met = conic_root([a.detach() for a in foot], [a.detach() for a in direction], c.detach(), _detach(shape))
     L, M, N = direction
-    x, y, z = foot + t * direction
-    F = 0.5 * c * (x * x + y * y + shape * z * z) - z
-    dF = c * (x * L + y * M + shape * z * N) - N
-    d2F = c * (L * L + M * M + shape * N * N)
-    return foot + _attach(t, F, dF, d2F) * direction, met
+    N = torch.where(met, N, 1.0)
+    x, y, z = (torch.addcmul(torch.where(met, p, 0.0), t, d) for p, d in zip(foot, (L, M, N), strict=True))
+    shaped = z if shape is None else shape * z
+    dF = c * torch.addcmul(x * L + y * M, shaped, N) - N
+    polish = t.dtype == torch.float64
+    if not (polish or differentiating()):
+        return Meeting((x, y, z), -dF, met)
+    F = (0.5 * c) * torch.addcmul(x * x + y * y, shaped, z) - z
+    d2F = c if shape is None else c * torch.addcmul(L * L + M * M, shape * N, N)
+    step = _step(F, dF, d2F, polish)
+    hit = tuple(torch.addcmul(a, step, d, value=-1) for a, d in zip((x, y, z), (L, M, N), strict=True))
+    return Meeting(hit, d2F * step - dF, met)
 
 
-def _intersect_asphere(surface: Surface, foot: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+def _foot(position, direction) -> list[Tensor]:
+    """Foot of the perpendicular from the vertex to the ray.
+
+    From there a far origin costs no digits (Feder 1951, Spencer & Murty 1962); the slide stays in the graph.
+    """
+    slide = -dot(position, direction)
+    return [torch.addcmul(p, slide, d) for p, d in zip(position, direction, strict=True)]
+
+
+def conic_root(foot, direction, c: Tensor, shape: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Path t (...) from the foot of the perpendicular to the conic of shape 1+k, 0 if there is none; and whether met.
+
+        A t² - 2 G t + F = 0,  A = c (L² + M² + (1+k) N²),  G = N - c k p_z N - c (p·d),
+        F = c (p_x² + p_y² + (1+k) p_z²) - 2 p_z
+
+    in the algebraic form that does not cancel (Kahan 2004), regular at c = 0 and at k = -1. For a sphere (shape None)
+    A = c and G = N, and G never cancels against the root. Worked in float64 also for float32 rays: within 1e-7 of the
+    edge of a surface rounding would decide between a hit and a miss.
+    """
+    dtype = direction[0].dtype
+    if dtype != torch.float64:
+        foot, direction, c = [a.double() for a in foot], [a.double() for a in direction], c.double()
+        shape = None if shape is None else shape.double()
+    L, M, N = direction
+    x, y, z = foot
+    if shape is None:
+        F = torch.sub(c * torch.addcmul(x * x + y * y, z, z), z, alpha=2)
+        discriminant = torch.addcmul(N * N, c, F, value=-1)
+        t = F / (N + torch.copysign(torch.sqrt(discriminant.clamp_min(0.0)), N))
+        met = (discriminant > 0) & ((c * torch.addcmul(z, t, N)).abs() < 1)
+        return torch.where(met, t, 0.0).to(dtype), met
+    shaped = shape * N
+    A = c * torch.addcmul(L * L + M * M, shaped, N)
+    G = torch.addcmul(N, c, torch.addcmul(x * L + y * M, shaped, z), value=-1)
+    F = torch.sub(c * torch.addcmul(x * x + y * y, shape * z, z), z, alpha=2)
+    discriminant = torch.addcmul(G * G, A, F, value=-1)
+    root = torch.copysign(torch.sqrt(discriminant.clamp_min(0.0)), N)
+    same_sign = torch.where(N < 0, -G, G) >= 0
+    t = torch.where(same_sign, F, G - root) / torch.where(same_sign, G + root, A)
+    met = (discriminant > 0) & ((shape * c) * torch.addcmul(z, t, N) < 1) & (t.abs() < float("inf"))
+    return torch.where(met, t, 0.0).to(dtype), met
+
+
+def _meet_asphere(surface: Surface, position, direction) -> Meeting:
     """F(t) = z - sag(x² + y²) = 0 along the ray; the root itself is found outside the graph."""
     c, k, a = surface.curvature, surface.conic, surface.coefficients
     zero = a.new_zeros(())
     rim = float("inf") if surface.semi_diameter is None else surface.semi_diameter
+    foot = _foot(position, direction)
     t, met = asphere_root(
-        foot.detach(),
-        direction.detach(),
+        torch.stack(torch.broadcast_tensors(*(p.detach() for p in foot))),
+        torch.stack(torch.broadcast_tensors(*(d.detach() for d in direction))),
         zero if c is None else c.detach(),
         zero if k is None else k.detach(),
         a.detach(),
         rim,
     )
-    foot, direction = _axial_where_lost(foot, direction, met)
-    L, M, N = direction
-    x, y, z = foot + t * direction
+    L, M, N = (torch.where(met, d, at) for d, at in zip(direction, (0.0, 0.0, 1.0), strict=True))
+    foot = [torch.where(met, p, 0.0) for p in foot]
+    x, y, z = (torch.addcmul(p, t, d) for p, d in zip(foot, (L, M, N), strict=True))
     S, dS, d2S = sag_and_derivatives(x * x + y * y, c, k, a)
     radial = x * L + y * M
     dF = N - 2 * dS * radial
     d2F = -(4 * d2S * radial * radial + 2 * dS * (L * L + M * M))
-    return foot + _attach(t, z - S, dF, d2F) * direction, met
+    step = _step(z - S, dF, d2F, t.dtype == torch.float64)
+    hit = tuple(torch.addcmul(a, step, d, value=-1) for a, d in zip((x, y, z), (L, M, N), strict=True))
+    n, norm_squared = normal(surface, hit)
+    return Meeting(hit, dot(n, (L, M, N)), met, (n, norm_squared))
 
 
-def _attach(t: Tensor, F: Tensor, dF: Tensor, d2F: Tensor) -> Tensor:
+def _step(F: Tensor, dF: Tensor, d2F: Tensor, polish: bool) -> Tensor:
     """One step of Chebyshev's method from a root t found outside the graph: it carries its derivatives and polishes t.
 
     With F(t, p) = 0 and δ = F/F', the step t - δ - (F''/2F') δ² has, at δ = 0, the first derivative -F_p/F_t of the
     implicit function and, because δ² has no first but a second derivative, also its second derivative: the last term
-    supplies -(F_tt/F_t) t_p t_q, which one Newton step lacks. F'' itself need not be differentiated. In float32 the
-    root comes from float64 and a step would only add rounding, so its value (not its derivative) is taken out.
+    supplies -(F_tt/F_t) t_p t_q, which one Newton step lacks. F'' itself need not be differentiated. The value of F at
+    the root is rounding: it polishes t (unless polish is False), but must not leak into derivatives through F'.
     """
-    step = F / dF
-    if step.dtype != torch.float64:
-        step = step - step.detach()
-    return t - step * (1 + 0.5 * (d2F / dF).detach() * step)
+    if not differentiating():
+        return F / dF if polish else F.new_zeros(())
+    step = (F - F.detach()) / dF
+    step = torch.addcmul(step, (0.5 * d2F / dF).detach() * step, step)
+    return step + (F / dF).detach() if polish else step
 
 
-def conic_root(foot: Tensor, direction: Tensor, c: Tensor, shape: Tensor | float) -> tuple[Tensor, Tensor]:
-    """Path t (...) from the foot of the perpendicular to the conic of shape 1+k, and whether it is met (...).
-
-        A t² - 2 G t + F = 0,  A = c (L² + M² + (1+k) N²),  G = N - c k p_z N - c (p·d),
-        F = c (p_x² + p_y² + (1+k) p_z²) - 2 p_z
-
-    in the algebraic form that does not cancel (Kahan 2004), regular at c = 0 and at k = -1. Worked in float64 also
-    for float32 rays: within 1e-7 of the edge of a surface rounding would decide between a hit and a miss.
-    """
-    dtype = foot.dtype
-    foot, direction, c = foot.double(), direction.double(), c.double()
-    shape = shape.double() if isinstance(shape, Tensor) else shape
-    L, M, N = direction
-    x, y, z = foot
-    A = c * (L * L + M * M + shape * N * N)
-    G = N - c * (x * L + y * M + shape * z * N)
-    F = c * (x * x + y * y + shape * z * z) - 2 * z
-    discriminant = G * G - A * F
-    real = discriminant > 0
-    root = torch.sqrt(torch.where(real, discriminant, 1.0))
-    s = torch.where(N < 0, -1.0, 1.0).to(N.dtype)
-    same_sign = s * G >= 0
-    numerator = torch.where(same_sign, F, G - s * root)
-    denominator = torch.where(same_sign, G + s * root, A)
-    finite = denominator != 0
-    t = numerator / torch.where(finite, denominator, 1.0)
-    on_vertex_sheet = 1 - shape * c * (z + t * N) > 0
-    met = real & finite & on_vertex_sheet & torch.isfinite(t)
-    return torch.where(met, t, 0.0).to(dtype), met
-
-
-def _axial_where_lost(foot: Tensor, direction: Tensor, met: Tensor) -> tuple[Tensor, Tensor]:
-    """Replace rays that miss by the axial ray, on which all arithmetic that follows is finite."""
-    axis = torch.zeros_like(direction)
-    axis[2] = 1.0
-    return torch.where(met, foot, 0.0), torch.where(met, direction, axis)
-
-
-def _detach(x: Tensor | float) -> Tensor | float:
-    return x.detach() if isinstance(x, Tensor) else x
+def _detach(x: Tensor | None) -> Tensor | None:
+    return None if x is None else x.detach()

@@ -4,17 +4,17 @@ The trace is a generator. To record, draw or find where a ray was lost, consume 
 rays, hand them with the surfaces that are left.
 """
 
-import dataclasses
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from raytrace import glass
 from raytrace.lens import Lens
-from raytrace.numerics import dot, safe_sqrt, unit, with_batch_axes
+from raytrace.numerics import dot, unit, with_batch_axes
 from raytrace.rays import Rays
-from raytrace.surface import Surface, inside, intersect, normal
+from raytrace.surface import Surface, inside, meet, normal
 from raytrace.value import value
 
 
@@ -33,35 +33,55 @@ class Crossing:
     clipped: Tensor
 
 
-def refract(direction: Tensor, normal: Tensor, norm_squared: Tensor, n1: Tensor, n2: Tensor) -> tuple[Tensor, Tensor]:
+def refract(direction, normal, cosine, norm_squared, n1: Tensor, n2: Tensor):
     """Snell's law n1 sin θ1 = n2 sin θ2 as a vector, and whether light passes (False: total internal reflection).
 
-        n2 d' = n1 d + sign(n·d) D/(a + b) n,   D = (n2 - n1)(n2 + n1),   a = n1 |n·d|,   b = √(a² + D |n|²)
+        d' = (n1/n2) d + sign(n·d) D/(a + b)/n2 n,   D = (n2 - n1)(n2 + n1),   a = n1 |n·d|,   b = √(a² + D |n|²)
 
-    direction: (3, ...) unit; normal: (3, ...) of squared length norm_squared (...); n1, n2: (...).
+    direction: unit, by components; normal: by components, of squared length norm_squared; cosine: n·d.
     No 1 - cos² anywhere: equal indices return d exactly, and grazing rays keep their digits. The squared length of
     d' is then brought to 1 within rounding, by a factor that is 1 identically and so is not differentiated.
     """
-    cosine = dot(normal, direction)
-    a = n1 * cosine.abs()
+    a = n1 * cosine
     D = (n2 - n1) * (n2 + n1)
-    b_squared = a * a + D * norm_squared
+    b_squared = torch.addcmul(D * norm_squared, a, a)
     passes = b_squared > 0
-    b = safe_sqrt(b_squared)
-    along_normal = torch.where(cosine < 0, -D, D) / torch.where(passes, a + b, 1.0)
-    # An index of 0 is a medium without a real index: nothing passes into it. n1/n2 is 1 exactly for equal indices.
-    safe_n2 = torch.where(n2 > 0, n2, 1.0)
-    refracted = (n1 / safe_n2) * direction + (along_normal / safe_n2) * normal
+    b = torch.sqrt(torch.where(passes, b_squared, 1.0))
+    # An index of 0 is a medium without a real index: nothing passes into it.
+    n2 = torch.where(n2 > 0, n2, 1.0)
+    along_normal = (D / n2) / (a + torch.copysign(b, a))
+    ratio = n1 / n2
+    refracted = [torch.addcmul(ratio * d, along_normal, n) for d, n in zip(direction, normal, strict=True)]
     return _renormalise(refracted), passes
 
 
-def reflect(direction: Tensor, normal: Tensor, norm_squared: Tensor) -> Tensor:
+def reflect(direction, normal, cosine, norm_squared):
     """Law of reflection d' = d - 2 (n·d) n / |n|²; arguments as for `refract`."""
-    return _renormalise(direction - (2 * dot(normal, direction) / norm_squared) * normal)
+    twice = 2 * cosine / norm_squared
+    return _renormalise([torch.addcmul(d, twice, n, value=-1) for d, n in zip(direction, normal, strict=True)])
 
 
-def _renormalise(direction: Tensor) -> Tensor:
-    return direction * (1.5 - 0.5 * dot(direction, direction)).detach()
+def _renormalise(direction):
+    detached = [d.detach() for d in direction]
+    factor = torch.rsub(dot(detached, detached), 1.5, alpha=0.5)
+    return [d * factor for d in direction]
+
+
+class _Ray(NamedTuple):
+    """Rays by components, as the loop over surfaces carries them."""
+
+    position: Sequence[Tensor]
+    direction: Sequence[Tensor]
+    valid: Tensor
+    opl: Tensor | None
+
+    @staticmethod
+    def of(rays: Rays) -> "_Ray":
+        return _Ray(rays.position.unbind(0), rays.direction.unbind(0), rays.valid, rays.opl)
+
+    def rays(self) -> Rays:
+        x, y, z, L, M, N = torch.broadcast_tensors(*self.position, *self.direction)
+        return Rays(torch.stack([x, y, z]), torch.stack([L, M, N]), self.valid, self.opl)
 
 
 def cross(surface: Surface, rays: Rays, gap: Tensor | None, side: int, n1: Tensor, n2: Tensor) -> Crossing:
@@ -71,51 +91,53 @@ def cross(surface: Surface, rays: Rays, gap: Tensor | None, side: int, n1: Tenso
     side: σ = ±1, the axial direction of light in the gap; n1, n2: (...) indices before and behind.
     If n2 is the same tensor as n1 the surface is a dummy and does not bend.
     """
-    axes = max(surface.batch_axes, n1.dim(), n2.dim(), 0 if gap is None else gap.dim(), len(rays.shape))
-    axes = max(axes, rays.position.dim() - 1)
-    rays = dataclasses.replace(
-        rays, position=with_batch_axes(rays.position, axes), direction=with_batch_axes(rays.direction, axes)
+    return _crossing(_Ray.of(rays), *_cross(surface, _Ray.of(rays), gap, side, n1, n2))
+
+
+def _crossing(before: _Ray, after: _Ray, met: Tensor, passes: Tensor | None, clear: Tensor | None) -> Crossing:
+    survives = met if passes is None else met & passes
+    return Crossing(
+        after.rays(),
+        ~met,
+        torch.zeros_like(met) if passes is None else met & ~passes,
+        torch.zeros_like(after.valid) if clear is None else before.valid & survives & ~clear,
     )
+
+
+def _cross(surface: Surface, rays: _Ray, gap: Tensor | None, side: int, n1: Tensor, n2: Tensor):
+    """Rays behind the surface, and which of those before met it, were not totally reflected, pass its apertures."""
     direction = rays.direction
-    arrival = rays.position if gap is None else _shift(rays.position, gap)
-    hit, met = intersect(surface, arrival, direction)
+    x, y, z = rays.position
+    arrival = rays.position if gap is None else (x, y, z - gap)
+    hit, cosine, met, known = meet(surface, arrival, direction)
     opl = rays.opl
     if opl is not None:
         opl = opl + n1 * _reduced_path(rays.position, hit, direction, gap, side)
+    passes = None
     if surface.is_mirror or n2 is not n1:
-        n, norm_squared = normal(surface, hit)
+        n, norm_squared = normal(surface, hit) if known is None else known
         if surface.is_mirror:
-            bent, passes = reflect(direction, n, norm_squared), torch.ones_like(met)
+            direction = reflect(direction, n, cosine, norm_squared)
         else:
-            bent, passes = refract(direction, n, norm_squared, n1, n2)
-        direction, survives = bent, met & passes
-    else:
-        passes, survives = torch.ones_like(met), met
+            direction, passes = refract(direction, n, cosine, norm_squared, n1, n2)
+    survives = met if passes is None else met & passes
     clear = inside(surface, hit)
     valid = rays.valid & survives
-    clipped = torch.zeros_like(valid) if clear is None else valid & ~clear
-    axis = torch.zeros_like(direction)
-    axis[2] = 1.0
-    after = Rays(
-        position=torch.where(survives, hit, 0.0),
-        direction=torch.where(survives, direction, axis),
-        valid=valid & ~clipped,
+    after = _Ray(
+        position=[at if surface.is_plane and i == 2 else torch.where(survives, at, 0.0) for i, at in enumerate(hit)],
+        direction=[torch.where(survives, d, axis) for d, axis in zip(direction, (0.0, 0.0, 1.0), strict=True)],
+        valid=valid if clear is None else valid & clear,
         opl=opl if opl is None else torch.where(survives, opl, 0.0),
     )
-    return Crossing(after, ~met, met & ~passes, clipped)
+    return after, met, passes, clear
 
 
-def _shift(position: Tensor, gap: Tensor) -> Tensor:
-    x, y, z = position
-    return torch.stack(torch.broadcast_tensors(x, y, z - gap))
-
-
-def _reduced_path(start: Tensor, hit: Tensor, direction: Tensor, gap: Tensor | None, side: int) -> Tensor:
+def _reduced_path(start, hit, direction, gap: Tensor | None, side: int) -> Tensor:
     """Path from start (old frame) to hit (new frame) less the axial ray's T σ, without forming either.
 
     t - T σ = (hit - start)·d + T (N - σ),   N - σ = -σ (L² + M²)/(1 + σ N)
     """
-    path = dot(hit - start, direction)
+    path = dot([a - b for a, b in zip(hit, start, strict=True)], direction)
     if gap is None:
         return path
     L, M, N = direction
@@ -130,19 +152,25 @@ def steps(surfaces: Sequence[Surface], rays: Rays, *, indices: Sequence[Tensor],
     rays: in the frame of surfaces[0], before it; indices: len(surfaces) + 1 media (...), the first before
     surfaces[0]; side: axial direction of light before it (-1 behind an odd number of mirrors).
     """
-    gap = None
+    for before, crossed in _walk(surfaces, rays, indices, side):
+        yield _crossing(before, *crossed)
+
+
+def _walk(surfaces: Sequence[Surface], rays: Rays, indices: Sequence[Tensor], side: int):
+    before, gap = _Ray.of(rays), None
     for surface, n1, n2 in zip(surfaces, indices[:-1], indices[1:], strict=True):
-        crossing = cross(surface, rays, gap, side, n1, n2)
-        yield crossing
-        rays, gap = crossing.rays, surface.thickness
+        crossed = _cross(surface, before, gap, side, n1, n2)
+        yield before, crossed
+        before, gap = crossed[0], surface.thickness
         side = -side if surface.is_mirror else side
 
 
 def trace_surfaces(surfaces: Sequence[Surface], rays: Rays, *, indices: Sequence[Tensor], side: int = 1) -> Rays:
     """The rays behind the last of the surfaces; arguments as for `steps`."""
-    for crossing in steps(surfaces, rays, indices=indices, side=side):
-        rays = crossing.rays
-    return rays
+    after = None
+    for _, crossed in _walk(surfaces, rays, indices, side):
+        after = crossed[0]
+    return rays if after is None else after.rays()
 
 
 def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:

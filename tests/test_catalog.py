@@ -301,14 +301,14 @@ def test_encodings_and_line_ends(tmp_path, encoding, line_end):
 def same(one, other):
     return (
         all(getattr(one, field) == getattr(other, field) for field in ("name", "formula", "catalog", "status"))
-        and (one.nd_listed, one.abbe_listed, one.wavelength_range, one.alternatives, one.comment, one.records)
+        and (one.nd_listed, one.abbe_listed, one.wavelength_range, one.alternatives, one.comment, sorted(one.records))
         == (
             other.nd_listed,
             other.abbe_listed,
             other.wavelength_range,
             other.alternatives,
             other.comment,
-            other.records,
+            sorted(other.records),
         )
         and torch.equal(one.coefficients, other.coefficients)
     )

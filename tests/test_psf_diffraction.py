@@ -221,6 +221,7 @@ def test_scaling_law():
     assert (one.kernel - two.kernel).abs().max() < 1e-9 * one.kernel.max()
 
 
+@pytest.mark.slow
 def test_a_blocked_pupil_gives_zero_energy_and_no_nan():
     lens = gauss(aperture=("entrance_pupil_diameter", 10.0))
     surfaces = list(lens.surfaces)
@@ -253,6 +254,7 @@ def test_an_undersampled_wavefront_is_reported():
         fft_psf(torch.ones(8, 8, dtype=torch.float64), 0.5 * W, pad=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("angle", "rim"), [(0.0, None), (0.0, 0.9), (4.0, 0.9)])
 def test_gradients(angle, rim):
     """Curvature, sensor distance and pixel, with and without vignetted rays; a rim moves with the lens."""

@@ -54,6 +54,7 @@ def test_energy_of_a_pixel_is_exact(place, mean, covariance, energy, allowed):
     assert abs(found - energy) <= allowed * ROUNDING * energy
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rho", [0.0, 1e-12, -0.3, 0.9, -0.9999, 1.0])
 @pytest.mark.parametrize("sigma", [1e-7, 0.002, 0.03])
 def test_a_large_grid_holds_all_the_energy(rho, sigma):
@@ -89,6 +90,7 @@ def test_a_line_lies_where_it_is():
     assert (found - torch.diag(found.diagonal())).abs().max() <= 1e-16
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("covariance", [(4e-6, 9e-6), (4e-6, 0.0, 9e-6), (4e-6, 4e-6, 9e-6), (4e-4, -5.9e-4, 9e-4)])
 def test_derivatives_of_pixels(covariance):
     """Derivatives in pixel units, the covariance scaled so that all numbers are about 1."""

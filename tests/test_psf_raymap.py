@@ -65,6 +65,7 @@ def test_error_halves_with_each_order(field):
     assert errors[2] < 0.6 * errors[1]
 
 
+@pytest.mark.slow
 def test_agrees_with_a_histogram_of_a_million_rays():
     of = scene_of(double_gauss(), 14.0)
     where = window(of)
@@ -73,6 +74,7 @@ def test_agrees_with_a_histogram_of_a_million_rays():
     assert distance(kernels(of, where, order=4).kernel, counted) < 0.003
 
 
+@pytest.mark.slow
 def test_smooth_vignetting_edges_are_mapped():
     of = scene_of(double_gauss(stop=11.5), 10.0)
     where = window(of)
@@ -92,6 +94,7 @@ def test_central_obscuration_is_mapped():
     assert float(found.kernel.sum()) == pytest.approx(1 - (396 / 1200) ** 2, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_falls_back_to_rays_and_says_why():
     """Wild aspheric terms: no map of degree 20 follows them. And a surface too small for the beam: rays are lost."""
     lens = double_gauss()

@@ -81,7 +81,7 @@ def test_examples_run(line, tmp_path, monkeypatch, capsys):
 
 
 def test_every_command_is_shown():
-    from raytrace.cli.options import COMMANDS
+    from raytrace.cli.commands import COMMANDS
 
     shown = {line.split()[0] for line in examples()}
     assert {command.name for command in COMMANDS} <= shown

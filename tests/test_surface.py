@@ -51,7 +51,8 @@ def test_normal_is_the_gradient_of_the_sag(shape):
     y = vector(0.0, 2.0, 1.0, -5.0).requires_grad_()
     z = sag(shape, x * x + y * y)
     slopes = torch.autograd.grad(z.sum(), (x, y)) if z.requires_grad else (torch.zeros(4), torch.zeros(4))
-    n, norm_squared = normal(shape, torch.stack([x, y, z]).detach())
+    n, norm_squared = normal(shape, (x.detach(), y.detach(), z.detach()))
+    n = torch.stack(torch.broadcast_tensors(*n))
     assert (n[0] / n[2] + slopes[0]).abs().max() <= 1e-14
     assert (n[1] / n[2] + slopes[1]).abs().max() <= 1e-14
     assert ((n * n).sum(0) - norm_squared).abs().max() <= 1e-14
@@ -63,7 +64,7 @@ def test_crossing_is_in_the_direction_of_propagation(shape):
     """The normal (n_z > 0) looks along the ray's own z direction, whichever way it travels."""
     position, direction = rays()
     hit, met = intersect(shape, position, direction)
-    n, _ = normal(shape, hit)
+    n = torch.stack(torch.broadcast_tensors(*normal(shape, hit)[0]))
     assert ((n * direction).sum(0) * direction[2] > 0)[met].all()
 
 
