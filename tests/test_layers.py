@@ -66,12 +66,12 @@ FLOORS = {
 }
 
 #: Folders that stand on one floor as a whole; inside them imports only have to run one way (no cycle).
-FAMILIES = {"psf": 9, "plot": 13, "bench": 14, "cli": 15}
+FAMILIES = {"psf": 9, "analysis": 10, "plot": 13, "bench": 14, "cli": 15}
 
 #: What only these files may import.
 RESERVED = {
     "matplotlib": ("plot",),
-    "pandas": ("formats.frame", "cli", "bench"),
+    "pandas": ("formats.frame", "analysis.frame", "cli", "bench"),
     "tqdm": ("cli", "bench"),
     "optiland": ("bench",),
 }

@@ -4,6 +4,7 @@ import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from raytrace.cli.analysis_table import ANALYSES
 from raytrace.cli.options import (
     aperture,
     catalog,
@@ -288,4 +289,5 @@ COMMANDS = (
         _bench,
         "bench_commands.bench",
     ),
+    *(Command(*entry) for entry in ANALYSES),
 )

@@ -1,9 +1,18 @@
-"""Figures: cross section, spot diagram, through-focus curve, focus report and PSFs, each a matplotlib Figure.
+"""Figures: cross section, spot diagram, through-focus curve, focus report, PSFs and analyses, each a matplotlib Figure.
 
 This folder is the only place that imports matplotlib, and it never touches pyplot: figures need no display and leave
 nothing behind.
 """
 
+from raytrace.plot.analysis import curvature_curves as curvature_curves
+from raytrace.plot.analysis import distortion_curves as distortion_curves
+from raytrace.plot.analysis import encircled_curves as encircled_curves
+from raytrace.plot.analysis import fan_plot as fan_plot
+from raytrace.plot.analysis import illumination_curve as illumination_curve
+from raytrace.plot.analysis import lateral_curves as lateral_curves
+from raytrace.plot.analysis import mtf_curves as mtf_curves
+from raytrace.plot.analysis import mtf_through_focus_curves as mtf_through_focus_curves
+from raytrace.plot.analysis import wavefront_maps as wavefront_maps
 from raytrace.plot.curve import through_focus_curve as through_focus_curve
 from raytrace.plot.layout import layout as layout
 from raytrace.plot.psf import psf_grid as psf_grid

@@ -1,0 +1,33 @@
+"""Analyses of a lens: each a function of the lens that gives a value, with `to_frame()` and, of tensors, gradients.
+
+| call                                      | what it shows                                                  |
+|-------------------------------------------|----------------------------------------------------------------|
+| ray_fan, opd_fan                          | aberrations along the two sections of the pupil                |
+| wavefront_map                             | OPD over the pupil, Noll's Zernike coefficients                |
+| mtf, mtf_through_focus                    | modulation, of diffraction or of rays                          |
+| encircled_energy                          | light within a radius, of diffraction or of rays               |
+| distortion, field_curvature, lateral_colour | what chief rays and the close rays about them show           |
+| relative_illumination                     | light of a field against the axis                              |
+"""
+
+from raytrace.analysis.chief import Distortion as Distortion
+from raytrace.analysis.chief import FieldCurvature as FieldCurvature
+from raytrace.analysis.chief import LateralColour as LateralColour
+from raytrace.analysis.chief import distortion as distortion
+from raytrace.analysis.chief import field_curvature as field_curvature
+from raytrace.analysis.chief import lateral_colour as lateral_colour
+from raytrace.analysis.encircled import EncircledEnergy as EncircledEnergy
+from raytrace.analysis.encircled import encircled_energy as encircled_energy
+from raytrace.analysis.fans import Fan as Fan
+from raytrace.analysis.fans import opd_fan as opd_fan
+from raytrace.analysis.fans import ray_fan as ray_fan
+from raytrace.analysis.illumination import RelativeIllumination as RelativeIllumination
+from raytrace.analysis.illumination import relative_illumination as relative_illumination
+from raytrace.analysis.mtf import Mtf as Mtf
+from raytrace.analysis.mtf import ThroughFocusMtf as ThroughFocusMtf
+from raytrace.analysis.mtf import cutoff as cutoff
+from raytrace.analysis.mtf import diffraction_limit as diffraction_limit
+from raytrace.analysis.mtf import mtf as mtf
+from raytrace.analysis.mtf import mtf_through_focus as mtf_through_focus
+from raytrace.analysis.wavefronts import WavefrontMap as WavefrontMap
+from raytrace.analysis.wavefronts import wavefront_map as wavefront_map

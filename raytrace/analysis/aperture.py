@@ -1,0 +1,99 @@
+"""The exit pupil as a regular grid of directions, whose autocorrelation is the optical transfer function."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from raytrace import zernike
+from raytrace.numerics import safe_divide, safe_sqrt
+from raytrace.psf.dft import phasor
+from raytrace.pupil import gauss_rings
+from raytrace.scene import Scene
+from raytrace.value import value
+from raytrace.wavefront import wavefront
+
+_PROBE = 10, 40
+_TERMS = 66  # Zernike terms (to degree 10) of the map from directions to the pupil
+MARGIN = 1.06  # the grid reaches that much beyond the outermost ray of the probe
+_LEAST, _MOST = 128, 1024  # points across the grid
+
+
+@value
+class ExitPupil:
+    """The wave of every field and wavelength over a regular grid of direction cosines (L, M).
+
+    amplitude: (F, W, N, N) complex, rows along M; energy: (F, W) Σ |A|², cells on the rim by their share.
+    step: (2, F, W) spatial frequency in 1/mm by which neighbours differ, n ΔL/λ and n ΔM/λ.
+    centre: (2, F, W) mm, the chief ray's point; centroid: (2, F, W) mm of the rays; light: (F, W) transmitted share.
+    """
+
+    amplitude: Tensor
+    energy: Tensor
+    step: Tensor
+    centre: Tensor
+    centroid: Tensor
+    light: Tensor
+
+
+def exit_pupil(scene: Scene, *, size: int | None = None) -> ExitPupil:
+    """Trace the rays of a regular grid of directions, found by a Zernike map from directions to the pupil.
+
+    Light is spread evenly over the entrance pupil: |A|² = |∂p/∂(L, M)|. A cell that the rim of the pupil crosses counts
+    by its share, so that the grid errs by O(1/N²); one at the rim of another aperture counts or does not.
+    size: N points across, by default as many as keep blurs from overlapping. Raises ValueError where that is too many.
+    """
+    like = {"dtype": scene.wavelengths.dtype, "device": scene.wavelengths.device}
+    points, weights = gauss_rings(*_PROBE, **like)
+    probe = wavefront(scene, points, weights)
+    if not bool((probe.usable.sum(-1) >= 2 * _TERMS).all()):
+        raise ValueError("too few rays of a field reach the sensor for a wavefront: check the field and the apertures")
+    waves_per = 1e3 * probe.index / probe.wavelength  # n/λ, 1/mm
+    middle, half = _box(probe.direction[:2].detach(), probe.usable)
+    if size is None:
+        blur = torch.where(probe.usable, torch.linalg.vector_norm(probe.landing, dim=0), 0.0).amax(-1)
+        needed = 4 * float((blur * half.amax(0) * waves_per).max().detach())
+        size = max(_LEAST, 64 * math.ceil(needed / 64))
+    if size > _MOST:
+        raise ValueError(
+            f"the blur needs {size} points across the pupil, more than {_MOST}: focus the lens, or use geometric rays"
+        )
+    orders = [zernike.noll(j) for j in range(1, _TERMS + 1)]
+    normal = (probe.direction[:2] - middle[..., None]) / half[..., None]
+    basis = zernike.polynomials(orders, *normal).movedim(0, -1)
+    root = safe_sqrt(torch.where(probe.usable, probe.weights, 0.0))[..., None]
+    map_to_pupil = torch.linalg.lstsq(root * basis, root * points.T).solution  # (1, F, W, J, 2)
+    line = (2 * torch.arange(size, **like) + 1 - size) / size
+    m, ell = (c.reshape(-1) for c in torch.meshgrid(line, line, indexing="ij"))
+    inside = ell * ell + m * m <= 1
+    ell, m = ell[inside], m[inside]
+    pupil = (zernike.polynomials(orders, ell, m).T @ map_to_pupil).movedim(-1, 0)
+    by_l, by_m = ((g.T @ map_to_pupil).movedim(-1, 0) for g in zernike.gradients(orders, ell, m))
+    radius = safe_sqrt((pupil * pupil).sum(0))
+    slope = safe_divide(safe_sqrt((pupil * by_l).sum(0) ** 2 + (pupil * by_m).sum(0) ** 2), radius)
+    share = (0.5 + safe_divide(1 - radius, 2 / size * slope)).clamp(0.0, 1.0)
+    share = torch.where(radius < 0.5, 1.0, share)
+    density = (by_l[0] * by_m[1] - by_l[1] * by_m[0]).abs()
+    traced = wavefront(scene, pupil * ((1 - 1e-9) / radius.clamp_min(1.0)))
+    share = torch.where(traced.valid, share, 0.0)
+    field = share * safe_sqrt(density) * phasor(traced.opd / (1e-3 * traced.wavelength)[:, None])
+    amplitude = field.new_zeros(*field.shape[1:3], size * size)
+    amplitude[..., inside] = field[0]
+    energy = torch.where(probe.valid, probe.energy, 0.0)
+    total = energy.sum(-1)
+    offset = safe_divide((energy * probe.landing).sum(-1), total.expand_as(probe.landing[..., 0]))
+    return ExitPupil(
+        amplitude=amplitude.unflatten(-1, (size, size)),
+        energy=(share * density).sum(-1)[0],
+        step=(2 / size * half * waves_per)[:, 0],
+        centre=probe.centre[:2, 0],
+        centroid=(probe.centre[:2] + offset)[:, 0],
+        light=total[0],
+    )
+
+
+def _box(directions: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:
+    """Middle and half width (2, ...) of the directions (2, ..., P) of usable rays, with a margin."""
+    low = torch.where(usable, directions, torch.inf).amin(-1)
+    high = torch.where(usable, directions, -torch.inf).amax(-1)
+    return (low + high) / 2, MARGIN * (high - low) / 2

@@ -1,0 +1,156 @@
+"""Curves over the field that follow the chief ray: distortion, field curvature, lateral colour."""
+
+import torch
+from torch import Tensor
+
+from raytrace.analysis.frame import Tabular, axis, masked
+from raytrace.analysis.setting import field_range, in_object_space, primary_number, unvignetted
+from raytrace.focus import image_rays
+from raytrace.launch import is_at_infinity
+from raytrace.lens import Lens
+from raytrace.numerics import safe_divide, safe_sqrt
+from raytrace.value import value
+
+_NEAR_AXIS = 1e-4  # of the field: its chief ray gives the scale of the image; it leaves 1e-8 of the distortion
+_NEAR_CHIEF = 1e-3  # of the pupil: close rays leave 1e-6 of the spherical aberration
+
+
+@value
+class Distortion(Tabular):
+    """Heights (F, W) in mm of chief rays on the sensor, and by how much they miss the ideal image.
+
+    f_tan: relative, height/(f tan θ) - 1, of an object at a finite distance height/(m h) - 1; 0 on the axis.
+    f_theta: relative, height/(f θ) - 1; None for an object at a finite distance.
+    fields: (2, F); wavelengths: (W,) µm; valid: (F, W) bool.
+    """
+
+    height: Tensor
+    f_tan: Tensor
+    f_theta: Tensor | None
+    fields: Tensor
+    wavelengths: Tensor
+    valid: Tensor
+
+    def columns(self) -> dict[str, Tensor]:
+        table = {**_heads(self), "height": masked(self.height, self.valid), "f_tan": masked(self.f_tan, self.valid)}
+        return table if self.f_theta is None else {**table, "f_theta": masked(self.f_theta, self.valid)}
+
+
+@value
+class FieldCurvature(Tabular):
+    """Where close rays about the chief ray meet: (F, W) mm from the sensor, positive behind it.
+
+    tangential: of rays in the plane of the field; sagittal: across it; valid: (F, W) bool.
+    fields: (2, F); wavelengths: (W,) µm.
+    """
+
+    tangential: Tensor
+    sagittal: Tensor
+    fields: Tensor
+    wavelengths: Tensor
+    valid: Tensor
+
+    def columns(self) -> dict[str, Tensor]:
+        tangential, sagittal = masked(self.tangential, self.valid), masked(self.sagittal, self.valid)
+        return {**_heads(self), "tangential": tangential, "sagittal": sagittal}
+
+
+@value
+class LateralColour(Tabular):
+    """Height (F, W) in mm of each wavelength's chief ray on the sensor, less the primary wavelength's.
+
+    fields: (2, F); wavelengths: (W,) µm; valid: (F, W) bool.
+    """
+
+    shift: Tensor
+    fields: Tensor
+    wavelengths: Tensor
+    valid: Tensor
+
+    def columns(self) -> dict[str, Tensor]:
+        return {**_heads(self), "shift": masked(self.shift, self.valid)}
+
+
+def distortion(
+    lens: Lens, *, fields: Tensor | None = None, wavelengths: Tensor | None = None, size: int = 41
+) -> Distortion:
+    """Distortion of the chief ray, 1 = 100 %; fields: (2, F), by default `size` from the axis to the lens's largest.
+
+    The scale of the ideal image is that of each wavelength's own chief ray close to the axis, on the sensor as it
+    stands: an image out of focus is not distorted for that.
+    """
+    lens = unvignetted(lens)
+    fields = field_range(lens, size) if fields is None else fields
+    wavelengths = lens.wavelengths if wavelengths is None else wavelengths
+    described, angles, extent = in_object_space(lens, fields)
+    near = in_object_space(lens, field_range(lens, 2)[:, 1:] * _NEAR_AXIS)
+    length = safe_sqrt((extent * extent).sum(0))
+    height, valid = _height(described, angles, wavelengths, extent)
+    close, _ = _height(near[0], near[1], wavelengths, near[2])
+    scale = close / safe_sqrt((near[2] * near[2]).sum(0))[:, None]
+    f_tan = _relative(height, scale * length[:, None])
+    infinite = is_at_infinity(lens)
+    f_theta = _relative(height, scale * torch.atan(length)[:, None]) if infinite else None
+    return Distortion(height, f_tan, f_theta, fields, wavelengths, valid)
+
+
+def field_curvature(
+    lens: Lens, *, fields: Tensor | None = None, wavelengths: Tensor | None = None, size: int = 41
+) -> FieldCurvature:
+    """Tangential and sagittal foci of close rays, s = -(∂x/∂p)/(∂m/∂p) with m = (L, M)/N, as Coddington's equations.
+
+    fields: (2, F) along y, by default `size` from the axis to the lens's largest. Raises ValueError for fields off the
+    y axis, whose principal sections are turned.
+    """
+    lens = unvignetted(lens)
+    fields = field_range(lens, size) if fields is None else fields
+    if bool((fields[0] != 0).any()):
+        raise ValueError("field curvature is drawn for fields along y; found a field with x other than 0")
+    wavelengths = lens.wavelengths if wavelengths is None else wavelengths
+    step = fields.new_tensor([[0.0, 0.0, 1.0, -1.0], [1.0, -1.0, 0.0, 0.0]]) * _NEAR_CHIEF
+    rays = image_rays(lens, step, fields=fields, wavelengths=wavelengths)
+    slope = safe_divide(rays.direction[:2], rays.direction[2].expand_as(rays.direction[:2]))
+    (x, y), (m_x, m_y) = rays.position[:2], slope
+    tangential = -safe_divide(y[..., 0] - y[..., 1], m_y[..., 0] - m_y[..., 1])
+    sagittal = -safe_divide(x[..., 2] - x[..., 3], m_x[..., 2] - m_x[..., 3])
+    valid = (rays.valid | _kept(rays.direction)).all(-1)
+    return FieldCurvature(tangential, sagittal, fields, wavelengths, valid)
+
+
+def lateral_colour(
+    lens: Lens, *, fields: Tensor | None = None, wavelengths: Tensor | None = None, size: int = 41
+) -> LateralColour:
+    """Lateral colour of the chief rays; fields: (2, F), by default `size` from the axis to the lens's largest."""
+    lens = unvignetted(lens)
+    fields = field_range(lens, size) if fields is None else fields
+    primary = primary_number(lens, wavelengths)
+    wavelengths = lens.wavelengths if wavelengths is None else wavelengths
+    height, valid = _height(lens, fields, wavelengths, fields)
+    valid = valid & valid[:, primary : primary + 1]
+    shift = torch.where(valid, height - height[:, primary : primary + 1], 0.0)
+    return LateralColour(shift, fields, wavelengths, valid)
+
+
+def _height(lens: Lens, fields: Tensor, wavelengths: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
+    """Heights (F, W) of chief rays in the direction `along` (2, F), and whether they arrive or were only vignetted."""
+    rays = image_rays(lens, fields.new_zeros(2, 1), fields=fields, wavelengths=wavelengths)
+    length = safe_sqrt((along * along).sum(0))
+    unit = torch.stack([safe_divide(a, length) for a in along])[:, :, None]
+    height = (rays.position[:2, ..., 0] * unit).sum(0)
+    on_axis = (fields == 0).all(0)[:, None]
+    return height, (rays.valid | _kept(rays.direction))[..., 0] | on_axis
+
+
+def _kept(direction: Tensor) -> Tensor:
+    """Whether rays keep their coordinates: a ray that missed a surface has become an axial one."""
+    return (direction[:2] != 0).any(0)
+
+
+def _relative(height: Tensor, ideal: Tensor) -> Tensor:
+    return safe_divide(height - ideal, ideal)
+
+
+def _heads(curve) -> dict[str, Tensor]:
+    """The columns of field and wavelength."""
+    x, y = (axis(component, 0, 2) for component in curve.fields)
+    return {"field_x": x, "field_y": y, "wavelength": axis(curve.wavelengths, 1, 2)}

@@ -1,0 +1,144 @@
+"""Encircled energy: the share of a field's light within a radius of its centroid."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from raytrace.analysis.aperture import ExitPupil, exit_pupil
+from raytrace.analysis.frame import Tabular, axis
+from raytrace.analysis.setting import scene_of, wavelength_weights
+from raytrace.focus import image_rays
+from raytrace.lens import Lens
+from raytrace.numerics import safe_divide, safe_sqrt
+from raytrace.paraxial import first_order
+from raytrace.psf.dft import phasor
+from raytrace.scene import Scene
+from raytrace.value import value
+
+_RAYS = 4096
+_RINGS_PER_STEP = 16
+
+
+@value
+class EncircledEnergy(Tabular):
+    """Share (F, K) of the light that reaches the sensor within radii (K,) mm of the centroid (2, F) mm of the rays.
+
+    fields: (2, F); kind: "diffraction" or "geometric".
+    """
+
+    share: Tensor
+    radii: Tensor
+    centroid: Tensor
+    fields: Tensor
+    kind: str
+
+    def columns(self) -> dict[str, Tensor]:
+        return {
+            "field_x": axis(self.fields[0], 0, 2),
+            "field_y": axis(self.fields[1], 0, 2),
+            "radius": axis(self.radii, 1, 2),
+            "share": self.share,
+        }
+
+
+def encircled_energy(
+    lens: Lens,
+    radii: Tensor | None = None,
+    *,
+    kind: str = "diffraction",
+    fields: Tensor | None = None,
+    wavelengths: Tensor | None = None,
+) -> EncircledEnergy:
+    """Encircled energy at radii (K,) mm, by default 41 up to the larger of the blur and six wavelengths times the F/#.
+
+        E(r) = ∬ OTF(ν) r J₁(2πrν)/ν d²ν        "diffraction"
+        E(r) = Σ_j w_j [|x_j - x̄| < r]           "geometric", linear between one ray and the next
+
+    Differentiable in the lens. Raises ValueError for another kind, and where too few rays arrive.
+    """
+    if kind not in ("diffraction", "geometric"):
+        raise ValueError(f"unknown kind of encircled energy {kind!r}; expected diffraction or geometric")
+    distance, energy, centroid = _rays(lens, fields, wavelengths)
+    if radii is None:
+        airy = 6e-3 * lens.wavelengths[lens.primary_wavelength] * first_order(lens).working_f_number
+        blur = torch.where(energy > 0, distance, 0.0).max()
+        top = torch.maximum(blur * 1.02, airy * (kind == "diffraction")).detach()
+        radii = top * torch.linspace(0, 1, 41, dtype=top.dtype, device=top.device)
+    if kind == "geometric":
+        share = _of_rays(distance, energy, radii)
+    else:
+        share = _of_waves(scene_of(lens, fields, wavelengths), wavelength_weights(lens, wavelengths), centroid, radii)
+    fields = torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields
+    return EncircledEnergy(share, radii, centroid, fields, kind)
+
+
+def _rays(lens: Lens, fields: Tensor | None, wavelengths: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Distances (F, W·P) from the centroid (2, F) of all wavelengths, and shares (F, W·P) of the light."""
+    points = _spiral(_RAYS, lens.wavelengths)
+    rays = image_rays(lens, points, fields=fields, wavelengths=wavelengths)
+    energy = torch.where(rays.valid, wavelength_weights(lens, wavelengths)[:, None] / _RAYS, 0.0).flatten(1)
+    hits = torch.where(rays.valid, rays.position[:2], 0.0).flatten(2)
+    total = energy.sum(-1)
+    if not bool((total > 0).all()):
+        raise ValueError("no ray of a field reaches the sensor: it has no encircled energy")
+    energy = energy / total[:, None]
+    centroid = (energy * hits).sum(-1)
+    x, y = torch.where(energy > 0, hits - centroid[..., None], 0.0)
+    return safe_sqrt(x * x + y * y), energy, centroid
+
+
+def _of_rays(distance: Tensor, energy: Tensor, radii: Tensor) -> Tensor:
+    """Half of a ray's light counts at its own distance; the curve is linear in between, and starts at 0."""
+    distance, order = torch.where(energy > 0, distance, distance.max()).sort(-1)
+    energy = torch.gather(energy, -1, order)
+    half = energy.cumsum(-1) - 0.5 * energy
+    zero = torch.zeros_like(distance[:, :1])
+    place = torch.cat([zero, distance, distance[:, -1:]], -1)
+    height = torch.cat([zero, half, torch.ones_like(zero)], -1)
+    inside = torch.searchsorted(place.detach(), radii.expand(len(place), -1).contiguous(), right=True)
+    after = inside.clamp(1, place.shape[-1] - 1)
+    low, high = (torch.gather(place, -1, k) for k in (after - 1, after))
+    below, above = (torch.gather(height, -1, k) for k in (after - 1, after))
+    share = below + (above - below) * safe_divide(radii - low, high - low)
+    return torch.where(radii >= place[:, -1:], 1.0, share)
+
+
+def _of_waves(scene: Scene, shares: Tensor, centroid: Tensor, radii: Tensor) -> Tensor:
+    rows = []
+    for f, field in enumerate(scene.fields.split(1, 1)):
+        pupil = exit_pupil(Scene(scene.lens, field, scene.wavelengths))
+        weights = shares * pupil.light[0]
+        parts = torch.stack([_of_wave(pupil, w, centroid[:, f], radii) for w in range(len(weights))])
+        rows.append((weights[:, None] * parts).sum(0) / weights.sum())
+    return torch.stack(rows)
+
+
+def _of_wave(pupil: ExitPupil, w: int, centroid: Tensor, radii: Tensor) -> Tensor:
+    """E (K,) of one wavelength of a field about the centroid (2,); the sum over ν is gathered in rings first."""
+    size = pupil.amplitude.shape[-1]
+    spectrum = torch.fft.fft2(pupil.amplitude[0, w], s=(2 * size, 2 * size))
+    overlap = torch.fft.ifft2(spectrum.real**2 + spectrum.imag**2) / pupil.energy[0, w]
+    first = torch.zeros_like(overlap, dtype=torch.bool)
+    first[0, 0] = True
+    overlap = torch.where(first, 1.0 + 0j, overlap)  # the rim's cells count by their share, not by its square
+    lag = torch.fft.fftfreq(2 * size, 1 / (2 * size), dtype=radii.dtype, device=radii.device)
+    step = pupil.step[:, 0, w]
+    x, y = lag * step[0], lag[:, None] * step[1]
+    offset_x, offset_y = centroid - pupil.centre[:, 0, w]
+    otf = (overlap * phasor(x * offset_x + y * offset_y)).real.flatten() * step.prod()
+    width = step.min().detach() / _RINGS_PER_STEP
+    place = torch.hypot(x, y).detach().flatten() / width
+    ring = place.floor().to(torch.int64)
+    rings = otf.new_zeros(int(ring.max()) + 2)
+    rings = rings.index_add(0, ring, otf * (ring + 1 - place)).index_add(0, ring + 1, otf * (place - ring))
+    frequency = (torch.arange(len(rings), dtype=radii.dtype, device=radii.device) * width).clamp_min(1e-6 * width)
+    r = radii.detach()[:, None]
+    return (r * torch.special.bessel_j1(2 * math.pi * r * frequency) / frequency) @ rings
+
+
+def _spiral(count: int, like: Tensor) -> Tensor:
+    """Points (2, P) of a sunflower: equal areas, no two at one radius, so that a share grows evenly with the radius."""
+    j = torch.arange(count, dtype=like.dtype, device=like.device)
+    radius, angle = torch.sqrt((j + 0.5) / count), j * (math.pi * (3 - math.sqrt(5)))
+    return torch.stack([radius * torch.cos(angle), radius * torch.sin(angle)])

@@ -1,0 +1,51 @@
+"""What an analysis looks at: fields, wavelengths and their weights, as a scene of one object distance."""
+
+import dataclasses
+
+import torch
+from torch import Tensor
+
+from raytrace.launch import is_at_infinity, object_field
+from raytrace.lens import Lens
+from raytrace.paraxial import first_order
+from raytrace.scene import Scene
+from raytrace.scene import scene as make_scene
+
+
+def scene_of(lens: Lens, fields: Tensor | None, wavelengths: Tensor | None) -> Scene:
+    """The scene (1, F, W) of the lens at its own object distance; fields (2, F), wavelengths (W,) µm."""
+    fields = torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields
+    wavelengths = lens.wavelengths if wavelengths is None else wavelengths
+    return make_scene(lens, fields, lens.surfaces[0].thickness[None], wavelengths)
+
+
+def wavelength_weights(lens: Lens, wavelengths: Tensor | None) -> Tensor:
+    """Shares (W,): the lens's for its own wavelengths, equal ones for others."""
+    weights = lens.wavelength_weights if wavelengths is None else torch.ones_like(wavelengths)
+    return weights / weights.sum()
+
+
+def primary_number(lens: Lens, wavelengths: Tensor | None) -> int:
+    """Which of the wavelengths is the reference: the lens's primary one, the first of others."""
+    return lens.primary_wavelength if wavelengths is None else 0
+
+
+def field_range(lens: Lens, size: int) -> Tensor:
+    """Fields (2, size) along y from the axis to the lens's largest."""
+    largest = torch.hypot(lens.fields.x, lens.fields.y).amax()
+    y = largest * torch.linspace(0.0, 1.0, size, dtype=largest.dtype, device=largest.device)
+    return torch.stack([torch.zeros_like(y), y])
+
+
+def unvignetted(lens: Lens) -> Lens:
+    """The lens without vignetting factors, which belong to single fields and would bend a curve over the field."""
+    return dataclasses.replace(lens, fields=dataclasses.replace(lens.fields, vignetting=None))
+
+
+def in_object_space(lens: Lens, fields: Tensor) -> tuple[Lens, Tensor, Tensor]:
+    """The lens with fields of a kind that scales with the object, those fields (2, F), and tan θ or mm (2, F)."""
+    extent = object_field(lens, fields, first_order(lens), ray_aiming=lens.ray_aiming)
+    infinite = is_at_infinity(lens)
+    described = torch.rad2deg(torch.atan(extent)) if infinite else extent
+    kind = "angle" if infinite else "object_height"
+    return dataclasses.replace(lens, fields=dataclasses.replace(lens.fields, kind=kind)), described, extent

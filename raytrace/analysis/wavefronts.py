@@ -1,0 +1,79 @@
+"""Wavefront maps: the OPD over the whole pupil, and its Zernike coefficients."""
+
+import torch
+from torch import Tensor
+
+from raytrace.analysis.frame import Tabular, axis
+from raytrace.analysis.setting import scene_of
+from raytrace.lens import Lens
+from raytrace.pupil import gauss_rings
+from raytrace.value import value
+from raytrace.wavefront import peak_to_valley, rms, wavefront, zernike_coefficients
+
+_RINGS = 14, 56
+
+
+@value
+class WavefrontMap(Tabular):
+    """The wavefront of every field and wavelength.
+
+    opd: (F, W, N, N) waves at pupil points y (rows) and x (columns) of `pupil` (N,), 0 where `valid` is False.
+    coefficients: (F, W, J) Noll's Zernike coefficients 1 … J in waves RMS, over the entrance pupil.
+    rms: (F, W) waves about the mean; peak_to_valley: (F, W) waves, over Gauss rings of the pupil.
+    fields: (2, F); wavelengths: (W,) µm.
+    """
+
+    opd: Tensor
+    valid: Tensor
+    pupil: Tensor
+    coefficients: Tensor
+    rms: Tensor
+    peak_to_valley: Tensor
+    fields: Tensor
+    wavelengths: Tensor
+
+    def columns(self) -> dict[str, Tensor]:
+        noll = torch.arange(1, self.coefficients.shape[-1] + 1, device=self.opd.device)
+        return {
+            "field_x": axis(self.fields[0], 0, 3),
+            "field_y": axis(self.fields[1], 0, 3),
+            "wavelength": axis(self.wavelengths, 1, 3),
+            "noll": axis(noll, 2, 3),
+            "coefficient": self.coefficients,
+        }
+
+
+def wavefront_map(
+    lens: Lens,
+    *,
+    fields: Tensor | None = None,
+    wavelengths: Tensor | None = None,
+    size: int = 64,
+    terms: int = 37,
+) -> WavefrontMap:
+    """OPD over `size` × `size` pupil points, and the Noll coefficients 1 … `terms` of 784 rays.
+
+    Raises ValueError where fewer rays than coefficients arrive.
+    """
+    view = scene_of(lens, fields, wavelengths)
+    like = {"dtype": lens.wavelengths.dtype, "device": lens.wavelengths.device}
+    line = (2 * torch.arange(size, **like) + 1 - size) / size
+    y, x = torch.meshgrid(line, line, indexing="ij")
+    inside = x * x + y * y <= 1
+    drawn = wavefront(view, torch.stack([x[inside], y[inside]]))
+    front = wavefront(view, *gauss_rings(*_RINGS, **like))
+    wave = 1e-3 * view.wavelengths
+    opd = drawn.opd.new_zeros(*drawn.opd.shape[1:3], size, size)
+    opd[..., inside] = drawn.opd[0] / wave[:, None]
+    valid = torch.zeros_like(opd, dtype=torch.bool)
+    valid[..., inside] = drawn.valid[0]
+    return WavefrontMap(
+        opd=opd,
+        valid=valid,
+        pupil=line,
+        coefficients=zernike_coefficients(front, terms)[0] / wave[:, None],
+        rms=rms(front)[0] / wave,
+        peak_to_valley=peak_to_valley(front)[0] / wave,
+        fields=view.fields,
+        wavelengths=view.wavelengths,
+    )

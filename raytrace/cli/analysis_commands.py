@@ -1,0 +1,152 @@
+"""`raytrace mtf`, `fan`, `opd`, `wavefront`, `distortion`, `curvature`, `lateral`, `illumination`, `encircled`."""
+
+import argparse
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from raytrace import analysis
+from raytrace.analysis.frame import Tabular, flat
+from raytrace.cli.door import CommandError, field_points, number, open_lens, print_json, say
+from raytrace.lens import FIELD_UNITS, Lens
+
+_UNITS = {
+    "wavelength": "µm", "frequency": "1/mm", "sensor_distance": "mm", "radius": "mm", "height": "mm", "shift": "mm",
+    "f_tan": "%", "f_theta": "%", "projected_solid_angle": "sr",
+}  # fmt: skip
+
+
+def mtf(arguments: argparse.Namespace) -> None:
+    """Modulation through frequency or through focus."""
+    lens, fields = _opened(arguments)
+    kind = "geometric" if arguments.geometric else "diffraction"
+    frequencies = None if arguments.frequency is None else lens.wavelengths.new_tensor(arguments.frequency)
+    if arguments.through_focus is None:
+        found = analysis.mtf(lens, frequencies, kind=kind, fields=fields)
+        _report(arguments, lens, found, "mtf_curves", every=5)
+        return
+    if frequencies is None or len(frequencies) != 1:
+        raise CommandError("--through-focus needs one spatial frequency: add --frequency F")
+    here = lens.surfaces[-2].thickness
+    distances = here + arguments.through_focus * torch.linspace(-1, 1, 21, dtype=here.dtype)
+    found = analysis.mtf_through_focus(lens, frequencies[0], distances, kind=kind, fields=fields)
+    _report(arguments, lens, found, "mtf_through_focus_curves", every=1)
+
+
+def fan(arguments: argparse.Namespace) -> None:
+    """Ray fans."""
+    lens, fields = _opened(arguments)
+    found = analysis.ray_fan(lens, fields=fields, size=arguments.size)
+    _report(arguments, lens, found, "fan_plot", every=5, unit="mm")
+
+
+def opd(arguments: argparse.Namespace) -> None:
+    """OPD fans."""
+    lens, fields = _opened(arguments)
+    found = analysis.opd_fan(lens, fields=fields, size=arguments.size)
+    _report(arguments, lens, found, "fan_plot", every=5, unit="waves")
+
+
+def wavefront(arguments: argparse.Namespace) -> None:
+    """Wavefront maps; the text is RMS, peak to valley and the coefficients."""
+    lens, fields = _opened(arguments)
+    found = analysis.wavefront_map(lens, fields=fields, size=arguments.size)
+    summary = {name: column for name, column in found.columns().items() if name in ("field_x", "field_y", "wavelength")}
+    summary = {**{n: c[..., 0] for n, c in summary.items()}, "rms": found.rms, "peak_to_valley": found.peak_to_valley}
+    _report(arguments, lens, found, "wavefront_maps", summary=summary, unit="waves")
+
+
+def distortion(arguments: argparse.Namespace) -> None:
+    """Distortion of the chief ray."""
+    lens, fields = _opened(arguments, own=False)
+    found = analysis.distortion(lens, fields=fields, size=arguments.size)
+    dense = analysis.distortion(lens, fields=fields) if arguments.plot else found
+    _report(arguments, lens, found, "distortion_curves", dense=dense)
+
+
+def curvature(arguments: argparse.Namespace) -> None:
+    """Foci of close rays."""
+    lens, fields = _opened(arguments, own=False)
+    found = analysis.field_curvature(lens, fields=fields, size=arguments.size)
+    dense = analysis.field_curvature(lens, fields=fields) if arguments.plot else found
+    _report(arguments, lens, found, "curvature_curves", unit="mm", dense=dense)
+
+
+def lateral(arguments: argparse.Namespace) -> None:
+    """Lateral colour, with the Airy radius in the figure."""
+    lens, fields = _opened(arguments, own=False)
+    found = analysis.lateral_colour(lens, fields=fields, size=arguments.size)
+    dense = analysis.lateral_colour(lens, fields=fields) if arguments.plot else found
+    airy = 1.22 / float(analysis.cutoff(lens, lens.wavelengths[lens.primary_wavelength]))
+    _report(arguments, lens, found, "lateral_curves", airy, dense=dense)
+
+
+def illumination(arguments: argparse.Namespace) -> None:
+    """Relative illumination."""
+    lens, fields = _opened(arguments, own=False)
+    found = analysis.relative_illumination(lens, fields=fields, size=arguments.size)
+    dense = analysis.relative_illumination(lens, fields=fields) if arguments.plot else found
+    _report(arguments, lens, found, "illumination_curve", dense=dense)
+
+
+def encircled(arguments: argparse.Namespace) -> None:
+    """Encircled energy."""
+    lens, fields = _opened(arguments)
+    kind = "geometric" if arguments.geometric else "diffraction"
+    radii = None if arguments.radius is None else lens.wavelengths.new_tensor(arguments.radius)
+    found = analysis.encircled_energy(lens, radii, kind=kind, fields=fields)
+    _report(arguments, lens, found, "encircled_curves", every=5)
+
+
+def _opened(arguments: argparse.Namespace, *, own: bool = True) -> tuple[Lens, Tensor | None]:
+    """The lens, and the fields of --field, else the lens's own, or None for the curve's own range."""
+    lens = open_lens(arguments)
+    return lens, field_points(lens, arguments) if own or arguments.field else None
+
+
+def _report(
+    arguments,
+    lens: Lens,
+    found: Tabular,
+    figure: str,
+    *marks: float,
+    every: int = 1,
+    unit: str = "",
+    summary: dict[str, Tensor] | None = None,
+    dense: Tabular | None = None,
+) -> None:
+    """Print the result as JSON, or every so many-th row of its table; save the figure of it, or of the dense one."""
+    if arguments.json:
+        columns = flat(found.columns())
+        rows = [dict(zip(columns, map(number, row), strict=True)) for row in zip(*columns.values(), strict=True)]
+        print_json({"analysis": arguments.command, "results": rows})
+    else:
+        _print(summary or found.columns(), FIELD_UNITS[lens.fields.kind], every if summary is None else 1, unit)
+    if arguments.plot:
+        from raytrace import plot
+
+        draw: Callable = getattr(plot, figure)
+        plot.save(draw(lens, found if dense is None else dense, *marks), arguments.plot)
+        say(f"written: {arguments.plot}")
+
+
+def _print(columns: dict[str, Tensor], field_unit: str, every: int, unit: str) -> None:
+    length = torch.broadcast_shapes(*(c.shape for c in columns.values()))[-1]
+    thin = every if length > 2 * every else 1
+    table = flat({name: c[..., ::thin] if c.shape[-1] == length else c for name, c in columns.items()})
+    if not table["field_x"].any():
+        del table["field_x"]
+    widths = {name: max(len(name), 9) for name in table}
+    print("  ".join(f"{name:>{width}}" for name, width in widths.items()))
+    units = {name: field_unit if name.startswith("field") else _UNITS.get(name, "") for name in table}
+    units |= {name: unit for name in ("tangential", "sagittal", "rms", "peak_to_valley") if name in table}
+    print("  ".join(f"{units[name]:>{width}}" for name, width in widths.items()))
+    factor = {name: 100 if units[name] == "%" else 1 for name in table}
+    for row in zip(*table.values(), strict=True):
+        cells = (_cell(factor[name] * float(value)) for name, value in zip(table, row, strict=True))
+        print("  ".join(f"{cell:>{width}}" for cell, width in zip(cells, widths.values(), strict=True)))
+
+
+def _cell(value: float) -> str:
+    return "-" if value != value else f"{value + 0.0:.6g}"

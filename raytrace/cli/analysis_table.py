@@ -1,0 +1,133 @@
+"""The commands that analyse a lens: name, summary, description, examples, arguments, and what runs it. No torch."""
+
+from raytrace.cli.options import conditions, count, fields, lens, plot, positive_finite
+
+
+def _analysis(parser, figure: str) -> None:
+    lens(parser)
+    conditions(parser)
+    fields(parser)
+    plot(parser, figure)
+
+
+def _sized(figure: str, size: int, what: str):
+    def add_arguments(parser) -> None:
+        _analysis(parser, figure)
+        parser.add_argument("--size", metavar="N", type=count, default=size, help=f"{what} (default {size})")
+
+    return add_arguments
+
+
+def _mtf(parser) -> None:
+    _analysis(parser, "the curves")
+    parser.add_argument("--geometric", action="store_true", help="of rays alone, without diffraction")
+    parser.add_argument(
+        "--frequency", metavar="F", type=positive_finite, nargs="+", help="spatial frequencies, cycles/mm"
+    )
+    parser.add_argument(
+        "--through-focus",
+        metavar="MM",
+        type=positive_finite,
+        help="move the sensor by ±MM, at the one frequency of --frequency",
+    )
+
+
+def _encircled(parser) -> None:
+    _analysis(parser, "the curves")
+    parser.add_argument("--geometric", action="store_true", help="of rays alone, without diffraction")
+    parser.add_argument("--radius", metavar="MM", type=positive_finite, nargs="+", help="radii from the centroid")
+
+
+ANALYSES = (
+    (
+        "mtf",
+        "modulation transfer function",
+        "Tangential and sagittal MTF of each field, all wavelengths by their weights, through frequency or focus.",
+        """examples:
+  raytrace mtf double_gauss --object-distance 25000 --plot mtf.png
+  raytrace mtf tessar --frequency 10 20 40 --geometric --json
+  raytrace mtf tessar --frequency 20 --through-focus 0.3 --plot focus.png""",
+        _mtf,
+        "analysis_commands.mtf",
+    ),
+    (
+        "fan",
+        "ray fans",
+        "Transverse ray aberration over the pupil, from the chief ray of the primary wavelength.",
+        """examples:
+  raytrace fan tessar --plot fan.png
+  raytrace fan double_gauss --field 0 14 --size 21 --json""",
+        _sized("the fans", 41, "rays across the pupil"),
+        "analysis_commands.fan",
+    ),
+    (
+        "opd",
+        "OPD fans",
+        "Optical path difference in waves over the pupil, each wavelength about its own chief ray.",
+        """examples:
+  raytrace opd tessar --plot opd.png
+  raytrace opd double_gauss --object-distance 25000 --json""",
+        _sized("the fans", 41, "rays across the pupil"),
+        "analysis_commands.opd",
+    ),
+    (
+        "wavefront",
+        "wavefront maps and Zernike coefficients",
+        "RMS and peak-to-valley OPD in waves, and Noll's Zernike coefficients 1 to 37 (waves RMS).",
+        """examples:
+  raytrace wavefront tessar --plot wavefront.png
+  raytrace wavefront double_gauss --field 0 --json""",
+        _sized("the maps", 96, "points across a map"),
+        "analysis_commands.wavefront",
+    ),
+    (
+        "distortion",
+        "distortion over the field",
+        "Height of the chief ray on the sensor against f tan θ and f θ (1 = 100 % in JSON, % in text).",
+        """examples:
+  raytrace distortion phone --plot distortion.png
+  raytrace distortion double_gauss --field 5 10 14 --json""",
+        _sized("the curves", 11, "fields from the axis to the largest"),
+        "analysis_commands.distortion",
+    ),
+    (
+        "curvature",
+        "field curvature",
+        "Tangential and sagittal foci of close rays about the chief ray, mm from the sensor.",
+        """examples:
+  raytrace curvature tessar --plot curvature.png
+  raytrace curvature double_gauss --field 0 10 14 --json""",
+        _sized("the curves", 11, "fields from the axis to the largest"),
+        "analysis_commands.curvature",
+    ),
+    (
+        "lateral",
+        "lateral colour",
+        "Height of each wavelength's chief ray on the sensor less the primary wavelength's.",
+        """examples:
+  raytrace lateral tessar --plot lateral.png
+  raytrace lateral double_gauss --wavelength 0.5876 0.4861 0.6563 --json""",
+        _sized("the curves", 11, "fields from the axis to the largest"),
+        "analysis_commands.lateral",
+    ),
+    (
+        "illumination",
+        "relative illumination",
+        "Light on the sensor against the axis, from the solid angle that the rays of a uniform object fill.",
+        """examples:
+  raytrace illumination phone --plot illumination.png
+  raytrace illumination double_gauss --field 0 10 14 --json""",
+        _sized("the curve", 11, "fields from the axis to the largest"),
+        "analysis_commands.illumination",
+    ),
+    (
+        "encircled",
+        "encircled energy",
+        "Share of the light within a radius of the centroid of the rays, by diffraction or of rays alone.",
+        """examples:
+  raytrace encircled tessar --plot encircled.png
+  raytrace encircled double_gauss --geometric --radius 0.005 0.01 0.02 --json""",
+        _encircled,
+        "analysis_commands.encircled",
+    ),
+)

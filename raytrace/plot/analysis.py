@@ -1,0 +1,254 @@
+"""Figures of the analyses: fans, wavefronts, MTF, encircled energy, and curves over the field."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from raytrace.analysis import (
+    Distortion,
+    EncircledEnergy,
+    Fan,
+    FieldCurvature,
+    LateralColour,
+    Mtf,
+    RelativeIllumination,
+    ThroughFocusMtf,
+    WavefrontMap,
+)
+from raytrace.lens import Lens
+from raytrace.plot.style import (
+    FAINT,
+    GREY,
+    INK,
+    array,
+    field_colour,
+    field_label,
+    field_title,
+    new_figure,
+    number_text,
+    styled,
+    wavelength_colours,
+)
+
+
+@styled
+def fan_plot(lens: Lens, found: Fan) -> Figure:
+    """A row for each field: the tangential fan on the left, the sagittal one on the right, one scale for all."""
+    labels = _labels(lens, found.fields)
+    ray = found.quantity == "ray"
+    figure = new_figure(6.6, 1.45 * len(labels) + 1.1)
+    axes = figure.subplots(len(labels), 2, sharex=True, sharey=True, squeeze=False)
+    pupil, colours = array(found.pupil), wavelength_colours(found.wavelengths.tolist())
+    scale = 1e3 if ray else 1.0
+    curves = ((found.tangential, found.tangential_valid), (found.sagittal, found.sagittal_valid))
+    for column, (values, valid) in enumerate(curves):
+        shown = np.where(array(valid).astype(bool), scale * array(values), np.nan)
+        for row, label in enumerate(labels):
+            panel = _ruled(axes[row][column])
+            for w, colour in enumerate(colours):
+                panel.plot(pupil, shown[row, w], color=colour, linewidth=1.2, label=_wavelength(found, w))
+            panel.axhline(0, color=GREY, linewidth=0.6)
+            panel.axvline(0, color=GREY, linewidth=0.6)
+            if column == 0:
+                panel.set_ylabel(label)
+    axes[0][0].set_title("tangential" + (": ε$_y$ over pupil y" if ray else ": over pupil y"))
+    axes[0][1].set_title("sagittal" + (": ε$_x$ over pupil x" if ray else ": over pupil x"))
+    for panel in axes[-1]:
+        panel.set_xlim(-1, 1)
+        panel.set_xlabel("pupil coordinate")
+    figure.supylabel("transverse aberration (µm)" if ray else "OPD (waves)", fontsize=8.5)
+    _legend(figure, axes[0][0], len(colours))
+    return _titled(figure, lens, "ray fans" if ray else "OPD fans")
+
+
+@styled
+def wavefront_maps(lens: Lens, found: WavefrontMap) -> Figure:
+    """A panel for each field (rows) and wavelength (columns), one scale for all, RMS and P-V below each."""
+    labels, count = _labels(lens, found.fields), len(found.wavelengths)
+    figure = new_figure(max(4.2, 1.9 * count + 1.4), 2.05 * len(labels) + 0.6)
+    axes = figure.subplots(len(labels), count, squeeze=False)
+    opd = np.where(array(found.valid).astype(bool), array(found.opd), np.nan)
+    largest = max(float(np.nanmax(np.abs(opd), initial=0.0)), 1e-6)
+    for row, label in enumerate(labels):
+        for w in range(count):
+            panel = axes[row][w]
+            drawn = panel.imshow(
+                opd[row, w], origin="lower", cmap="RdBu_r", vmin=-largest, vmax=largest, extent=(-1, 1, -1, 1)
+            )
+            panel.set_xticks([])
+            panel.set_yticks([])
+            for spine in panel.spines.values():
+                spine.set_visible(False)
+            rms, valley = (number_text(float(v[row, w]), 3) for v in (found.rms, found.peak_to_valley))
+            panel.set_xlabel(f"RMS {rms}, P–V {valley}", fontsize=7.5, color=GREY)
+            if row == 0:
+                panel.set_title(_wavelength(found, w), color=INK)
+            if w == 0:
+                panel.set_ylabel(label)
+    bar = figure.colorbar(drawn, ax=axes, shrink=0.8, aspect=30, pad=0.02)
+    bar.set_label("OPD (waves)")
+    bar.outline.set_visible(False)
+    return _titled(figure, lens, "wavefront")
+
+
+@styled
+def mtf_curves(lens: Lens, found: Mtf) -> Figure:
+    """Modulation over spatial frequency: tangential solid, sagittal dashed, the diffraction limit grey."""
+    figure = new_figure(6.4, 4.0)
+    panel = _ruled(figure.add_subplot())
+    frequency = array(found.frequencies)
+    if found.limit is not None:
+        panel.plot(frequency, array(found.limit), color=GREY, linewidth=1.0, linestyle=":", label="diffraction limit")
+    _pairs(panel, lens, found, frequency, array(found.tangential), array(found.sagittal))
+    panel.set_xlim(0, frequency.max())
+    panel.set_ylim(0, 1.0)
+    panel.set_xlabel("spatial frequency (cycles/mm)")
+    panel.set_ylabel("modulation")
+    _legend(figure, panel, 4)
+    return _titled(figure, lens, f"{found.kind} MTF")
+
+
+@styled
+def mtf_through_focus_curves(lens: Lens, found: ThroughFocusMtf) -> Figure:
+    """Modulation at one frequency over the sensor distance."""
+    figure = new_figure(6.4, 4.0)
+    panel = _ruled(figure.add_subplot())
+    distance = array(found.sensor_distances)
+    _pairs(panel, lens, found, distance, array(found.tangential).T, array(found.sagittal).T)
+    panel.axvline(float(lens.surfaces[-2].thickness), color=GREY, linewidth=0.8)
+    panel.set_xlim(distance.min(), distance.max())
+    panel.set_ylim(0, 1.0)
+    panel.set_xlabel("sensor distance (mm)")
+    panel.set_ylabel(f"modulation at {number_text(float(found.frequency), 4)} cycles/mm")
+    _legend(figure, panel, 4)
+    return _titled(figure, lens, f"{found.kind} MTF through focus")
+
+
+@styled
+def encircled_curves(lens: Lens, found: EncircledEnergy) -> Figure:
+    """Share of the light over the radius about the centroid."""
+    figure = new_figure(6.0, 3.8)
+    panel = _ruled(figure.add_subplot())
+    radii = 1e3 * array(found.radii)
+    for f, label in enumerate(_labels(lens, found.fields)):
+        panel.plot(radii, array(found.share[f]), color=field_colour(f), linewidth=1.5, label=label)
+    panel.axhline(0.8, color=GREY, linewidth=0.7, linestyle=":")
+    panel.set_xlim(0, radii.max())
+    panel.set_ylim(0, 1.02)
+    panel.set_xlabel("radius from the centroid (µm)")
+    panel.set_ylabel("encircled energy")
+    _legend(figure, panel, 6)
+    return _titled(figure, lens, f"{found.kind} encircled energy")
+
+
+@styled
+def distortion_curves(lens: Lens, found: Distortion) -> Figure:
+    """Distortion in percent over the field: against f tan θ, and against f θ where the object is at infinity."""
+    curves = [("F-tan θ" if found.f_theta is not None else "Height", found.f_tan)]
+    curves += [] if found.f_theta is None else [("F-θ", found.f_theta)]
+    figure = new_figure(3.1 * len(curves) + 0.9, 4.2)
+    for panel, (name, values) in zip(figure.subplots(1, len(curves), squeeze=False)[0], curves, strict=True):
+        _over_field(panel, lens, found, 100 * array(values), array(found.valid))
+        panel.set_xlabel(f"{name} distortion (%)")
+    _legend(figure, panel, len(found.wavelengths))
+    return _titled(figure, lens, "distortion")
+
+
+@styled
+def curvature_curves(lens: Lens, found: FieldCurvature) -> Figure:
+    """Foci of close rays over the field: tangential solid, sagittal dashed."""
+    figure = new_figure(4.6, 4.4)
+    panel = figure.add_subplot()
+    valid = array(found.valid)
+    _over_field(panel, lens, found, array(found.tangential), valid, suffix=" T")
+    _over_field(panel, lens, found, array(found.sagittal), valid, suffix=" S", linestyle=(0, (4, 2)))
+    panel.set_xlabel("focus from the sensor (mm)")
+    _legend(figure, panel, 2 if len(found.wavelengths) < 3 else 3)
+    return _titled(figure, lens, "field curvature")
+
+
+@styled
+def lateral_curves(lens: Lens, found: LateralColour, airy_radius: float) -> Figure:
+    """Chief rays' heights less the primary wavelength's over the field, beside the Airy radius (mm) in grey."""
+    figure = new_figure(4.6, 4.4)
+    panel = figure.add_subplot()
+    shift = 1e3 * array(found.shift)
+    panel.axvspan(-1e3 * airy_radius, 1e3 * airy_radius, color=FAINT, alpha=0.35, linewidth=0, label="Airy radius")
+    _over_field(panel, lens, found, shift, array(found.valid))
+    panel.set_xlabel("lateral colour (µm)")
+    _legend(figure, panel, 4)
+    return _titled(figure, lens, "lateral colour")
+
+
+@styled
+def illumination_curve(lens: Lens, found: RelativeIllumination) -> Figure:
+    """Relative illumination over the field, beside cos⁴θ where fields are angles."""
+    figure = new_figure(5.4, 3.6)
+    panel = _ruled(figure.add_subplot())
+    field = _field_axis(found)
+    panel.plot(field, array(found.illumination), color=field_colour(0), linewidth=1.5, marker="o", markersize=3)
+    if lens.fields.kind == "angle":
+        fine = np.linspace(0, field.max(), 100)
+        panel.plot(fine, np.cos(np.deg2rad(fine)) ** 4, color=GREY, linewidth=1.0, linestyle=":")
+        panel.annotate("cos⁴θ", (fine[70], math.cos(math.radians(fine[70])) ** 4), (4, 4),
+                       textcoords="offset points", color=GREY)  # fmt: skip
+    panel.set_xlim(0, max(field.max(), 1e-9))
+    panel.set_ylim(0, 1.05 * max(1.0, float(found.illumination.max())))
+    panel.set_xlabel(f"{field_title(lens)} ({_unit(lens)})")
+    panel.set_ylabel("relative illumination")
+    return _titled(figure, lens, "relative illumination")
+
+
+def _pairs(panel: Axes, lens: Lens, found, x: np.ndarray, tangential: np.ndarray, sagittal: np.ndarray) -> None:
+    for f, label in enumerate(_labels(lens, found.fields)):
+        panel.plot(x, tangential[f], color=field_colour(f), linewidth=1.5, label=f"{label} T")
+        panel.plot(x, sagittal[f], color=field_colour(f), linewidth=1.5, linestyle=(0, (4, 2)), label=f"{label} S")
+
+
+def _over_field(panel: Axes, lens: Lens, found, values: np.ndarray, valid: np.ndarray, *, suffix="", **line) -> None:
+    """Curves (F, W) drawn upwards over the field, as lens designers do."""
+    _ruled(panel)
+    field, shown = _field_axis(found), np.where(valid.astype(bool), values, np.nan)
+    for w, colour in enumerate(wavelength_colours(found.wavelengths.tolist())):
+        panel.plot(shown[:, w], field, color=colour, linewidth=1.4, label=_wavelength(found, w) + suffix, **line)
+    panel.axvline(0, color=GREY, linewidth=0.6)
+    panel.set_ylim(0, max(field.max(), 1e-9))
+    panel.set_ylabel(f"{field_title(lens)} ({_unit(lens)})")
+    widest = np.nanmax(np.abs(shown), initial=0.0)
+    if widest < 1e-9:
+        panel.set_xlim(-1, 1)
+
+
+def _field_axis(found) -> np.ndarray:
+    return np.hypot(*array(found.fields))
+
+
+def _unit(lens: Lens) -> str:
+    return "°" if lens.fields.kind == "angle" else "mm"
+
+
+def _labels(lens: Lens, fields) -> Sequence[str]:
+    return [field_label(lens, field) for field in array(fields).T]
+
+
+def _wavelength(found, w: int) -> str:
+    return f"{number_text(1e3 * float(found.wavelengths[w]), 4)} nm"
+
+
+def _ruled(panel: Axes) -> Axes:
+    panel.grid(color="#ececec", linewidth=0.6, zorder=0)
+    panel.set_axisbelow(True)
+    return panel
+
+
+def _legend(figure: Figure, panel: Axes, columns: int) -> None:
+    handles, labels = panel.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=max(columns, 1))
+
+
+def _titled(figure: Figure, lens: Lens, what: str) -> Figure:
+    figure.suptitle(f"{lens.name}\n{what}" if lens.name else what.capitalize(), fontweight="bold", fontsize=10)
+    return figure

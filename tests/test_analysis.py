@@ -1,0 +1,291 @@
+"""Analyses: closed forms of perfect lenses, laws of the field, limits, and gradients."""
+
+import dataclasses
+import json
+import math
+
+import problems
+import pytest
+import torch
+from problems import MICROMETRE, NANOMETRE, vector
+
+from raytrace import analysis
+from raytrace.cli import main
+from raytrace.focus import image_rays
+from raytrace.lens import Lens, with_sensor_distance
+from raytrace.numerics import safe_sqrt
+from raytrace.paraxial import first_order
+from raytrace.pupil import gauss_rings
+
+WAVELENGTH = 0.55e-3  # mm
+
+
+def perfect(shift: float = 0.0, diameter: float = 4.0) -> Lens:
+    """A plano-hyperbolic lens, F/12: no aberration on the axis but the defocus of a shifted sensor (mm)."""
+    surfaces = [problems.surface(None, 10.0, 1.5), problems.surface(-0.04, 50.0 + shift, conic=-2.25)]
+    return problems.lens(surfaces, aperture=("entrance_pupil_diameter", diameter))
+
+
+def numerical_aperture(lens: Lens) -> float:
+    edge = image_rays(lens, vector(0.0, 1.0)[:, None])
+    return abs(float(edge.direction[1, 0, 0, 0]))
+
+
+def thin_lens(*angles: float, diameter: float = 0.5) -> Lens:
+    """Stop at a thin lens of f = 100 mm: chief rays go straight through."""
+    surfaces = [problems.surface(0.01, 1e-9, 1.5), problems.surface(-0.01, 100.0)]
+    field = problems.fields("angle", angles)
+    return problems.lens(surfaces, field=field, aperture=("entrance_pupil_diameter", diameter))
+
+
+# fans and wavefronts
+
+
+def test_fans_of_a_perfect_lens_are_flat_and_those_of_defocus_straight():
+    flat, tilted = analysis.ray_fan(perfect()), analysis.ray_fan(perfect(1.0))
+    assert max(flat.tangential.abs().max(), flat.sagittal.abs().max()) < 1e-3 * NANOMETRE
+    assert analysis.opd_fan(perfect()).tangential.abs().max() < 1e-9
+    slope = -tilted.pupil * numerical_aperture(
+        perfect()
+    )  # ε = -NA p per mm of sensor shift: behind the focus rays cross
+    assert torch.allclose(tilted.tangential[0, 0], slope, atol=0.5 * MICROMETRE)
+    assert torch.allclose(tilted.tangential, tilted.sagittal, atol=1e-12)
+
+
+def test_ray_fan_counts_lateral_colour_and_lands_where_rays_land():
+    lens = problems.double_gauss(wavelengths=(0.53, 0.6))
+    found = analysis.ray_fan(lens, size=5)
+    rays = image_rays(lens, torch.stack([torch.zeros(5).double(), found.pupil]))
+    expected = rays.position[1] - rays.position[1, :, :1, 2:3]
+    assert torch.allclose(found.tangential, expected, atol=NANOMETRE * 1e-3)
+
+
+def test_zernike_coefficients_of_defocus():
+    """OPD = -Δ (1 - cos θ) = -Δ NA² r²/2 in a slow beam: Noll 4 is that over 2√12 … of r², c₄ = -Δ NA²/(4√3)."""
+    shift = 0.1
+    found = analysis.wavefront_map(perfect(shift), size=16)
+    c4 = -shift * numerical_aperture(perfect()) ** 2 / (4 * math.sqrt(3)) / WAVELENGTH
+    assert float(found.coefficients[0, 0, 3]) == pytest.approx(c4, rel=2e-3)
+    assert found.coefficients[0, 0, [1, 2, 4, 5, 6, 7, 8, 9]].abs().max() < 1e-9
+    assert float(found.rms[0, 0]) == pytest.approx(abs(c4), rel=2e-3)
+    y = found.pupil[:, None] ** 2 + found.pupil**2
+    expected = torch.where(found.valid[0, 0], c4 * 2 * math.sqrt(3) * y, 0.0)
+    assert (found.opd[0, 0] - expected).abs().max() < 5e-3 * abs(c4)
+
+
+# MTF
+
+
+def test_mtf_of_a_circular_pupil():
+    """(2/π)(acos s - s √(1 - s²)); the rim of the grid of 128² cells leaves 2e-3."""
+    lens = perfect()
+    top = 2 * numerical_aperture(lens) / WAVELENGTH
+    s = torch.linspace(0, 1.1, 23, dtype=torch.float64)
+    found = analysis.mtf(lens, s * top)
+    inside = s.clamp(max=1.0)
+    expected = (2 / math.pi) * (torch.acos(inside) - inside * safe_sqrt(1 - inside**2))
+    for curve in (found.tangential[0], found.sagittal[0]):
+        assert (curve - expected).abs().max() < 2e-3
+    assert (found.limit - expected).abs().max() < 2e-3
+    assert float(found.tangential[0, 0]) == pytest.approx(1.0, abs=1e-9)
+
+
+def test_geometric_mtf_at_low_frequency_is_that_of_the_variance():
+    """1 - 2π²σ²ν² + O(ν⁴), σ² the variance of where rays land along the section."""
+    lens = problems.double_gauss()
+    found = analysis.mtf(lens, vector(0.1), kind="geometric")
+    rays = image_rays(lens, gauss_rings(12)[0])
+    weights = gauss_rings(12)[1]
+    for along, curve in ((1, found.tangential), (0, found.sagittal)):
+        hits = rays.position[along, :, 0]
+        variance = (weights * hits**2).sum(-1) - (weights * hits).sum(-1) ** 2
+        drop = 2 * math.pi**2 * variance * 0.1**2
+        assert torch.allclose(1 - curve[:, 0], drop, rtol=5e-3)
+
+
+def test_diffraction_meets_rays_where_the_blur_is_large():
+    """A defocus of 9 waves: at frequencies far below the cutoff both see a uniform disc."""
+    lens = perfect(12.0)
+    frequency = vector(0.2, 0.5, 1.0)
+    wave, rays = (analysis.mtf(lens, frequency, kind=kind) for kind in ("diffraction", "geometric"))
+    assert (wave.tangential - rays.tangential).abs().max() < 0.02
+
+
+def test_through_focus_is_the_mtf_at_each_sensor():
+    lens = perfect()
+    distances = vector(49.5, 50.0, 50.5)
+    found = analysis.mtf_through_focus(lens, 60.0, distances)
+    alone = analysis.mtf(with_sensor_distance(lens, distances[2]), vector(60.0))
+    assert float(found.tangential[2, 0]) == float(alone.tangential[0, 0])
+    assert found.tangential[1, 0] > found.tangential[[0, 2], 0].max()
+
+
+def test_unknown_kinds_are_refused():
+    with pytest.raises(ValueError, match="diffraction, geometric"):
+        analysis.mtf(perfect(), kind="fast")
+    with pytest.raises(ValueError, match="diffraction or geometric"):
+        analysis.encircled_energy(perfect(), kind="fast")
+
+
+# encircled energy
+
+
+def test_encircled_energy_of_an_airy_disc():
+    lens = perfect()
+    found = analysis.encircled_energy(lens)
+    v = 2 * math.pi * numerical_aperture(lens) * found.radii / WAVELENGTH
+    expected = 1 - torch.special.bessel_j0(v) ** 2 - torch.special.bessel_j1(v) ** 2
+    assert (found.share[0] - expected).abs().max() < 2e-3
+
+
+def test_encircled_energy_of_a_uniform_disc():
+    """(r/R)²: 4096 rays and the little spherical aberration of the defocused cone leave 2e-3."""
+    lens = perfect(0.5)
+    edge = float(image_rays(lens, vector(0.0, 1.0)[:, None]).position[1].abs())
+    radii = edge * torch.linspace(0, 1.2, 25, dtype=torch.float64)
+    found = analysis.encircled_energy(lens, radii, kind="geometric")
+    assert (found.share[0] - (radii / edge).clamp(max=1.0) ** 2).abs().max() < 2e-3
+
+
+# over the field
+
+
+def test_a_thin_lens_with_its_stop_does_not_distort():
+    found = analysis.distortion(thin_lens(0.0, 30.0), size=7)
+    assert found.f_tan.abs().max() < 1e-7
+    theta = torch.deg2rad(found.fields[1, 1:])
+    assert torch.allclose(found.f_theta[1:, 0], torch.tan(theta) / theta - 1, atol=1e-7)
+    assert torch.allclose(found.height[:, 0], 100 * torch.tan(torch.deg2rad(found.fields[1])), atol=MICROMETRE)
+
+
+def test_distortion_of_a_finite_object_is_against_its_height():
+    lens = problems.double_gauss(object_distance=500.0)
+    found = analysis.distortion(lens, size=3)
+    assert found.f_theta is None
+    near = analysis.distortion(lens, fields=vector(0.0, 0.01)[:, None])
+    assert near.f_tan.abs().max() < 1e-6
+    assert 1e-4 < found.f_tan[-1].abs().max() < 0.1
+
+
+@pytest.mark.parametrize("angle", [0.0, 10.0, 25.0])
+def test_foci_of_a_sphere_are_coddingtons(angle):
+    """n' cos²I'/t' - cos²I n/t = (n' cos I' - n cos I)/R and n'/s' = the same, along the refracted chief ray."""
+    n, radius = 1.5, 30.0
+    sphere = [problems.surface(1 / radius, 80.0, n)]
+    lens = problems.lens(sphere, field=problems.fields("angle", (angle,)), aperture=("entrance_pupil_diameter", 1.0))
+    found = analysis.field_curvature(lens, fields=vector(0.0, angle)[:, None])
+    sine = math.sin(math.radians(angle))
+    cosine, refracted = math.sqrt(1 - sine**2), math.sqrt(1 - (sine / n) ** 2)
+    power = (n * refracted - cosine) / radius
+    assert float(found.tangential) == pytest.approx(n * refracted**2 / power * refracted - 80.0, abs=0.1 * MICROMETRE)
+    assert float(found.sagittal) == pytest.approx(n / power * refracted - 80.0, abs=0.1 * MICROMETRE)
+
+
+def test_near_the_axis_foci_bend_as_petzval_says():
+    """The sagittal focus lies a third of the way from Petzval's surface to the tangential one."""
+    lens = problems.double_gauss()
+    found = analysis.field_curvature(lens, fields=vector(0.0, 1.0).diag()[:, :2])
+    bend = [float(curve[1, 0] - curve[0, 0]) for curve in (found.tangential, found.sagittal)]
+    height = 99.5 * math.tan(math.radians(1.0))
+    petzval = height**2 / 2 / float(first_order(lens).petzval_radius)
+    assert (3 * bend[1] - bend[0]) / 2 == pytest.approx(petzval, rel=0.02)
+
+
+def test_lateral_colour_is_the_difference_of_chief_rays():
+    lens = problems.double_gauss(wavelengths=(0.48, 0.53, 0.65), primary_wavelength=1)
+    found = analysis.lateral_colour(lens, size=3)
+    rays = image_rays(lens, vector(0.0, 0.0)[:, None], fields=found.fields)
+    assert torch.allclose(found.shift, rays.position[1, ..., 0] - rays.position[1, :, 1:2, 0], atol=1e-12)
+    assert (found.shift[:, 1] == 0).all()
+
+
+def test_relative_illumination_is_cos_to_the_fourth():
+    """A small stop at a thin lens, seen from the sensor at θ; the marginal cone of F/200 leaves 1e-5."""
+    found = analysis.relative_illumination(thin_lens(0.0, 30.0), size=4)
+    expected = torch.cos(torch.deg2rad(found.fields[1])) ** 4
+    assert (found.illumination - expected).abs().max() < 1e-3
+
+
+def test_relative_illumination_counts_vignetting():
+    lens = problems.double_gauss()
+    free = analysis.relative_illumination(lens, size=3).illumination
+    surfaces = list(lens.surfaces)
+    surfaces[1] = dataclasses.replace(surfaces[1], apertures=problems.vignetting_aperture(18.0))
+    clipped = dataclasses.replace(lens, surfaces=tuple(surfaces))
+    found = analysis.relative_illumination(clipped, size=3).illumination
+    assert float(found[0]) == pytest.approx(float(free[0]), abs=1e-12)
+    assert found[2] < 0.97 * free[2]
+
+
+# derivatives and doors
+
+
+def test_gradients_are_those_of_differences():
+    """Of the sensor distance, at a place where no ray of the double Gauss is lost."""
+
+    def everything(distance: torch.Tensor) -> torch.Tensor:
+        lens = with_sensor_distance(problems.double_gauss(field=problems.fields("angle", (10.0,))), distance)
+        fields = vector(0.0, 10.0)[:, None]
+        return torch.stack(
+            [
+                analysis.ray_fan(lens, size=5).tangential.square().sum(),
+                analysis.opd_fan(lens, size=5).sagittal.square().sum(),
+                analysis.mtf(lens, vector(5.0)).tangential.sum(),
+                analysis.mtf(lens, vector(5.0), kind="geometric").sagittal.sum(),
+                analysis.encircled_energy(lens, vector(0.02)).share.sum(),
+                analysis.distortion(lens, fields=fields).height.sum(),
+                analysis.field_curvature(lens, fields=fields).tangential.sum(),
+                analysis.relative_illumination(lens, fields=fields).projected_solid_angle.sum(),
+            ]
+        )
+
+    distance = problems.scalar(57.9).requires_grad_()
+    here = everything(distance)
+    gradient = torch.stack([torch.autograd.grad(entry, distance, retain_graph=True)[0] for entry in here])
+    with torch.no_grad():
+        step = 1e-4
+        slope = (everything(distance + step) - everything(distance - step)) / (2 * step)
+    assert torch.isfinite(gradient).all()
+    assert torch.allclose(gradient, slope, rtol=1e-2, atol=1e-6)
+
+
+def test_results_are_tables():
+    frame = analysis.mtf(perfect(), vector(0.0, 50.0)).to_frame()
+    assert list(frame.columns) == ["field_x", "field_y", "frequency", "tangential", "sagittal", "diffraction_limit"]
+    assert len(frame) == 2
+    assert frame.frequency[1] == 50
+    assert len(analysis.wavefront_map(perfect(), size=8).to_frame()) == 37
+
+
+COMMANDS = {
+    "fan": ["--size", "5"],
+    "opd": ["--size", "5"],
+    "wavefront": ["--size", "16"],
+    "distortion": ["--size", "3"],
+    "curvature": ["--size", "3"],
+    "lateral": ["--size", "3"],
+    "illumination": ["--size", "2"],
+    "mtf": ["--geometric", "--frequency", "5", "10"],
+    "encircled": ["--geometric", "--radius", "0.05"],
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_commands_write_strict_json_and_a_figure(command, capsys, tmp_path):
+    def refuse(word):
+        raise AssertionError(f"{word} is no JSON")
+
+    picture = tmp_path / "figure.png"
+    arguments = [command, "double_gauss", *COMMANDS[command], "--plot", str(picture)]
+    assert main([*arguments, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out, parse_constant=refuse)
+    assert document["analysis"] == command
+    assert len(document["results"]) >= 2
+    assert picture.stat().st_size > 10_000
+    assert main(arguments[:-2]) == 0
+    assert "field_y" in capsys.readouterr().out
+
+
+def test_through_focus_needs_one_frequency(capsys):
+    assert main(["mtf", "double_gauss", "--through-focus", "0.1"]) == 1
+    assert "--frequency" in capsys.readouterr().err
