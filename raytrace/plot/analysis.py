@@ -189,7 +189,8 @@ def illumination_curve(lens: Lens, found: RelativeIllumination) -> Figure:
     figure = new_figure(5.4, 3.6)
     panel = _ruled(figure.add_subplot())
     field = _field_axis(found)
-    panel.plot(field, array(found.illumination), color=field_colour(0), linewidth=1.5, marker="o", markersize=3)
+    joined = "solid" if len(field) > 5 else "none"  # a few fields are points, not a curve
+    panel.plot(field, array(found.illumination), "o", color=field_colour(0), linestyle=joined, markersize=3.5)
     if lens.fields.kind == "angle":
         fine = np.linspace(0, field.max(), 100)
         panel.plot(fine, np.cos(np.deg2rad(fine)) ** 4, color=GREY, linewidth=1.0, linestyle=":")
