@@ -15,33 +15,59 @@ def psf_grid(found: Psf, object_distances: Sequence[float], labels: Sequence[str
 
     Below each kernel: the energy inside its window (or the energy it was normalised by), and its peak.
     """
-    rows, columns = len(labels), len(object_distances)
+    energy, kernels = array(found.energy).T, array(found.kernel).swapaxes(0, 1)
+    notes = [
+        [f"energy {e:.3f}, peak {kernel.max():.3g}" for e, kernel in zip(*row, strict=True)]
+        for row in zip(energy, kernels, strict=True)
+    ]
+    return _panels(kernels, found, object_distances, labels, notes, title)
+
+
+@styled
+def model_grid(
+    found: Sequence[Psf], object_distances: Sequence[float], labels: Sequence[str], *, title: str = ""
+) -> Figure:
+    """Kernels of the first field over object distance (columns) and model (rows, named by `labels`).
+
+    Below each kernel: its energy inside the window, and its relative L1 difference from the last row, the reference.
+    """
+    kernels = [array(one.kernel)[:, 0] for one in found]
+    notes = []
+    for one in kernels:
+        difference = abs(one - kernels[-1]).sum((-2, -1)) / kernels[-1].sum((-2, -1))
+        notes.append([f"energy {k.sum():.2f}" for k in one])
+        if one is not kernels[-1]:
+            notes[-1] = [f"{note},  Δ {d:.2f}" for note, d in zip(notes[-1], difference, strict=True)]
+    remark = f"Δ: relative L¹ difference from {labels[-1].splitlines()[0]}"
+    return _panels(kernels, found[-1], object_distances, labels, notes, title, remark)
+
+
+def _panels(kernels, found: Psf, distances, labels, notes, title: str, remark: str = "") -> Figure:
+    """Kernels[row][column] with a note below each, the distances above and the labels on the left."""
+    rows, columns = len(labels), len(distances)
     figure = new_figure(max(3.2, 1.55 * columns + 0.5), 1.85 * rows + 0.75)
     axes = figure.subplots(rows, columns, squeeze=False)
-    kernels, energy = array(found.kernel), array(found.energy)
     width = 1000 * float(found.grid.pitch) * found.grid.columns
-    half = 0.5 * width
+    height = 1000 * float(found.grid.pitch) * found.grid.rows
+    extent = (-0.5 * width, 0.5 * width, -0.5 * height, 0.5 * height)
     for row, label in enumerate(labels):
-        for column, distance in enumerate(object_distances):
-            panel, kernel = axes[row][column], kernels[column, row]
-            panel.imshow(kernel, origin="lower", cmap="magma", vmin=0.0, extent=(-half, half, -half, half))
+        for column, distance in enumerate(distances):
+            panel, kernel = axes[row][column], kernels[row][column]
+            panel.imshow(kernel, origin="lower", cmap="magma", vmin=0.0, extent=extent)
             panel.set_xticks([])
             panel.set_yticks([])
             for spine in panel.spines.values():
                 spine.set_visible(True)
                 spine.set_color(GREY)
-            panel.set_xlabel(f"energy {energy[column, row]:.3f}, peak {kernel.max():.3g}", fontsize=7, color=GREY)
+            panel.set_xlabel(notes[row][column], fontsize=7, color=GREY)
             if row == 0:
                 panel.set_title(_distance(distance), color=INK)
             if column == 0:
                 panel.set_ylabel(label)
     figure.suptitle(title, fontweight="bold", fontsize=10)
     pixels = f"{found.grid.columns} × {found.grid.rows} pixels of {1000 * float(found.grid.pitch):g} µm"
-    figure.supxlabel(
-        f"window {width:g} µm, {pixels}; each panel from black (0) to its own peak",
-        fontsize=7.5,
-        color=GREY,
-    )
+    said = [f"window {width:g} µm, {pixels}; each panel from black (0) to its own peak", remark]
+    figure.supxlabel("\n".join(filter(None, said)), fontsize=7.5, color=GREY)
     return figure
 
 

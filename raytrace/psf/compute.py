@@ -124,7 +124,8 @@ def psf(
         found = _merge(compute(distances[~infinite]), compute(distances[infinite]), infinite)
     else:
         found = compute(distances)
-    if not bool((found.energy > 0).any()) and bool((found.covariance.isnan() | (found.covariance == 0)).all()):
+    # Only traced light can be lost; light beside the window is not.
+    if found.rays and not bool((found.energy > 0).any()) and not bool((found.covariance != 0).any()):
         raise EmptyPsf("no ray reaches the sensor: the lens is blocked or the field is outside its reach")
     if normalise == "window":
         kernel = safe_divide(found.kernel, found.energy[..., None, None])
@@ -218,7 +219,7 @@ def _estimate(ladder: Model, changes: list[Tensor], order: int, lost: Tensor | N
         error = ladder.left * changes[-1]
     else:
         ratios = [safe_divide(later, earlier) for earlier, later in itertools.pairwise(changes)]
-        rho = torch.stack(ratios).amax(0).clamp(0.001, 0.9)
+        rho = torch.stack(ratios).amax(0).clamp(1e-4, 0.9)
         error = changes[-1] * rho / (1 - rho)
     if lost is not None:
         error = torch.maximum(error, torch.minimum(2 * lost, torch.full_like(lost, 0.8 / order)))

@@ -1,0 +1,79 @@
+"""`raytrace psf`: its fixed form, its JSON and its arrays."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from raytrace.cli import main
+
+LENS = str(Path(__file__).parents[1] / "lenses" / "double_gauss.zmx")
+FORM = ["psf", LENS, "--model", "gaussian", "--object-distance", "10000", "30000", "--field", "0", "2"]
+FORM += ["--pixel", "0.005", "--size", "21", "--sensor-distance", "57.88", "--f-number", "4", "--tol", "1e-3"]
+KEYS = {"object_distance", "field", "centroid", "covariance", "energy", "error", "rays"}
+
+
+def test_json_is_one_document_distance_major_with_nothing_beside_it(capsys):
+    assert main([*FORM, "--json"]) == 0
+    said = capsys.readouterr()
+    assert said.err == ""
+    results = json.loads(said.out)["results"]
+    assert [entry["object_distance"] for entry in results] == [1e4, 1e4, 3e4, 3e4]
+    assert [entry["field"] for entry in results] == [[0.0, 0.0], [0.0, 2.0]] * 2
+    for entry in results:
+        assert set(entry) >= KEYS
+        (xx, xy), (yx, yy) = entry["covariance"]
+        assert xy == yx
+        assert xx > 0 < yy
+        assert 0 < entry["error"] <= 1e-3
+    # The blur of an ideal disc of the same defocus, 2σ = ε, to the aberrations at F/4.
+    assert 0.8 < results[0]["energy"] < 1
+    assert results[0]["covariance"][0][0] ** 0.5 == pytest.approx(0.6 / 8 / 2, rel=0.25)
+    assert results[1]["centroid"][1] == pytest.approx(99.5145 * math.tan(math.radians(2.0)), rel=0.01)
+
+
+def test_arrays_are_those_of_the_json(tmp_path, capsys):
+    out, picture = tmp_path / "psf.npz", tmp_path / "psf.png"
+    assert main([*FORM, "--center", "chief", "--json", "-o", str(out), "--plot", str(picture)]) == 0
+    said = capsys.readouterr()
+    results = json.loads(said.out)["results"]
+    assert str(out) in said.err
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+    with np.load(out) as arrays:
+        assert arrays["psf"].shape == (2, 2, 21, 21)
+        assert float(arrays["pixel_pitch"]) == 0.005
+        assert arrays["energy"].flatten().tolist() == [entry["energy"] for entry in results]
+        assert arrays["error"].flatten().tolist() == [entry["error"] for entry in results]
+        assert str(arrays["model"]) == "gaussian"
+        np.testing.assert_allclose(arrays["psf"].sum((-2, -1)), arrays["energy"], atol=1e-12)
+
+
+def test_default_window_is_centred_on_the_axis_with_a_pixel_at_its_centre(tmp_path):
+    out = tmp_path / "psf.npz"
+    assert main(["psf", LENS, "--model", "gaussian", "--object-distance", "10000", "-o", str(out)]) == 0
+    with np.load(out) as arrays:
+        kernel = arrays["psf"][0, 0]
+        assert kernel.shape == (21, 21)
+        assert arrays["centre"].tolist() == [0.0, 0.0]
+        assert np.unravel_index(kernel.argmax(), kernel.shape) == (10, 10)
+        np.testing.assert_allclose(kernel, kernel[::-1, ::-1], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (["--tol", "0.1", "--rays", "5"], 2, "not allowed with"),
+        (["--model", "geometric"], 2, "invalid choice"),
+        (["--model", "auto", "--rays", "5"], 1, "auto chooses by a tolerance"),
+        (["--model", "paraxial", "--rays", "5"], 1, "traces no rays"),
+        (["--size", "0"], 2, "not above 0"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_one_line(capsys, words, code, message):
+    assert main(["psf", LENS, *words]) == code
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert message in said.err
+    assert len(said.err.splitlines()) == 1
