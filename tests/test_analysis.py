@@ -116,7 +116,7 @@ def test_through_focus_is_the_mtf_at_each_sensor():
     distances = vector(49.5, 50.0, 50.5)
     found = analysis.mtf_through_focus(lens, 60.0, distances)
     alone = analysis.mtf(with_sensor_distance(lens, distances[2]), vector(60.0))
-    assert float(found.tangential[2, 0]) == float(alone.tangential[0, 0])
+    assert float(found.tangential[2, 0]) == pytest.approx(float(alone.tangential[0, 0]), abs=1e-12)
     assert found.tangential[1, 0] > found.tangential[[0, 2], 0].max()
 
 
