@@ -12,7 +12,8 @@ from torch import Tensor
 from raytrace.grid import Grid
 from raytrace.grid import grid as make_grid
 from raytrace.lens import Lens
-from raytrace.numerics import safe_divide
+from raytrace.numerics import safe_divide, safe_sqrt
+from raytrace.paraxial import first_order
 from raytrace.psf import diffraction, fourier, gaussian, paraxial, raymap, rays
 from raytrace.scene import EmptyPsf, Kernels, Scene, scene, trace_scene
 from raytrace.value import value
@@ -266,11 +267,19 @@ def _climb(batch: Scene, pixels: Grid, weights: Tensor, tol: float) -> Psf:
         above = _by_tolerance(batch, pixels, weights, name, tol)
         with torch.no_grad():
             gap = float(_kernel_change(above, here).max())
-        if gap <= tol:
+        if gap <= tol and (name == "wave" or not _diffracts(batch, pixels, above)):
             said = f"{here.model}: its kernels differ from those of {name} by {gap:.1e}, within {tol:g}"
             return dataclasses.replace(here, reason=said)
         here, below = above, here.model
     return dataclasses.replace(here, reason=f"wave: {below} differs from it by {gap:.1e}, more than {tol:g}")
+
+
+def _diffracts(batch: Scene, pixels: Grid, light: Psf) -> bool:
+    """Whether somewhere neither a pixel nor the blur is twice as wide as the Airy disc: rays alike prove nothing."""
+    with torch.no_grad():
+        airy = 1.22e-3 * batch.wavelengths.max() * first_order(batch.lens).working_f_number.max()
+        blur = 2 * safe_sqrt(light.covariance[0] + light.covariance[2])
+        return bool((torch.maximum(blur, pixels.pitch) < 4 * airy).any())
 
 
 def _polychromatic(found: Kernels, weights: Tensor, model: str) -> Psf:
