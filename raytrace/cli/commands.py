@@ -12,7 +12,6 @@ from raytrace.cli.options import (
     count,
     fields,
     file_name,
-    finite,
     json,
     lens,
     output,
@@ -59,7 +58,14 @@ def _layout(parser):
     lens(parser)
     conditions(parser)
     fields(parser)
-    output(parser, "picture to write: .png, .pdf or .svg (default: LENS_layout.png in this folder)")
+    parser.add_argument(
+        "-o",
+        "--output",
+        "--plot",
+        metavar="FILE",
+        type=file_name,
+        help="picture to write: .png, .pdf or .svg (default: LENS_layout.png in this folder)",
+    )
 
 
 def _spot(parser):
@@ -73,17 +79,7 @@ def _spot(parser):
 
 def _focus(parser):
     lens(parser)
-    group = parser.add_argument_group("conditions other than the file's")
-    group.add_argument(
-        "--object-distance",
-        metavar="MM",
-        type=positive,
-        nargs="+",
-        help="from the object to the vertex of surface 1; inf allowed; several are focused together",
-    )
-    group.add_argument("--sensor-distance", metavar="MM", type=finite, help="sensor distance to start from")
-    aperture(group)
-    wavelength(group)
+    conditions(parser, several="several are focused together")
     fields(parser)
     parser.add_argument(
         "--criterion",
@@ -121,17 +117,7 @@ def _psf(parser):
         default="auto",
         help="how much of the lens the PSF knows; auto (default) climbs until the next model changes nothing",
     )
-    group = parser.add_argument_group("conditions other than the file's")
-    group.add_argument(
-        "--object-distance",
-        metavar="MM",
-        type=positive,
-        nargs="+",
-        help="from the object to the vertex of surface 1; inf allowed; one row of kernels each",
-    )
-    group.add_argument("--sensor-distance", metavar="MM", type=finite, help="sensor distance")
-    aperture(group)
-    wavelength(group)
+    conditions(parser, several="one row of kernels each")
     fields(parser)
     parser.add_argument(
         "--pixel", metavar="MM", type=positive_finite, default=0.005, help="pixel pitch (default 0.005)"

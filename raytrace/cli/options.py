@@ -88,14 +88,18 @@ def json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="write one JSON document instead of text")
 
 
-def conditions(parser: argparse.ArgumentParser) -> None:
-    """What may be set other than in the file: distances, aperture, wavelength."""
+def conditions(parser: argparse.ArgumentParser, *, several: str = "") -> None:
+    """What may be set other than in the file: distances, aperture, wavelength.
+
+    several: what a command does with several object distances; it takes one if this is empty.
+    """
     group = parser.add_argument_group("conditions other than the file's")
     group.add_argument(
         "--object-distance",
         metavar="MM",
         type=positive,
-        help="from the object to the vertex of surface 1; inf allowed",
+        nargs="+" if several else None,
+        help="from the object to the vertex of surface 1; inf allowed" + (f"; {several}" if several else ""),
     )
     group.add_argument(
         "--sensor-distance", metavar="MM", type=finite, help="from the last vertex before the image to the image"
