@@ -366,7 +366,7 @@ def test_damaged_files_give_a_lens_or_a_clear_error(seed, which):
 
 
 @pytest.mark.slow
-@settings(max_examples=100_000, deadline=None)
+@settings(max_examples=20_000, deadline=None)
 @given(seed=st.integers(0, 2**63), which=st.integers(0, len(_ORIGINALS) - 1))
 def test_very_many_damaged_files_give_a_lens_or_a_clear_error(seed, which):
     path, content = _ORIGINALS[which]
