@@ -205,7 +205,8 @@ def _model(coefficients: Tensor, wavelength: Tensor) -> Tensor:
     first_fc, first_gf = 1 / _F - 1 / _C, 1 / _G - 1 / _F
     power_fc, power_gf = _F**-3.5 - _C**-3.5, _G**-3.5 - _F**-3.5
     determinant = first_fc * power_gf - first_gf * power_fc
-    dispersion = safe_divide(nd - 1.0, vd)
+    # A V_d so small that 1/V_d² is no number counts as 0: its derivative would be inf·0.
+    dispersion = safe_divide(nd - 1.0, torch.where(vd.abs() > 1e-100, vd, 0.0))
     partial_dispersion = (0.6438 - 0.001682 * vd + dpgf) * dispersion
     b = (power_gf * dispersion - power_fc * partial_dispersion) / determinant
     c = (first_fc * partial_dispersion - first_gf * dispersion) / determinant
