@@ -171,6 +171,24 @@ def test_a_positive_field_lands_at_positive_y():
     assert centroid[0].item() == 0
 
 
+@pytest.mark.parametrize("field", [(0.0, 0.0), (0.0, 10.0)])
+def test_centroid_follows_the_field_in_x_and_y(field):
+    """Symmetry must not hide the derivative by the field that would break it: 1.7 mm a degree, on the axis and off."""
+    lens, pixel = lens_at(), grid(scalar(0.005), 3)
+
+    def centroid(fields):
+        return gaussian.kernels(scene(lens, fields, vector(25_000.0), vector(0.530)), pixel, order=5).centroid.flatten()
+
+    start, step = vector(*field)[:, None], 1e-4
+    found = torch.autograd.functional.jacobian(centroid, start)[:, :, 0]
+    for axis in (0, 1):
+        moved = torch.zeros_like(start)
+        moved[axis] = step
+        expected = (centroid(start + moved) - centroid(start - moved)) / (2 * step)
+        assert abs(float(expected[axis])) > 1.0
+        assert (found[:, axis] - expected).abs().max() <= 1e-6  # mm a degree; the difference errs by step² and rounding
+
+
 def test_energy_is_the_transmitted_fraction_of_the_whole_pupil():
     lens = clipped(lens_at(), 6, 5.0)
     found = gaussian.kernels(scene_of(lens), grid(0.05, 41), order=8).kernel.sum().item()

@@ -29,10 +29,7 @@ def positive_finite(text: str) -> float:
 
 def count(text: str) -> int:
     """A whole number above 0."""
-    try:
-        number = int(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
+    number = _whole(text)
     if number < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not above 0")
     return number
@@ -40,10 +37,7 @@ def count(text: str) -> int:
 
 def seed_number(text: str) -> int:
     """A whole number that seeds a generator: 0 to 2⁶³ - 1."""
-    try:
-        number = int(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
+    number = _whole(text)
     if not 0 <= number < 2**63:
         raise argparse.ArgumentTypeError(f"{text!r} is not from 0 to 2**63 - 1")
     return number
@@ -54,6 +48,13 @@ def file_name(text: str) -> str:
     if not text:
         raise argparse.ArgumentTypeError("the name of the file is empty")
     return text
+
+
+def _whole(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
 
 
 def _number(text: str) -> float:

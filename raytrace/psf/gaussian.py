@@ -40,8 +40,13 @@ def kernels(scene: Scene, grid: Grid, *, order: int) -> Kernels:
 
 
 def symmetry(scene: Scene) -> str:
-    """What of the pupil represents all of it: "meridian" (one arm), "half" (x > 0), or "none"."""
+    """What of the pupil represents all of it: "meridian" (one arm), "half" (x > 0), or "none".
+
+    Fields to be differentiated have none: moving one breaks the symmetry.
+    """
     lens, fields = scene.lens, scene.fields.detach()
+    if scene.fields.requires_grad:
+        return "none"
     apertures = [aperture for surface in lens.surfaces for aperture in surface.apertures]
     vdx, vdy, vcx, vcy, angle = fields.new_zeros(5, 1) if lens.fields.vignetting is None else lens.fields.vignetting
     if bool((fields[0] != 0).any() | (vdx != 0).any() | (angle != 0).any()) or any(a.centre[0] for a in apertures):
