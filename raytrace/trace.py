@@ -146,18 +146,26 @@ def _reduced_path(start, hit, direction, gap: Tensor | None, side: int) -> Tenso
     return path + gap * lag
 
 
-def steps(surfaces: Sequence[Surface], rays: Rays, *, indices: Sequence[Tensor], side: int = 1) -> Iterator[Crossing]:
+def steps(
+    surfaces: Sequence[Surface],
+    rays: Rays,
+    *,
+    indices: Sequence[Tensor],
+    side: int = 1,
+    gap: Tensor | None = None,
+) -> Iterator[Crossing]:
     """Yield what happens at each surface in turn.
 
-    rays: in the frame of surfaces[0], before it; indices: len(surfaces) + 1 media (...), the first before
-    surfaces[0]; side: axial direction of light before it (-1 behind an odd number of mirrors).
+    rays: before surfaces[0], in its frame, or with `gap` in that of a vertex `gap` mm before it; indices:
+    len(surfaces) + 1 media (...), the first before surfaces[0]; side: axial direction of light before it (-1 behind
+    an odd number of mirrors).
     """
-    for before, crossed in _walk(surfaces, rays, indices, side):
+    for before, crossed in _walk(surfaces, rays, indices, side, gap):
         yield _crossing(before, *crossed)
 
 
-def _walk(surfaces: Sequence[Surface], rays: Rays, indices: Sequence[Tensor], side: int):
-    before, gap = _Ray.of(rays), None
+def _walk(surfaces: Sequence[Surface], rays: Rays, indices: Sequence[Tensor], side: int, gap: Tensor | None):
+    before = _Ray.of(rays)
     for surface, n1, n2 in zip(surfaces, indices[:-1], indices[1:], strict=True):
         crossed = _cross(surface, before, gap, side, n1, n2)
         yield before, crossed
@@ -165,10 +173,17 @@ def _walk(surfaces: Sequence[Surface], rays: Rays, indices: Sequence[Tensor], si
         side = -side if surface.is_mirror else side
 
 
-def trace_surfaces(surfaces: Sequence[Surface], rays: Rays, *, indices: Sequence[Tensor], side: int = 1) -> Rays:
+def trace_surfaces(
+    surfaces: Sequence[Surface],
+    rays: Rays,
+    *,
+    indices: Sequence[Tensor],
+    side: int = 1,
+    gap: Tensor | None = None,
+) -> Rays:
     """The rays behind the last of the surfaces; arguments as for `steps`."""
     after = None
-    for _, crossed in _walk(surfaces, rays, indices, side):
+    for _, crossed in _walk(surfaces, rays, indices, side, gap):
         after = crossed[0]
     return rays if after is None else after.rays()
 

@@ -17,6 +17,8 @@ FLOORS = {
     "pupil": 0,
     "zernike": 0,
     "files": 0,
+    "image": 0,
+    "pictures": 0,
     # 1: the nouns
     "grid": 1,
     "glass": 1,
@@ -37,9 +39,11 @@ FLOORS = {
     "spot": 6,
     # 7
     "focus": 7,
-    "scene": 7,
+    "reuse": 7,
     # 8
-    "wavefront": 8,
+    "scene": 8,
+    # 9
+    "wavefront": 9,
     # lens files: a family of its own between the lens and the plots
     "formats.source": 4,
     "formats.zemax_keywords": 4,
@@ -61,12 +65,12 @@ FLOORS = {
     "formats.frame": 11,
     "formats": 12,
     # a command's modules are loaded when it runs
-    "__init__": 16,
-    "__main__": 16,
+    "__init__": 17,
+    "__main__": 17,
 }
 
 #: Folders that stand on one floor as a whole; inside them imports only have to run one way (no cycle).
-FAMILIES = {"psf": 9, "analysis": 10, "plot": 13, "bench": 14, "cli": 15}
+FAMILIES = {"psf": 10, "analysis": 11, "design": 13, "plot": 14, "bench": 15, "cli": 16}
 
 #: What only these files may import.
 RESERVED = {

@@ -1,0 +1,164 @@
+"""Variables: which numbers of a lens are learned, how far one step moves them, and what keeps the lens buildable.
+
+variables = Variables(lens, "sensor thickness:5,6 curvature:1-4")
+changed = variables()          # the lens with its variables, differentiable
+"""
+
+import dataclasses
+import re
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from raytrace.lens import Lens
+from raytrace.surface import Surface, sag
+
+KINDS = ("sensor", "thickness", "curvature", "conic")
+_LEAST_GLASS = 1.0, 0.5  # mm at the centre and at the edge of a lens
+_LEAST_AIR = 0.05, 0.0
+
+
+class BadVariables(ValueError):
+    """A list of variables that the lens does not have, or that cannot be read."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Variable:
+    """One number of one surface.
+
+    unit: how much of the lens's number one unit of the parameter is. Thicknesses are in mm; curvatures and conics in
+    what moves the surface by 1 mm of sag at its semi-diameter, so that one step means the same for all of them.
+    """
+
+    kind: str
+    surface: int
+    start: float
+    unit: float
+
+    @property
+    def name(self) -> str:
+        return "sensor" if self.kind == "sensor" else f"{self.kind}_{self.surface}"
+
+
+class Variables(nn.Module):
+    """The variables of a lens as parameters: 0 at the start, in units of `Variable.unit`.
+
+    vary: "sensor", and lists like "thickness:5,6,10 curvature:1-4", of the file's surface numbers.
+    bounds: by name ("sensor", "curvature_3"), smallest and largest number of the lens; `project` keeps them.
+    """
+
+    def __init__(self, lens: Lens, vary: str = "sensor", *, bounds: Mapping[str, tuple[float, float]] | None = None):
+        super().__init__()
+        self.lens = lens
+        self.variables = parse(lens, vary)
+        self.bounds = dict(bounds or {})
+        unknown = set(self.bounds) - {variable.name for variable in self.variables}
+        if unknown:
+            raise BadVariables(f"bounds for {', '.join(sorted(unknown))}, not among the variables: {vary}")
+        for variable in self.variables:
+            start = torch.zeros((), dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
+            self.register_parameter(variable.name, nn.Parameter(start))
+
+    def forward(self) -> Lens:
+        """The lens with its variables where they are now."""
+        surfaces = list(self.lens.surfaces)
+        for variable in self.variables:
+            kind = "thickness" if variable.kind == "sensor" else variable.kind
+            surface = surfaces[variable.surface]
+            surfaces[variable.surface] = dataclasses.replace(surface, **{kind: self.number(variable)})
+        return dataclasses.replace(self.lens, surfaces=tuple(surfaces))
+
+    def number(self, variable: Variable) -> Tensor:
+        """The lens's number, 1/mm or mm."""
+        return variable.start + variable.unit * getattr(self, variable.name)
+
+    def numbers(self) -> dict[str, float]:
+        """Every variable as the lens has it, by name."""
+        return {variable.name: float(self.number(variable).detach()) for variable in self.variables}
+
+    @torch.no_grad()
+    def project(self) -> None:
+        """Bring variables back within their bounds, after a step of an optimiser."""
+        for variable in self.variables:
+            if variable.name in self.bounds:
+                low, high = ((end - variable.start) / variable.unit for end in self.bounds[variable.name])
+                getattr(self, variable.name).clamp_(min(low, high), max(low, high))
+
+    def violation(self) -> Tensor:
+        """How far the lens is from one that can be built: the sum of what thicknesses lack, mm².
+
+        At the centre and at the edge, of glass and of air; 0 for a lens that keeps `_LEAST_GLASS`, `_LEAST_AIR`.
+        """
+        return violation(self())
+
+
+def parse(lens: Lens, vary: str) -> tuple[Variable, ...]:
+    """The variables of a list like "sensor thickness:5,6 curvature:1-4". Raises BadVariables saying what is wrong."""
+    found: dict[str, Variable] = {}
+    for word in vary.split():
+        kind, _, numbers = word.partition(":")
+        if kind not in KINDS or bool(numbers) == (kind == "sensor"):
+            raise BadVariables(
+                f"{word!r}: expected sensor, or one of {', '.join(KINDS[1:])} with surfaces: thickness:5,6"
+            )
+        last = len(lens.surfaces) - 2
+        for number in [last] if kind == "sensor" else _numbers(word, numbers):
+            variable = _variable(lens, kind, number, word)
+            found[f"{'thickness' if kind == 'sensor' else kind}_{number}"] = variable
+    if not found:
+        raise BadVariables("no variables: give sensor, or thickness:…, curvature:…, conic:… with surface numbers")
+    return tuple(found.values())
+
+
+def _numbers(word: str, numbers: str) -> list[int]:
+    found: list[int] = []
+    for part in numbers.split(","):
+        match = re.fullmatch(r"(\d+)(?:-(\d+))?", part)
+        if not match:
+            raise BadVariables(f"{word!r}: {part!r} is no surface number; expected numbers and ranges like 1,3-5")
+        first, last = int(match[1]), int(match[2] or match[1])
+        found += range(first, last + 1)
+    return found
+
+
+def _variable(lens: Lens, kind: str, number: int, word: str) -> Variable:
+    if not 1 <= number <= len(lens.surfaces) - 2:
+        raise BadVariables(f"{word!r}: surface {number}; this lens has surfaces 1 to {len(lens.surfaces) - 2} to vary")
+    surface = lens.surfaces[number]
+    if kind in ("sensor", "thickness"):
+        return Variable(kind, number, float(surface.thickness), 1.0)
+    edge = surface.semi_diameter
+    if not edge:
+        raise BadVariables(f"{word!r}: surface {number} has no semi-diameter, by which its {kind} is scaled; give one")
+    curvature = 0.0 if surface.curvature is None else float(surface.curvature)
+    if kind == "curvature":
+        return Variable(kind, number, curvature, 2 / edge**2)  # z ≈ c r²/2
+    if curvature == 0:
+        raise BadVariables(f"{word!r}: surface {number} is flat, and a conic constant changes nothing there")
+    start = 0.0 if surface.conic is None else float(surface.conic)
+    return Variable(kind, number, start, 8 / (abs(curvature) ** 3 * edge**4))  # z ≈ … + (1 + k) c³ r⁴/8
+
+
+def violation(lens: Lens) -> Tensor:
+    """Σ (what a thickness lacks)² in mm², over the centres and edges of all elements and air spaces; 0 is buildable."""
+    total, side = torch.zeros_like(lens.surfaces[-2].thickness), 1
+    for before, after in zip(lens.surfaces[1:-1], lens.surfaces[2:], strict=True):
+        side = -side if before.is_mirror else side
+        centre, edge = _LEAST_AIR if _is_air(before) else _LEAST_GLASS
+        lacks = [centre - side * before.thickness]
+        if before.semi_diameter and after.semi_diameter:
+            lacks.append(edge - side * edge_thickness(before, after))
+        for lack in lacks:
+            total = total + lack.clamp_min(0).square()
+    return total
+
+
+def edge_thickness(before: Surface, after: Surface) -> Tensor:
+    """Thickness in mm between two surfaces at the smaller of their semi-diameters."""
+    height = before.thickness.new_tensor(min(before.semi_diameter, after.semi_diameter)) ** 2
+    return before.thickness + sag(after, height) - sag(before, height)
+
+
+def _is_air(surface: Surface) -> bool:
+    return surface.is_mirror or surface.glass.name in ("", "AIR")

@@ -1,0 +1,132 @@
+"""Pictures to train on: folders of real ones, and dead leaves where there are none.
+
+Every draw is keyed by whole numbers (seed, epoch, sample), never by the order of calls: a sample is the same on one
+process or on many, in a first run or in a resumed one.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
+_SPLIT, _ORDER, _CROP, _LEAVES = range(4)  # what a draw is for: the last number of its key
+
+
+class NoPictures(ValueError):
+    """A folder without pictures, or with pictures that are all too small."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Pictures:
+    """Grey pictures, each (H, W) of 8 bits, and the name of each."""
+
+    samples: tuple[np.ndarray, ...]
+    names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+
+def draws(*key: int) -> np.random.Generator:
+    """Random numbers of a key of whole numbers ≥ 0, independent of those of every other key."""
+    return np.random.Generator(np.random.Philox(np.random.SeedSequence(key)))
+
+
+def files(folder: str | Path) -> list[Path]:
+    """All pictures under a folder, sorted by path. Raises NoPictures for one without any."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise NoPictures(f"{folder}: no such folder; expected one with pictures in it, in any subfolders")
+    found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
+    if not found:
+        raise NoPictures(f"{folder}: no pictures found; expected {', '.join(SUFFIXES)} files in it or below")
+    return found
+
+
+def read(paths: Sequence[str | Path], *, least: int, progress: Callable[[Iterable], Iterable] = iter) -> Pictures:
+    """Pictures of at least `least` × `least` pixels; smaller ones are left out.
+
+    progress: wraps the paths, for a bar. Raises ValueError naming a file that is none, NoPictures if none is left.
+    """
+    samples = [(read_grey(path), str(path)) for path in progress(paths)]
+    kept = [(sample, name) for sample, name in samples if min(sample.shape) >= least]
+    if not kept:
+        raise NoPictures(f"none of {len(samples)} pictures has {least} × {least} pixels, a patch and its margin")
+    return Pictures(*zip(*kept, strict=True))
+
+
+def read_grey(path: str | Path) -> np.ndarray:
+    """A picture as (H, W) luma of 8 bits (ITU-R BT.601). Raises ValueError naming a file that is none."""
+    try:
+        with Image.open(path) as picture:
+            return np.asarray(picture.convert("L"))
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read as a picture ({error}); remove it or convert it") from error
+
+
+def split(pictures: Pictures, *, share: float = 0.8, seed: int = 0) -> tuple[Pictures, Pictures]:
+    """Pictures to train on and pictures to test on. Whole ones: crops of one texture never stand on both sides."""
+    if len(pictures) < 2:
+        raise NoPictures(f"{len(pictures)} picture cannot be split into training and test ones: give two at least")
+    order = draws(seed, _SPLIT).permutation(len(pictures))
+    count = min(max(1, round(share * len(order))), len(order) - 1)
+    return tuple(
+        Pictures(tuple(pictures.samples[i] for i in part), tuple(pictures.names[i] for i in part))
+        for part in (np.sort(order[:count]), np.sort(order[count:]))
+    )
+
+
+def dead_leaves(count: int, *, size: int = 256, seed: int = 0) -> Pictures:
+    """Opaque discs of radii ∝ r⁻³ over one another until nothing shows through: natural statistics without a file.
+
+    Lee, Mumford and Huang, Int. J. Comput. Vis. 41, 2001: occlusion alone gives the spectra of natural pictures.
+    """
+    return Pictures(
+        tuple(_leaves(size, draws(seed, number, _LEAVES)) for number in range(count)),
+        tuple(f"dead leaves {number}" for number in range(count)),
+    )
+
+
+def _leaves(size: int, random: np.random.Generator) -> np.ndarray:
+    picture, bare = np.zeros((size, size), np.uint8), np.ones((size, size), bool)
+    while bare.any():
+        for radius, x, y, shade in _leaf_batch(size, random):
+            rows = slice(max(0, int(y - radius)), min(size, int(y + radius) + 2))
+            columns = slice(max(0, int(x - radius)), min(size, int(x + radius) + 2))
+            open_here = bare[rows, columns]
+            if open_here.any():
+                j, i = np.ogrid[rows, columns]
+                covered = ((i - x) ** 2 + (j - y) ** 2 <= radius * radius) & open_here
+                picture[rows, columns][covered] = shade
+                open_here &= ~covered
+    return picture
+
+
+def _leaf_batch(size: int, random: np.random.Generator) -> Iterable[tuple]:
+    """Radius, place and shade of the next leaves, the topmost first; of density ∝ r⁻³, so that 1/r² is even."""
+    count, smallest, largest = 4096, 1.0, size / 2
+    radius = 1 / np.sqrt(random.uniform(largest**-2, smallest**-2, count))
+    x, y = random.uniform(-1, 1, (2, count)) * (size / 2 + radius) + size / 2
+    return zip(radius.tolist(), x.tolist(), y.tolist(), random.integers(0, 256, count).tolist(), strict=True)
+
+
+def crop(pictures: Pictures, sample: int, *, epoch: int, size: int, crops: int = 4, seed: int = 0) -> np.ndarray:
+    """Patch (size, size) in [0, 1] of a sample of an epoch of `crops` patches a picture, turned and mirrored by chance.
+
+    sample: 0 … crops · len(pictures) - 1; the pictures come in an order of the epoch's own.
+    """
+    number = int(order(len(pictures) * crops, epoch=epoch, seed=seed)[sample]) // crops
+    picture, random = pictures.samples[number], draws(seed, epoch, sample, _CROP)
+    row, column = (int(random.integers(0, extent - size + 1)) for extent in picture.shape)
+    patch = np.rot90(picture[row : row + size, column : column + size], int(random.integers(4)))
+    return (patch.T if random.integers(2) else patch).astype(np.float32) / 255
+
+
+@functools.lru_cache(maxsize=4)
+def order(count: int, *, epoch: int, seed: int = 0) -> np.ndarray:
+    """The order of `count` samples in an epoch."""
+    return draws(seed, epoch, count, _ORDER).permutation(count)

@@ -1,0 +1,125 @@
+"""Round kernels: what is symmetric about the centre of the window is computed along one radius only.
+
+    E_ij = ∬_ij I(r) dx dy = Σ_k M_ijk I(r_k)      waves: I is band-limited, so that a few radii hold all of it
+    E_ij = ∫ g_ij(r) dE(r)                         rays: g_ij the share of a ring of radius r that lies in the pixel
+
+M and g are constants of the window in units of a pixel. Pixels alike by symmetry are computed once: 66 of 21 × 21.
+"""
+
+import functools
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.grid import Grid
+
+_STEPS = 64  # of the table of g in a pixel
+
+
+def is_centred(grid: Grid) -> bool:
+    """Whether every window is centred on the axis, and stays there under differentiation."""
+    return not grid.centre.requires_grad and bool((grid.centre == 0).all())
+
+
+def reach(grid: Grid) -> float:
+    """Distance in pixels from the centre of a window to its corner."""
+    return 0.5 * math.hypot(grid.rows, grid.columns)
+
+
+def radii_of_waves(grid: Grid, cutoff: float, order: int) -> tuple[Tensor, Tensor]:
+    """Radii (K,) mm at which to know an intensity of frequencies up to `cutoff` in 1/mm, and the matrix (U, K) mm² to
+    the energy of the pixels that differ, for `unfold`.
+
+    Even Chebyshev terms up to degree 2K - 2 hold exp(iat) up to J_2K(a), a = 2π · cutoff · reach.
+    """
+    pitch = float(grid.pitch.detach())
+    argument = 2 * math.pi * cutoff * pitch * reach(grid)
+    count = math.ceil(0.5 * argument + (2 + order) * (4 + argument ** (1 / 3)))
+    nodes = math.ceil(0.5 * math.pi * cutoff * pitch) + 4 + order
+    radii, matrix = (grid.pitch.new_tensor(a) for a in _wave_rule(grid.rows, grid.columns, nodes, count))
+    return radii * grid.pitch, matrix * grid.pitch**2
+
+
+def energy_of_rings(grid: Grid, heights: Tensor, energy: Tensor) -> Tensor:
+    """Pixel energies (..., U) of a line of rays, each cell between two of them turned about the axis; for `unfold`.
+
+        E_u = Σ_c e_c (G_u(h_c+1) - G_u(h_c))/(h_c+1 - h_c),   G_u(h) = ∫_0^h g_u(|r|) dr
+
+    heights: (..., N) mm, of either sign; energy: (..., N - 1) of the cells, spread evenly over their heights.
+    """
+    table = grid.pitch.new_tensor(_ring_table(grid.rows, grid.columns))
+    last = len(table) - 1
+    h = heights / grid.pitch
+    width = h.diff()
+    # A caustic has cells without width: the share of a ring is taken there, over a thousandth of a pixel.
+    narrow = width.abs() < 1e-3
+    middle = 0.5 * (h[..., 1:] + h[..., :-1])
+    lower = torch.where(narrow, middle - 5e-4, h[..., :-1])
+    upper = torch.where(narrow, middle + 5e-4, h[..., 1:])
+    density = energy / (upper - lower)
+    weights = density.new_zeros(*density.shape[:-1], last + 1)
+    for end, share in ((lower, -density), (upper, density)):
+        share = torch.where(end < 0, -share, share)
+        place = (end.abs() * _STEPS).clamp(max=float(last))
+        below = place.detach().floor().clamp(max=last - 1)
+        above = place - below
+        index = below.long()
+        weights = weights.scatter_add(-1, index, share * (1 - above)).scatter_add(-1, index + 1, share * above)
+    return weights @ table
+
+
+def unfold(grid: Grid, values: Tensor) -> Tensor:
+    """Pixels (..., rows, columns) from those that differ (..., U)."""
+    index = torch.as_tensor(_distinct(grid.rows, grid.columns)[1], device=values.device)
+    return values[..., index]
+
+
+@functools.lru_cache(maxsize=16)
+def _distinct(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (U, 2) in pixels of the pixels that differ, 0 <= a <= b, and which of them each pixel (rows, columns) is."""
+    y, x = np.abs(np.arange(rows) - 0.5 * (rows - 1)), np.abs(np.arange(columns) - 0.5 * (columns - 1))
+    pair = np.sort(np.stack(np.broadcast_arrays(y[:, None], x[None, :]), -1), -1)
+    places, index = np.unique(pair.reshape(-1, 2), axis=0, return_inverse=True)
+    return places, index.reshape(rows, columns)
+
+
+@functools.lru_cache(maxsize=16)
+def _wave_rule(rows: int, columns: int, nodes: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Chebyshev radii (K,) in pixels and the matrix (U, K): Gauss-Legendre nodes in every pixel, read off the series."""
+    corner = 0.5 * math.hypot(rows, columns)
+    angle = (2 * np.arange(count) + 1) * (np.pi / (4 * count))
+    terms = 2 * np.arange(count)
+    # c_m = (2 - δ_m0)/K Σ_k f(r_k) T_2m(r_k/R)
+    series = np.where(terms == 0, 1, 2)[:, None] / count * np.cos(terms[:, None] * angle)
+    node, weight = (a / 2 for a in np.polynomial.legendre.leggauss(nodes))
+    places = _distinct(rows, columns)[0]
+    x, y = (places[:, axis, None] + node for axis in (0, 1))
+    turn = np.arccos(np.minimum(np.hypot(x[:, :, None], y[:, None, :]) / corner, 1.0))
+    pixels = np.stack([np.einsum("uab,a,b->u", np.cos(m * turn), weight, weight) for m in terms], -1)
+    return corner * np.cos(angle), pixels @ series
+
+
+@functools.lru_cache(maxsize=16)
+def _ring_table(rows: int, columns: int) -> np.ndarray:
+    """G (K, U): ∫_0^r of the share of rings in each pixel, at r in steps of 1/_STEPS pixel to beyond the corner."""
+    corner = 0.5 * math.hypot(rows, columns)
+    fine = 16  # midpoints in a step
+    count = math.ceil(corner * _STEPS) + 1
+    r = (np.arange(count * fine) + 0.5) / (_STEPS * fine)
+    places = _distinct(rows, columns)[0]
+    # Share of a ring in the quadrant rectangle [0, a] × [0, b]: from acos(a/r) to asin(b/r).
+    edges = np.unique(np.concatenate([places - 0.5, places + 0.5]))
+    arc = {edge: np.sign(edge) * np.arcsin(np.minimum(1.0, abs(edge) / r)) for edge in edges}
+
+    def corner_share(a: float, b: float) -> np.ndarray:
+        share = np.maximum(0.0, np.abs(arc[a]) + np.abs(arc[b]) - 0.5 * np.pi) / (2 * np.pi)
+        return np.sign(a) * np.sign(b) * share
+
+    shares = []
+    for a, b in places:
+        (a0, a1), (b0, b1) = (a - 0.5, a + 0.5), (b - 0.5, b + 0.5)
+        shares.append(corner_share(a1, b1) - corner_share(a0, b1) - corner_share(a1, b0) + corner_share(a0, b0))
+    steps = np.stack(shares, -1).reshape(count, fine, -1).mean(1) / _STEPS
+    return np.concatenate([np.zeros((1, len(places))), np.cumsum(steps, 0)])

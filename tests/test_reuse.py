@@ -1,0 +1,158 @@
+"""A memo changes no result: it only traces less."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+
+from raytrace.formats import read_lens
+from raytrace.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
+from raytrace.pupil import gauss_rings
+from raytrace.reuse import Memo, cross_bundle, trace_bundle
+
+LENSES = Path(__file__).parents[1] / "lenses"
+PUPIL = gauss_rings(3, 8)[0]
+
+
+def number(x) -> torch.Tensor:
+    return torch.tensor(x, dtype=torch.float64)
+
+
+def bundle(lens: Lens, angle: float = 7.0):
+    return lens, number([[0.0], [angle]]), lens.wavelengths[:1], PUPIL
+
+
+def double_gauss() -> Lens:
+    return with_object_distance(read_lens(LENSES / "double_gauss.zmx"), 1e4)
+
+
+def with_curvature(lens: Lens, k: int, curvature: torch.Tensor) -> Lens:
+    surfaces = list(lens.surfaces)
+    surfaces[k] = dataclasses.replace(surfaces[k], curvature=curvature)
+    return dataclasses.replace(lens, surfaces=tuple(surfaces))
+
+
+def spread(rays) -> torch.Tensor:
+    return rays.position[:2].square().sum() + 1e-3 * rays.opl.sum()
+
+
+def crossed_by(memo: Memo, call) -> int:
+    before = memo.crossed
+    call()
+    return memo.crossed - before
+
+
+def test_a_sensor_that_moves_retraces_nothing():
+    """One plane is crossed, the sensor; of eleven surfaces none."""
+    lens, memo = double_gauss(), Memo()
+    sensor = number(57.9).requires_grad_()
+    for step in range(3):
+        moved = with_sensor_distance(lens, sensor + 0.01 * step)
+        found = trace_bundle(bundle(moved), memo)
+        torch.testing.assert_close(found.position, trace_bundle(bundle(moved)).position, atol=0, rtol=0)
+        torch.testing.assert_close(found.opl, trace_bundle(bundle(moved)).opl, atol=0, rtol=0)
+    assert crossed_by(memo, lambda: trace_bundle(bundle(with_sensor_distance(lens, sensor)), memo)) == 1
+
+
+@pytest.mark.parametrize("k", [2, 7, 11])
+def test_surfaces_before_a_variable_one_are_not_retraced(k):
+    lens, memo = double_gauss(), Memo()
+    curvature = lens.surfaces[k].curvature.clone().requires_grad_()
+    changed = with_curvature(lens, k, curvature)
+    trace_bundle(bundle(changed), memo)
+    behind = len(lens.surfaces) - k
+    # The stop is surface 6: what lies before it also moves the entrance pupil, and so where all rays start.
+    expected = behind if k > lens.stop else len(lens.surfaces) - 1
+    assert crossed_by(memo, lambda: trace_bundle(bundle(changed), memo)) == expected
+
+
+@pytest.mark.parametrize("k", [0, 2, 5, 7, 10, 11])
+def test_values_and_derivatives_are_those_of_a_full_trace(k):
+    lens, memo = double_gauss(), Memo()
+    thickness = (lens.surfaces[k].thickness + 0.01).requires_grad_()
+    surfaces = list(lens.surfaces)
+
+    def value(scale: float, memo: Memo | None) -> torch.Tensor:
+        surfaces[k] = dataclasses.replace(surfaces[k], thickness=scale * thickness)
+        return spread(trace_bundle(bundle(dataclasses.replace(lens, surfaces=tuple(surfaces))), memo))
+
+    for scale in (1.0, 1.001):
+        with_memo, plain = value(scale, memo), value(scale, None)
+        assert float(with_memo.detach()) == float(plain.detach())
+        gradients = [torch.autograd.grad(found, thickness)[0] for found in (with_memo, plain)]
+        assert float(gradients[0]) == pytest.approx(float(gradients[1]), rel=1e-13)
+        assert float(gradients[1]) != 0
+
+
+@pytest.mark.parametrize("angle", [0.0, 3.0])
+def test_what_has_changed_is_traced_anew(angle):
+    """A curvature without gradient, changed in place, and back again; a mirror as well."""
+    lens, memo = double_gauss(), Memo()
+    for factor in (1.0, 1.01, 1.0):
+        changed = with_curvature(lens, 3, lens.surfaces[3].curvature * factor)
+        expected = trace_bundle(bundle(changed, angle)).position
+        torch.testing.assert_close(trace_bundle(bundle(changed, angle), memo).position, expected, atol=0, rtol=0)
+    curvature = lens.surfaces[3].curvature.clone()
+    changed = with_curvature(lens, 3, curvature)
+    trace_bundle(bundle(changed, angle), memo)
+    curvature *= 1.02
+    expected = trace_bundle(bundle(changed, angle)).position
+    torch.testing.assert_close(trace_bundle(bundle(changed, angle), memo).position, expected, atol=0, rtol=0)
+
+
+def test_a_number_that_becomes_a_variable_has_its_derivative():
+    lens, memo = double_gauss(), Memo()
+    trace_bundle(bundle(lens), memo)
+    curvature = lens.surfaces[9].curvature.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(spread(trace_bundle(bundle(with_curvature(lens, 9, curvature)), memo)), curvature)
+    (expected,) = torch.autograd.grad(spread(trace_bundle(bundle(with_curvature(lens, 9, curvature)))), curvature)
+    assert float(gradient) == pytest.approx(float(expected), rel=1e-13)
+
+
+def test_crossings_behind_mirrors_are_those_of_a_full_trace():
+    lens, memo = read_lens(LENSES / "hubble.zmx"), Memo()
+    sensor = lens.surfaces[-2].thickness.clone().requires_grad_()
+    lens = with_sensor_distance(lens, sensor)
+    for _ in range(2):
+        found, plain = (
+            cross_bundle((lens, number([[0.0], [0.02]]), lens.wavelengths[:1], PUPIL), m) for m in (memo, None)
+        )
+        assert len(found) == len(plain) == len(lens.surfaces) - 1
+        for one, other in zip(found, plain, strict=True):
+            torch.testing.assert_close(one.rays.position, other.rays.position, atol=0, rtol=0)
+            torch.testing.assert_close(one.rays.opl, other.rays.opl, atol=0, rtol=0)
+            assert torch.equal(one.rays.valid, other.rays.valid)
+            assert torch.equal(one.clipped, other.clipped)
+
+
+def test_a_beam_that_follows_the_focal_length_is_launched_anew():
+    """At a fixed F-number a curvature behind the stop widens the beam in front of it."""
+    lens = dataclasses.replace(double_gauss(), aperture=SystemAperture("image_f_number", number(4.0)))
+    memo, curvature = Memo(), lens.surfaces[10].curvature.clone().requires_grad_()
+    for _ in range(2):
+        gradients = [
+            torch.autograd.grad(spread(trace_bundle(bundle(with_curvature(lens, 10, curvature)), m)), curvature)[0]
+            for m in (memo, None)
+        ]
+        assert float(gradients[0]) == pytest.approx(float(gradients[1]), rel=1e-13)
+
+
+def test_transforms_pass_the_memo_by():
+    lens, memo = double_gauss(), Memo()
+    trace_bundle(bundle(lens), memo)
+
+    def of(curvature, memo):
+        return spread(trace_bundle(bundle(with_curvature(lens, 9, curvature)), memo))
+
+    for transform in (torch.func.grad, torch.func.jacfwd):
+        one, other = (transform(of)(lens.surfaces[9].curvature, m) for m in (memo, None))
+        assert float(one) == float(other) != 0
+
+
+def test_the_oldest_bundle_is_forgotten_first():
+    lens, memo = double_gauss(), Memo(most=2)
+    for angle in (1.0, 2.0, 3.0):
+        trace_bundle(bundle(lens, angle), memo)
+    assert crossed_by(memo, lambda: trace_bundle(bundle(lens, 3.0), memo)) == 0
+    assert crossed_by(memo, lambda: trace_bundle(bundle(lens, 1.0), memo)) > 0
