@@ -1,0 +1,196 @@
+"""Training: steps of an optimiser that may be killed at any moment and go on as if nothing had happened.
+
+A run lives in a folder: `settings.json` (what it was asked for), `log.csv` (one row a step) and `checkpoint.pt` (the
+last state, replaced as a whole). Nothing that a step draws depends on what was drawn before, so a resumed run repeats
+the steps since its checkpoint bit by bit.
+
+Several processes (torchrun) share every batch: each takes its samples, and gradients are summed over all of them. Only
+the first process writes.
+"""
+
+import csv
+import dataclasses
+import io
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor, distributed, nn
+
+from raytrace.files import write_atomically
+
+#: What a step reports: numbers by name, a column of the log each.
+Record = dict[str, float]
+
+
+class NotFinite(ArithmeticError):
+    """A loss or a gradient that is no number; the run stops, its last checkpoint stands."""
+
+
+class OtherSettings(ValueError):
+    """A run that is resumed with other settings than it was begun with."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Share:
+    """What one process takes of every batch: samples `rank`, `rank + processes`, … ."""
+
+    rank: int = 0
+    processes: int = 1
+
+    def of(self, samples: range) -> list[int]:
+        return list(samples[self.rank :: self.processes])
+
+
+def share() -> Share:
+    """The share of this process: all, unless torch.distributed is running."""
+    if distributed.is_available() and distributed.is_initialized():
+        return Share(distributed.get_rank(), distributed.get_world_size())
+    return Share()
+
+
+class Run:
+    """A folder of a training run.
+
+    settings: whatever decides the result, as JSON; a folder begun with others is refused with OtherSettings.
+    """
+
+    def __init__(self, folder: str | Path, settings: Mapping):
+        self.folder = Path(folder)
+        self.settings = json.loads(json.dumps(settings))
+        self.folder.mkdir(parents=True, exist_ok=True)
+        written = self.folder / "settings.json"
+        if written.exists():
+            self._compare(json.loads(written.read_text()))
+        elif share().rank == 0:
+            write_atomically(written, lambda file: file.write(json.dumps(self.settings, indent=1).encode()))
+
+    def _compare(self, before: dict) -> None:
+        differ = [
+            f"{key} was {before.get(key)!r}, now {self.settings.get(key)!r}"
+            for key in sorted({*before, *self.settings})
+            if before.get(key) != self.settings.get(key)
+        ]
+        if differ:
+            raise OtherSettings(f"{self.folder} holds another run: {'; '.join(differ)}; choose another folder")
+
+    @property
+    def checkpoint(self) -> Path:
+        return self.folder / "checkpoint.pt"
+
+    @property
+    def log(self) -> Path:
+        return self.folder / "log.csv"
+
+    def save(self, state: dict) -> None:
+        write_atomically(self.checkpoint, lambda file: torch.save(state, file))
+
+    def load(self) -> dict | None:
+        """The last checkpoint, or None; its tensors as they were, on the processor."""
+        if not self.checkpoint.exists():
+            return None
+        return torch.load(self.checkpoint, map_location="cpu", weights_only=True)
+
+    def rows(self) -> list[dict[str, float]]:
+        """The log as numbers, a dict for every step."""
+        if not self.log.exists():
+            return []
+        with self.log.open(newline="") as file:
+            return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+
+    def forget_after(self, step: int) -> None:
+        """Drop rows of the log from `step` on: those that a killed run wrote after its last checkpoint."""
+        if not self.log.exists():
+            return
+        with self.log.open(newline="") as file:
+            header, *rows = list(csv.reader(file)) or [[]]
+        kept = [row for row in rows if len(row) == len(header) and int(row[0]) < step]
+        write_atomically(self.log, lambda file: file.write(_csv([header, *kept]).encode()))
+
+    def append(self, rows: list[tuple[int, Record]]) -> None:
+        if not rows:
+            return
+        new = not self.log.exists()
+        header = [["step", *rows[0][1]]] if new else []
+        lines = [[step, *(repr(value) for value in record.values())] for step, record in rows]
+        with self.log.open("a", newline="") as file:
+            file.write(_csv(header + lines))
+
+
+def _csv(rows: list[list]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
+
+
+def train(
+    module: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    loss: Callable[[int, Share], tuple[Tensor, Record]],
+    *,
+    steps: int,
+    run: Run,
+    every: int = 100,
+    after_step: Callable[[], None] = lambda: None,
+) -> Iterator[tuple[int, Record]]:
+    """Take the steps that are left, one for each item taken from this iterator: (step, what it reports).
+
+    loss: (step, share of this process) -> its part of the loss of the batch, to be summed over processes, and numbers
+    for the log (of the first process); every: steps between checkpoints; after_step: a projection, say.
+    Raises NotFinite at a loss or a gradient that is no number, before it is stepped into.
+    """
+    step, mine = _resume(module, optimizer, run), share()
+    rows: list[tuple[int, Record]] = []
+    parameters = [p for p in module.parameters() if p.requires_grad]
+    while step < steps:
+        optimizer.zero_grad(set_to_none=True)
+        value, record = loss(step, mine)
+        if value.requires_grad:
+            value.backward()
+        total = _sum_over_processes(parameters, value.detach())
+        if not math.isfinite(total):
+            kept = (
+                f"the last checkpoint is {run.checkpoint}" if run.checkpoint.exists() else "no checkpoint was made yet"
+            )
+            raise NotFinite(f"step {step}: the loss is {total}, or its gradient is none; {kept}")
+        optimizer.step()
+        after_step()
+        record = {"loss": total, **record}
+        rows.append((step, record))
+        step += 1
+        if mine.rank == 0 and (step % every == 0 or step == steps):
+            # The log first: rows beyond a checkpoint are dropped on resuming, missing ones could not be made up.
+            run.append(rows)
+            run.save({"step": step, "module": module.state_dict(), "optimizer": optimizer.state_dict()})
+            rows = []
+        yield step - 1, record
+
+
+def _resume(module: nn.Module, optimizer: torch.optim.Optimizer, run: Run) -> int:
+    """Bring module and optimiser to the last checkpoint; returns the step to go on with."""
+    state = run.load()
+    step = 0 if state is None else state["step"]
+    if state is not None:
+        module.load_state_dict(state["module"])
+        optimizer.load_state_dict(state["optimizer"])
+    if share().rank == 0:
+        run.forget_after(step)
+    return step
+
+
+def _sum_over_processes(parameters: list[nn.Parameter], value: Tensor) -> float:
+    """Sum gradients and the loss over processes; NaN if any gradient is not finite."""
+    gradients = [p.grad for p in parameters if p.grad is not None]
+    if share().processes > 1:
+        for parameter in parameters:
+            # The order of these sums is the same in all processes, so all take the same step.
+            if parameter.grad is None:
+                parameter.grad = torch.zeros_like(parameter)
+            distributed.all_reduce(parameter.grad)
+        value = value.clone()
+        distributed.all_reduce(value)
+        gradients = [p.grad for p in parameters]
+    finite = all(bool(torch.isfinite(g).all()) for g in gradients)
+    return float(value) if finite else math.nan

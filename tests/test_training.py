@@ -1,0 +1,126 @@
+"""Training runs: killed, resumed, shared between processes, stopped when a number is none."""
+
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+import torch
+
+import raytrace
+from raytrace.design.training import NotFinite, OtherSettings, Run, Share, train
+
+#: Where processes started by a test find it and the package.
+PATHS = [os.path.dirname(__file__), str(Path(raytrace.__file__).parents[1])]
+
+
+def fit(folder, steps, *, every=5, stop_at=None, poison=None):
+    """Adam on a small regression whose samples are keyed by their number; returns the weights."""
+    module = torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.Tanh(), torch.nn.Linear(4, 1)).double()
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for p in module.parameters():
+            p.copy_(torch.randn(p.shape, generator=generator, dtype=torch.float64))
+    optimizer = torch.optim.Adam(module.parameters(), 1e-2)
+
+    def loss(step, share):
+        total = torch.zeros((), dtype=torch.float64)
+        for sample in share.of(range(8 * step, 8 * step + 8)):
+            x = torch.randn(3, generator=torch.Generator().manual_seed(sample), dtype=torch.float64)
+            total = total + (module(x) - x.sum()).square().sum() / 8
+        return total * (float("nan") if step == poison else 1.0), {"weight": float(module[0].bias[0].detach())}
+
+    run = Run(folder, {"rate": 1e-2})
+    for step, _ in train(module, optimizer, loss, steps=steps, run=run, every=every):
+        if stop_at is not None and step == stop_at:
+            return None
+    return [p.detach().clone() for p in module.parameters()]
+
+
+def test_a_run_that_was_stopped_goes_on_bit_by_bit(tmp_path):
+    whole = fit(tmp_path / "whole", 23)
+    for stop_at in (13, 4, 17):
+        fit(tmp_path / "parts", 23, stop_at=stop_at)
+    parts = fit(tmp_path / "parts", 23)
+    assert all(torch.equal(a, b) for a, b in zip(whole, parts, strict=True))
+    assert (tmp_path / "whole/log.csv").read_bytes() == (tmp_path / "parts/log.csv").read_bytes()
+    rows = Run(tmp_path / "parts", {"rate": 1e-2}).rows()
+    assert [row["step"] for row in rows] == list(range(23))
+    assert rows[-1]["loss"] < rows[0]["loss"]
+    assert set(rows[0]) == {"step", "loss", "weight"}
+
+
+def test_a_killed_process_leaves_a_run_that_goes_on(tmp_path):
+    """kill -9 in the middle, twice; the end is that of a run that was never killed."""
+    script = textwrap.dedent(f"""
+        import sys, time
+        sys.path[:0] = {PATHS!r}
+        import raytrace.design.training as training
+        from test_training import fit
+        append = training.Run.append
+        def slowly(self, rows):
+            append(self, rows)
+            print("row", flush=True)
+            time.sleep(0.05)
+        training.Run.append = slowly
+        fit({str(tmp_path / "killed")!r}, 40, every=2)
+    """)
+    for _ in range(2):
+        process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+        for _ in range(4):
+            process.stdout.readline()
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        process.stdout.close()
+    checkpoint = Run(tmp_path / "killed", {"rate": 1e-2}).load()
+    assert 0 < checkpoint["step"] < 40
+    killed, whole = fit(tmp_path / "killed", 40, every=2), fit(tmp_path / "whole", 40, every=2)
+    assert all(torch.equal(a, b) for a, b in zip(whole, killed, strict=True))
+    assert (tmp_path / "whole/log.csv").read_bytes() == (tmp_path / "killed/log.csv").read_bytes()
+
+
+def test_other_settings_are_refused(tmp_path):
+    fit(tmp_path, 3)
+    with pytest.raises(OtherSettings, match=r"rate was 0\.01, now 0\.1; choose another folder"):
+        Run(tmp_path, {"rate": 0.1})
+
+
+def test_a_loss_that_is_no_number_stops_the_run_before_the_step(tmp_path):
+    with pytest.raises(NotFinite, match=r"step 7: the loss is nan.*the last checkpoint is .*checkpoint\.pt"):
+        fit(tmp_path, 20, poison=7)
+    state = Run(tmp_path, {"rate": 1e-2}).load()
+    assert state["step"] == 5
+    assert all(bool(torch.isfinite(p).all()) for p in state["module"].values())
+    with pytest.raises(NotFinite, match="no checkpoint was made yet"):
+        fit(tmp_path / "early", 20, poison=2)
+
+
+def test_shares_of_a_batch_are_all_of_it():
+    shares = [Share(rank, 3).of(range(32, 64)) for rank in range(3)]
+    assert sorted(itertools.chain(*shares)) == list(range(32, 64))
+    assert max(map(len, shares)) - min(map(len, shares)) <= 1
+
+
+def test_two_processes_take_the_steps_of_one(tmp_path):
+    """Weights after ten steps of Adam, to 1e-12: only the order of sums differs."""
+    script = textwrap.dedent(f"""
+        import sys
+        sys.path[:0] = {PATHS!r}
+        import torch
+        torch.distributed.init_process_group("gloo")
+        from test_training import fit
+        weights = fit({str(tmp_path / "two")!r}, 10)
+        if torch.distributed.get_rank() == 0:
+            torch.save(weights, {str(tmp_path / "weights.pt")!r})
+        torch.distributed.destroy_process_group()
+    """)
+    (tmp_path / "script.py").write_text(script)
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    subprocess.run([*command, str(tmp_path / "script.py")], check=True, timeout=120)
+    two, one = torch.load(tmp_path / "weights.pt"), fit(tmp_path / "one", 10)
+    for a, b in zip(one, two, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-12, rtol=1e-12)
