@@ -10,6 +10,7 @@ from raytrace.formats import read_lens
 from raytrace.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
 from raytrace.pupil import gauss_rings
 from raytrace.reuse import Memo, cross_bundle, trace_bundle
+from raytrace.surface import Aperture
 
 LENSES = Path(__file__).parents[1] / "lenses"
 PUPIL = gauss_rings(3, 8)[0]
@@ -156,3 +157,52 @@ def test_the_oldest_bundle_is_forgotten_first():
         trace_bundle(bundle(lens, angle), memo)
     assert crossed_by(memo, lambda: trace_bundle(bundle(lens, 3.0), memo)) == 0
     assert crossed_by(memo, lambda: trace_bundle(bundle(lens, 1.0), memo)) > 0
+
+
+def axial_bundle(lens: Lens, distances: torch.Tensor):
+    lens = with_object_distance(lens, distances.reshape(-1, 1, 1, 1))
+    field = number([[0.0, 0.0], [0.0, 5.0]]).reshape(2, 2, 1, 1)
+    return lens, field, lens.wavelengths[:1, None], PUPIL
+
+
+@pytest.mark.parametrize("call", [trace_bundle, lambda b, m: cross_bundle(b, m)[-1].rays])
+def test_drawn_object_distances_are_interpolated_to_a_nanometre(call):
+    lens, sensor = double_gauss(), number(57.9).requires_grad_()
+    memo = Memo(object_distances=(1e4, 5e4))
+    generator = torch.Generator().manual_seed(4)
+    for _ in range(3):
+        distances = 1e4 + 4e4 * torch.rand(7, generator=generator, dtype=torch.float64)
+        moved = axial_bundle(with_sensor_distance(lens, sensor), distances)
+        found, plain = call(moved, memo), call(moved, None)
+        torch.testing.assert_close(found.position, plain.position, atol=1e-9, rtol=0)
+        torch.testing.assert_close(found.direction, plain.direction, atol=1e-10, rtol=0)
+        torch.testing.assert_close(found.opl, plain.opl, atol=1e-9, rtol=0)
+        assert torch.equal(found.valid, plain.valid.expand_as(found.valid))
+        gradients = [torch.autograd.grad(spread(rays), sensor)[0] for rays in (found, plain)]
+        assert float(gradients[0]) == pytest.approx(float(gradients[1]), rel=1e-9)
+    assert crossed_by(memo, lambda: call(moved, memo)) == 1
+
+
+def test_derivative_in_an_interpolated_object_distance():
+    lens, memo = double_gauss(), Memo(object_distances=(1e4, 5e4))
+    distances = number([12e3, 31e3]).requires_grad_()
+    gradients = [
+        torch.autograd.grad(spread(trace_bundle(axial_bundle(lens, distances), m)), distances)[0] for m in (memo, None)
+    ]
+    torch.testing.assert_close(*gradients, rtol=1e-7, atol=0)
+
+
+def test_distances_beyond_the_range_or_with_rays_lost_on_the_way_are_traced():
+    lens, memo = double_gauss(), Memo(object_distances=(1e4, 5e4))
+    near = axial_bundle(lens, number([3e3, 2e4]))
+    torch.testing.assert_close(trace_bundle(near, memo).position, trace_bundle(near).position, atol=0, rtol=0)
+    surfaces = list(lens.surfaces)
+    surfaces[1] = dataclasses.replace(surfaces[1], apertures=(Aperture("circular", (0.0, 15.65)),))
+    clipped = dataclasses.replace(lens, surfaces=tuple(surfaces))
+    bundles = axial_bundle(clipped, number([1.1e4, 2e4, 4.9e4]))
+    expected = trace_bundle(bundles)
+    rows = expected.valid[:, 0, 0]
+    assert not torch.equal(rows[0], rows[2]), "the aperture should stop a ray at one distance and not at the other"
+    found = trace_bundle(bundles, memo)
+    assert torch.equal(found.valid, expected.valid)
+    torch.testing.assert_close(found.position, expected.position, atol=0, rtol=0)
