@@ -1,13 +1,15 @@
 """Scene: object distance × field × wavelength, the rays of one, and what every PSF model gives back."""
 
-import torch
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
+from torch.autograd import forward_ad
 
 from raytrace.grid import Grid
-from raytrace.launch import rays_of_field, vignette
+from raytrace.launch import vignette
 from raytrace.lens import Lens, with_object_distance
 from raytrace.rays import Rays
-from raytrace.trace import trace
+from raytrace.reuse import Bundle, Memo, cross_bundle, trace_bundle
+from raytrace.trace import Crossing
 from raytrace.value import value
 
 
@@ -21,11 +23,13 @@ class Scene:
 
     lens: its object distance is (D, 1, 1), all finite or all inf.
     fields: (2, F) in the lens's kind of field; wavelengths: (W,) µm.
+    memo: rays of earlier scenes to go on from, if any.
     """
 
     lens: Lens
     fields: Tensor
     wavelengths: Tensor
+    memo: Memo | None = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -53,20 +57,73 @@ class Kernels:
     residual: Tensor | None = None
 
 
-def scene(lens: Lens, fields: Tensor, object_distances: Tensor, wavelengths: Tensor) -> Scene:
+def scene(lens: Lens, fields: Tensor, object_distances: Tensor, wavelengths: Tensor, memo: Memo | None = None) -> Scene:
     """A scene; object_distances: (D,) mm, all finite or all inf; fields: (2, F); wavelengths: (W,) µm."""
-    return Scene(with_object_distance(lens, object_distances[:, None, None]), fields, wavelengths)
+    return Scene(with_object_distance(lens, object_distances[:, None, None]), fields, wavelengths, memo)
 
 
 def trace_scene(scene: Scene, pupil: Tensor) -> Rays:
-    """Rays (3, D, F, W, P) of pupil points (2, P) on the sensor, vignetting factors of the fields applied."""
-    lens = with_object_distance(scene.lens, scene.lens.surfaces[0].thickness[..., None])
-    field = scene.fields[:, :, None, None]
-    wavelength = scene.wavelengths[:, None]
-    rays = rays_of_field(lens, field, vignette(lens, field, pupil), wavelength=wavelength)
-    rays = trace(lens, rays, wavelength)
+    """Rays (3, D, F, W, P) of pupil points (2, P) or (2, D, F, W, P) on the sensor, vignetting factors applied."""
+    rays = trace_bundle(_bundle(scene, pupil), scene.memo)
+    batch = *scene.shape, pupil.shape[-1]
     return Rays(
-        *(torch.broadcast_to(t, (*t.shape[:-1], pupil.shape[1])) for t in (rays.position, rays.direction)),
-        rays.valid,
-        rays.opl,
+        rays.position.expand(3, *batch),
+        rays.direction.expand(3, *batch),
+        rays.valid.expand(batch),
+        rays.opl if rays.opl is None else rays.opl.expand(batch),
     )
+
+
+def cross_scene(scene: Scene, pupil: Tensor) -> list[Crossing]:
+    """What happens to the same rays at every surface after the object; axes D, F and W may be 1 where all are alike."""
+    return cross_bundle(_bundle(scene, pupil), scene.memo)
+
+
+def _bundle(scene: Scene, pupil: Tensor) -> Bundle:
+    lens = with_object_distance(scene.lens, scene.lens.surfaces[0].thickness[..., None])
+    return lens, scene.fields[:, :, None, None], scene.wavelengths[:, None], pupil
+
+
+def symmetry(scene: Scene) -> str:
+    """What the light of every field has in common with its images: "round", "mirror" or "none".
+
+    "round": symmetric about the axis, a meridian of the pupil stands for all of it; "mirror": symmetric in x, the half
+    of x > 0 stands for the other. Fields and vignetting factors to be differentiated have none: moving one breaks it.
+    """
+    apertures = [aperture for surface in scene.lens.surfaces for aperture in surface.apertures]
+    moving = [scene.fields, scene.lens.fields.vignetting, *(c for aperture in apertures for c in aperture.centre)]
+    if any(varies(number) for number in moving):
+        return "none"
+    centre, along_x, along_y = _beams(scene)
+    tilted = (scene.fields[0] != 0).any() | (centre[0] != 0).any() | (along_x[1] != 0).any() | (along_y[0] != 0).any()
+    if bool(tilted) or any(aperture.centre[0] != 0 for aperture in apertures):
+        return "none"
+    skewed = (scene.fields[1] != 0).any() | (centre[1] != 0).any() | (along_x[0] != along_y[1]).any()
+    if bool(skewed) or any(aperture.centre[1] != 0 or aperture.shape != "circular" for aperture in apertures):
+        return "mirror"
+    return "round"
+
+
+def beam_share(scene: Scene) -> Tensor:
+    """Share (1, F, 1) of the entrance pupil that the vignetting factors of each field leave, (1 - VCX)(1 - VCY)."""
+    _, along_x, along_y = _beams(scene)
+    return (along_x[0] * along_y[1] - along_x[1] * along_y[0]).abs()[None, :, None]
+
+
+def _beams(scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
+    """Centre and half axes (2, F) of the beams in the entrance pupil, vignetting factors applied."""
+    corners = scene.fields.new_tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    centre, x, y = vignette(scene.lens, scene.fields[:, :, None], corners).unbind(-1)
+    return centre, x - centre, y - centre
+
+
+def varies(number: Tensor | float | None) -> bool:
+    """Whether a derivative may be asked for by this number: backward, forward, or by a transform of torch.func.
+
+    Inside nested transforms a tensor tells only of the innermost one: wrapped at all, it may vary for one further out.
+    """
+    if not isinstance(number, Tensor):
+        return False
+    if number.requires_grad or is_functorch_wrapped_tensor(number):
+        return True
+    return getattr(forward_ad, "_current_level", -1) >= 0 and forward_ad.unpack_dual(number).tangent is not None

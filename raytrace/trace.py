@@ -4,6 +4,7 @@ The trace is a generator. To record, draw or find where a ray was lost, consume 
 rays, hand them with the surfaces that are left.
 """
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -194,16 +195,36 @@ def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:
     wavelength: (...) µm; returns one tensor (...) for each surface of the lens, in the lens's dtype. A medium that
     does not change is the same tensor, which tells `cross` that nothing bends.
     """
-    dtype = lens.surfaces[-2].thickness.dtype
-    indices: list[Tensor] = []
-    medium = None
+    media: list[glass.Glass] = []
     for surface in lens.surfaces:
-        if medium is None or not (surface.is_mirror or _same_medium(surface.glass, medium)):
-            medium = surface.glass
-            indices.append(glass.refractive_index(medium, wavelength).to(dtype))
-        else:
-            indices.append(indices[-1])
-    return indices
+        same = media and (surface.is_mirror or _same_medium(surface.glass, media[-1]))
+        media.append(media[-1] if same else surface.glass)
+    # Air stands between all elements: each medium is evaluated once, and none for a surface that keeps the one before.
+    distinct = {(medium.formula, id(medium.coefficients)): medium for medium in media}
+    dtype = lens.surfaces[-2].thickness.dtype
+    found = _refractive_indices(list(distinct.values()), wavelength)
+    by_medium = dict(zip(distinct, (n.to(dtype) for n in found), strict=True))
+    return [by_medium[medium.formula, id(medium.coefficients)] for medium in media]
+
+
+def _refractive_indices(glasses: Sequence[glass.Glass], wavelength: Tensor) -> list[Tensor]:
+    """n of each glass, as `refractive_index` gives it; glasses of one formula are evaluated together."""
+    groups: dict[object, list[int]] = {}
+    for number, medium in enumerate(glasses):
+        together = medium.formula not in ("mirror", "constant") and medium.coefficients.dim() == 1
+        groups.setdefault((medium.formula, len(medium.coefficients)) if together else number, []).append(number)
+    found: dict[int, Tensor] = {}
+    for numbers in groups.values():
+        if len(numbers) == 1:
+            found[numbers[0]] = glass.refractive_index(glasses[numbers[0]], wavelength)
+            continue
+        stacked = torch.stack([glasses[number].coefficients for number in numbers], -1)
+        stacked = stacked.reshape(*stacked.shape, *(1,) * wavelength.dim())
+        indices = glass.refractive_index(
+            dataclasses.replace(glasses[numbers[0]], coefficients=stacked), wavelength[None]
+        )
+        found |= dict(zip(numbers, indices.unbind(0), strict=True))
+    return [found[number] for number in range(len(glasses))]
 
 
 def _same_medium(a: glass.Glass, b: glass.Glass) -> bool:

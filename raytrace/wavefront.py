@@ -7,14 +7,12 @@ import torch
 from torch import Tensor
 
 from raytrace import zernike
-from raytrace.glass import refractive_index
-from raytrace.launch import rays_of_field, vignette
-from raytrace.lens import with_object_distance
+from raytrace.launch import vignette
 from raytrace.numerics import dot, safe_divide, safe_sqrt
 from raytrace.paraxial import first_order
 from raytrace.rays import Rays
-from raytrace.scene import Scene
-from raytrace.trace import trace
+from raytrace.scene import Scene, trace_scene
+from raytrace.trace import media
 from raytrace.value import value
 
 
@@ -85,7 +83,7 @@ def wavefront(scene: Scene, pupil: Tensor, weights: Tensor | None = None) -> Wav
     """
     weights = torch.full_like(pupil[0], 1.0) / pupil.shape[-1] if weights is None else weights
     with_chief = torch.cat([torch.zeros_like(pupil[..., :1]), pupil], -1)
-    rays = rays_on_sensor(scene, with_chief)
+    rays = trace_scene(scene, with_chief)
     usable = rays.valid | (rays.position != 0).any(0) | (rays.direction[:2] != 0).any(0)
     usable = torch.cat([usable[..., :1] | (with_chief[..., :1] == 0).all(0) & _on_axis(scene), usable[..., 1:]], -1)
 
@@ -97,7 +95,7 @@ def wavefront(scene: Scene, pupil: Tensor, weights: Tensor | None = None) -> Wav
 
     centre = at_chief(rays.position)
     radius = _reference_radius(scene, centre)
-    index = refractive_index(scene.lens.surfaces[-2].glass, scene.wavelengths).to(pupil.dtype)
+    index = media(scene.lens, scene.wavelengths)[-2]
     path = path_to_reference_sphere(rays, centre, radius, index[:, None])
     opd = torch.where(rays.valid, path - at_chief(path), 0.0)
     direction = towards_centre(rays, centre, radius)
@@ -160,21 +158,6 @@ def _noll_basis(wavefront: Wavefront, count: int) -> Tensor:
 
 def _share(wavefront: Wavefront) -> Tensor:
     return safe_divide(wavefront.energy, wavefront.energy.sum(-1, keepdim=True))
-
-
-def rays_on_sensor(scene: Scene, pupil: Tensor) -> Rays:
-    """Rays (3, D, F, W, P) of pupil points (2, P) or (2, D, F, W, P), on the sensor."""
-    lens = with_object_distance(scene.lens, scene.lens.surfaces[0].thickness[..., None])
-    field, wavelength = scene.fields[:, :, None, None], scene.wavelengths[:, None]
-    rays = rays_of_field(lens, field, vignette(lens, field, pupil), wavelength=wavelength)
-    rays = trace(lens, rays, wavelength)
-    batch = *scene.shape, pupil.shape[-1]
-    return Rays(
-        rays.position.expand(3, *batch),
-        rays.direction.expand(3, *batch),
-        rays.valid.expand(batch),
-        rays.opl.expand(batch),
-    )
 
 
 def _on_axis(scene: Scene) -> Tensor:

@@ -73,7 +73,40 @@ def test_zernike_coefficients_of_defocus():
     assert (found.opd[0, 0] - expected).abs().max() < 5e-3 * abs(c4)
 
 
+def test_strehl_of_a_defocused_perfect_lens():
+    """(sin πW / πW)², W = 2√3 c₄ the waves from the centre to the rim."""
+    assert analysis.wavefront_map(perfect(), size=8).strehl.item() == pytest.approx(1.0, abs=1e-6)
+    found = analysis.wavefront_map(perfect(0.1), size=8)
+    half = math.pi * 2 * math.sqrt(3) * float(found.coefficients[0, 0, 3])
+    # Below a wave of defocus the best point is on the axis.
+    assert abs(half) < 0.5 * math.pi
+    assert found.strehl.item() == pytest.approx((math.sin(half) / half) ** 2, rel=2e-3)
+
+
+def test_wavefront_command_reports_the_strehl_ratio(capsys):
+    words = ["wavefront", "tessar", "--size", "8", "--field", "0"]
+    assert main([*words, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert {row["noll"] for row in document["results"]} == set(range(1, 38))
+    for row in document["summary"]:
+        assert set(row) == {"field_x", "field_y", "wavelength", "rms", "peak_to_valley", "strehl"}
+        assert 0 < row["strehl"] <= 1
+    assert main(words) == 0
+    heading, _, first = capsys.readouterr().out.splitlines()[:3]
+    assert heading.split()[-1] == "strehl"
+    assert float(first.split()[-1]) == pytest.approx(document["summary"][0]["strehl"], rel=1e-5)
+
+
 # MTF
+
+
+def test_default_frequencies_end_where_the_sharpest_field_ends():
+    """At 2/σ of a defocused disc, and at half the cutoff of a perfect lens."""
+    sharp = analysis.mtf(perfect()).frequencies
+    assert float(sharp[-1]) == pytest.approx(0.5 * float(analysis.cutoff(perfect(), vector(0.55)[0])), rel=1e-9)
+    edge = float(image_rays(perfect(12.0), vector(0.0, 1.0)[:, None]).position[1].abs())
+    blurred = analysis.mtf(perfect(12.0), kind="geometric").frequencies
+    assert float(blurred[-1]) == pytest.approx(2 / (edge / 2), rel=1e-3)  # σ of a uniform disc is half its radius
 
 
 def test_mtf_of_a_circular_pupil():

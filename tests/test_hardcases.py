@@ -1,39 +1,23 @@
 """The hard cases: values, statuses, roots, gradients and OPD against 30-digit references.
 
 Oracle: tests/oracles/hardcases.json.gz (mpmath at 220 digits; schema in its `meta`). RAYTRACE_HARDCASES=FILE runs the
-same test on another file of that schema, plain or compressed. score = |error|/(u·cond), with u = 2⁻⁵³ (2⁻²⁴ in
+same test on another file of that schema, every case of every kind. score = |error|/(u·cond), with u = 2⁻⁵³ (2⁻²⁴ in
 float32), is 1 for what an exact algorithm loses by the rounding of its inputs.
 """
 
-import gzip
-import json
 import math
-import os
 import warnings
 from decimal import Decimal, getcontext
-from pathlib import Path
 
 import hardcases_gaussian
+import hardcases_property
 import hardcases_splat
 import hardcases_wave
 import pytest
 import torch
+from hardcases_scene import CASES, OUTPUTS, Scene
 
-from raytrace.glass import (
-    AIR,
-    MIRROR,
-    InvalidIndex,
-    OutOfRange,
-    check_wavelengths,
-    constant,
-    refractive_index,
-    sellmeier,
-)
-from raytrace.launch import rays_from_infinity, rays_from_point
-from raytrace.numerics import dot, unit
-from raytrace.rays import Rays
-from raytrace.surface import Aperture, Surface
-from raytrace.trace import axial_path, start, steps
+from raytrace.glass import InvalidIndex, OutOfRange, check_wavelengths, refractive_index, sellmeier
 from raytrace.wavefront import path_to_reference_sphere
 
 getcontext().prec = 60
@@ -46,21 +30,31 @@ GRADIENT_SCORE = 100.0
 OPD_WAVES = {torch.float64: 1e-11, torch.float32: 3e-3}
 STATUS = {"tangent": "miss", "tir_critical": "tir"}  # limits of a miss and of total reflection
 
-OUTPUTS = ("x", "y", "z", "L", "M", "N", "opl")
-
-
-def load_cases() -> list[dict]:
-    """Cases of the file named by RAYTRACE_HARDCASES, else of the oracle; an unreadable file is an error, no skip."""
-    path = Path(os.environ.get("RAYTRACE_HARDCASES") or Path(__file__).parent / "oracles" / "hardcases.json.gz")
-    content = path.read_bytes()
-    return json.loads(gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content)["cases"]
-
-
-CASES = load_cases()
-
 
 def of_kind(kind: str) -> list:
-    return [pytest.param(case, id=case["id"]) for case in CASES if case["kind"] == kind]
+    """Parameters of a test: the cases of a kind."""
+    return [pytest.param(case, id=f"{kind}-{case['id']}") for case in CASES if case["kind"] == kind]
+
+
+@pytest.mark.parametrize("case", [case for kind in dict.fromkeys(c["kind"] for c in CASES) for case in of_kind(kind)])
+def test_hard_case(case):
+    check(case)
+
+
+def check(case: dict) -> None:
+    """Run a case by its kind; one of a kind that is not known fails."""
+    if case["kind"] not in KINDS:
+        pytest.fail(f"{case['id']}: no check for cases of kind {case['kind']!r}; known are {', '.join(KINDS)}")
+    KINDS[case["kind"]](case)
+
+
+def test_a_case_that_is_not_known_fails():
+    with pytest.raises(pytest.fail.Exception, match="no check for cases of kind 'spots'"):
+        check({"id": "A9-d-0", "kind": "spots"})
+    with pytest.raises(pytest.fail.Exception, match="no law 'shuffle'"):
+        check({"id": "A7-d-shuffle", "kind": "property", "data": {"of": CASES[0]["id"]}})
+    with pytest.raises(pytest.fail.Exception, match="no system 'F99'"):
+        check({"id": "A7-d-permute", "kind": "property", "data": {"of": "F99"}})
 
 
 def error(value: float, expected: str) -> float:
@@ -68,94 +62,7 @@ def error(value: float, expected: str) -> float:
     return float(abs(Decimal(value) - Decimal(expected))) if math.isfinite(value) else math.inf
 
 
-class Scene:
-    """One case as surfaces, media and rays; every number of it is a leaf with one entry per ray."""
-
-    def __init__(self, case: dict, dtype: torch.dtype, *, shared: bool = False, rays: list[int] | None = None):
-        self.case, self.dtype = case, dtype
-        self.rays = [case["rays"][i] for i in (range(len(case["rays"])) if rays is None else rays)]
-        self.shared = shared
-        self.parameters: dict[str, torch.Tensor] = {}
-        self.surfaces = [self._surface(i, s) for i, s in enumerate(case["surfaces"])]
-        self.indices = self._media()
-
-    def leaf(self, name: str, value: float) -> torch.Tensor:
-        if name not in self.parameters:
-            shape = () if self.shared else (len(self.rays),)
-            self.parameters[name] = torch.tensor(value, dtype=self.dtype).expand(shape).clone().requires_grad_()
-        return self.parameters[name]
-
-    def _surface(self, i: int, s: dict) -> Surface:
-        asked = any(f"s{i}.c" in e.get("grad", {}).get("x", ()) for e in self.case["expected"])
-        plane = s["type"] == "plane" and not asked
-        coefficients = None
-        if s["type"] == "even_asphere":
-            terms = [self.leaf(f"s{i}.a{2 * j + 4}", a) for j, a in enumerate(s["a"])]
-            coefficients = torch.stack([torch.zeros_like(terms[0]), *terms])
-        rim = s["semi_diameter"]
-        return Surface(
-            thickness=self.leaf(f"s{i}.thickness", s["thickness"]),
-            curvature=None if plane else self.leaf(f"s{i}.c", s["c"]),
-            conic=None if plane else self.leaf(f"s{i}.k", s["k"]),
-            coefficients=coefficients,
-            glass=MIRROR if s["mode"] == "reflect" else constant(1.5) if s["mode"] == "refract" else AIR,
-            semi_diameter=rim,
-            apertures=() if rim is None else (Aperture("circular", (0.0, rim)),),
-        )
-
-    def _media(self) -> list[torch.Tensor]:
-        media = [self.leaf("n0", self.case["media"][0])]
-        for i, s in enumerate(self.case["surfaces"]):
-            refracts = s["mode"] == "refract"
-            media.append(self.leaf(f"n{i + 1}", self.case["media"][i + 1]) if refracts else media[-1])
-        return media
-
-    def _points(self, key: str) -> torch.Tensor:
-        rows = []
-        for j, axis in enumerate("xyz"):
-            name = f"{key}.{axis}"
-            values = [ray[key][j] for ray in self.rays]
-            self.parameters[name] = torch.tensor(values, dtype=self.dtype, requires_grad=True)
-            rows.append(self.parameters[name])
-        return torch.stack(rows)
-
-    def launch(self) -> tuple[Rays, torch.Tensor]:
-        """The rays, and what turns their reduced path into the full one."""
-        n0 = self.indices[0]
-        origin = axial_path(self.surfaces, self.indices)
-        form = set(self.rays[0])
-        if form == {"o", "d"}:
-            position = self._points("o")
-            return start(position, self._points("d"), torch.zeros_like(position[0])), origin
-        if form == {"field_dir", "aim"}:
-            direction = self._points("field_dir")
-            return rays_from_infinity(direction, self._points("aim"), index=n0), origin
-        point = self._points("object")
-        return rays_from_point(point, self._points("aim"), index=n0), origin + n0 * dot(point, unit(point))
-
-    def run(self) -> dict:
-        rays, origin = self.launch()
-        status, fail_surface = ["ok"] * len(self.rays), [None] * len(self.rays)
-        walk = list(steps(self.surfaces, rays, indices=self.indices))
-        for k, crossing in enumerate(walk):
-            reasons = ("miss", crossing.missed), ("tir", crossing.totally_reflected), ("vignetted", crossing.clipped)
-            for reason, lost in reasons:
-                for i in lost.nonzero().flatten().tolist():
-                    if status[i] == "ok":
-                        status[i], fail_surface[i] = reason, k
-        last = walk[-1].rays
-        values = (*last.position, *last.direction, last.opl + origin)
-        return {
-            "status": status,
-            "fail_surface": fail_surface,
-            "last": last,
-            "walk": walk,
-            **dict(zip(OUTPUTS, values, strict=True)),
-        }
-
-
-@pytest.mark.parametrize("case", of_kind("trace"))
-def test_trace(case):
+def check_trace(case):
     check_float64(case)
     check_float32(case)
     check_gradients_of_shared_numbers(case)
@@ -265,8 +172,7 @@ def opd_errors(case, result, scene, dtype) -> list[float]:
     return [error(W[i].item(), expected) for i, expected in enumerate(opd["W_waves"]) if expected is not None]
 
 
-@pytest.mark.parametrize("case", of_kind("index"))
-def test_index(case):
+def check_index(case):
     """Sellmeier index and its gradient inside and outside the range of the glass, next to poles, n² ≤ 0 and n < 1."""
     data, expected = case["data"], case["expected"]
     B = torch.tensor(data["B"], dtype=torch.float64, requires_grad=True)
@@ -293,29 +199,16 @@ def test_index(case):
         assert error(gradients[name], value) <= allowed, name
 
 
-@pytest.mark.parametrize("case", of_kind("spot"))
-def test_spot(case):
-    hardcases_gaussian.check_spot(case)
-
-
-@pytest.mark.parametrize("case", of_kind("gauss_pixel"))
-def test_gauss_pixel(case):
-    hardcases_gaussian.check_gauss_pixel(case)
-
-
-@pytest.mark.parametrize("case", of_kind("splat"))
-def test_splat(case):
-    hardcases_splat.check_splat(case)
-
-
-@pytest.mark.parametrize("case", of_kind("fft_psf"))
-def test_fft_psf(case):
-    hardcases_wave.check_fft_psf(case)
-
-
-@pytest.mark.parametrize("case", of_kind("huygens"))
-def test_huygens(case):
-    hardcases_wave.check_huygens(case)
+KINDS = {
+    "trace": check_trace,
+    "index": check_index,
+    "spot": hardcases_gaussian.check_spot,
+    "gauss_pixel": hardcases_gaussian.check_gauss_pixel,
+    "splat": hardcases_splat.check_splat,
+    "fft_psf": hardcases_wave.check_fft_psf,
+    "huygens": hardcases_wave.check_huygens,
+    "property": hardcases_property.check_property,
+}
 
 
 def table() -> str:

@@ -159,7 +159,7 @@ def test_own_centre_of_the_grid_counts_from_the_point_asked_for():
 @pytest.mark.parametrize("model", ["paraxial", "fourier", "gaussian", "drt"])
 def test_polychromatic_kernel_is_the_weighted_sum(model):
     lens = made_for(model, double_gauss())
-    options = {"fields": field(0.0), "object_distances": number([1e4]), "grid": grid(0.02, 5), "tol": 0.02}
+    options = {"fields": field(0.0), "object_distances": number([1e4]), "grid": grid(0.02, 5), "tol": 1e-3}
     blue, red = (psf(lens, model, wavelengths=number([w]), **options) for w in (0.48, 0.65))
     both = psf(lens, model, wavelengths=number([0.48, 0.65]), wavelength_weights=number([3.0, 1.0]), **options)
     torch.testing.assert_close(both.kernel, 0.75 * blue.kernel + 0.25 * red.kernel, atol=2e-4, rtol=0)
@@ -180,19 +180,17 @@ def test_moments_of_a_polychromatic_kernel_hold_the_lateral_colour():
 
 @pytest.mark.parametrize("model", ["gaussian", "drt"])
 def test_energy_is_the_transmitted_share(model):
-    """Of an aperture that clips the beam; 78,000 rays traced at random say how much passes."""
+    """Of an aperture that clips the beam; the last of 4,000 rays along a radius that passes says how much."""
     lens = with_object_distance(double_gauss(stop=9.0), 1e4)
-    generator = torch.Generator().manual_seed(1)
-    disc = 2 * torch.rand(2, 100_000, generator=generator, dtype=torch.float64) - 1
-    disc = disc[:, disc.square().sum(0) <= 1]
-    rays = trace(lens, launch(lens, disc, fields=field(0.0)), lens.wavelengths[:, None])
-    share = float(rays.valid.to(torch.float64).mean())
+    radius = torch.linspace(0, 1, 4001, dtype=torch.float64)
+    rays = trace(lens, launch(lens, torch.stack([0 * radius, radius]), fields=field(0.0)), lens.wavelengths[:, None])
+    share = float(radius[rays.valid.flatten()].max()) ** 2
     assert 0.1 < share < 0.9
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotConverged)  # rings that an edge crosses settle slowly
-        found = psf(lens, model, fields=field(0.0), grid=grid(0.05, 11), tol=0.05)
-    # Counting noise of 0.002, and the light that a ring of `gaussian` counts at the edge.
-    assert float(found.energy) == pytest.approx(share, abs=0.06 if model == "gaussian" else 0.012)
+        warnings.simplefilter("ignore", NotConverged)
+        found = psf(lens, model, fields=field(0.0), grid=grid(0.1, 41), tol=0.01)
+    # The step of the radius, 1/4000, is 4e-4 of the area.
+    assert float(found.energy) == pytest.approx(share, abs=1e-3)
 
 
 # Models chosen, rays counted ------------------------------------------------------------------------------------------
@@ -233,7 +231,7 @@ def test_a_tighter_tolerance_takes_more_rays_and_errs_less():
 
 def test_a_tolerance_out_of_reach_is_said():
     with pytest.warns(NotConverged, match="gaussian: the estimated error .* stays above the tolerance 1e-11"):
-        found = psf(double_gauss(stop=9.0), "gaussian", fields=field(14.0), object_distances=number([1e4]), tol=1e-11)
+        found = psf(double_gauss(stop=11.5), "gaussian", fields=field(14.0), object_distances=number([1e4]), tol=1e-11)
     assert float(found.error) > 1e-11
     assert "stays above" in found.reason
 
@@ -332,9 +330,8 @@ def test_derivatives_in_the_lens_the_sensor_and_the_grid_with_rays_vignetted(mod
     assert float(traced.sum().detach()) > 0.05
     for t, gradient in zip(inputs, torch.autograd.grad(traced[0, 0, 1].square().sum(), inputs), strict=True):
         assert float(gradient.abs()) > 0, t
-    # Cells cut by the aperture are smooth only in pieces: differences of `drt` are good to a tenth at this order.
-    rtol = 0.1 if model == "drt" else 1e-3
-    assert torch.autograd.gradcheck(kernel, inputs, eps=1e-7, atol=1e-4, rtol=rtol, fast_mode=True)
+    # A kernel of `drt` is smooth in pieces: a curvature may change by less than the way to the next, 1e-8/mm.
+    assert torch.autograd.gradcheck(kernel, inputs, eps=1e-9, atol=1e-5, rtol=1e-4, fast_mode=True)
 
 
 def test_derivatives_in_the_object_distance_and_the_field():

@@ -69,10 +69,51 @@ def test_default_window_is_centred_on_the_axis_with_a_pixel_at_its_centre(tmp_pa
         (["--model", "auto", "--rays", "5"], 1, "auto chooses by a tolerance"),
         (["--model", "paraxial", "--rays", "5"], 1, "traces no rays"),
         (["--size", "0"], 2, "not above 0"),
+        (["--size", "-3"], 2, "not above 0"),
+        (["--size", "2.5"], 2, "--size"),
+        (["--pixel", "-0.005"], 2, "--pixel"),
+        (["--pixel", "nan"], 2, "--pixel"),
+        (["--tol", "0"], 2, "--tol"),
+        (["--rays", "0", "--model", "drt"], 2, "--rays"),
+        (["--field", "one"], 2, "--field"),
+        (["--field", "90"], 1, "below 90 degrees"),
+        (["--object-distance", "0", "--model", "paraxial"], 2, "--object-distance"),
+        (["--model", "paraxial", "-o", "no/such/folder/psf.npz"], 1, "no/such/folder"),
+        (["--model", "paraxial", "--plot", "no/such/folder/psf.png"], 1, "no/such/folder"),
+        (["--model", "paraxial", "--plot", "psf.bmp"], 1, ".png, .pdf, .svg"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_one_line(capsys, words, code, message):
     assert main(["psf", LENS, *words]) == code
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert message in said.err
+    assert len(said.err.splitlines()) == 1
+
+
+def test_an_even_window_has_the_axis_between_its_pixels(tmp_path):
+    out = tmp_path / "psf.npz"
+    words = ["--model", "gaussian", "--object-distance", "10000", "--size", "20", "-o", str(out)]
+    assert main(["psf", LENS, *words]) == 0
+    with np.load(out) as arrays:
+        kernel = arrays["psf"][0, 0]
+        assert kernel.shape == (20, 20)
+        np.testing.assert_allclose(kernel, kernel[::-1, ::-1], atol=1e-12)
+        assert kernel[9, 9] == pytest.approx(kernel.max(), rel=1e-12)
+        assert kernel[10, 10] == pytest.approx(kernel.max(), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (["--focus-distance", "10"], 1, "within the focal length"),
+        (["--focus-distance", "-1"], 2, "--focus-distance"),
+        (["--distances", "0"], 2, "--distances"),
+        (["--start", "best"], 2, "invalid choice"),
+    ],
+)
+def test_comparisons_that_make_no_sense_are_refused_in_one_line(capsys, words, code, message):
+    assert main(["compare", LENS, *words]) == code
     said = capsys.readouterr()
     assert said.out == ""
     assert message in said.err

@@ -17,10 +17,10 @@ def number(x) -> torch.Tensor:
     return torch.tensor(x, dtype=torch.float64)
 
 
-def line(rays: int, radius: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Heights in mm of a defocused beam, its rim at `radius`, and the energy of the cells between."""
+def line(rays: int, radius: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Pieces of a meridian of a defocused beam, its rim at `radius` mm: where each begins and ends, and its energy."""
     heights = torch.linspace(0, radius, rays, dtype=torch.float64)
-    return heights, heights.square().diff() / radius**2
+    return heights[:-1], heights[1:], heights.square().diff() / radius**2
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -61,12 +61,12 @@ def test_all_light_inside_the_window_is_kept_and_the_rest_is_not_counted():
 
 def test_heights_below_the_axis_are_the_same_rings():
     window = grid(0.005, 21)
-    heights, energy = line(101, 0.05)
-    found, mirrored = (energy_of_rings(window, h, energy) for h in (heights, -heights))
+    first, last, energy = line(101, 0.05)
+    found, mirrored = (energy_of_rings(window, side * first, side * last, energy) for side in (1, -1))
     torch.testing.assert_close(found, mirrored, atol=1e-15, rtol=0)
     # A cell on both sides of the axis covers the axis twice over.
-    both = energy_of_rings(window, number([-0.01, 0.02]), number([1.0]))
-    apart = energy_of_rings(window, number([-0.01, 0.0, 0.02]), number([1 / 3, 2 / 3]))
+    both = energy_of_rings(window, number([-0.01]), number([0.02]), number([1.0]))
+    apart = energy_of_rings(window, number([-0.01, 0.0]), number([0.0, 0.02]), number([1 / 3, 2 / 3]))
     torch.testing.assert_close(both, apart, atol=1e-15, rtol=0)
 
 
@@ -74,7 +74,7 @@ def test_a_focus_and_a_caustic_are_finite_and_have_finite_derivatives():
     window = grid(0.005, 21)
     for heights in (torch.zeros(9), 0.013 * torch.ones(9), torch.linspace(-1, 1, 9) ** 2 * 0.02):
         heights = heights.to(torch.float64).requires_grad_()
-        found = energy_of_rings(window, heights, torch.full((8,), 0.125, dtype=torch.float64))
+        found = energy_of_rings(window, heights[:-1], heights[1:], torch.full((8,), 0.125, dtype=torch.float64))
         (gradient,) = torch.autograd.grad(found.square().sum(), heights)
         assert bool(torch.isfinite(gradient).all())
         assert float(unfold(window, found).sum().detach()) == pytest.approx(1.0, abs=1e-9)
@@ -82,7 +82,7 @@ def test_a_focus_and_a_caustic_are_finite_and_have_finite_derivatives():
 
 def test_derivatives_in_the_heights_the_energy_and_the_pitch():
     def energies(heights, energy, pitch):
-        return energy_of_rings(grid(pitch, 9), heights, energy)
+        return energy_of_rings(grid(pitch, 9), heights[..., :-1], heights[..., 1:], energy)
 
     generator = torch.Generator().manual_seed(3)
     heights = 0.02 * torch.rand(2, 8, generator=generator, dtype=torch.float64)

@@ -10,9 +10,9 @@ from raytrace import pupil
 from raytrace.formats import read_lens
 from raytrace.grid import Grid, grid
 from raytrace.lens import Lens, with_sensor_distance
-from raytrace.psf.rays import beam_share, kernels, trace_fans
+from raytrace.psf.rays import kernels, trace_fans
 from raytrace.psf.splat import below_edge, histogram, splat, splat_cells, splat_smooth
-from raytrace.scene import scene
+from raytrace.scene import beam_share, scene
 from raytrace.surface import Aperture
 
 LENSES = Path(__file__).parents[1] / "lenses"
@@ -202,7 +202,7 @@ def test_vignetting_factors_take_their_area():
     factors = lens.fields.vignetting[:, 2]
     share = float((1 - factors[2]) * (1 - factors[3]))
     assert share < 1
-    assert float(beam_share(of, number(0.0)).squeeze()) == pytest.approx(share, rel=1e-12)
+    assert float(beam_share(of).squeeze()) == pytest.approx(share, rel=1e-12)
 
 
 def test_symmetric_scenes_trace_a_line_or_half_a_pupil_and_find_the_same():

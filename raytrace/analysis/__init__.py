@@ -8,6 +8,7 @@
 | encircled_energy                          | light within a radius, of diffraction or of rays               |
 | distortion, field_curvature, lateral_colour | what chief rays and the close rays about them show           |
 | relative_illumination                     | light of a field against the axis                              |
+| compare, abilities                        | PSF models side by side, and what each of them can represent   |
 """
 
 from raytrace.analysis.chief import Distortion as Distortion
@@ -16,6 +17,11 @@ from raytrace.analysis.chief import LateralColour as LateralColour
 from raytrace.analysis.chief import distortion as distortion
 from raytrace.analysis.chief import field_curvature as field_curvature
 from raytrace.analysis.chief import lateral_colour as lateral_colour
+from raytrace.analysis.compare import Abilities as Abilities
+from raytrace.analysis.compare import Comparison as Comparison
+from raytrace.analysis.compare import abilities as abilities
+from raytrace.analysis.compare import common_focus as common_focus
+from raytrace.analysis.compare import compare as compare
 from raytrace.analysis.encircled import EncircledEnergy as EncircledEnergy
 from raytrace.analysis.encircled import encircled_energy as encircled_energy
 from raytrace.analysis.fans import Fan as Fan

@@ -1,5 +1,7 @@
 """Results as tables: every analysis names its columns, and one row is one number of its curves. Loads pandas."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pandas as pd
 import torch
@@ -24,6 +26,12 @@ def flat(columns: dict[str, Tensor]) -> dict[str, np.ndarray]:
     """Columns as flat arrays of one length, in the order of their common shape."""
     shape = torch.broadcast_shapes(*(column.shape for column in columns.values()))
     return {name: column.detach().cpu().expand(shape).reshape(-1).numpy() for name, column in columns.items()}
+
+
+def numbered(columns: dict[str, Tensor], **names: Sequence[str]) -> pd.DataFrame:
+    """A table in which the numbers of some columns, 0 and up, are replaced by names."""
+    frame = pd.DataFrame(flat(columns))
+    return frame.assign(**{name: [words[number] for number in frame[name]] for name, words in names.items()})
 
 
 def axis(values: Tensor, place: int, axes: int) -> Tensor:

@@ -15,6 +15,7 @@ from raytrace.paraxial import first_order
 from raytrace.psf.dft import phasor, rings_and_arms
 from raytrace.pupil import gauss_rings
 from raytrace.scene import Scene
+from raytrace.spot import spot
 from raytrace.value import value
 
 _LEAST_RINGS, _MOST_RAYS = 24, 100_000
@@ -80,7 +81,7 @@ def mtf(
     fields: Tensor | None = None,
     wavelengths: Tensor | None = None,
 ) -> Mtf:
-    """MTF at frequencies (K,) cycles/mm, by default 41 up to half the cutoff of diffraction; fields: (2, F).
+    """MTF at frequencies (K,) cycles/mm, by default 41 of `frequency_range`; fields: (2, F).
 
         OTF(ν) = ∬ A(L, M + λν) A*(L, M) dL dM / ∬ |A|²              "diffraction"
         OTF(ν) = Σ_j w_j exp(-2πi ν y_j),  y_j where ray j lands      "geometric"
@@ -92,8 +93,7 @@ def mtf(
     if kind not in functions:
         raise ValueError(f"unknown kind of MTF {kind!r}; expected one of {', '.join(functions)}")
     if frequencies is None:
-        top = 0.5 * cutoff(lens, lens.wavelengths[lens.primary_wavelength])
-        frequencies = top.detach() * torch.linspace(0, 1, 41, dtype=top.dtype, device=top.device)
+        frequencies = frequency_range(lens, 41, fields=fields)
     tangential, sagittal = functions[kind](lens, frequencies, fields, wavelengths)
     return Mtf(
         tangential=tangential,
@@ -122,6 +122,17 @@ def mtf_through_focus(
     ]
     tangential, sagittal = (torch.stack([getattr(m, name)[:, 0] for m in found]) for name in ("tangential", "sagittal"))
     return ThroughFocusMtf(tangential, sagittal, sensor_distances, frequency, found[0].fields, kind)
+
+
+def frequency_range(lens: Lens, size: int, *, fields: Tensor | None = None) -> Tensor:
+    """Frequencies (size,) cycles/mm from 0 to 2/σ, σ along a section of the spot of the sharpest field (2, F), and to
+    half the cutoff of diffraction at the most; not differentiated."""
+    with torch.no_grad():
+        rays = image_rays(lens, gauss_rings(6)[0], fields=fields)
+        radius = spot(rays, gauss_rings(6)[1]).rms_radius
+        sharpest = torch.where(rays.valid.any(-1), radius, torch.inf).amin() * 0.5**0.5
+        top = torch.minimum(0.5 * cutoff(lens, lens.wavelengths[lens.primary_wavelength]), 2 / sharpest)
+    return top * torch.linspace(0, 1, size, dtype=top.dtype, device=top.device)
 
 
 def cutoff(lens: Lens, wavelength: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Wavefront maps: the OPD over the whole pupil, and its Zernike coefficients."""
+"""Wavefront maps: the OPD over the whole pupil, its Zernike coefficients and the Strehl ratio."""
 
 import torch
 from torch import Tensor
@@ -6,7 +6,9 @@ from torch import Tensor
 from raytrace.analysis.frame import Tabular, axis
 from raytrace.analysis.setting import scene_of
 from raytrace.lens import Lens
+from raytrace.psf.diffraction import strehl
 from raytrace.pupil import gauss_rings
+from raytrace.scene import Scene
 from raytrace.value import value
 from raytrace.wavefront import peak_to_valley, rms, wavefront, zernike_coefficients
 
@@ -20,6 +22,8 @@ class WavefrontMap(Tabular):
     opd: (F, W, N, N) waves at pupil points y (rows) and x (columns) of `pupil` (N,), 0 where `valid` is False.
     coefficients: (F, W, J) Noll's Zernike coefficients 1 … J in waves RMS, over the entrance pupil.
     rms: (F, W) waves about the mean; peak_to_valley: (F, W) waves, over Gauss rings of the pupil.
+    strehl: (F, W) the largest intensity on the sensor over that without aberrations, defocus counted among them; nan
+        where the blur is too large for the sum of waves.
     fields: (2, F); wavelengths: (W,) µm.
     """
 
@@ -29,6 +33,7 @@ class WavefrontMap(Tabular):
     coefficients: Tensor
     rms: Tensor
     peak_to_valley: Tensor
+    strehl: Tensor
     fields: Tensor
     wavelengths: Tensor
 
@@ -40,6 +45,17 @@ class WavefrontMap(Tabular):
             "wavelength": axis(self.wavelengths, 1, 3),
             "noll": axis(noll, 2, 3),
             "coefficient": self.coefficients,
+        }
+
+    def summary(self) -> dict[str, Tensor]:
+        """The columns of a table with a row for every field and wavelength."""
+        return {
+            "field_x": axis(self.fields[0], 0, 2),
+            "field_y": axis(self.fields[1], 0, 2),
+            "wavelength": axis(self.wavelengths, 1, 2),
+            "rms": self.rms,
+            "peak_to_valley": self.peak_to_valley,
+            "strehl": self.strehl,
         }
 
 
@@ -74,6 +90,18 @@ def wavefront_map(
         coefficients=zernike_coefficients(front, terms)[0] / wave[:, None],
         rms=rms(front)[0] / wave,
         peak_to_valley=peak_to_valley(front)[0] / wave,
+        strehl=_strehl(view),
         fields=view.fields,
         wavelengths=view.wavelengths,
     )
+
+
+def _strehl(view: Scene) -> Tensor:
+    """Strehl ratios (F, W); nan for a field whose blur would need too many rays."""
+    ratios = []
+    for field in view.fields.split(1, 1):
+        try:
+            ratios.append(strehl(Scene(view.lens, field, view.wavelengths))[0])
+        except ValueError:  # a map of so many waves is still worth seeing
+            ratios.append(torch.full_like(view.wavelengths, torch.nan)[None])
+    return torch.cat(ratios)

@@ -15,6 +15,7 @@ _UNITS = {
     "wavelength": "µm", "frequency": "1/mm", "sensor_distance": "mm", "radius": "mm", "height": "mm", "shift": "mm",
     "f_tan": "%", "f_theta": "%", "projected_solid_angle": "sr",
 }  # fmt: skip
+_DENSE = 65  # fields of a curve over the field, when it is drawn
 
 
 def mtf(arguments: argparse.Namespace) -> None:
@@ -49,45 +50,30 @@ def opd(arguments: argparse.Namespace) -> None:
 
 
 def wavefront(arguments: argparse.Namespace) -> None:
-    """Wavefront maps; the text is RMS, peak to valley and the coefficients."""
+    """Wavefront maps; the text is RMS, peak to valley and the Strehl ratio, the JSON also the coefficients."""
     lens, fields = _opened(arguments)
     found = analysis.wavefront_map(lens, fields=fields, size=arguments.size)
-    summary = {name: column for name, column in found.columns().items() if name in ("field_x", "field_y", "wavelength")}
-    summary = {**{n: c[..., 0] for n, c in summary.items()}, "rms": found.rms, "peak_to_valley": found.peak_to_valley}
-    _report(arguments, lens, found, "wavefront_maps", summary=summary, unit="waves")
+    _report(arguments, lens, found, "wavefront_maps", summary=found.summary(), unit="waves")
 
 
 def distortion(arguments: argparse.Namespace) -> None:
     """Distortion of the chief ray."""
-    lens, fields = _opened(arguments, own=False)
-    found = analysis.distortion(lens, fields=fields, size=arguments.size)
-    dense = analysis.distortion(lens, fields=fields) if arguments.plot else found
-    _report(arguments, lens, found, "distortion_curves", dense=dense)
+    _over_field(arguments, analysis.distortion, "distortion_curves")
 
 
 def curvature(arguments: argparse.Namespace) -> None:
     """Foci of close rays."""
-    lens, fields = _opened(arguments, own=False)
-    found = analysis.field_curvature(lens, fields=fields, size=arguments.size)
-    dense = analysis.field_curvature(lens, fields=fields) if arguments.plot else found
-    _report(arguments, lens, found, "curvature_curves", unit="mm", dense=dense)
+    _over_field(arguments, analysis.field_curvature, "curvature_curves")
 
 
 def lateral(arguments: argparse.Namespace) -> None:
     """Lateral colour, with the Airy radius in the figure."""
-    lens, fields = _opened(arguments, own=False)
-    found = analysis.lateral_colour(lens, fields=fields, size=arguments.size)
-    dense = analysis.lateral_colour(lens, fields=fields) if arguments.plot else found
-    airy = 1.22 / float(analysis.cutoff(lens, lens.wavelengths[lens.primary_wavelength]))
-    _report(arguments, lens, found, "lateral_curves", airy, dense=dense)
+    _over_field(arguments, analysis.lateral_colour, "lateral_curves")
 
 
 def illumination(arguments: argparse.Namespace) -> None:
     """Relative illumination."""
-    lens, fields = _opened(arguments, own=False)
-    found = analysis.relative_illumination(lens, fields=fields, size=arguments.size)
-    dense = analysis.relative_illumination(lens, fields=fields) if arguments.plot else found
-    _report(arguments, lens, found, "illumination_curve", dense=dense)
+    _over_field(arguments, analysis.relative_illumination, "illumination_curve")
 
 
 def encircled(arguments: argparse.Namespace) -> None:
@@ -99,10 +85,19 @@ def encircled(arguments: argparse.Namespace) -> None:
     _report(arguments, lens, found, "encircled_curves", every=5)
 
 
-def _opened(arguments: argparse.Namespace, *, own: bool = True) -> tuple[Lens, Tensor | None]:
-    """The lens, and the fields of --field, else the lens's own, or None for the curve's own range."""
+def _opened(arguments: argparse.Namespace) -> tuple[Lens, Tensor]:
+    """The lens, and the fields of --field, else the lens's own."""
     lens = open_lens(arguments)
-    return lens, field_points(lens, arguments) if own or arguments.field else None
+    return lens, field_points(lens, arguments)
+
+
+def _over_field(arguments: argparse.Namespace, analyse: Callable, figure: str) -> None:
+    """Report an analysis at the fields of --field, else at --size fields; its figure is drawn through many."""
+    lens = open_lens(arguments)
+    fields = field_points(lens, arguments) if arguments.field else None
+    found = analyse(lens, fields=fields, size=arguments.size)
+    dense = analyse(lens, fields=fields, size=_DENSE) if arguments.plot else None
+    _report(arguments, lens, found, figure, unit="mm", dense=dense)
 
 
 def _report(
@@ -110,7 +105,7 @@ def _report(
     lens: Lens,
     found: Tabular,
     figure: str,
-    *marks: float,
+    *,
     every: int = 1,
     unit: str = "",
     summary: dict[str, Tensor] | None = None,
@@ -118,17 +113,21 @@ def _report(
 ) -> None:
     """Print the result as JSON, or every so many-th row of its table; save the figure of it, or of the dense one."""
     if arguments.json:
-        columns = flat(found.columns())
-        rows = [dict(zip(columns, map(number, row), strict=True)) for row in zip(*columns.values(), strict=True)]
-        print_json({"analysis": arguments.command, "results": rows})
+        document = {"analysis": arguments.command, "results": _rows(found.columns())}
+        print_json(document if summary is None else {**document, "summary": _rows(summary)})
     else:
         _print(summary or found.columns(), FIELD_UNITS[lens.fields.kind], every if summary is None else 1, unit)
     if arguments.plot:
         from raytrace import plot
 
         draw: Callable = getattr(plot, figure)
-        plot.save(draw(lens, found if dense is None else dense, *marks), arguments.plot)
+        plot.save(draw(lens, found if dense is None else dense), arguments.plot)
         say(f"written: {arguments.plot}")
+
+
+def _rows(columns: dict[str, Tensor]) -> list[dict]:
+    table = flat(columns)
+    return [dict(zip(table, map(number, row), strict=True)) for row in zip(*table.values(), strict=True)]
 
 
 def _print(columns: dict[str, Tensor], field_unit: str, every: int, unit: str) -> None:

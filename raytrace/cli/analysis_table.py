@@ -18,11 +18,24 @@ def _sized(figure: str, size: int, what: str):
     return add_arguments
 
 
-def _mtf(parser) -> None:
+_FANS = _sized("the fans", 41, "rays across the pupil")
+_CURVES = _sized("the curves", 11, "fields from the axis to the largest")
+
+
+def _light(parser) -> None:
     _analysis(parser, "the curves")
     parser.add_argument("--geometric", action="store_true", help="of rays alone, without diffraction")
+
+
+def _mtf(parser) -> None:
+    _light(parser)
     parser.add_argument(
-        "--frequency", metavar="F", type=positive_finite, nargs="+", help="spatial frequencies, cycles/mm"
+        "--frequency",
+        metavar="F",
+        type=positive_finite,
+        nargs="+",
+        help="spatial frequencies, cycles/mm (default: 41 from 0 to what the sharpest field resolves, at most half of "
+        "the cutoff of diffraction)",
     )
     parser.add_argument(
         "--through-focus",
@@ -33,9 +46,14 @@ def _mtf(parser) -> None:
 
 
 def _encircled(parser) -> None:
-    _analysis(parser, "the curves")
-    parser.add_argument("--geometric", action="store_true", help="of rays alone, without diffraction")
-    parser.add_argument("--radius", metavar="MM", type=positive_finite, nargs="+", help="radii from the centroid")
+    _light(parser)
+    parser.add_argument(
+        "--radius",
+        metavar="MM",
+        type=positive_finite,
+        nargs="+",
+        help="radii from the centroid, mm (default: from 0 to where almost all light lies)",
+    )
 
 
 ANALYSES = (
@@ -57,7 +75,7 @@ ANALYSES = (
         """examples:
   raytrace fan tessar --plot fan.png
   raytrace fan double_gauss --field 0 14 --size 21 --json""",
-        _sized("the fans", 41, "rays across the pupil"),
+        _FANS,
         "analysis_commands.fan",
     ),
     (
@@ -67,13 +85,14 @@ ANALYSES = (
         """examples:
   raytrace opd tessar --plot opd.png
   raytrace opd double_gauss --object-distance 25000 --json""",
-        _sized("the fans", 41, "rays across the pupil"),
+        _FANS,
         "analysis_commands.opd",
     ),
     (
         "wavefront",
-        "wavefront maps and Zernike coefficients",
-        "RMS and peak-to-valley OPD in waves, and Noll's Zernike coefficients 1 to 37 (waves RMS).",
+        "wavefront maps, Zernike coefficients, Strehl ratio",
+        "RMS and peak-to-valley OPD in waves and the Strehl ratio; with --json also Noll's Zernike coefficients 1 to "
+        "37 (waves RMS).",
         """examples:
   raytrace wavefront tessar --plot wavefront.png
   raytrace wavefront double_gauss --field 0 --json""",
@@ -87,7 +106,7 @@ ANALYSES = (
         """examples:
   raytrace distortion phone --plot distortion.png
   raytrace distortion double_gauss --field 5 10 14 --json""",
-        _sized("the curves", 11, "fields from the axis to the largest"),
+        _CURVES,
         "analysis_commands.distortion",
     ),
     (
@@ -97,7 +116,7 @@ ANALYSES = (
         """examples:
   raytrace curvature tessar --plot curvature.png
   raytrace curvature double_gauss --field 0 10 14 --json""",
-        _sized("the curves", 11, "fields from the axis to the largest"),
+        _CURVES,
         "analysis_commands.curvature",
     ),
     (
@@ -107,7 +126,7 @@ ANALYSES = (
         """examples:
   raytrace lateral tessar --plot lateral.png
   raytrace lateral double_gauss --wavelength 0.5876 0.4861 0.6563 --json""",
-        _sized("the curves", 11, "fields from the axis to the largest"),
+        _CURVES,
         "analysis_commands.lateral",
     ),
     (
@@ -117,7 +136,7 @@ ANALYSES = (
         """examples:
   raytrace illumination phone --plot illumination.png
   raytrace illumination double_gauss --field 0 10 14 --json""",
-        _sized("the curve", 11, "fields from the axis to the largest"),
+        _CURVES,
         "analysis_commands.illumination",
     ),
     (

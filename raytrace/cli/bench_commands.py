@@ -4,22 +4,28 @@ import argparse
 import dataclasses
 import importlib
 import importlib.util
+from pathlib import Path
 from types import ModuleType
 
 import torch
 from tqdm import tqdm
 
+from raytrace.bench import psf, psf_report
 from raytrace.bench.measure import Row, calls, field_rays, measure, surfaces_of
+from raytrace.bench.psf_cases import USUAL, cases
 from raytrace.bench.report import machine, markdown
 from raytrace.cli.door import CommandError, open_lens, print_json, say
 from raytrace.files import write_atomically
+from raytrace.lens import Lens
 
 
 def bench(arguments: argparse.Namespace) -> None:
-    """Speed of the trace beside its error, and beside a peer's if there is one."""
-    lens = open_lens(argparse.Namespace(lens=arguments.lens, catalog=[]))
-    if not bool(field_rays(lens, 1000).valid.all()):
-        raise CommandError(f"{arguments.lens}: not every ray of the middle field starts; choose another lens")
+    """Speed beside error, and beside a peer's if there is one: of the trace or of the PSFs."""
+    other = {"trace": ("lenses", "csv"), "psf": ("lens", "rays")}[arguments.what]
+    for name in other:
+        if getattr(arguments, name):
+            word = "LENS" if name == "lenses" else f"--{name}"
+            raise CommandError(f"bench {arguments.what} takes no {word}")
     peer = None if arguments.no_peers else _peer()
     before = torch.get_num_threads()
     threads = arguments.threads or before
@@ -27,23 +33,54 @@ def bench(arguments: argparse.Namespace) -> None:
         torch.set_num_threads(threads)
         if peer:
             peer.set_threads(threads)
-        peers = peer.peers(lens) if peer else []
-        total = calls(arguments.rays, repeats=arguments.repeats, peers=peers)
-        with tqdm(total=total, desc="measuring", unit="call", disable=None) as bar:
-            rows = measure(
-                lens,
-                arguments.rays,
-                repeats=arguments.repeats,
-                peers=peers,
-                threads=threads,
-                progress=bar.update,
-            )
-        about = machine()
+        (_bench_trace if arguments.what == "trace" else _bench_psf)(arguments, peer, threads)
     finally:
         torch.set_num_threads(before)
-    if peer:
-        about |= {"Optiland": peer.VERSION, "numba": peer.NUMBA_VERSION}
-    _write(arguments, rows, surfaces_of(lens), about)
+
+
+def _bench_trace(arguments: argparse.Namespace, peer: ModuleType | None, threads: int) -> None:
+    name, counts = arguments.lens or "double_gauss", arguments.rays or [10**3, 10**4, 10**5, 10**6]
+    lens = _open(name)
+    if not bool(field_rays(lens, 1000).valid.all()):
+        raise CommandError(f"{name}: not every ray of the middle field starts; choose another lens")
+    peers = peer.peers(lens) if peer else []
+    total = calls(counts, repeats=arguments.repeats, peers=peers)
+    with tqdm(total=total, desc="measuring", unit="call", disable=None) as bar:
+        rows = measure(lens, counts, repeats=arguments.repeats, peers=peers, threads=threads, progress=bar.update)
+    _write_trace(arguments, name, rows, surfaces_of(lens), _about(peer))
+
+
+def _bench_psf(arguments: argparse.Namespace, peer: ModuleType | None, threads: int) -> None:
+    lenses = {Path(name).stem: name for name in arguments.lenses or USUAL}
+    found = cases([(stem, _open(name)) for stem, name in lenses.items()])
+    others = {"peer_methods": importlib.import_module("raytrace.bench.psf_peer").peer_methods} if peer else {}
+    with tqdm(total=psf.steps(found), desc="measuring", disable=None) as bar:
+        rows = psf.measure(
+            found, repeats=arguments.repeats, threads=threads, progress=bar.update, say=bar.write, **others
+        )
+    about, titles = _about(peer), {(case.name, case.field): case.title for case in found}
+    report = psf_report.markdown(rows, titles=titles, about=about, repeats=arguments.repeats)
+    if arguments.output:
+        write_atomically(arguments.output, lambda file: file.write(report.encode()))
+    if arguments.csv:
+        write_atomically(arguments.csv, lambda file: file.write(psf_report.table(rows).encode()))
+    mappings = [dataclasses.asdict(row) for row in rows]
+    if arguments.plot:
+        plot = importlib.import_module("raytrace.plot.pareto")
+        importlib.import_module("raytrace.plot.style").save(plot.pareto_figure(mappings, titles), arguments.plot)
+    if arguments.json:
+        goals = [dataclasses.asdict(target) for target in psf_report.targets(rows)]
+        print_json({"repeats": arguments.repeats, "machine": about, "targets": goals, "rows": mappings})
+    else:
+        print(report, end="")
+
+
+def _open(name: str) -> Lens:
+    return open_lens(argparse.Namespace(lens=name, catalog=[]))
+
+
+def _about(peer: ModuleType | None) -> dict[str, str | int]:
+    return machine() | ({"Optiland": peer.VERSION, "numba": peer.NUMBA_VERSION} if peer else {})
 
 
 def _peer() -> ModuleType | None:
@@ -54,8 +91,10 @@ def _peer() -> ModuleType | None:
     return importlib.import_module("raytrace.bench.peer")
 
 
-def _write(arguments: argparse.Namespace, rows: list[Row], surfaces: int, about: dict[str, str | int]) -> None:
-    report = markdown(rows, lens=arguments.lens, surfaces=surfaces, about=about, repeats=arguments.repeats)
+def _write_trace(
+    arguments: argparse.Namespace, name: str, rows: list[Row], surfaces: int, about: dict[str, str | int]
+) -> None:
+    report = markdown(rows, lens=name, surfaces=surfaces, about=about, repeats=arguments.repeats)
     if arguments.output:
         write_atomically(arguments.output, lambda file: file.write(report.encode()))
     if arguments.plot:
@@ -65,7 +104,7 @@ def _write(arguments: argparse.Namespace, rows: list[Row], surfaces: int, about:
     if arguments.json:
         print_json(
             {
-                "lens": arguments.lens,
+                "lens": name,
                 "surfaces": surfaces,
                 "repeats": arguments.repeats,
                 "machine": about,

@@ -152,17 +152,26 @@ def _glass(parser):
 
 
 def _bench(parser):
-    parser.add_argument("what", choices=("trace",), help="what to measure")
-    json(parser)
-    parser.add_argument("--lens", default="double_gauss", metavar="LENS", help="lens to trace (default double_gauss)")
+    parser.add_argument("what", choices=("trace", "psf"), help="what to measure")
     parser.add_argument(
-        "--rays", metavar="N", type=count, nargs="+", default=[10**3, 10**4, 10**5, 10**6], help="numbers of rays"
+        "lenses",
+        metavar="LENS",
+        type=file_name,
+        nargs="*",
+        help="psf: lenses to measure, on the axis and at the largest field "
+        "(default double_gauss phone hubble, in conditions of their own)",
+    )
+    json(parser)
+    parser.add_argument("--lens", metavar="LENS", help="trace: lens to trace (default double_gauss)")
+    parser.add_argument(
+        "--rays", metavar="N", type=count, nargs="+", help="trace: numbers of rays (default 1000 10000 100000 1000000)"
     )
     parser.add_argument("--repeats", metavar="N", type=count, default=5, help="runs of which the median is kept")
     parser.add_argument("--threads", metavar="N", type=count, help="threads of torch")
     parser.add_argument("--no-peers", action="store_true", help="leave out Optiland even if it is installed")
     output(parser, "report to write (.md)")
-    plot(parser, "speed over number of rays")
+    parser.add_argument("--csv", metavar="FILE", type=file_name, help="psf: table to write, one line a figure")
+    plot(parser, "speed over number of rays, or time over error,")
 
 
 def _compare(parser):
@@ -285,7 +294,8 @@ COMMANDS = (
         "one sensor, in a window of 21 pixels of 5 µm, at 0.53 µm unless told otherwise; and show by numbers what each "
         "can represent: change of the kernel when the conic of the most curved surface grows by 0.2; longer over "
         "shorter σ and asymmetry of the kernel of the largest field; radius of the first dark ring at F/16 over that "
-        "of the Airy disc; how many of the lens's numbers move the kernel; rays traced.",
+        "of the Airy disc; how many of the lens's numbers move the kernel; rays traced. For these numbers DRT runs to "
+        "a tolerance: the noise of 256 rays would pass for aberrations.",
         """examples:
   raytrace compare lenses/double_gauss.zmx --plot compare.png
   raytrace compare double_gauss --start rms --json""",
@@ -306,10 +316,11 @@ COMMANDS = (
     Command(
         "bench",
         "measure speed against error",
-        "Measure the trace forward and backward, in float32 and float64, against a high-precision reference; with the "
-        "extra [bench] Optiland runs beside it.",
+        "Measure, forward and backward, in float32 and float64: the trace against a high-precision reference, or every "
+        "PSF model at every sampling against converged ones (minutes). With the extra [bench] Optiland runs beside it.",
         """examples:
   raytrace bench trace
+  raytrace bench psf -o speed_vs_error.md --csv speed_vs_error.csv --plot speed_vs_error.png
   raytrace bench trace --rays 1000 100000 -o bench.md --plot bench.png""",
         _bench,
         "bench_commands.bench",

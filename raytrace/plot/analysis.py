@@ -1,6 +1,5 @@
 """Figures of the analyses: fans, wavefronts, MTF, encircled energy, and curves over the field."""
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -17,6 +16,7 @@ from raytrace.analysis import (
     RelativeIllumination,
     ThroughFocusMtf,
     WavefrontMap,
+    cutoff,
 )
 from raytrace.lens import Lens
 from raytrace.plot.style import (
@@ -32,6 +32,10 @@ from raytrace.plot.style import (
     styled,
     wavelength_colours,
 )
+
+_SAGITTAL = (0, (4, 2))
+#: Dashes of wavelengths, in order, for readers who do not tell their colours apart.
+_DASHES = ("solid", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)))
 
 
 @styled
@@ -49,7 +53,8 @@ def fan_plot(lens: Lens, found: Fan) -> Figure:
         for row, label in enumerate(labels):
             panel = _ruled(axes[row][column])
             for w, colour in enumerate(colours):
-                panel.plot(pupil, shown[row, w], color=colour, linewidth=1.2, label=_wavelength(found, w))
+                style = {"color": colour, "linewidth": 1.2, "linestyle": _DASHES[w % len(_DASHES)]}
+                panel.plot(pupil, shown[row, w], label=_wavelength(found, w), **style)
             panel.axhline(0, color=GREY, linewidth=0.6)
             panel.axvline(0, color=GREY, linewidth=0.6)
             if column == 0:
@@ -66,7 +71,7 @@ def fan_plot(lens: Lens, found: Fan) -> Figure:
 
 @styled
 def wavefront_maps(lens: Lens, found: WavefrontMap) -> Figure:
-    """A panel for each field (rows) and wavelength (columns), one scale for all, RMS and P-V below each."""
+    """A panel for each field (rows) and wavelength (columns), one scale for all, RMS, P-V and Strehl below."""
     labels, count = _labels(lens, found.fields), len(found.wavelengths)
     figure = new_figure(max(4.2, 1.9 * count + 1.4), 2.05 * len(labels) + 0.6)
     axes = figure.subplots(len(labels), count, squeeze=False)
@@ -82,8 +87,10 @@ def wavefront_maps(lens: Lens, found: WavefrontMap) -> Figure:
             panel.set_yticks([])
             for spine in panel.spines.values():
                 spine.set_visible(False)
-            rms, valley = (number_text(float(v[row, w]), 3) for v in (found.rms, found.peak_to_valley))
-            panel.set_xlabel(f"RMS {rms}, P–V {valley}", fontsize=7.5, color=GREY)
+            rms, valley, strehl = (
+                number_text(float(v[row, w]), 3) for v in (found.rms, found.peak_to_valley, found.strehl)
+            )
+            panel.set_xlabel(f"RMS {rms}, P–V {valley}\nStrehl {strehl}", fontsize=7.5, color=GREY)
             if row == 0:
                 panel.set_title(_wavelength(found, w), color=INK)
             if w == 0:
@@ -97,16 +104,13 @@ def wavefront_maps(lens: Lens, found: WavefrontMap) -> Figure:
 @styled
 def mtf_curves(lens: Lens, found: Mtf) -> Figure:
     """Modulation over spatial frequency: tangential solid, sagittal dashed, the diffraction limit grey."""
-    figure = new_figure(6.4, 4.0)
-    panel = _ruled(figure.add_subplot())
+    figure, panel = _chart(6.4, 4.0, "spatial frequency (cycles/mm)", "modulation")
     frequency = array(found.frequencies)
     if found.limit is not None:
         panel.plot(frequency, array(found.limit), color=GREY, linewidth=1.0, linestyle=":", label="diffraction limit")
     _pairs(panel, lens, found, frequency, array(found.tangential), array(found.sagittal))
     panel.set_xlim(0, frequency.max())
     panel.set_ylim(0, 1.0)
-    panel.set_xlabel("spatial frequency (cycles/mm)")
-    panel.set_ylabel("modulation")
     _legend(figure, panel, 4)
     return _titled(figure, lens, f"{found.kind} MTF")
 
@@ -114,15 +118,13 @@ def mtf_curves(lens: Lens, found: Mtf) -> Figure:
 @styled
 def mtf_through_focus_curves(lens: Lens, found: ThroughFocusMtf) -> Figure:
     """Modulation at one frequency over the sensor distance."""
-    figure = new_figure(6.4, 4.0)
-    panel = _ruled(figure.add_subplot())
+    modulation = f"modulation at {number_text(float(found.frequency), 4)} cycles/mm"
+    figure, panel = _chart(6.4, 4.0, "sensor distance (mm)", modulation)
     distance = array(found.sensor_distances)
     _pairs(panel, lens, found, distance, array(found.tangential).T, array(found.sagittal).T)
     panel.axvline(float(lens.surfaces[-2].thickness), color=GREY, linewidth=0.8)
     panel.set_xlim(distance.min(), distance.max())
     panel.set_ylim(0, 1.0)
-    panel.set_xlabel("sensor distance (mm)")
-    panel.set_ylabel(f"modulation at {number_text(float(found.frequency), 4)} cycles/mm")
     _legend(figure, panel, 4)
     return _titled(figure, lens, f"{found.kind} MTF through focus")
 
@@ -130,16 +132,13 @@ def mtf_through_focus_curves(lens: Lens, found: ThroughFocusMtf) -> Figure:
 @styled
 def encircled_curves(lens: Lens, found: EncircledEnergy) -> Figure:
     """Share of the light over the radius about the centroid."""
-    figure = new_figure(6.0, 3.8)
-    panel = _ruled(figure.add_subplot())
+    figure, panel = _chart(6.0, 3.8, "radius from the centroid (µm)", "encircled energy")
     radii = 1e3 * array(found.radii)
     for f, label in enumerate(_labels(lens, found.fields)):
         panel.plot(radii, array(found.share[f]), color=field_colour(f), linewidth=1.5, label=label)
     panel.axhline(0.8, color=GREY, linewidth=0.7, linestyle=":")
     panel.set_xlim(0, radii.max())
     panel.set_ylim(0, 1.02)
-    panel.set_xlabel("radius from the centroid (µm)")
-    panel.set_ylabel("encircled energy")
     _legend(figure, panel, 6)
     return _titled(figure, lens, f"{found.kind} encircled energy")
 
@@ -151,7 +150,7 @@ def distortion_curves(lens: Lens, found: Distortion) -> Figure:
     curves += [] if found.f_theta is None else [("F-θ", found.f_theta)]
     figure = new_figure(3.1 * len(curves) + 0.9, 4.2)
     for panel, (name, values) in zip(figure.subplots(1, len(curves), squeeze=False)[0], curves, strict=True):
-        _over_field(panel, lens, found, 100 * array(values), array(found.valid))
+        _over_field(panel, lens, found, 100 * array(values), array(found.valid), dashes=_DASHES)
         panel.set_xlabel(f"{name} distortion (%)")
     _legend(figure, panel, len(found.wavelengths))
     return _titled(figure, lens, "distortion")
@@ -160,25 +159,21 @@ def distortion_curves(lens: Lens, found: Distortion) -> Figure:
 @styled
 def curvature_curves(lens: Lens, found: FieldCurvature) -> Figure:
     """Foci of close rays over the field: tangential solid, sagittal dashed."""
-    figure = new_figure(4.6, 4.4)
-    panel = figure.add_subplot()
+    figure, panel = _chart(4.6, 4.4, "focus from the sensor (mm)", "")
     valid = array(found.valid)
-    _over_field(panel, lens, found, array(found.tangential), valid, suffix=" T")
-    _over_field(panel, lens, found, array(found.sagittal), valid, suffix=" S", linestyle=(0, (4, 2)))
-    panel.set_xlabel("focus from the sensor (mm)")
+    _over_field(panel, lens, found, array(found.tangential), valid, suffix=" T", dashes=("solid",))
+    _over_field(panel, lens, found, array(found.sagittal), valid, suffix=" S", dashes=(_SAGITTAL,))
     _legend(figure, panel, 2 if len(found.wavelengths) < 3 else 3)
     return _titled(figure, lens, "field curvature")
 
 
 @styled
-def lateral_curves(lens: Lens, found: LateralColour, airy_radius: float) -> Figure:
-    """Chief rays' heights less the primary wavelength's over the field, beside the Airy radius (mm) in grey."""
-    figure = new_figure(4.6, 4.4)
-    panel = figure.add_subplot()
-    shift = 1e3 * array(found.shift)
-    panel.axvspan(-1e3 * airy_radius, 1e3 * airy_radius, color=FAINT, alpha=0.35, linewidth=0, label="Airy radius")
-    _over_field(panel, lens, found, shift, array(found.valid))
-    panel.set_xlabel("lateral colour (µm)")
+def lateral_curves(lens: Lens, found: LateralColour) -> Figure:
+    """Chief rays' heights less the primary wavelength's over the field, beside the Airy radius of that one in grey."""
+    figure, panel = _chart(4.6, 4.4, "lateral colour (µm)", "")
+    airy = 1.22e3 / float(cutoff(lens, lens.wavelengths[lens.primary_wavelength]))
+    panel.axvspan(-airy, airy, color=FAINT, alpha=0.35, linewidth=0, label="Airy radius")
+    _over_field(panel, lens, found, 1e3 * array(found.shift), array(found.valid), dashes=_DASHES)
     _legend(figure, panel, 4)
     return _titled(figure, lens, "lateral colour")
 
@@ -186,38 +181,37 @@ def lateral_curves(lens: Lens, found: LateralColour, airy_radius: float) -> Figu
 @styled
 def illumination_curve(lens: Lens, found: RelativeIllumination) -> Figure:
     """Relative illumination over the field, beside cos⁴θ where fields are angles."""
-    figure = new_figure(5.4, 3.6)
-    panel = _ruled(figure.add_subplot())
+    figure, panel = _chart(5.4, 3.6, _field_name(lens), "relative illumination")
     field = _field_axis(found)
-    joined = "solid" if len(field) > 5 else "none"  # a few fields are points, not a curve
-    panel.plot(field, array(found.illumination), "o", color=field_colour(0), linestyle=joined, markersize=3.5)
+    line = {"linewidth": 1.5} if len(field) > 5 else {"linestyle": "none", "marker": "o", "markersize": 3.5}
+    panel.plot(
+        field, array(found.illumination), color=field_colour(0), clip_on=False, zorder=3, label="this lens", **line
+    )
     if lens.fields.kind == "angle":
         fine = np.linspace(0, field.max(), 100)
-        panel.plot(fine, np.cos(np.deg2rad(fine)) ** 4, color=GREY, linewidth=1.0, linestyle=":")
-        panel.annotate("cos⁴θ", (fine[70], math.cos(math.radians(fine[70])) ** 4), (4, 4),
-                       textcoords="offset points", color=GREY)  # fmt: skip
+        panel.plot(fine, np.cos(np.deg2rad(fine)) ** 4, color=GREY, linewidth=1.0, linestyle=":", label="cos⁴θ")
     panel.set_xlim(0, max(field.max(), 1e-9))
     panel.set_ylim(0, 1.05 * max(1.0, float(found.illumination.max())))
-    panel.set_xlabel(f"{field_title(lens)} ({_unit(lens)})")
-    panel.set_ylabel("relative illumination")
+    _legend(figure, panel, 2)
     return _titled(figure, lens, "relative illumination")
 
 
 def _pairs(panel: Axes, lens: Lens, found, x: np.ndarray, tangential: np.ndarray, sagittal: np.ndarray) -> None:
     for f, label in enumerate(_labels(lens, found.fields)):
         panel.plot(x, tangential[f], color=field_colour(f), linewidth=1.5, label=f"{label} T")
-        panel.plot(x, sagittal[f], color=field_colour(f), linewidth=1.5, linestyle=(0, (4, 2)), label=f"{label} S")
+        panel.plot(x, sagittal[f], color=field_colour(f), linewidth=1.5, linestyle=_SAGITTAL, label=f"{label} S")
 
 
-def _over_field(panel: Axes, lens: Lens, found, values: np.ndarray, valid: np.ndarray, *, suffix="", **line) -> None:
-    """Curves (F, W) drawn upwards over the field, as lens designers do."""
+def _over_field(panel: Axes, lens: Lens, found, values: np.ndarray, valid: np.ndarray, *, dashes, suffix="") -> None:
+    """Curves (F, W) drawn upwards over the field, as lens designers do; dashes: one after another by wavelength."""
     _ruled(panel)
     field, shown = _field_axis(found), np.where(valid.astype(bool), values, np.nan)
     for w, colour in enumerate(wavelength_colours(found.wavelengths.tolist())):
-        panel.plot(shown[:, w], field, color=colour, linewidth=1.4, label=_wavelength(found, w) + suffix, **line)
+        style = {"color": colour, "linewidth": 1.4, "linestyle": dashes[w % len(dashes)]}
+        panel.plot(shown[:, w], field, label=_wavelength(found, w) + suffix, **style)
     panel.axvline(0, color=GREY, linewidth=0.6)
     panel.set_ylim(0, max(field.max(), 1e-9))
-    panel.set_ylabel(f"{field_title(lens)} ({_unit(lens)})")
+    panel.set_ylabel(_field_name(lens))
     widest = np.nanmax(np.abs(shown), initial=0.0)
     if widest < 1e-9:
         panel.set_xlim(-1, 1)
@@ -227,8 +221,8 @@ def _field_axis(found) -> np.ndarray:
     return np.hypot(*array(found.fields))
 
 
-def _unit(lens: Lens) -> str:
-    return "°" if lens.fields.kind == "angle" else "mm"
+def _field_name(lens: Lens) -> str:
+    return f"{field_title(lens)} ({'°' if lens.fields.kind == 'angle' else 'mm'})"
 
 
 def _labels(lens: Lens, fields) -> Sequence[str]:
@@ -237,6 +231,15 @@ def _labels(lens: Lens, fields) -> Sequence[str]:
 
 def _wavelength(found, w: int) -> str:
     return f"{number_text(1e3 * float(found.wavelengths[w]), 4)} nm"
+
+
+def _chart(width: float, height: float, x: str, y: str) -> tuple[Figure, Axes]:
+    """A figure of one ruled panel, its axes named."""
+    figure = new_figure(width, height)
+    panel = _ruled(figure.add_subplot())
+    panel.set_xlabel(x)
+    panel.set_ylabel(y)
+    return figure, panel
 
 
 def _ruled(panel: Axes) -> Axes:

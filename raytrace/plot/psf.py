@@ -1,10 +1,12 @@
 """Point spread functions as pictures: one panel a kernel, object distances from left to right."""
 
 import math
+import textwrap
 from collections.abc import Sequence
 
 from matplotlib.figure import Figure
 
+from raytrace.analysis import Comparison
 from raytrace.plot.style import GREY, INK, array, new_figure, styled
 from raytrace.psf import Psf
 
@@ -24,22 +26,25 @@ def psf_grid(found: Psf, object_distances: Sequence[float], labels: Sequence[str
 
 
 @styled
-def model_grid(
-    found: Sequence[Psf], object_distances: Sequence[float], labels: Sequence[str], *, title: str = ""
-) -> Figure:
-    """Kernels of the first field over object distance (columns) and model (rows, named by `labels`).
+def model_grid(found: Comparison, *, title: str = "") -> Figure:
+    """Kernels over object distance (columns) and model (rows, with the number of its rays).
 
     Below each kernel: its energy inside the window, and its relative L1 difference from the last row, the reference.
     """
-    kernels = [array(one.kernel)[:, 0] for one in found]
-    notes = []
-    for one in kernels:
-        difference = abs(one - kernels[-1]).sum((-2, -1)) / kernels[-1].sum((-2, -1))
-        notes.append([f"energy {k.sum():.2f}" for k in one])
-        if one is not kernels[-1]:
-            notes[-1] = [f"{note},  Δ {d:.2f}" for note, d in zip(notes[-1], difference, strict=True)]
-    remark = f"Δ: relative L¹ difference from {labels[-1].splitlines()[0]}"
-    return _panels(kernels, found[-1], object_distances, labels, notes, title, remark)
+    kernels = [array(one.kernel)[:, 0] for one in found.psfs]
+    notes = [
+        [
+            f"energy {k.sum():.2f}" + (f",  Δ {d:.2f}" if one is not kernels[-1] else "")
+            for k, d in zip(one, row, strict=True)
+        ]
+        for one, row in zip(kernels, array(found.difference), strict=True)
+    ]
+    labels = [
+        f"{name}\n" + (f"({one.rays} rays)" if one.rays else "")
+        for name, one in zip(found.models, found.psfs, strict=True)
+    ]
+    remark = f"Δ: relative L¹ difference from {found.models[-1]}"
+    return _panels(kernels, found.psfs[-1], found.object_distances.tolist(), labels, notes, title, remark)
 
 
 def _panels(kernels, found: Psf, distances, labels, notes, title: str, remark: str = "") -> Figure:
@@ -64,11 +69,16 @@ def _panels(kernels, found: Psf, distances, labels, notes, title: str, remark: s
                 panel.set_title(_distance(distance), color=INK)
             if column == 0:
                 panel.set_ylabel(label)
-    figure.suptitle(title, fontweight="bold", fontsize=10)
+    figure.suptitle(_filled(title, figure, 10), fontweight="bold", fontsize=10)
     pixels = f"{found.grid.columns} × {found.grid.rows} pixels of {1000 * float(found.grid.pitch):g} µm"
     said = [f"window {width:g} µm, {pixels}; each panel from black (0) to its own peak", remark]
-    figure.supxlabel("\n".join(filter(None, said)), fontsize=7.5, color=GREY)
+    figure.supxlabel("\n".join(_filled(line, figure, 7.5) for line in said if line), fontsize=7.5, color=GREY)
     return figure
+
+
+def _filled(text: str, figure: Figure, size: float) -> str:
+    """A text in lines as wide as the figure; a letter is about 0.62 of its size (points) wide."""
+    return textwrap.fill(text, int(72 * figure.get_figwidth() / (0.62 * size)))
 
 
 def _distance(millimetres: float) -> str:

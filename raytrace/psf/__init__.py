@@ -11,11 +11,12 @@
 | wave     | the traced wavefront: diffraction with the true aberrations                     | diffraction.py |
 
 Each gives `kernels(scene, grid, …) -> Kernels`, energy integrated over pixels, 1 = all light through the entrance
-pupil. `compute.py` drives them to a tolerance, and climbs them for `model="auto"`.
+pupil. `ladder.py` drives them to a tolerance, and climbs them for `model="auto"`; `compute.py` is the call.
 """
 
-from raytrace.psf.compute import MODELS as MODELS
-from raytrace.psf.compute import NotConverged as NotConverged
-from raytrace.psf.compute import Psf as Psf
 from raytrace.psf.compute import psf as psf
+from raytrace.psf.ladder import MODELS as MODELS
+from raytrace.psf.ladder import NotConverged as NotConverged
+from raytrace.psf.ladder import Psf as Psf
+from raytrace.reuse import Memo as Memo
 from raytrace.scene import EmptyPsf as EmptyPsf

@@ -2,9 +2,6 @@
 
 import dataclasses
 import functools
-import itertools
-import warnings
-from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -12,73 +9,11 @@ from torch import Tensor
 from raytrace.grid import Grid
 from raytrace.grid import grid as make_grid
 from raytrace.lens import Lens
-from raytrace.numerics import safe_divide, safe_sqrt
-from raytrace.paraxial import first_order
-from raytrace.psf import diffraction, fourier, gaussian, paraxial, raymap, rays
-from raytrace.scene import EmptyPsf, Kernels, Scene, scene, trace_scene
-from raytrace.value import value
-
-
-class NotConverged(UserWarning):
-    """A PSF whose estimated error stayed above the tolerance at the finest order there is."""
-
-
-@value
-class Psf:
-    """PSFs over object distance × field.
-
-    kernel: (D, F, rows, columns), integrated over pixels.
-    grid: where the pixels lie on the sensor, centre (2,) or (2, D, F) mm.
-    energy: (D, F) inside the window, of the light through the entrance pupil.
-    error: (D, F) estimated relative L1 error of the kernel against the model's own limit (`gaussian`: relative error
-        of σ); nan where it was not estimated. How far it can be believed is measured in docs/psf_error.md.
-    centroid: (2, D, F) mm; covariance: (3, D, F) xx, xy, yy in mm², of the distribution before pixel integration.
-    residual: (D, F) how wrong the model itself is, where it can tell, or None.
-    model: its name; rays: traced for each kernel; reason: why `auto` chose the model, or a remark on convergence.
-    normalised: "energy" (1 = all light through the entrance pupil) or "window" (each kernel sums to 1).
-    """
-
-    kernel: Tensor
-    grid: Grid
-    energy: Tensor
-    error: Tensor
-    centroid: Tensor
-    covariance: Tensor
-    residual: Tensor | None = None
-    model: str = ""
-    rays: int = 0
-    reason: str = ""
-    normalised: str = "energy"
-
-
-@dataclasses.dataclass(frozen=True)
-class Model:
-    """A PSF model as a ladder of orders, each finer than the one before.
-
-    kernels: (scene, grid, order) -> Kernels; orders: from the coarsest to the finest.
-    by_width: True if the error is that of σ, False if it is that of the kernel.
-    left: the error that remains behind the last change of the kernel, in units of that change; None if the rate of
-        convergence is to be measured. The constants cover 95 % of the cases of docs/psf_error.md.
-    """
-
-    kernels: Callable[[Scene, Grid, int], Kernels]
-    orders: Sequence[int]
-    by_width: bool = False
-    left: float | None = None
-
-
-MODELS: dict[str, Model] = {
-    "paraxial": Model(lambda scene, grid, order: paraxial.kernels(scene, grid), (0,)),
-    "fourier": Model(lambda scene, grid, order: fourier.kernels(scene, grid, order=order), range(6), left=0.2),
-    "gaussian": Model(
-        lambda scene, grid, order: gaussian.kernels(scene, grid, order=order), (2, 3, 4, 5, 6, 8, 10, 12, 16, 24), True
-    ),
-    "drt": Model(lambda scene, grid, order: raymap.kernels(scene, grid, order=order), range(11), left=1.5),
-    "wave": Model(lambda scene, grid, order: diffraction.kernels(scene, grid, order=order), range(6), left=0.2),
-}
-
-#: Models from the one that knows least to the one that knows most: the rungs of `model="auto"`.
-LADDER = ("paraxial", "gaussian", "drt", "wave")
+from raytrace.numerics import safe_divide
+from raytrace.psf import gaussian
+from raytrace.psf.ladder import MODELS, Psf, by_order, by_rays, by_tolerance, climb, polychromatic, with_options
+from raytrace.reuse import Memo
+from raytrace.scene import EmptyPsf, Scene, scene, trace_scene
 
 
 def psf(
@@ -93,7 +28,11 @@ def psf(
     center: str = "axis",
     tol: float | None = None,
     rays: int | None = None,
+    order: int | None = None,
     normalise: str = "energy",
+    rho: Tensor | float = 0.5,
+    zernike: Tensor | None = None,
+    memo: Memo | None = None,
 ) -> Psf:
     """PSFs of a lens, differentiable in every number of the lens, its sensor distance and the grid.
 
@@ -104,11 +43,15 @@ def psf(
     ray at the primary wavelength) or "centroid".
     tol: bound on the estimated error, 0.01 by default; the coarsest order that meets it is returned. rays: instead,
     about that many rays per kernel (`drt`: plain Sobol rays), the error then estimated from half of them.
+    order: instead, an order of the model's ladder, as `Psf.order` of an earlier call tells it: for loops, it estimates
+    nothing.
     normalise: "energy" (1 = all light through the entrance pupil) or "window".
+    rho: of `paraxial`, σ over the blur radius. zernike: of `fourier`, Noll coefficients from 1 on, mm RMS of path.
+    memo: rays of earlier calls, which are not traced again where nothing before them has changed.
     Raises ValueError for arguments that make no sense, EmptyPsf if no ray of the whole batch reaches the sensor;
     a single empty kernel of a batch is 0 with gradient 0. Warns NotConverged.
     """
-    _check(model, center, normalise, tol, rays)
+    _check(model, center, normalise, tol=tol, rays=rays, order=order)
     fields = torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields
     distances = lens.surfaces[0].thickness.reshape(1) if object_distances is None else object_distances
     weights = lens.wavelength_weights if wavelengths is None else None
@@ -117,9 +60,14 @@ def psf(
     weights = torch.ones_like(wavelengths) if weights is None else weights
     _check_batch(fields, distances, wavelengths, weights)
     base = make_grid(wavelengths.new_tensor(0.005), 21) if grid is None else grid
-    compute = functools.partial(
-        _group, lens, model, fields, wavelengths, weights / weights.sum(), base, center, tol or 0.01, rays
-    )
+    models = with_options({"paraxial": {"rho": rho}, "fourier": {"zernike": zernike}})
+    drive = {
+        "auto": lambda *scene: climb(*scene, models, tol or 0.01),
+        "order": lambda *scene: by_order(*scene, models, model, order),
+        "rays": lambda *scene: by_rays(*scene, models, model, rays),
+        "tol": lambda *scene: by_tolerance(*scene, models, model, tol or 0.01),
+    }["auto" if model == "auto" else "order" if order is not None else "rays" if rays is not None else "tol"]
+    compute = functools.partial(_group, lens, fields, wavelengths, weights / weights.sum(), base, center, memo, drive)
     infinite = torch.isinf(distances)
     if bool(infinite.any()) and not bool(infinite.all()):
         found = _merge(compute(distances[~infinite]), compute(distances[infinite]), infinite)
@@ -134,7 +82,7 @@ def psf(
     return found
 
 
-def _check(model: str, center: str, normalise: str, tol: float | None, rays: int | None) -> None:
+def _check(model: str, center: str, normalise: str, *, tol: float | None, rays: int | None, order: int | None) -> None:
     if model != "auto" and model not in MODELS:
         raise ValueError(f"model {model!r} is not known; expected auto, {', '.join(MODELS)}")
     if center not in ("axis", "chief", "centroid"):
@@ -143,6 +91,8 @@ def _check(model: str, center: str, normalise: str, tol: float | None, rays: int
         raise ValueError(f"normalise {normalise!r} is not known; expected energy or window")
     if tol is not None and rays is not None:
         raise ValueError("tol and rays exclude each other: a tolerance chooses the number of rays")
+    if order is not None and (tol is not None or rays is not None or model == "auto"):
+        raise ValueError("order belongs to one model and excludes tol and rays: an order says how much work is done")
     if tol is not None and not tol > 0:
         raise ValueError(f"tol {tol:g}: expected a number above 0")
     if rays is not None and rays < 1:
@@ -167,153 +117,12 @@ def _check_batch(fields: Tensor, distances: Tensor, wavelengths: Tensor, weights
         raise ValueError(f"wavelength_weights {weights.tolist()} are below 0 or sum to 0")
 
 
-def _group(lens, model, fields, wavelengths, weights, base, center, tol, rays, distances) -> Psf:
+def _group(lens, fields, wavelengths, weights, base, center, memo, drive, distances) -> Psf:
     """The PSFs of object distances (D,) that are all finite or all infinite."""
-    batch = scene(lens, fields, distances, wavelengths)
+    batch = scene(lens, fields, distances, wavelengths, memo)
     place = _centre(batch, lens, center, weights)
     pixels = dataclasses.replace(base, centre=_with_centre(base.centre, place, len(wavelengths)))
-    if model == "auto":
-        return _climb(batch, pixels, weights, tol)
-    if rays is not None:
-        return _by_rays(batch, pixels, weights, model, rays)
-    return _by_tolerance(batch, pixels, weights, model, tol)
-
-
-def _by_tolerance(batch: Scene, pixels: Grid, weights: Tensor, model: str, tol: float) -> Psf:
-    """Climb the orders until the estimated error of the last meets the tolerance; see `_estimate`."""
-    ladder = MODELS[model]
-    with torch.no_grad():
-        lost = _lost_light(batch) if ladder.by_width else None
-        before, changes, error = None, [], None
-        for order in ladder.orders:
-            found = _polychromatic(ladder.kernels(batch, pixels, order), weights, model)
-            if before is not None:
-                changes.append(_width_change(before, found) if ladder.by_width else _kernel_change(before, found))
-            error = _estimate(ladder, changes, order, lost, like=found.energy)
-            if bool((error <= tol).all()):
-                break
-            before = found
-    reason = ""
-    if not bool((error <= tol).all()):
-        reason = f"{model}: the estimated error {float(error.max()):.1e} stays above the tolerance {tol:g}"
-        warnings.warn(reason, NotConverged, stacklevel=4)
-    if torch.is_grad_enabled():
-        found = _polychromatic(ladder.kernels(batch, pixels, order), weights, model)
-    return dataclasses.replace(found, error=error, reason=reason)
-
-
-def _estimate(ladder: Model, changes: list[Tensor], order: int, lost: Tensor | None, *, like: Tensor) -> Tensor:
-    """Estimated error (D, F) after changes δ_1 … δ_n from one order to the next; inf while too few are known.
-
-    Cells (`drt`) halve their error with each order, waves divide it by 10 or more: the error left is a constant
-    `left` times δ_n. Gauss rings (`gaussian`) converge as fast as the lens is smooth, so the geometric series
-    δ_n ρ/(1 - ρ) is summed, ρ the largest ratio of successive changes so far: one lucky small change is not believed.
-    Rings that an edge crosses jump instead by up to half a ring's weight, π/4n of the light, or by all that is lost.
-    A floor stands for rounding.
-    """
-    if len(ladder.orders) == 1:
-        return torch.zeros_like(like)
-    floor = 1e-12 if like.dtype == torch.float64 else 1e-5
-    if not changes or (ladder.left is None and len(changes) < 2):
-        return torch.full_like(like, torch.inf)
-    if ladder.left is not None:
-        error = ladder.left * changes[-1]
-    else:
-        ratios = [safe_divide(later, earlier) for earlier, later in itertools.pairwise(changes)]
-        rho = torch.stack(ratios).amax(0).clamp(1e-4, 0.9)
-        error = changes[-1] * rho / (1 - rho)
-    if lost is not None:
-        error = torch.maximum(error, torch.minimum(2 * lost, torch.full_like(lost, 0.8 / order)))
-    return error.clamp_min(floor)
-
-
-def _lost_light(batch: Scene) -> Tensor:
-    """The largest share (D, F) of the beam that is lost, over wavelengths, by rings between those of any order; 0
-    where it arrives as a whole or not at all."""
-    fold = gaussian.symmetry(batch)
-    points, share = gaussian.fold_pupil(20, fold, batch.wavelengths)
-    arrived = torch.where(trace_scene(batch, points).valid, share, 0.0).sum(-1)
-    arrived = arrived.expand(batch.shape)
-    return torch.where(arrived > 0, (1 - arrived).clamp_min(0.0), 0.0).amax(-1)
-
-
-def _by_rays(batch: Scene, pixels: Grid, weights: Tensor, model: str, count: int) -> Psf:
-    """About `count` rays a kernel; the error is the change from half as many."""
-    if model == "drt":
-        found, half = (
-            _polychromatic(rays.kernels(batch, pixels, rays=max(n, 1)), weights, model) for n in (count, count // 2)
-        )
-        return dataclasses.replace(found, error=_kernel_change(half, found).detach())
-    ladder, before = MODELS[model], None
-    for order in ladder.orders:
-        found = _polychromatic(ladder.kernels(batch, pixels, order), weights, model)
-        if found.rays > count:
-            break
-        before, coarser = found, before
-    if before is None:
-        raise ValueError(f"{model} needs at least {found.rays} rays a kernel; {count} given")
-    if len(ladder.orders) == 1:
-        return dataclasses.replace(before, error=torch.zeros_like(before.energy))
-    if coarser is None:
-        return before
-    change = _width_change(coarser, before) if ladder.by_width else _kernel_change(coarser, before)
-    return dataclasses.replace(before, error=change.detach())
-
-
-def _climb(batch: Scene, pixels: Grid, weights: Tensor, tol: float) -> Psf:
-    """The first rung of LADDER whose kernels differ from those of the next by less than the tolerance."""
-    here = _by_tolerance(batch, pixels, weights, LADDER[0], tol)
-    for name in LADDER[1:]:
-        above = _by_tolerance(batch, pixels, weights, name, tol)
-        with torch.no_grad():
-            gap = float(_kernel_change(above, here).max())
-        if gap <= tol and (name == "wave" or not _diffracts(batch, pixels, above)):
-            said = f"{here.model}: its kernels differ from those of {name} by {gap:.1e}, within {tol:g}"
-            return dataclasses.replace(here, reason=said)
-        here, below = above, here.model
-    return dataclasses.replace(here, reason=f"wave: {below} differs from it by {gap:.1e}, more than {tol:g}")
-
-
-def _diffracts(batch: Scene, pixels: Grid, light: Psf) -> bool:
-    """Whether somewhere neither a pixel nor the blur is twice as wide as the Airy disc: rays alike prove nothing."""
-    with torch.no_grad():
-        airy = 1.22e-3 * batch.wavelengths.max() * first_order(batch.lens).working_f_number.max()
-        blur = 2 * safe_sqrt(light.covariance[0] + light.covariance[2])
-        return bool((torch.maximum(blur, pixels.pitch) < 4 * airy).any())
-
-
-def _polychromatic(found: Kernels, weights: Tensor, model: str) -> Psf:
-    """Sum over wavelengths by their weights; moments are those of the sum of the distributions."""
-    share = weights / weights.sum()
-    centroid = (share * found.centroid).sum(-1)
-    offset = found.centroid - centroid[..., None]
-    spread = torch.stack([offset[0] * offset[0], offset[0] * offset[1], offset[1] * offset[1]])
-    kernel = (share[:, None, None] * found.kernel).sum(-3)
-    centre = found.grid.centre if found.grid.centre.dim() == 1 else found.grid.centre[..., 0]
-    energy = kernel.sum((-2, -1))
-    return Psf(
-        kernel=kernel,
-        grid=dataclasses.replace(found.grid, centre=centre),
-        energy=energy,
-        error=torch.full_like(energy.detach(), torch.nan),
-        centroid=centroid,
-        covariance=(share * (found.covariance + spread)).sum(-1),
-        residual=None if found.residual is None else (share * found.residual).sum(-1),
-        model=model,
-        rays=found.rays,
-    )
-
-
-def _kernel_change(one: Psf, other: Psf) -> Tensor:
-    """Relative L1 difference (D, F) of two kernels, in units of the second's energy; 0 where both are empty."""
-    return safe_divide((one.kernel - other.kernel).abs().sum((-2, -1)), other.energy)
-
-
-def _width_change(one: Psf, other: Psf) -> Tensor:
-    """Relative difference (D, F) of σ, from the larger change of the two variances, and of the energy."""
-    width = other.covariance[0] + other.covariance[2]
-    variance = 0.5 * safe_divide((one.covariance[::2] - other.covariance[::2]).abs().sum(0), width)
-    return torch.maximum(variance, safe_divide((one.energy - other.energy).abs(), other.energy))
+    return drive(batch, pixels, weights)
 
 
 def _centre(batch: Scene, lens: Lens, center: str, weights: Tensor) -> Tensor | None:
@@ -323,7 +132,7 @@ def _centre(batch: Scene, lens: Lens, center: str, weights: Tensor) -> Tensor | 
     with torch.no_grad():
         if center == "centroid":
             pixel = make_grid(batch.wavelengths.new_tensor(1.0), 1)
-            return _polychromatic(gaussian.kernels(batch, pixel, order=6), weights, "gaussian").centroid
+            return polychromatic(gaussian.kernels(batch, pixel, order=6), weights, "gaussian").centroid
         primary = lens.wavelengths[lens.primary_wavelength][None]
         rays = trace_scene(dataclasses.replace(batch, wavelengths=primary), batch.fields.new_zeros(2, 1))
         return rays.position[:2, :, :, 0, 0]

@@ -107,9 +107,9 @@ def rings_and_arms(phase: float, order: int) -> tuple[int, int]:
     """Gauss rings and arms that integrate waves whose phase varies by `phase` radians along a pupil radius.
 
     A Gauss rule in r² of n rings integrates it up to J_2n(phase/2), arms up to J_arms(phase): both fall faster than any
-    power beyond the argument. Each order adds a margin of the width of that fall, ∝ phase^(1/3).
+    power beyond the argument. Order 0 adds a margin of the width of that fall, ∝ phase^(1/3); three orders add another.
     """
-    margin = 1 + order
+    margin = 1 + order / 3
     rings = math.ceil(phase / 4 + margin * (2 + 0.8 * phase ** (1 / 3)))
     arms = math.ceil(phase + margin * (6 + 1.5 * phase ** (1 / 3)))
     return rings, 4 * math.ceil(arms / 4)
@@ -129,9 +129,10 @@ def disc_rule(phase: float, order: int, *, most: int, what: str, like: Tensor) -
 def nodes_per_pixel(pitch: float, cutoff: float, order: int) -> int:
     """Gauss-Legendre nodes across a pixel for an intensity with spatial frequencies up to `cutoff` in 1/mm.
 
-    n nodes integrate exp(iat) over [-1, 1] up to J_2n(a), a = π·cutoff·pitch; little light is near the cutoff.
+    n nodes integrate exp(iat) over [-1, 1] up to J_2n(a), a = π·cutoff·pitch; little light is near the cutoff. From
+    order -2 on; a margin of two nodes makes order 0.
     """
-    return math.ceil(0.5 * math.pi * cutoff * pitch) + 2 + order
+    return max(1, math.ceil(0.5 * math.pi * cutoff * pitch) + 2 + order)
 
 
 def sub_pixels(grid: Grid, nodes: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -155,6 +156,8 @@ def _fraction(waves: Tensor) -> Tensor:
 class _J0(torch.autograd.Function):
     """J₀' = -J₁."""
 
+    generate_vmap_rule = True
+
     @staticmethod
     def forward(x):
         return torch.special.bessel_j0(x)
@@ -162,14 +165,19 @@ class _J0(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx, inputs, output):
         ctx.save_for_backward(*inputs)
+        ctx.save_for_forward(*inputs)
 
     @staticmethod
     def backward(ctx, gradient):
         return -gradient * _J1.apply(*ctx.saved_tensors)
 
+    jvp = backward
+
 
 class _J1(torch.autograd.Function):
     """J₁' = J₀ - J₁/x, 1/2 at 0."""
+
+    generate_vmap_rule = True
 
     @staticmethod
     def forward(x):
@@ -178,9 +186,12 @@ class _J1(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx, inputs, output):
         ctx.save_for_backward(*inputs)
+        ctx.save_for_forward(*inputs)
 
     @staticmethod
     def backward(ctx, gradient):
         (x,) = ctx.saved_tensors
         quotient = torch.where(x == 0, 0.5, safe_divide(_J1.apply(x), x))
         return gradient * (_J0.apply(x) - quotient)
+
+    jvp = backward

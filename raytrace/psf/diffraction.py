@@ -8,17 +8,18 @@ W is the OPD on the reference sphere and (L, M) point from there to its centre (
 """
 
 import dataclasses
+import functools
+import itertools
 import math
-from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from raytrace import zernike
 from raytrace.grid import Grid
-from raytrace.launch import rays_of_field, vignette
-from raytrace.lens import with_object_distance
 from raytrace.numerics import safe_divide, safe_sqrt
+from raytrace.psf.clear import between, clear_arms
 from raytrace.psf.dft import (
     disc_rule,
     integrate,
@@ -30,17 +31,17 @@ from raytrace.psf.dft import (
     to_grid,
     to_grid_mirrored,
 )
+from raytrace.psf.radial import is_centred, radii_of_waves, unfold
 from raytrace.pupil import gauss_rings
-from raytrace.scene import Kernels, Scene
-from raytrace.surface import inside
-from raytrace.trace import media, steps
-from raytrace.value import value
-from raytrace.wavefront import Wavefront, rays_on_sensor, wavefront
+from raytrace.scene import Kernels, Scene, symmetry, trace_scene
+from raytrace.value import to, value
+from raytrace.wavefront import Wavefront, wavefront
 
 _MOST_RAYS = 400_000  # rays of one kernel; beyond, the phase is refused
-_TERMS = 66  # Zernike terms (to degree 10) of the map from the pupil to directions
+_DEGREE = 10  # of the map from the pupil to directions
+_TERMS = (_DEGREE + 1) * (_DEGREE + 2) // 2  # its Zernike terms
 _PROBE = 8, 32  # rings and arms of the rays that find the map and the sampling
-_SCAN, _SECTIONS, _ZOOMS = 24, 16, 6  # the edge of the pupil is found to 16⁻⁶/24 of its radius
+_RIM = 1 - 1e-6  # of the pupil: a stop at its very edge clips nothing
 
 
 @value
@@ -59,7 +60,7 @@ class Waves:
 def kernels(scene: Scene, grid: Grid, *, order: int = 0) -> Kernels:
     """Kernels of the wave model; a kernel whose light is blocked altogether is 0 with gradient 0.
 
-    order: each one adds rays and pixel nodes; two successive ones estimate the error.
+    order: from -2 on; each one adds rays and pixel nodes, successive ones estimate the error.
     centroid and covariance are those of the rays: the mean of the wave is theirs (Ehrenfest), its second moment does
     not exist behind a hard edge. residual: size of the terms that Debye's integral leaves out.
     Raises ValueError where the window or the blur would need too many rays.
@@ -69,7 +70,8 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0) -> Kernels:
         torch.cat(parts, axis)
         for parts, axis in zip(zip(*(entries for _, *entries in fields), strict=True), (1, 2, 2, 1), strict=True)
     )
-    return Kernels(kernel, grid, centroid, covariance, max(rays for rays, *_ in fields), residual)
+    found = Kernels(kernel, grid, centroid, covariance, max(rays for rays, *_ in fields), residual)
+    return dataclasses.replace(to(found, dtype=grid.pitch.dtype), grid=grid)
 
 
 def waves(scene: Scene, reach: Tensor | float, *, order: int = 0) -> Waves:
@@ -78,21 +80,15 @@ def waves(scene: Scene, reach: Tensor | float, *, order: int = 0) -> Waves:
     The rays are Gauss rings over the pupil; where it is vignetted, over the clear part of every arm. One arm is enough
     on the axis of a round lens, half the arms for a field in the y-z plane.
     """
-    probe, symmetry = _probe(scene), _symmetry(scene)
-    phase = phase_along_radius(probe, reach)
-    rings, arms = rings_and_arms(phase, order)
-    if symmetry == "round":
-        arms, rule = 1, gauss_rings(rings, 1, dtype=probe.opd.dtype, device=probe.opd.device)
-    else:
-        rule = disc_rule(phase, order, most=_MOST_RAYS, what="the wave model", like=probe.opd)
-    clear = _clear_arms(scene, arms, like=probe.opd)
-    pupil, weights = rule if clear is None else _between(*clear, *rule)
-    if symmetry == "mirror":
-        right = rule[0][0] > 0
-        pupil, weights = pupil[..., right], 2 * weights[..., right]
+    return _waves(scene, _probe(scene), reach, order)
+
+
+def _waves(scene: Scene, probe: Wavefront, reach: Tensor | float, order: int) -> Waves:
+    fold = symmetry(scene)
+    pupil, weights = _rays(scene, probe, fold, phase_along_radius(probe, reach), order)
     front = wavefront(scene, pupil, weights)
     solid = math.pi * weights * _jacobian(_direction_map(probe), pupil)
-    return Waves(safe_sqrt(front.energy * solid), front, symmetry)
+    return Waves(safe_sqrt(front.energy * solid), front, fold)
 
 
 def amplitude(waves: Waves, x: Tensor, y: Tensor) -> Tensor:
@@ -118,7 +114,7 @@ def strehl(scene: Scene, *, order: int = 0) -> Tensor:
     value does not depend on it. 0 where no light arrives.
     """
     ratios = [_strehl(_one_field(scene, f), order) for f in range(scene.shape[1])]
-    return torch.cat(ratios, 1)
+    return torch.cat(ratios, 1).to(scene.wavelengths.dtype)
 
 
 def phase_along_radius(probe: Wavefront, reach: Tensor | float) -> float:
@@ -139,13 +135,23 @@ def _field_kernels(scene: Scene, grid: Grid, order: int) -> tuple:
     centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))) - probe.centre[:2]
     local = Grid(grid.pitch, grid.rows, grid.columns, centre)
     cutoff = 2e3 * float((_half_spread(probe) * probe.index / probe.wavelength).max())
-    x, y, weight = sub_pixels(local, nodes_per_pixel(float(grid.pitch), cutoff, order))
-    corner = torch.hypot(x.detach().abs().amax(-1), y.detach().abs().amax(-1)).max()
-    light = waves(scene, corner, order=order)
+    if symmetry(scene) == "round" and is_centred(grid):
+        # One radius tells all: as a row of points, without pixels.
+        radii, matrix = radii_of_waves(grid, cutoff, order)
+        x, y = radii, torch.zeros_like(radii[:1])
+        corner = radii.detach().max()
+    else:
+        x, y, weight = sub_pixels(local, nodes_per_pixel(float(grid.pitch.detach()), cutoff, order))
+        matrix, corner = None, torch.hypot(x.detach().abs().amax(-1), y.detach().abs().amax(-1)).max()
+    light = _waves(scene, probe, corner, order)
     U = amplitude(light, x, y)
+    intensity = U.real**2 + U.imag**2
     centroid, covariance = _moments(light)
     residual = _debye_residual(light.wavefront, probe, corner)
-    kernel = integrate(U.real**2 + U.imag**2, weight, grid.pitch)
+    if matrix is None:
+        kernel = integrate(intensity, weight, grid.pitch)
+    else:
+        kernel = unfold(grid, intensity[..., 0, :] @ matrix.mT)
     return light.amplitude.shape[-1], kernel, centroid, covariance, residual
 
 
@@ -153,18 +159,6 @@ def _probe(scene: Scene) -> Wavefront:
     """A few hundred rays that find the blur, the map of directions and so the sampling."""
     points, weights = gauss_rings(*_PROBE, dtype=scene.wavelengths.dtype, device=scene.wavelengths.device)
     return wavefront(scene, points, weights)
-
-
-def _symmetry(scene: Scene) -> str:
-    """What a field of a lens has in common with its mirror images; "none" where a gradient may break it."""
-    apertures = [a for surface in scene.lens.surfaces for a in surface.apertures]
-    if scene.fields.requires_grad or scene.lens.fields.vignetting is not None or bool((scene.fields[0] != 0).any()):
-        return "none"
-    if any(a.centre[0] != 0 for a in apertures):
-        return "none"
-    if bool((scene.fields[1] != 0).any()) or any(a.centre[1] != 0 or a.shape != "circular" for a in apertures):
-        return "mirror"
-    return "round"
 
 
 def _moments(light: Waves) -> tuple[Tensor, Tensor]:
@@ -185,13 +179,19 @@ def _moments(light: Waves) -> tuple[Tensor, Tensor]:
 
 
 def _debye_residual(front: Wavefront, probe: Wavefront, corner: Tensor) -> Tensor:
-    """2π n b² s²/(2 |R| λ) (...): phase that |q - p| - R leaves out beside L x + M y, over the window or the blur b."""
+    """Relative L1 error (...) by what |q - p| - R leaves out beside L x + M y, π n (s·p)²/(|R| λ) of phase.
+
+    Over the window or the blur b, and directions up to s, the mean of (s·p)² is b² s²/8; a fifth allows for light that
+    gathers at the rim. Where that turns many times it only moves rays, by up to b² s/|R|, which changes densities by
+    up to 6 b s/|R|. Against sums of wavelets on the exit pupil it is 1 to 10 times the true error out of focus.
+    """
     with torch.no_grad():
         spread = _half_spread(probe)
         wavelength = 1e-3 * front.wavelength / front.index
         blur = torch.where(probe.usable, torch.linalg.vector_norm(probe.landing, dim=0), 0.0).amax(-1)
         b = torch.minimum(corner, blur + wavelength / spread.clamp_min(1e-30))
-        return math.pi * (b * spread) ** 2 / (front.radius.abs() * wavelength)
+        stretch = b * spread / front.radius.abs()
+        return torch.minimum(0.2 * math.pi * b * spread / wavelength, torch.full_like(b, 6.0)) * stretch
 
 
 def _half_spread(front: Wavefront) -> Tensor:
@@ -216,101 +216,51 @@ def _direction_map(probe: Wavefront) -> Tensor:
 
 
 def _jacobian(directions: Tensor, pupil: Tensor) -> Tensor:
-    """|∂(L, M)/∂(p_x, p_y)| (..., P) at pupil points."""
-    by_x, by_y = (g.movedim(0, -2) for g in zernike.gradients(_orders(), *pupil))
-    (L_x, M_x), (L_y, M_y) = ((directions[..., None, :] @ g)[..., 0, :] for g in (by_x, by_y))
+    """|∂(L, M)/∂(p_x, p_y)| (..., P) at pupil points, of Zernike series (2, ..., J) written out in powers of p."""
+    matrix, i, j = _powers()
+    terms = directions @ directions.new_tensor(matrix)
+    x, y = (torch.stack([torch.ones_like(p), *itertools.accumulate([p] * _DEGREE, torch.mul)]) for p in pupil)
+    by_x = (x[np.maximum(i - 1, 0)] * y[j]).movedim(0, -2)
+    by_y = (x[i] * y[np.maximum(j - 1, 0)]).movedim(0, -2)
+    (L_x, M_x), (L_y, M_y) = (
+        ((terms * terms.new_tensor(power))[..., None, :] @ slope)[..., 0, :] for power, slope in ((i, by_x), (j, by_y))
+    )
     return (L_x * M_y - L_y * M_x).abs()
 
 
-def _clear_arms(scene: Scene, arms: int, *, like: Tensor) -> tuple[Tensor, Tensor] | None:
-    """Radii (D, F, W, arms) between which light passes along each arm of a ring rule; None if everything passes.
+@functools.cache
+def _powers() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Matrix (J, T) from Zernike coefficients to those of x^i y^j, and the exponents i and j (T,)."""
+    i, j = np.array([(n - k, k) for n in range(_DEGREE + 1) for k in range(n + 1)]).T
+    points, _ = gauss_rings(2 * _DEGREE, 4 * _DEGREE)
+    x, y = points.numpy()[:, :, None]
+    values = zernike.polynomials(_orders(), *points).numpy()
+    return np.linalg.lstsq(x**i * y**j, values.T, rcond=None)[0].T, i, j
 
-    The first and the last clear point of a scan, refined by repeated division. A gap inside (the arm of a spider)
-    stays: its rays are blocked one by one.
-    """
-    angle = (torch.arange(arms, dtype=like.dtype, device=like.device) + 0.5) * (2 * math.pi / arms)
-    unit = torch.stack([torch.cos(angle), torch.sin(angle)])
 
-    def clear(radii: Tensor) -> Tensor:
-        """(K, D, F, W, arms) for radii (K, D, F, W, arms), or (K, 1, 1, 1, arms) for all alike."""
-        points = torch.stack([(radii * direction).movedim(0, -2).flatten(-2) for direction in unit])
-        points = points.reshape(2, -1) if radii.shape[1:4] == (1, 1, 1) else points
-        return rays_on_sensor(scene, points).valid.unflatten(-1, (len(radii), arms)).movedim(-2, 0)
-
+def _rays(scene: Scene, probe: Wavefront, fold: str, phase: float, order: int) -> tuple[Tensor, Tensor]:
+    """Pupil points (2, P) and weights (P,): Gauss rings; where light is lost, (2, D, F, W, P) and (D, F, W, P) over the
+    clear part of every arm."""
+    like = {"dtype": probe.opd.dtype, "device": probe.opd.device}
+    rings, arms = rings_and_arms(phase, order)
+    if fold == "round":
+        arms, (points, weights) = 1, gauss_rings(rings, 1, **like)
+    else:
+        points, weights = disc_rule(phase, order, most=_MOST_RAYS, what="the wave model", like=probe.opd)
+    unit = points[:, :arms] / torch.hypot(*points[:, :arms])
+    if fold == "mirror":
+        right = points[0] > 0
+        points, weights, unit = points[:, right], 2 * weights[right], unit[:, unit[0] > 0]
     with torch.no_grad():
-        step = torch.arange(_SCAN + 1, dtype=angle.dtype, device=angle.device) / _SCAN
-        passed = clear(step[:, None, None, None, None].expand(-1, 1, 1, 1, arms))
-        if bool(passed.all()):
-            return None
-        first = passed.to(torch.int8).argmax(0)
-        last = _SCAN - passed.flip(0).to(torch.int8).argmax(0)
-        some = passed.any(0)
-        edges = [_edge(clear, step[i], step[(i + d).clamp(0, _SCAN)]) for i, d in ((first, -1), (last, 1))]
-    return tuple(torch.where(some, _follow_rim(scene, *edge, unit), 0.0) for edge in edges)
-
-
-def _edge(clear: Callable[[Tensor], Tensor], passes: Tensor, blocked: Tensor) -> tuple[Tensor, Tensor]:
-    """The last radius (...) that passes on the way from one that does to one that does not, and the next."""
-    share = torch.arange(_SECTIONS + 1, dtype=passes.dtype, device=passes.device) / _SECTIONS
-    for _ in range(_ZOOMS):
-        radii = passes + share.reshape(-1, *(1,) * passes.dim()) * (blocked - passes)
-        reached = clear(radii)[1:].to(torch.int64).cumprod(0).sum(0)
-        passes, blocked = (
-            torch.gather(radii, 0, index[None])[0] for index in (reached, (reached + 1).clamp_max(_SECTIONS))
-        )
-    return passes, blocked
-
-
-def _follow_rim(scene: Scene, passes: Tensor, blocked: Tensor, unit: Tensor) -> Tensor:
-    """The radius `passes` with the derivatives of a rim that moves with the lens.
-
-    The ray just outside is stopped where its r² in an aperture has the value of the rim, r²(ρ, θ) = constant:
-        dρ/dθ = -(∂r²/∂θ) / (∂r²/∂ρ)
-    for circular apertures; a rim of another shape, or where rays miss a surface, stands still.
-    """
-    if not torch.is_grad_enabled():
-        return passes
-    radius = blocked.clone().requires_grad_()
-    along = _level_at_rim(scene, radius * unit[0], radius * unit[1])
-    if not along.requires_grad:
-        return passes
-    (slope,) = torch.autograd.grad(along.sum(), radius, retain_graph=True)
-    level = _level_at_rim(scene, blocked * unit[0], blocked * unit[1])
-    return passes - safe_divide(level - level.detach(), slope)
-
-
-def _level_at_rim(scene: Scene, *pupil: Tensor) -> Tensor:
-    """r² (D, F, W, P) in mm² of rays in the circular aperture that stops them; 0 for others."""
-    lens = with_object_distance(scene.lens, scene.lens.surfaces[0].thickness[..., None])
-    field, wavelength = scene.fields[:, :, None, None], scene.wavelengths[:, None]
-    rays = rays_of_field(lens, field, vignette(lens, field, torch.stack(pupil)), wavelength=wavelength)
-    level = torch.zeros_like(pupil[0])
-    walk = steps(lens.surfaces[1:], rays, indices=media(lens, wavelength))
-    for surface, crossing in zip(lens.surfaces[1:], walk, strict=True):
-        for aperture in surface.apertures:
-            stops = ~inside(dataclasses.replace(surface, apertures=(aperture,)), crossing.rays.position)
-            x, y = (crossing.rays.position[i] - aperture.centre[i] for i in (0, 1))
-            here = crossing.clipped & stops & (level == 0) & (aperture.shape == "circular")
-            level = torch.where(here, x * x + y * y, level)
-    return level
-
-
-def _between(inner: Tensor, outer: Tensor, pupil: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """A ring rule squeezed, arm by arm, into the clear annulus: r² = i² + (o² - i²) u; same share of its area."""
-    arms = inner.shape[-1]
-    rings = pupil.shape[1] // arms
-    share = outer**2 - inner**2
-    u = (pupil**2).sum(0).reshape(rings, arms)[:, 0]
-    radius = torch.sqrt(inner[..., None, :] ** 2 + share[..., None, :] * u[:, None])
-    unit = pupil[:, :arms] / torch.hypot(*pupil[:, :arms])
-    points = torch.stack([(radius * direction).flatten(-2) for direction in unit])
-    return points, (share[..., None, :] * weights.reshape(rings, arms)).flatten(-2)
+        if bool(probe.valid.all()) and bool(trace_scene(scene, _RIM * unit).valid.all()):
+            return points, weights
+    return between(*clear_arms(scene, unit), unit, rings=rings)
 
 
 def _strehl(scene: Scene, order: int) -> Tensor:
     probe = _probe(scene)
     spacing = 0.25e-3 * probe.wavelength / probe.index / _half_spread(probe).clamp_min(1e-30)
-    light = waves(scene, 20 * spacing.max(), order=order + 1)
+    light = _waves(scene, probe, 20 * spacing.max(), order + 1)
     front = light.wavefront
     with torch.no_grad():
         x, y = _moments(light)[0] - front.centre[:2]
@@ -328,11 +278,12 @@ def _strehl(scene: Scene, order: int) -> Tensor:
 
 
 def _one_field(scene: Scene, f: int) -> Scene:
-    return Scene(scene.lens, scene.fields[:, f : f + 1], scene.wavelengths)
+    """One field of a scene in double precision: in single precision the OPD itself is known to 1/400 wave only."""
+    return to(dataclasses.replace(scene, fields=scene.fields[:, f : f + 1]), dtype=torch.float64)
 
 
 def _one_field_grid(grid: Grid, f: int) -> Grid:
     centre = grid.centre
     if centre.dim() > 1 and centre.shape[2] > 1:
         centre = centre[:, :, f : f + 1]
-    return Grid(grid.pitch, grid.rows, grid.columns, centre)
+    return to(Grid(grid.pitch, grid.rows, grid.columns, centre), dtype=torch.float64)

@@ -10,6 +10,7 @@ from the lens's own first-order data: power φ and principal planes at every wav
 so that the integral of |U|² over the sensor is 1 (Parseval).
 """
 
+import dataclasses
 import itertools
 import math
 
@@ -21,6 +22,7 @@ from raytrace.grid import Grid
 from raytrace.launch import is_at_infinity, object_field
 from raytrace.paraxial import first_order, signed, system_matrix
 from raytrace.psf.dft import (
+    bessel_j0,
     disc_rule,
     integrate,
     nodes_per_pixel,
@@ -30,10 +32,11 @@ from raytrace.psf.dft import (
     sub_pixels,
     to_grid,
 )
+from raytrace.psf.radial import is_centred, radii_of_waves, reach, unfold
 from raytrace.pupil import gauss_rings, with_rim
-from raytrace.scene import Kernels, Scene
+from raytrace.scene import Kernels, Scene, symmetry
 from raytrace.trace import media
-from raytrace.value import value
+from raytrace.value import to, value
 
 _MOST_POINTS = 400_000  # pupil points of one kernel; beyond, the phase is refused
 
@@ -55,22 +58,54 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0, zernike: Tensor | None 
     """Kernels of the Fourier model about the paraxial chief ray.
 
     zernike: Noll coefficients from 1 on, (J,) or (J, D, F, W) with axes of length 1 to broadcast, mm RMS of path.
-    order: each one adds pupil points and pixel nodes; two successive ones estimate the error.
+    order: from -2 on; each one adds pupil points and pixel nodes, successive ones estimate the error.
     centroid and covariance are those of the geometric limit: the second moment of a hard-edged diffraction pattern
     does not exist. Raises ValueError where the window or the blur would need too many pupil points.
     """
-    lens, shape = paraxial(scene), scene.shape
-    waves = _aberrations(scene, zernike)
-    centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))) - lens.chief
-    nodes = nodes_per_pixel(float(grid.pitch), 2 * float(lens.frequency.detach().abs().max()), order)
-    x, y, weight = sub_pixels(Grid(grid.pitch, grid.rows, grid.columns, centre), nodes)
+    # Phases of hundreds of radians leave single precision three digits.
+    scene, window = (to(each, dtype=torch.float64) for each in (scene, grid))
+    lens = paraxial(scene)
+    waves = None if zernike is None else _aberrations(scene, zernike.to(torch.float64))
+    centroid, covariance = _moments(lens, waves)
+    if waves is None and symmetry(scene) == "round" and is_centred(window):
+        kernel = _round_kernels(lens, window, order)
+    else:
+        kernel = _kernels(lens, window, waves, order)
+    found = Kernels(kernel, grid, lens.chief + centroid, covariance, rays=0)
+    return dataclasses.replace(to(found, dtype=grid.pitch.dtype), grid=grid)
+
+
+def _kernels(lens: Paraxial, window: Grid, waves: Tensor | None, order: int) -> Tensor:
+    """Kernels (D, F, W, rows, columns), one after the other: each has its own phases."""
+    shape = lens.defocus.shape
+    centre = window.centre.reshape(2, *(window.centre.shape[1:] or (1, 1, 1))) - lens.chief
+    nodes = nodes_per_pixel(float(window.pitch.detach()), 2 * float(lens.frequency.detach().abs().max()), order)
+    x, y, weight = sub_pixels(Grid(window.pitch, window.rows, window.columns, centre), nodes)
     pixels = []
     for place in itertools.product(*map(range, shape)):
         own = None if waves is None else waves[(slice(None), *place)]
         intensity = _intensity(x[place], y[place], lens.defocus[place], lens.frequency[place], own, order=order)
-        pixels.append(integrate(intensity, weight, grid.pitch))
-    centroid, covariance = _moments(lens, waves)
-    return Kernels(torch.stack(pixels).unflatten(0, shape), grid, lens.chief + centroid, covariance, rays=0)
+        pixels.append(integrate(intensity, weight, window.pitch))
+    return torch.stack(pixels).unflatten(0, shape)
+
+
+def _round_kernels(lens: Paraxial, window: Grid, order: int) -> Tensor:
+    """The same on the axis, along one radius; Bessel functions are shared by all object distances.
+
+    Sensor and pupil decide the frequency a, an object distance only the defocus.
+    """
+    shared = bool((lens.frequency == lens.frequency[:1]).all())
+    frequency = (lens.frequency[:1] if shared else lens.frequency)[..., None]
+    steepest = float(lens.frequency.detach().abs().max())
+    radii, matrix = radii_of_waves(window, 2 * steepest, order)
+    corner = float(window.pitch.detach()) * reach(window)
+    phase = 2 * math.pi * steepest * corner + 2 * float(lens.defocus.detach().abs().max())
+    radius, weights = _rings(rings_and_arms(phase, order)[0], like=radii)
+    spectrum = weights * phasor(lens.defocus[..., None] * radius * radius / (2 * math.pi))
+    J0 = bessel_j0(2 * math.pi * (frequency * radii)[..., None] * radius)
+    real, imag = (torch.einsum("dfwkj,dfwj->dfwk", J0, part) for part in (spectrum.real, spectrum.imag))
+    intensity = math.pi * lens.frequency[..., None] ** 2 * (real * real + imag * imag)
+    return unfold(window, intensity @ matrix.mT)
 
 
 def paraxial(scene: Scene) -> Paraxial:
@@ -101,7 +136,7 @@ def _intensity(x: Tensor, y: Tensor, defocus: Tensor, frequency: Tensor, waves: 
     Without them the pupil is symmetric and its rings are integrals in closed form: Σ_r w_r e^{iψ r²} J₀(2π a r ρ).
     """
     reach = math.hypot(float(x.detach().abs().max()), float(y.detach().abs().max()))
-    phase = 2 * math.pi * abs(float(frequency)) * reach + 2 * abs(float(defocus))
+    phase = 2 * math.pi * abs(float(frequency.detach())) * reach + 2 * abs(float(defocus.detach()))
     if waves is None:
         rings, _ = rings_and_arms(phase, order)
         radius, weights = _rings(rings, like=x)
@@ -115,10 +150,8 @@ def _intensity(x: Tensor, y: Tensor, defocus: Tensor, frequency: Tensor, waves: 
     return math.pi * frequency**2 * (U.real**2 + U.imag**2)
 
 
-def _aberrations(scene: Scene, zernike: Tensor | None) -> Tensor | None:
+def _aberrations(scene: Scene, zernike: Tensor) -> Tensor:
     """Noll coefficients (J, D, F, W) in waves."""
-    if zernike is None:
-        return None
     zernike = zernike.reshape(len(zernike), *(zernike.shape[1:] or (1, 1, 1)))
     return (1e3 * zernike / scene.wavelengths).expand(-1, *scene.shape)
 

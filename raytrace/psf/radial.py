@@ -8,19 +8,22 @@ M and g are constants of the window in units of a pixel. Pixels alike by symmetr
 
 import functools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from raytrace.grid import Grid
+from raytrace.numerics import safe_divide
+from raytrace.scene import varies
 
 _STEPS = 64  # of the table of g in a pixel
 
 
 def is_centred(grid: Grid) -> bool:
     """Whether every window is centred on the axis, and stays there under differentiation."""
-    return not grid.centre.requires_grad and bool((grid.centre == 0).all())
+    return not varies(grid.centre) and bool((grid.centre == 0).all())
 
 
 def reach(grid: Grid) -> float:
@@ -36,38 +39,49 @@ def radii_of_waves(grid: Grid, cutoff: float, order: int) -> tuple[Tensor, Tenso
     """
     pitch = float(grid.pitch.detach())
     argument = 2 * math.pi * cutoff * pitch * reach(grid)
-    count = math.ceil(0.5 * argument + (2 + order) * (4 + argument ** (1 / 3)))
+    count = math.ceil(0.5 * argument + max(1.5, 2 + order) * (4 + argument ** (1 / 3)))
     nodes = math.ceil(0.5 * math.pi * cutoff * pitch) + 4 + order
     radii, matrix = (grid.pitch.new_tensor(a) for a in _wave_rule(grid.rows, grid.columns, nodes, count))
     return radii * grid.pitch, matrix * grid.pitch**2
 
 
-def energy_of_rings(grid: Grid, heights: Tensor, energy: Tensor) -> Tensor:
-    """Pixel energies (..., U) of a line of rays, each cell between two of them turned about the axis; for `unfold`.
+def energy_of_rings(grid: Grid, first: Tensor, last: Tensor, energy: Tensor) -> Tensor:
+    """Pixel energies (..., U) of pieces of one meridian turned about the axis; for `unfold`.
 
-        E_u = Σ_c e_c (G_u(h_c+1) - G_u(h_c))/(h_c+1 - h_c),   G_u(h) = ∫_0^h g_u(|r|) dr
+        E_u = Σ_c e_c (G_u(b_c) - G_u(a_c))/(b_c - a_c),   G_u(h) = ∫_0^h g_u(|r|) dr
 
-    heights: (..., N) mm, of either sign; energy: (..., N - 1) of the cells, spread evenly over their heights.
+    first, last: (..., C) mm, heights of either sign a, b where a piece begins and ends; energy: (..., C) of the pieces,
+    spread evenly over their heights.
     """
     table = grid.pitch.new_tensor(_ring_table(grid.rows, grid.columns))
-    last = len(table) - 1
-    h = heights / grid.pitch
-    width = h.diff()
-    # A caustic has cells without width: the share of a ring is taken there, over a thousandth of a pixel.
-    narrow = width.abs() < 1e-3
-    middle = 0.5 * (h[..., 1:] + h[..., :-1])
-    lower = torch.where(narrow, middle - 5e-4, h[..., :-1])
-    upper = torch.where(narrow, middle + 5e-4, h[..., 1:])
+    last_step = len(table) - 1
+    a, b = first / grid.pitch, last / grid.pitch
+    # A caustic has pieces without width: the share of a ring is taken there, over a thousandth of a pixel.
+    narrow = (b - a).abs() < 1e-3
+    middle = 0.5 * (a + b)
+    lower, upper = torch.where(narrow, middle - 5e-4, a), torch.where(narrow, middle + 5e-4, b)
     density = energy / (upper - lower)
-    weights = density.new_zeros(*density.shape[:-1], last + 1)
+    weights = density.new_zeros(*density.shape[:-1], last_step + 1)
     for end, share in ((lower, -density), (upper, density)):
         share = torch.where(end < 0, -share, share)
-        place = (end.abs() * _STEPS).clamp(max=float(last))
-        below = place.detach().floor().clamp(max=last - 1)
+        place = (end.abs() * _STEPS).clamp(max=float(last_step))
+        below = place.detach().floor().clamp(max=last_step - 1)
         above = place - below
         index = below.long()
         weights = weights.scatter_add(-1, index, share * (1 - above)).scatter_add(-1, index + 1, share * above)
     return weights @ table
+
+
+def lit_part(first: Tensor, last: Tensor, clearances: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor | float]:
+    """Where between a and b (..., C) light passes, if clearances (..., C + 1) run linearly: its ends, and its share."""
+    begin, end = torch.zeros_like(first), torch.ones_like(first)
+    for clearance in clearances:
+        c, d = clearance[..., :-1], clearance[..., 1:]
+        edge = safe_divide(c, c - d)
+        begin = torch.maximum(begin, torch.where(c >= 0, 0.0, torch.where(d > 0, edge, 1.0)))
+        end = torch.minimum(end, torch.where(d >= 0, 1.0, torch.where(c > 0, edge, 0.0)))
+    share = (end - begin).clamp_min(0.0)
+    return first + begin * (last - first), first + end * (last - first), share
 
 
 def unfold(grid: Grid, values: Tensor) -> Tensor:
@@ -78,7 +92,7 @@ def unfold(grid: Grid, values: Tensor) -> Tensor:
 
 @functools.lru_cache(maxsize=16)
 def _distinct(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (U, 2) in pixels of the pixels that differ, 0 <= a <= b, and which of them each pixel (rows, columns) is."""
+    """Centres (U, 2) in pixels of the pixels that differ, 0 <= a <= b; and which each pixel is, (rows, columns)."""
     y, x = np.abs(np.arange(rows) - 0.5 * (rows - 1)), np.abs(np.arange(columns) - 0.5 * (columns - 1))
     pair = np.sort(np.stack(np.broadcast_arrays(y[:, None], x[None, :]), -1), -1)
     places, index = np.unique(pair.reshape(-1, 2), axis=0, return_inverse=True)
@@ -87,7 +101,7 @@ def _distinct(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
 
 @functools.lru_cache(maxsize=16)
 def _wave_rule(rows: int, columns: int, nodes: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Chebyshev radii (K,) in pixels and the matrix (U, K): Gauss-Legendre nodes in every pixel, read off the series."""
+    """Chebyshev radii (K,) in pixels; and the matrix (U, K) to pixels, by Gauss-Legendre nodes read off the series."""
     corner = 0.5 * math.hypot(rows, columns)
     angle = (2 * np.arange(count) + 1) * (np.pi / (4 * count))
     terms = 2 * np.arange(count)

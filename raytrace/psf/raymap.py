@@ -16,28 +16,28 @@ import torch
 from torch import Tensor
 
 from raytrace.grid import Grid
+from raytrace.numerics import safe_divide
+from raytrace.psf.radial import energy_of_rings, is_centred, lit_part, unfold
 from raytrace.psf.rays import (
     Fans,
-    beam_share,
     cell_width,
     clearance,
     energy_of_fans,
-    is_axial,
-    is_mirrored,
     kernels_of_fans,
-    lines,
     moments_of_fans,
+    places,
     trace_apertures,
     trace_fans,
     turned,
 )
 from raytrace.psf.splat import cell_widths
-from raytrace.scene import Kernels, Scene
+from raytrace.scene import Kernels, Scene, beam_share, symmetry
 from raytrace.surface import Aperture
 from raytrace.value import value
 
 _LINES = 32  # round the pupil at least, and half as many cells on each
 _MOST_LINES = 8192
+_PIECES = 32  # of the meridian of round light at order 0
 _DEGREES = (6, 8, 10, 12, 14, 16, 20)
 _CHECKS = 8  # rays that are traced but not fitted
 _PIXELS = 0.1  # error of a ray in pixels that order 0 takes; each order takes half of the one before
@@ -98,7 +98,8 @@ def kernels_and_reason(scene: Scene, grid: Grid, *, order: int = 3) -> tuple[Ker
 def fit(scene: Scene, degree: int) -> RayMap:
     """Trace the rays of a degree and those that check them; linear in the traced points, so gradients flow through."""
     like = scene.lens.surfaces[-2].thickness
-    axial, mirrored = is_axial(scene), is_mirrored(scene)
+    fold = symmetry(scene)
+    axial, mirrored = fold == "round", fold == "mirror"
     constant = functools.partial(torch.tensor, dtype=like.dtype, device=like.device)
     if axial:
         height, checked = _axial_nodes(degree), np.sqrt((np.arange(4) + 1) / 4)
@@ -137,16 +138,17 @@ def fit(scene: Scene, degree: int) -> RayMap:
 def fans_of_map(ray_map: RayMap, across: int, along: int) -> Fans:
     """The map on so many lines of so many cells."""
     like = ray_map.hits
-    angle, radius = lines(across, along, like)
+    at_angle, at_radius = places(across, along)
+    angle, radius = (torch.as_tensor(t, dtype=like.dtype, device=like.device) for t in (at_angle, at_radius))
     if ray_map.axial:
-        radial = torch.as_tensor(_axial_basis(ray_map.degree, radius.cpu().numpy()), dtype=like.dtype).to(like.device)
+        radial = torch.as_tensor(_axial_basis(ray_map.degree, at_radius), dtype=like.dtype).to(like.device)
 
         def on_fans(terms: Tensor) -> Tensor:
             return turned((terms[1] @ radial.T)[..., None, :], angle)
     else:
         radial, around = (
             torch.as_tensor(t, dtype=like.dtype, device=like.device)
-            for t in _factors(ray_map.degree, radius.cpu().numpy(), angle.cpu().numpy())
+            for t in _factors(ray_map.degree, at_radius, at_angle)
         )
 
         def on_fans(terms: Tensor) -> Tensor:
@@ -167,7 +169,7 @@ def reference(scene: Scene, grid: Grid, *, lines: int = 2048) -> Tensor:
         ray_map = fit(scene, _DEGREES[-1])
         if float((ray_map.residual / grid.pitch).amax()) <= 1e-4 and float(ray_map.edge_residual.amax()) <= 1e-4:
             fans = fans_of_map(ray_map, lines, lines // 2)
-            return energy_of_fans(grid, fans) * beam_share(scene, fans.points)[..., None, None]
+            return energy_of_fans(grid, fans) * beam_share(scene)[..., None, None]
         return kernels_of_fans(scene, grid, trace_fans(scene, 10), width=cell_width(4)).kernel
 
 
@@ -177,17 +179,41 @@ def _degrees(order: int) -> list[int]:
 
 
 def _kernels_of_map(scene: Scene, grid: Grid, ray_map: RayMap, order: int) -> Kernels:
+    if ray_map.axial and is_centred(grid):
+        return _kernels_of_meridian(scene, grid, ray_map, order)
     # Order 0 has cells as wide as a pixel, measured on a coarse map; each order makes them √2 narrower.
     coarse = fans_of_map(ray_map, 2 * _LINES, _LINES)
-    widths = cell_widths(grid, coarse.points)
+    *widths, both = cell_widths(grid, coarse.points)
     across, along = (
-        2 * math.ceil(min(_MOST_LINES, max(least, width * count) * 2 ** (order / 2)) / 2)
+        2 * math.ceil(min(_MOST_LINES, max(least, width * count) * both * 2 ** (order / 2)) / 2)
         for width, count, least in zip(widths, (2 * _LINES, _LINES), (_LINES, _LINES // 2), strict=True)
     )
     fans = fans_of_map(ray_map, across, along)
-    kernel = energy_of_fans(grid, fans) * beam_share(scene, fans.points)[..., None, None]
+    kernel = energy_of_fans(grid, fans) * beam_share(scene)[..., None, None]
     centroid, covariance = moments_of_fans(fans)
     return _with_residual(Kernels(kernel, grid, centroid, covariance, ray_map.rays), ray_map.residual)
+
+
+def _kernels_of_meridian(scene: Scene, grid: Grid, ray_map: RayMap, order: int) -> Kernels:
+    """The same where the light is round about the middle of the window: pieces of one line, turned about the axis."""
+    like = ray_map.hits
+    nodes = np.linspace(0, 1, math.ceil(_PIECES * 2 ** (order / 2)) + 1)
+    basis = torch.as_tensor(_axial_basis(ray_map.degree, nodes), dtype=like.dtype, device=like.device)
+    height, *crossed = (terms[1] @ basis.mT for terms in (ray_map.hits, *ray_map.crossings))
+    clearances = [
+        clearance(aperture, torch.stack([torch.zeros_like(hit), hit]))
+        for aperture, hit in zip(ray_map.apertures, crossed, strict=True)
+    ]
+    first, last, share = lit_part(height[..., :-1], height[..., 1:], clearances)
+    energy = (share * like.new_tensor(np.diff(nodes**2))).expand(first.shape)
+    kernel = unfold(grid, energy_of_rings(grid, first, last, energy)) * beam_share(scene)[..., None, None]
+    weights = safe_divide(energy, energy.sum(-1, keepdim=True).expand_as(energy))
+    # A ring of radius h has the variance h²/2 per axis; h² is averaged over every piece.
+    variance = (weights * (first * first + first * last + last * last)).sum(-1) / 6
+    zero = torch.zeros_like(variance)
+    covariance = torch.stack([variance, zero, variance])
+    found = Kernels(kernel, grid, torch.stack([zero, zero]), covariance, ray_map.rays)
+    return _with_residual(found, ray_map.residual)
 
 
 def _with_residual(kernels: Kernels, residual: Tensor) -> Kernels:

@@ -10,19 +10,17 @@ vignetting edges are thus crossed smoothly: no blur is needed for a derivative, 
 import math
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from raytrace import pupil
 from raytrace.grid import Grid
-from raytrace.launch import rays_of_field, vignette
-from raytrace.lens import with_object_distance
 from raytrace.numerics import safe_divide
 from raytrace.psf.splat import cell_energy, cell_widths, cells, clear_share, histogram, splat_cells, splat_smooth
-from raytrace.scene import Kernels, Scene, trace_scene
+from raytrace.scene import Kernels, Scene, beam_share, cross_scene, symmetry, trace_scene
 from raytrace.spot import spot
 from raytrace.surface import Aperture
-from raytrace.trace import media, steps
 from raytrace.value import value
 
 _LINES = (16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512)  # round the pupil, by order; half as many nodes on each
@@ -71,15 +69,17 @@ def trace_fans(scene: Scene, order: int) -> Fans:
     """Trace the rays of an order; of a scene symmetric in x half the pupil, of a rotational one a single line."""
     like = scene.lens.surfaces[-2].thickness
     angle, radius = lines(_LINES[order], _LINES[order] // 2, like)
-    axial, mirrored = is_axial(scene), is_mirrored(scene)
-    seen = like.new_tensor([torch.pi / 2]) if axial else angle[: len(angle) // 2] if mirrored else angle
+    fold = symmetry(scene)
+    seen = (
+        like.new_tensor([torch.pi / 2]) if fold == "round" else angle[: len(angle) // 2] if fold == "mirror" else angle
+    )
     disc = radius * torch.stack([torch.cos(seen), torch.sin(seen)])[..., None]
     hits, clearances = trace_clearances(scene, disc.flatten(1))
     hits, clearances = hits.unflatten(-1, disc.shape[1:]), [c.unflatten(-1, disc.shape[1:]) for c in clearances]
-    if axial:
+    if fold == "round":
         hits = turned(hits[1], angle)
         clearances = [c.expand(hits.shape[1:]) for c in clearances]
-    elif mirrored:
+    elif fold == "mirror":
         hits = torch.cat([hits, torch.stack([-hits[0], hits[1]]).flip(-2)], -2)
         clearances = [torch.cat([c, c.flip(-2)], -2) for c in clearances]
     return Fans(hits, radius, tuple(clearances), disc[0].numel())
@@ -87,8 +87,13 @@ def trace_fans(scene: Scene, order: int) -> Fans:
 
 def lines(count: int, nodes: int, like: Tensor) -> tuple[Tensor, Tensor]:
     """Angles (A,) of lines round the pupil, those of x > 0 first; and radii (N + 1,), closer towards the rim."""
-    angle = (torch.arange(count, dtype=like.dtype, device=like.device) + 0.5) * (2 * torch.pi / count) - torch.pi / 2
-    return angle, torch.linspace(0, 1, nodes + 1, dtype=like.dtype, device=like.device) ** 0.75
+    return tuple(torch.as_tensor(t, dtype=like.dtype, device=like.device) for t in places(count, nodes))
+
+
+def places(count: int, nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """The same, as plain numbers."""
+    angle = (np.arange(count) + 0.5) * (2 * np.pi / count) - np.pi / 2
+    return angle, np.linspace(0, 1, nodes + 1) ** 0.75
 
 
 def turned(height: Tensor, angle: Tensor) -> Tensor:
@@ -110,15 +115,16 @@ def trace_clearances(scene: Scene, disc: Tensor) -> tuple[Tensor, list[Tensor]]:
 
 
 def trace_apertures(scene: Scene, disc: Tensor) -> tuple[Tensor, list[tuple[Aperture, Tensor]], Tensor]:
-    """Hits (2, D, F, W, P) on the sensor, on every aperture, and which rays met every surface; none is clipped."""
-    lens = with_object_distance(scene.lens, scene.lens.surfaces[0].thickness[..., None])
-    field, wavelength = scene.fields[:, :, None, None], scene.wavelengths[:, None]
-    rays = rays_of_field(lens, field, vignette(lens, field, disc), wavelength=wavelength)
-    shape = (*scene.shape, disc.shape[1])
-    crossed, met = [], rays.valid
-    for surface, crossing in zip(
-        lens.surfaces[1:], steps(lens.surfaces[1:], rays, indices=media(lens, wavelength)), strict=True
-    ):
+    """Hits (2, D, F, W, P) on the sensor, on every aperture, and which rays met every surface; none is clipped.
+
+    disc: pupil points (2, P), or (2, D, F, W, P) with axes of 1 where kernels have the same ones.
+    """
+    shape = (*scene.shape, disc.shape[-1])
+    crossings = cross_scene(scene, disc)
+    # Rays that do not start are lost before the first surface.
+    met = crossings[0].rays.valid | crossings[0].clipped
+    crossed = []
+    for surface, crossing in zip(scene.lens.surfaces[1:], crossings, strict=True):
         met = met & ~crossing.missed & ~crossing.totally_reflected
         hit = crossing.rays.position[:2]
         crossed += [(aperture, hit.expand(2, *shape)) for aperture in surface.apertures]
@@ -151,9 +157,10 @@ def kernels_of_fans(scene: Scene, grid: Grid, fans: Fans, *, width: float = 1.0)
 
     Cells wider than `width` pixels (at most 1) are cut, the image point running linearly between rays.
     """
-    fine = refined(fans, [math.ceil(found / width) for found in cell_widths(grid, fans.points)])
+    *widths, both = cell_widths(grid, fans.points)
+    fine = refined(fans, [math.ceil(found * max(1 / width, both)) for found in widths])
     centroid, covariance = moments_of_fans(fans)
-    kernel = energy_of_fans(grid, fine) * beam_share(scene, fine.points)[..., None, None]
+    kernel = energy_of_fans(grid, fine) * beam_share(scene)[..., None, None]
     return Kernels(kernel, grid, centroid, covariance, fans.rays)
 
 
@@ -210,41 +217,6 @@ def moments_of_fans(fans: Fans) -> tuple[Tensor, Tensor]:
     return torch.where(lit, centroid, 0.0), covariance
 
 
-def beam_share(scene: Scene, like: Tensor) -> Tensor:
-    """Area (1, F, 1) of each field's beam by its vignetting factors, 1 = the whole entrance pupil."""
-    _, along_x, along_y = _beam(scene, like)
-    area = along_x[0] * along_y[1] - along_x[1] * along_y[0]
-    return area.abs().expand(1, scene.shape[1], 1)
-
-
-def _beam(scene: Scene, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Centre and half axes (2, F, 1) of the beams in the pupil, vignetting factors applied."""
-    corners = like.new_tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    centre, x, y = vignette(scene.lens, scene.fields[:, :, None, None].to(like.dtype), corners).unbind(-1)
-    return centre, x - centre, y - centre
-
-
-def is_mirrored(scene: Scene) -> bool:
-    """Whether the light is symmetric in x: every field in the y-z plane and no aperture or vignetting off it.
-
-    Fields to be differentiated are not: their x moves the light to one side.
-    """
-    centre, along_x, along_y = _beam(scene, scene.lens.wavelengths)
-    upright = not bool((centre[0] != 0).any() | (along_x[1] != 0).any() | (along_y[0] != 0).any())
-    centred = all(aperture.centre[0] == 0 for surface in scene.lens.surfaces for aperture in surface.apertures)
-    return upright and centred and not scene.fields.requires_grad and not bool((scene.fields[0] != 0).any())
-
-
-def is_axial(scene: Scene) -> bool:
-    """Whether the light is symmetric about the axis: no field off it, round apertures centred, round beams."""
-    centre, along_x, along_y = _beam(scene, scene.lens.wavelengths)
-    round_beam = not bool((centre != 0).any() | (along_x[0] != along_y[1]).any())
-    if not is_mirrored(scene) or bool((scene.fields != 0).any()) or not round_beam:
-        return False
-    apertures = [aperture for surface in scene.lens.surfaces for aperture in surface.apertures]
-    return all(aperture.shape == "circular" and aperture.centre == (0.0, 0.0) for aperture in apertures)
-
-
 def _kernels_of_points(scene: Scene, grid: Grid, count: int, sampling: Callable, width: float) -> Kernels:
     thickness = scene.lens.surfaces[-2].thickness
     disc, weights = sampling(count, dtype=thickness.dtype, device=thickness.device)
@@ -256,5 +228,5 @@ def _kernels_of_points(scene: Scene, grid: Grid, count: int, sampling: Callable,
     share = safe_divide(energy, energy.sum(-1, keepdim=True))
     x, y = torch.where(energy > 0, points - light.centroid[..., None], 0.0)
     covariance = torch.stack([(share * a * b).sum(-1) for a, b in ((x, x), (x, y), (y, y))])
-    kernel = kernel * beam_share(scene, points)[..., None, None]
+    kernel = kernel * beam_share(scene)[..., None, None]
     return Kernels(kernel, grid, light.centroid.expand(2, *scene.shape), covariance, count)

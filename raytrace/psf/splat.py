@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from raytrace.grid import Grid
+from raytrace.numerics import safe_divide
 
 
 def splat(grid: Grid, points: Tensor, weights: Tensor) -> Tensor:
@@ -78,10 +79,18 @@ def splat_cells(
     return _deposit(grid, [(i, j, energy * share) for i, j, share in deposits], axes=2)
 
 
-def cell_widths(grid: Grid, points: Tensor) -> tuple[float, float]:
-    """Width in pixels of the widest cell of points (2, ..., A, N), across the lines and along them."""
+def cell_widths(grid: Grid, points: Tensor) -> tuple[float, float, float]:
+    """Width in pixels of the widest cell of points (2, ..., A, N), across the lines and along them; and their sum.
+
+    The sum, 1 … 2, is that of both parts of one cell along x or y, each in units of its largest: cut into that many
+    times as many parts as its widths alone ask for, no cell is wider than a pixel.
+    """
     w = points.detach() / grid.pitch.detach()
-    return tuple(2 * float(half.abs().amax()) for half in half_widths(w))
+    across, along = (torch.roll(w, -1, -2) - w).abs(), w.diff().abs()
+    sides = torch.maximum(across[..., 1:], across[..., :-1]), torch.maximum(along, torch.roll(along, -1, -2))
+    widest = [side.amax() for side in sides]
+    both = sum(safe_divide(side, most.expand_as(side)) for side, most in zip(sides, widest, strict=True))
+    return *(float(most) for most in widest), max(1.0, float(both.amax()))
 
 
 def half_widths(w: Tensor, *, closed: bool = True) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,141 @@
+"""The direct Huygens sum: every ray a wavelet on the reference sphere, added up at every point of every pixel.
+
+    U(p) = (n/λ) Σ_j √(E_j Ω_j) exp(2πi n [W_j/n + |q_j - p| - R]/λ),   kernel = ∫ |U|² over the pixel
+
+It is the reference of the wave model, and shares with it only the traced wavefront W. Distances are exact (the model
+has Debye's plane waves), Ω is taken by differences of neighbouring rays, the rim of the pupil by bisection, no symmetry
+is used, and no sum is separated into x and y. One object distance, one field, one wavelength at a time; no gradients.
+"""
+
+import dataclasses
+import math
+
+import torch
+from torch import Tensor
+
+from raytrace.grid import Grid
+from raytrace.psf.dft import huygens, sub_pixels
+from raytrace.pupil import gauss_rings, square
+from raytrace.scene import Scene, trace_scene
+from raytrace.wavefront import Wavefront, wavefront
+
+_TERMS = 2**21  # wavelets × points that are added at once
+_STEP = 1e-4  # of the pupil radius, for Ω
+_SCAN, _BISECTIONS = 64, 48
+
+
+@dataclasses.dataclass(frozen=True)
+class Sampling:
+    """How finely a direct sum is made.
+
+    rings, arms: Gauss rings over the clear pupil; with arms = 0 a square grid of `rings` points across instead, as
+    wave-optics programs take it. nodes: points across a pixel, Gauss-Legendre.
+    """
+
+    rings: int
+    arms: int
+    nodes: int
+
+    def __str__(self) -> str:
+        pupil = f"{self.rings} × {self.arms} rings" if self.arms else f"{self.rings}² grid"
+        return f"{pupil}, {self.nodes}² a pixel"
+
+
+@torch.no_grad()
+def direct_sum(scene: Scene, grid: Grid, sampling: Sampling) -> tuple[Tensor, int]:
+    """Kernel (rows, columns) of a scene of shape (1, 1, 1), and the number of rays."""
+    like = scene.lens.surfaces[-2].thickness
+    points, weights = rule(scene, sampling, like)
+    front = wavefront(scene, points, weights)
+    amplitude = torch.sqrt(front.energy * weights * math.pi * solid_angle(scene, points))[0, 0, 0]
+    lit = amplitude > 0
+    pupil = (-front.radius * front.direction)[:, 0, 0, 0][:, lit]
+    x, y, share = sub_pixels(_about(grid, front), sampling.nodes)
+    v, h = (t.flatten() for t in torch.meshgrid(y, x, indexing="ij"))
+    wavelength = 1e-3 * front.wavelength[0] / front.index[0]
+    path, radius = front.opd[0, 0, 0][lit] / front.index[0], front.radius[0, 0, 0]
+    size = max(1, _TERMS // int(lit.sum()))
+    intensity = []
+    for a, b in zip(h.split(size), v.split(size), strict=True):
+        places = torch.stack([a, b, torch.zeros_like(a)])
+        U = huygens(places, pupil, radius, path=path, amplitude=amplitude[lit], wavelength=wavelength)
+        intensity.append((U.real**2 + U.imag**2) / wavelength**2)
+    fine = torch.cat(intensity).reshape(grid.rows, sampling.nodes, grid.columns, sampling.nodes)
+    return torch.einsum("iajb,a,b->ij", fine, share, share) * grid.pitch**2, points.shape[1]
+
+
+def rule(scene: Scene, sampling: Sampling, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Pupil points (2, P) and weights (P,) of a sampling."""
+    if not sampling.arms:
+        return square(sampling.rings, dtype=like.dtype, device=like.device)
+    return clear_rings(scene, sampling.rings, sampling.arms)
+
+
+@torch.no_grad()
+def clear_rings(scene: Scene, rings: int, arms: int) -> tuple[Tensor, Tensor]:
+    """Gauss rings squeezed, arm by arm, between the radii at which light begins and ceases to pass: (2, P), (P,)."""
+    like = scene.lens.surfaces[-2].thickness
+    points, weights = gauss_rings(rings, arms, dtype=like.dtype, device=like.device)
+    angle = (torch.arange(arms, dtype=like.dtype, device=like.device) + 0.5) * (2 * math.pi / arms)
+    unit = torch.stack([torch.cos(angle), torch.sin(angle)])
+
+    def passes(radius: Tensor) -> Tensor:
+        """(K, arms) for radii (K, arms)."""
+        disc = (unit[:, None] * radius).flatten(1)
+        return trace_scene(scene, disc).valid[0, 0, 0].unflatten(0, radius.shape)
+
+    scan = torch.linspace(0, 1, _SCAN + 1, dtype=like.dtype, device=like.device)
+    clear = passes(scan[:, None].expand(-1, arms))
+    if bool(clear.all()):
+        return points, weights
+    first, last = clear.to(torch.int8).argmax(0), _SCAN - clear.flip(0).to(torch.int8).argmax(0)
+    inner = _bisect(passes, scan[first], scan[(first - 1).clamp_min(0)])
+    outer = _bisect(passes, scan[last], scan[(last + 1).clamp_max(_SCAN)])
+    area = torch.where(clear.any(0), outer**2 - inner**2, 0.0)
+    u = (points**2).sum(0).reshape(rings, arms)
+    radius = torch.sqrt(inner**2 + area * u)
+    return (unit[:, None] * radius).flatten(1), (area * weights.reshape(rings, arms)).flatten()
+
+
+def _bisect(passes, clear: Tensor, dark: Tensor) -> Tensor:
+    """The edge between a radius (arms) that passes and one that does not (the same one, if there is no edge)."""
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (clear + dark)
+        through = passes(middle[None])[0]
+        clear, dark = torch.where(through, middle, clear), torch.where(through, dark, middle)
+    return clear
+
+
+def solid_angle(scene: Scene, points: Tensor) -> Tensor:
+    """|∂(L, M)/∂(p_x, p_y)| (P,) at pupil points, by central differences of traced directions."""
+    steps = points.new_tensor([[_STEP, 0.0], [-_STEP, 0.0], [0.0, _STEP], [0.0, -_STEP]])
+    ends = wavefront(scene, torch.cat([points + step[:, None] for step in steps], 1)).direction[:2, 0, 0, 0]
+    right, left, up, down = ends.unflatten(1, (4, -1)).unbind(1)
+    (a, b), (c, d) = (right - left) / (2 * _STEP), (up - down) / (2 * _STEP)
+    return (a * d - b * c).abs()
+
+
+def _about(grid: Grid, front: Wavefront) -> Grid:
+    """The grid from the centre of the reference sphere."""
+    return Grid(grid.pitch, grid.rows, grid.columns, grid.centre - front.centre[:2, 0, 0, 0])
+
+
+@dataclasses.dataclass(frozen=True)
+class Moments:
+    """centroid: (2,) mm; variance: (2,) mm² along x and y; energy: share of the entrance pupil's light that arrives."""
+
+    centroid: Tensor
+    variance: Tensor
+    energy: Tensor
+
+
+@torch.no_grad()
+def moments(scene: Scene, rings: int = 96, arms: int = 384) -> Moments:
+    """Converged moments of the rays of a scene of shape (1, 1, 1)."""
+    points, weights = clear_rings(scene, rings, arms)
+    hits = trace_scene(scene, points)
+    passed = torch.where(hits.valid[0, 0, 0], weights, 0.0)
+    share = passed / passed.sum()
+    x = hits.position[:2, 0, 0, 0]
+    centroid = ((x - x[:, :1]) * share).sum(1) + x[:, 0]
+    return Moments(centroid, (share * (x - centroid[:, None]) ** 2).sum(1), passed.sum())

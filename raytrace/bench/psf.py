@@ -1,0 +1,339 @@
+"""Measure PSFs: time forward and forward+backward beside the error against converged references.
+
+Geometric models are compared with `raymap.reference` (10⁸ random rays would be no closer), waves with the direct
+Huygens sum, the others with their own limit: Gaussians with that of converged moments, the Fourier model with its
+finest order.
+"""
+
+import dataclasses
+import math
+import statistics
+import time
+import warnings
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from raytrace.bench.huygens import Sampling, direct_sum, moments
+from raytrace.bench.measure import clock
+from raytrace.bench.psf_cases import DIRECT, RANDOM, Case, Method, doors, methods, random_histogram
+from raytrace.grid import Grid
+from raytrace.lens import Lens
+from raytrace.psf import MODELS, NotConverged, Psf, diffraction, paraxial, raymap
+from raytrace.psf.dft import nodes_per_pixel, rings_and_arms
+from raytrace.psf.pixels import gaussian_pixels
+from raytrace.pupil import gauss_rings
+from raytrace.scene import Kernels, Scene
+from raytrace.value import to
+from raytrace.wavefront import wavefront
+
+RAYS_ERROR = 0.01  # that random rays are brought to
+WAVE_ERROR = 1e-3  # that direct sums are brought to
+_PIECE = 2**16  # random rays at a time
+_PILOT = 2**17  # random rays that find how many are needed
+_PATIENCE = 20.0  # s: what would take longer is extrapolated
+_LIMIT = 0.4  # s for the repeats of one figure
+_REFERENCE = 0.75  # of the rings and arms of the wave model's order 0 and some more, for the reference
+_LADDER = ((0.65, -1), (0.75, -1), (0.75, 0))  # of its rings and arms, and of its nodes; cheapest first
+_FINEST_WAVE = 3  # order of the wave model that stands for its limit
+_SQUARE = (64, 96)  # points across the square pupil grids that are run
+
+
+@dataclasses.dataclass(frozen=True)
+class PsfRow:
+    """One figure. Errors are relative; None where a quantity does not exist or was not measured.
+
+    forward_s, both_s: median seconds, the second with one backward pass. l1_error: of the kernel against its model's
+    limit; sigma_error: of σx or σy, the larger; centroid_error: in units of σ; estimate: what `psf` says of own_error,
+    the error against the model's own finest order (`gaussian`: of σ and of the energy, else of the kernel);
+    model_error: of the kernel against the direct sum of waves.
+    against: what l1_error counts from; extrapolated: not run, but computed from runs with fewer rays.
+    """
+
+    lens: str
+    field: float
+    model: str
+    sampling: str
+    dtype: str
+    rays: int
+    forward_s: float
+    both_s: float | None = None
+    l1_error: float | None = None
+    sigma_error: float | None = None
+    centroid_error: float | None = None
+    estimate: float | None = None
+    own_error: float | None = None
+    model_error: float | None = None
+    against: str = "rays"
+    extrapolated: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Truth:
+    """What a case converges to. kernels: (rows, columns) by the name of the limit; windows: their grids.
+
+    centroid: (2,) mm; sigma: (2,) mm of the rays; rings, arms, nodes: the wave model's own sampling at order 0.
+    """
+
+    case: Case
+    kernels: dict[str, Tensor]
+    windows: dict[str, Grid]
+    centroid: Tensor
+    sigma: Tensor
+    rings: int = 0
+    arms: int = 0
+    nodes: int = 0
+
+
+def measure(
+    cases: Sequence[Case],
+    *,
+    repeats: int,
+    threads: int,
+    peer_methods: Callable[[Truth], Sequence[Method]] = lambda truth: (),
+    progress: Callable[[int], object] = lambda done: None,
+    say: Callable[[str], object] = lambda words: None,
+) -> list[PsfRow]:
+    """Every method on every case; what a method refuses is said, and left out. progress: of `steps(cases)`."""
+    torch.set_num_threads(threads)
+    rows = []
+    for case in cases:
+        truth = truth_of(case, say)
+        progress(1)
+        for method in (*methods(), *doors()):
+            for dtype in (torch.float64, torch.float32):
+                rows += _kept(truth, method, dtype, repeats, threads, say)
+                progress(1)
+        for dtype in (torch.float64, torch.float32):
+            rows += random_rows(truth, dtype, threads)
+            progress(1)
+        rows += direct_rows(truth, threads) if "wave" in truth.kernels else []
+        progress(1)
+        for method in peer_methods(truth):
+            rows += _kept(truth, method, torch.float64, repeats, threads, say)
+        progress(1)
+    return rows
+
+
+def steps(cases: Sequence[Case]) -> int:
+    """How often `measure` reports progress."""
+    return len(cases) * (2 * len([*methods(), *doors()]) + 5)
+
+
+@torch.no_grad()
+def truth_of(case: Case, say: Callable[[str], object] = lambda words: None) -> Truth:
+    """The converged kernels of a case; without "wave" where the wave model refuses the lens, which is said."""
+    scene = case.scene
+    light = moments(scene)
+    window = case.window(light.centroid)
+    shape = gaussian_pixels(window, *(t.reshape(2, 1, 1, 1) for t in (light.centroid, light.variance)))
+    own = case.window(paraxial.chief_ray_height(scene).flatten())
+    kernels = {
+        "rays": raymap.reference(scene, window)[0, 0, 0],
+        "gaussian": light.energy * shape[0, 0, 0],
+        "paraxial": paraxial.kernels(scene, own).kernel[0, 0, 0],
+    }
+    try:
+        kernels["fourier"] = MODELS["fourier"].kernels(scene, own, order=MODELS["fourier"].orders[-1]).kernel[0, 0, 0]
+    except ValueError as refusal:
+        say(f"{case.title}: {refusal}")
+    windows = dict.fromkeys(("rays", "gaussian", "wave"), window) | dict.fromkeys(("paraxial", "fourier"), own)
+    truth = Truth(case, kernels, windows, light.centroid, torch.sqrt(light.variance))
+    try:
+        rings, arms, nodes = wave_sampling(scene, window)
+        finest = Sampling(*_scaled(rings + 4, arms + 16, _REFERENCE), nodes + 2)
+        kernels["wave"] = direct_sum(scene, window, finest)[0]
+        kernels["finest wave"] = MODELS["wave"].kernels(scene, window, order=_FINEST_WAVE).kernel[0, 0, 0]
+    except ValueError as refusal:
+        say(f"{case.title}: {refusal}")
+        return truth
+    return dataclasses.replace(truth, rings=rings, arms=arms, nodes=nodes)
+
+
+def wave_sampling(scene: Scene, grid: Grid) -> tuple[int, int, int]:
+    """Rings, arms and nodes across a pixel that the wave model takes at order 0, from the phase over the pupil."""
+    front = wavefront(scene, *gauss_rings(8, 32))
+    offset = torch.linalg.vector_norm(grid.centre - front.centre[:2, 0, 0, 0])
+    reach = float(offset + grid.pitch * math.hypot(grid.rows, grid.columns) / 2)
+    L, M = front.direction[:2, 0, 0, 0]
+    spread = torch.hypot(L - L.mean(), M - M.mean()).max()
+    cutoff = 2e3 * float(spread * front.index[0] / front.wavelength[0])
+    return (
+        *rings_and_arms(diffraction.phase_along_radius(front, reach), 0),
+        nodes_per_pixel(float(grid.pitch), cutoff, 0),
+    )
+
+
+def one_row(truth: Truth, method: Method, dtype: torch.dtype, *, repeats: int, threads: int) -> PsfRow:
+    """Time and errors of one method."""
+    scene, grid = to(truth.case.scene, dtype=dtype), to(truth.windows[method.against], dtype=dtype)
+    both = None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotConverged)  # its words are in the row: the estimate
+        with torch.no_grad():
+            found = method.run(scene, grid)  # fills caches
+            forward = timed(lambda: method.run(scene, grid), repeats, threads)
+        if method.has_gradient:
+            both = timed(lambda: gradient(method, scene, grid), repeats, threads)
+    errors = errors_of(truth, method.against, found)
+    return _row(truth, method, dtype, found.rays, forward_s=forward, both_s=both, **errors)
+
+
+def random_rows(truth: Truth, dtype: torch.dtype, threads: int) -> list[PsfRow]:
+    """Random rays: some thousands, and as many as bring the histogram to RAYS_ERROR (error ∝ rays^-1/2)."""
+    scene, grid = to(truth.case.scene, dtype=dtype), to(truth.windows["rays"], dtype=dtype)
+
+    def run(count: int) -> PsfRow:
+        with torch.no_grad():
+            began = clock(threads)()
+            found = random_histogram(scene, grid, count, piece=_PIECE)
+            seconds = clock(threads)() - began
+        method = Method(RANDOM, f"{count:,} rays", random_histogram, "rays", has_gradient=False)
+        return _row(truth, method, dtype, count, forward_s=seconds, **errors_of(truth, "rays", found))
+
+    run(1000)  # fills caches
+    rows = [run(1000), run(10_000), run(_PILOT)]
+    pilot = rows[-1]
+    needed = math.ceil(_PILOT * (pilot.l1_error / RAYS_ERROR) ** 2)
+    if needed <= 1000:
+        return rows
+    if needed * pilot.forward_s / _PILOT > _PATIENCE:
+        return [*rows, _extrapolated(pilot, needed, RAYS_ERROR)]
+    rows.append(run(needed))
+    if RAYS_ERROR < rows[-1].l1_error < 1.5 * RAYS_ERROR:  # errors of random rays scatter; more than that is rounding
+        rows.append(run(math.ceil(1.1 * needed * (rows[-1].l1_error / RAYS_ERROR) ** 2)))
+    return rows
+
+
+def direct_rows(truth: Truth, threads: int) -> list[PsfRow]:
+    """Direct sums over Gauss rings, up to the cheapest that meets WAVE_ERROR, and over square grids, extrapolated.
+
+    The error of a square grid falls with a power of its rays: it is that of its ragged rim.
+    """
+    window, rows = truth.windows["wave"], []
+
+    def run(sampling: Sampling) -> PsfRow:
+        began = clock(threads)()
+        kernel, count = direct_sum(truth.case.scene, window, sampling)
+        seconds = clock(threads)() - began
+        model = f"{DIRECT}, {'rings' if sampling.arms else 'grid'}"
+        method = Method(model, str(sampling), direct_sum, "wave", has_gradient=False)
+        l1 = relative_l1(kernel, truth.kernels["wave"])
+        return _row(truth, method, torch.float64, count, forward_s=seconds, l1_error=l1, model_error=l1)
+
+    for part, more in _LADDER:
+        nodes = max(2, truth.nodes + more)
+        rows.append(run(Sampling(*_scaled(truth.rings, truth.arms, part), nodes)))
+        if rows[-1].l1_error <= WAVE_ERROR:
+            break
+    square = [run(Sampling(across, 0, nodes)) for across in _SQUARE]
+    rows += square
+    coarse, fine = square
+    if fine.l1_error > WAVE_ERROR and fine.l1_error < coarse.l1_error:
+        power = math.log(coarse.l1_error / fine.l1_error) / math.log(fine.rays / coarse.rays)
+        rows.append(_extrapolated(fine, math.ceil(fine.rays * (fine.l1_error / WAVE_ERROR) ** (1 / power)), WAVE_ERROR))
+    return rows
+
+
+def _extrapolated(row: PsfRow, rays: int, error: float) -> PsfRow:
+    """The same with as many rays as the error needs, and time in proportion to them."""
+    sampling = f"{rays:,} rays" if row.model == RANDOM else f"{round(math.sqrt(4 * rays / math.pi))}² grid"
+    seconds = row.forward_s * rays / row.rays
+    return dataclasses.replace(
+        row, sampling=sampling, rays=rays, forward_s=seconds, l1_error=error, sigma_error=None, centroid_error=None,
+        model_error=None, extrapolated=True,
+    )  # fmt: skip
+
+
+def gradient(method: Method, scene: Scene, grid: Grid) -> tuple[Tensor | None, ...]:
+    """Derivatives of a number made of the kernel, by every curvature, conic, coefficient and thickness of the lens."""
+    lens, leaves = with_all_leaves(scene.lens)
+    kernel = method.run(dataclasses.replace(scene, lens=lens), grid).kernel
+    pattern = torch.cos(torch.arange(kernel.shape[-2] * kernel.shape[-1], dtype=kernel.dtype))
+    return torch.autograd.grad(kernel.flatten() @ pattern, leaves, allow_unused=True)
+
+
+def with_all_leaves(lens: Lens) -> tuple[Lens, list[Tensor]]:
+    """The lens with leaves for every shape that is modelled and every thickness behind surface 1, and the leaves."""
+    surfaces, leaves = list(lens.surfaces), []
+    for number in range(1, len(surfaces) - 1):
+        changed = {}
+        for name in ("curvature", "conic", "coefficients", "thickness"):
+            value = getattr(surfaces[number], name)
+            if value is not None:
+                changed[name] = value.detach().clone().requires_grad_()
+        surfaces[number] = dataclasses.replace(surfaces[number], **changed)
+        leaves += changed.values()
+    return dataclasses.replace(lens, surfaces=tuple(surfaces)), leaves
+
+
+def timed(call: Callable[[], object], repeats: int, threads: int) -> float:
+    """Median time of a call; slow ones are repeated less often."""
+    now, seconds, end = clock(threads), [], time.perf_counter() + _LIMIT
+    while not seconds or (len(seconds) < repeats and time.perf_counter() < end):
+        began = now()
+        call()
+        seconds.append(now() - began)
+    return statistics.median(seconds)
+
+
+def errors_of(truth: Truth, against: str, found: Kernels) -> dict[str, float | None]:
+    """Errors of what a method found; moments only of those that have the rays' moments for a limit."""
+    kernel = found.kernel.detach().double().reshape(found.kernel.shape[-2:])
+    errors = {"l1_error": relative_l1(kernel, truth.kernels[against])}
+    if "wave" in truth.kernels:
+        errors["model_error"] = relative_l1(kernel, truth.kernels["wave"])
+    estimate = getattr(found, "error", None)
+    if estimate is not None:
+        errors["estimate"], errors["own_error"] = float(estimate), own_error(truth, against, found)
+    if getattr(found, "covariance", None) is not None and float(truth.sigma.min()) > 0:
+        sigma = torch.sqrt(found.covariance.detach().double().reshape(3)[::2])
+        errors["sigma_error"] = float((sigma / truth.sigma - 1).abs().max())
+        offset = found.centroid.detach().double().reshape(2) - truth.centroid
+        errors["centroid_error"] = float(offset.norm() / truth.sigma.norm())
+    return errors
+
+
+def own_error(truth: Truth, against: str, found: Psf) -> float:
+    """The error that `psf` estimates: of the kernel, or of the variances and the energy of a Gaussian."""
+    kernel = found.kernel.detach().double().reshape(found.kernel.shape[-2:])
+    if against != "gaussian":
+        return relative_l1(kernel, truth.kernels["finest wave" if against == "wave" else against])
+    variance = truth.sigma**2
+    width = 0.5 * (found.covariance.detach().double().reshape(3)[::2] - variance).abs().sum() / variance.sum()
+    energy, total = float(kernel.sum()), float(truth.kernels["gaussian"].sum())
+    return max(float(width), abs(energy / total - 1))
+
+
+def relative_l1(kernel: Tensor, reference: Tensor) -> float:
+    """Σ |k - r| / Σ r."""
+    return float((kernel - reference).abs().sum() / reference.sum())
+
+
+def _kept(truth: Truth, method: Method, dtype: torch.dtype, repeats: int, threads: int, say) -> list[PsfRow]:
+    """The row of a method, or none where it has no limit or refuses the case."""
+    if method.against not in truth.kernels:
+        return []
+    try:
+        return [one_row(truth, method, dtype, repeats=repeats, threads=threads)]
+    except ValueError as refusal:
+        say(f"{truth.case.title}, {method.model}, {method.sampling}: {refusal}")
+        return []
+
+
+def _row(truth: Truth, method: Method, dtype: torch.dtype, rays: int, **figures) -> PsfRow:
+    return PsfRow(
+        lens=truth.case.name,
+        field=truth.case.field,
+        model=method.model,
+        sampling=method.sampling,
+        dtype=str(dtype).removeprefix("torch."),
+        rays=rays,
+        against=method.against,
+        **figures,
+    )
+
+
+def _scaled(rings: int, arms: int, part: float) -> tuple[int, int]:
+    return max(4, round(part * rings)), max(8, 4 * round(part * arms / 4))

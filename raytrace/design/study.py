@@ -1,0 +1,107 @@
+"""Study: the runs of several models and seeds side by side: tables, courses and what to draw.
+
+A study is a folder of runs, `<model>-<seed>/`; finished ones are read again, never repeated.
+"""
+
+import csv
+import dataclasses
+import io
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from raytrace.design.camera import Camera
+from raytrace.design.codesign import STEPS, Outcome, Settings, batch, outcome
+from raytrace.files import write_atomically
+from raytrace.launch import launch
+from raytrace.lens import Lens, with_object_distance
+from raytrace.pictures import Pictures
+from raytrace.pupil import gauss_rings
+from raytrace.spot import spot
+from raytrace.trace import trace
+
+#: The paper's table: L1 after step 1, L1 with DRT PSFs after step 2, focus distance in m.
+PAPER = {"paraxial": (0.0415, 0.0504, 33.9), "fourier": (0.0408, 0.0509, 35.7), "gaussian": (0.0429, 0.0430, 27.3)}
+
+COLUMNS = ("model", "seed", "l1_joint", "l1_drt", "focus_paraxial_m", "focus_rms_m", "sensor_mm")
+
+
+@dataclasses.dataclass(frozen=True)
+class Summary:
+    """One model over its seeds: mean and standard deviation of every column of the table; seeds: how many."""
+
+    model: str
+    seeds: int
+    mean: dict[str, float]
+    deviation: dict[str, float]
+
+
+def run_folder(study: Path, settings: Settings) -> Path:
+    return Path(study) / f"{settings.model}-{settings.seed}"
+
+
+def outcomes(study: Path, models: Sequence[str], seeds: Sequence[int]) -> list[Outcome]:
+    """The finished runs of a study."""
+    found = [outcome(Path(study) / f"{model}-{seed}") for model in models for seed in seeds]
+    return [one for one in found if one is not None]
+
+
+def rows(found: Sequence[Outcome]) -> list[dict[str, str | float]]:
+    """The table, a row for each model and seed."""
+    return [{column: getattr(one, column) for column in COLUMNS} for one in found]
+
+
+def write_table(found: Sequence[Outcome], path: Path) -> None:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows(found))
+    write_atomically(path, lambda file: file.write(text.getvalue().encode()))
+
+
+def summaries(found: Sequence[Outcome]) -> list[Summary]:
+    """Mean and deviation over seeds, in the order in which the models come first."""
+    result = []
+    for model in dict.fromkeys(one.model for one in found):
+        own = [one for one in found if one.model == model]
+        values = {c: [float(getattr(one, c)) for one in own] for c in (*COLUMNS[2:], "l1_before")}
+        mean = {c: statistics.fmean(v) for c, v in values.items()}
+        deviation = {c: statistics.stdev(v) if len(v) > 1 else 0.0 for c, v in values.items()}
+        result.append(Summary(model, len(own), mean, deviation))
+    return result
+
+
+def course(study: Path, model: str, seed: int, step: str = STEPS[0]) -> dict[str, list[float]]:
+    """The log of one step of one run, a list for each of its columns; empty if it has not begun."""
+    path = Path(study) / f"{model}-{seed}" / step / "log.csv"
+    if not path.exists():
+        return {}
+    with path.open(newline="") as file:
+        read = list(csv.DictReader(file))
+    return {key: [float(row[key]) for row in read] for key in (read[0] if read else ())}
+
+
+@torch.no_grad()
+def blur_diameters(lens: Lens, distances: Tensor) -> Tensor:
+    """RMS blur diameter (Z,) mm of traced rays on the axis, over object distances (Z,) mm."""
+    pupil, weights = gauss_rings(12, dtype=lens.wavelengths.dtype)
+    axis = lens.wavelengths.new_zeros(2, 1)
+    found = []
+    for distance in distances:
+        own = with_object_distance(lens, distance)
+        rays = trace(own, launch(own, pupil, fields=axis), own.wavelengths[:, None])
+        found.append(2 * spot(rays, weights).rms_radius[0, 0])
+    return torch.stack(found)
+
+
+@torch.no_grad()
+def examples(camera: Camera, pictures: Pictures, settings: Settings, distances: Sequence[float]) -> dict[str, Tensor]:
+    """One test patch at several distances (Z,): "picture", "image" and "restored", each (Z, h, w)."""
+    own = batch(pictures, settings, [0], 2**20)
+    many = torch.tensor(distances, dtype=camera.fields.dtype)
+    picture = own.picture.expand(len(many), -1, -1)
+    image = camera.image(picture, many) + camera.noise * own.noise
+    return {"picture": camera.target(picture), "image": image, "restored": camera.restore(image)}

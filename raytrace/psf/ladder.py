@@ -1,0 +1,265 @@
+"""Ladders: every PSF model as orders of growing effort, climbed until the estimated error meets a tolerance."""
+
+import dataclasses
+import functools
+import itertools
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from raytrace.grid import Grid
+from raytrace.numerics import safe_divide, safe_sqrt
+from raytrace.paraxial import first_order
+from raytrace.psf import diffraction, fourier, gaussian, paraxial, raymap, rays
+from raytrace.scene import Kernels, Scene
+from raytrace.value import value
+
+
+class NotConverged(UserWarning):
+    """A PSF whose estimated error stayed above the tolerance at the finest order there is."""
+
+
+@value
+class Psf:
+    """PSFs over object distance × field.
+
+    kernel: (D, F, rows, columns), integrated over pixels.
+    grid: where the pixels lie on the sensor, centre (2,) or (2, D, F) mm.
+    energy: (D, F) inside the window, of the light through the entrance pupil.
+    error: (D, F) estimated relative L1 error of the kernel against the model's own limit (`gaussian`: relative error
+        of σ); nan where it was not estimated. How far it can be believed is measured in docs/psf_error.md.
+    centroid: (2, D, F) mm; covariance: (3, D, F) xx, xy, yy in mm², of the distribution before pixel integration.
+    residual: (D, F) how wrong the model itself is, where it can tell, or None.
+    model: its name; order: of its ladder, to repeat with `psf(order=…)`, None for plain rays; rays: traced for each
+        kernel; reason: why `auto` chose the model, or a remark on convergence.
+    normalised: "energy" (1 = all light through the entrance pupil) or "window" (each kernel sums to 1).
+    """
+
+    kernel: Tensor
+    grid: Grid
+    energy: Tensor
+    error: Tensor
+    centroid: Tensor
+    covariance: Tensor
+    residual: Tensor | None = None
+    model: str = ""
+    order: int | None = None
+    rays: int = 0
+    reason: str = ""
+    normalised: str = "energy"
+
+
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """A PSF model as a ladder of orders, each finer than the one before.
+
+    kernels: (scene, grid, order=…) -> Kernels; orders: from the coarsest to the finest.
+    lean: the same without the residual, where that costs time; None if it does not.
+    by_width: True if the error is that of σ, False if it is that of the kernel.
+    proof: the error of an order is so many times its difference from the next, which is computed to prove it; None: the
+        error of the finer of two orders is extrapolated from their difference, by the numbers that follow.
+    first: ratio of successive changes that is taken for granted while only one change is known; None: two are needed.
+    least, most: bounds on the ratios measured after that; margin: a factor on the estimate, see `_estimate`.
+    unseen: share of `Kernels.residual` that counts as error: what two orders may have in common.
+    floor: what rounding leaves at least. The constants cover 95 % of the cases that docs/psf_error.md calls fitted.
+    """
+
+    kernels: Callable[..., Kernels]
+    orders: Sequence[int]
+    lean: Callable[..., Kernels] | None = None
+    by_width: bool = False
+    proof: float | None = None
+    first: float | None = None
+    least: float = 0.0
+    most: float = 0.0
+    margin: float = 1.0
+    unseen: float = 0.0
+    floor: float = 0.0
+
+
+MODELS: dict[str, Model] = {
+    "paraxial": Model(lambda scene, grid, order, **options: paraxial.kernels(scene, grid, **options), (0,)),
+    # torch's J₀ is good to 3e-7 only.
+    "fourier": Model(fourier.kernels, range(-2, 6), first=0.23, least=1e-3, most=0.5, floor=1e-7),
+    "gaussian": Model(
+        gaussian.kernels,
+        (2, 3, 4, 5, 6, 8, 10, 12, 16, 24),
+        lean=gaussian.kernels_alone,
+        by_width=True,
+        # Rings converge as fast as the lens is smooth, in leaps: what is left after one says nothing of the next.
+        proof=2.0,
+        least=1e-4,
+        most=0.6,
+        margin=2.0,
+        floor=1e-11,
+    ),
+    # Cells halve their error with each order: no faster, whatever a lucky change says.
+    "drt": Model(raymap.kernels, range(11), first=0.6, least=0.6, most=0.6, unseen=0.15),
+    "wave": Model(diffraction.kernels, range(-2, 6), first=0.23, least=1e-3, most=0.5, floor=1e-7),
+}
+
+#: Models from the one that knows least to the one that knows most: the rungs of `model="auto"`.
+LADDER = ("paraxial", "gaussian", "drt", "wave")
+
+
+def with_options(options: Mapping[str, Mapping]) -> dict[str, Model]:
+    """MODELS, the kernels of some with further arguments: {"paraxial": {"rho": 0.4}}."""
+    models = dict(MODELS)
+    for name, arguments in options.items():
+        models[name] = dataclasses.replace(models[name], kernels=functools.partial(models[name].kernels, **arguments))
+    return models
+
+
+def by_order(batch: Scene, pixels: Grid, weights: Tensor, models: Mapping[str, Model], model: str, order: int) -> Psf:
+    """The kernels of one order, for loops that have planned it: no error is estimated, and no residual."""
+    ladder = models[model]
+    if order not in ladder.orders:
+        raise ValueError(f"{model} has no order {order}; expected one of {', '.join(map(str, ladder.orders))}")
+    found = polychromatic((ladder.lean or ladder.kernels)(batch, pixels, order=order), weights, model)
+    return dataclasses.replace(found, order=order)
+
+
+def by_tolerance(
+    batch: Scene, pixels: Grid, weights: Tensor, models: Mapping[str, Model], model: str, tol: float
+) -> Psf:
+    """Climb the orders until the estimated error of the last meets the tolerance; see `_estimate`."""
+    ladder = models[model]
+    with torch.no_grad():
+        before, changes = None, []
+        for order in ladder.orders:
+            found = polychromatic(ladder.kernels(batch, pixels, order=order), weights, model)
+            found = dataclasses.replace(found, order=order)
+            if before is not None:
+                changes.append(_width_change(before, found) if ladder.by_width else _kernel_change(before, found))
+            rounding = _rounding(batch, pixels, found, ladder)
+            if ladder.proof is not None and changes:
+                error = ladder.proof * changes[-1] + rounding
+                if bool((error <= tol).all()):
+                    found = before
+                    break
+            error = _estimate(ladder, changes, found, rounding)
+            if ladder.proof is None and bool((error <= tol).all()):
+                break
+            before = found
+    reason = ""
+    if not bool((error <= tol).all()):
+        reason = f"{model}: the estimated error {float(error.max()):.1e} stays above the tolerance {tol:g}"
+        warnings.warn(reason, NotConverged, stacklevel=4)
+    residual, order = found.residual, found.order
+    if torch.is_grad_enabled():
+        found = by_order(batch, pixels, weights, models, model, order)
+    return dataclasses.replace(found, error=error, residual=residual, reason=reason)
+
+
+def _estimate(ladder: Model, changes: list[Tensor], found: Psf, rounding: Tensor) -> Tensor:
+    """Estimated error (D, F) after changes δ_1 … δ_n from one order to the next; inf while too few are known.
+
+    The geometric series δ_n ρ/(1 - ρ) times a margin, ρ the largest ratio of successive changes so far: one lucky small
+    change is not believed. Added are the share of the model's residual that no change shows, and rounding.
+    """
+    if len(ladder.orders) == 1:
+        return torch.zeros_like(found.energy)
+    ratios = [safe_divide(later, earlier) for earlier, later in itertools.pairwise(changes)]
+    if ratios:
+        rho = torch.stack(ratios).amax(0).clamp(ladder.least, ladder.most)
+    elif changes and ladder.first is not None:
+        rho = torch.full_like(found.energy, ladder.first)
+    else:
+        return torch.full_like(found.energy, torch.inf)
+    unseen = ladder.unseen * found.residual if ladder.unseen else 0.0
+    return ladder.margin * changes[-1] * rho / (1 - rho) + unseen + rounding
+
+
+def _rounding(batch: Scene, pixels: Grid, found: Psf, ladder: Model) -> Tensor:
+    """Error (D, F) by rounding: of directions, over a focal length, in units of σ or of a pixel; or the model's floor.
+
+    In float32 the measured error is 0.02 to 0.7 of it. Waves are summed in float64, whatever they start from.
+    """
+    if found.model in ("fourier", "wave"):
+        return torch.full_like(found.energy, max(ladder.floor, torch.finfo(found.kernel.dtype).eps))
+    width = safe_sqrt(found.covariance[0] + found.covariance[2]) if ladder.by_width else pixels.pitch
+    focal = first_order(batch.lens).effective_focal_length.abs()
+    focal = focal.reshape(-1)[:1] if bool(torch.isfinite(focal).all()) else torch.ones_like(pixels.pitch)
+    blurred = safe_divide(torch.finfo(found.kernel.dtype).eps * focal, width)
+    return blurred.clamp_min(ladder.floor).expand(found.energy.shape)
+
+
+def by_rays(batch: Scene, pixels: Grid, weights: Tensor, models: Mapping[str, Model], model: str, count: int) -> Psf:
+    """About `count` rays a kernel; the error is the change from half as many."""
+    if model == "drt":
+        found, half = (
+            polychromatic(rays.kernels(batch, pixels, rays=max(n, 1)), weights, model) for n in (count, count // 2)
+        )
+        return dataclasses.replace(found, error=_kernel_change(half, found).detach())
+    ladder, before = models[model], None
+    for order in ladder.orders:
+        found = polychromatic(ladder.kernels(batch, pixels, order=order), weights, model)
+        if found.rays > count:
+            break
+        before, coarser = dataclasses.replace(found, order=order), before
+    if before is None:
+        raise ValueError(f"{model} needs at least {found.rays} rays a kernel; {count} given")
+    if len(ladder.orders) == 1:
+        return dataclasses.replace(before, error=torch.zeros_like(before.energy))
+    if coarser is None:
+        return before
+    change = _width_change(coarser, before) if ladder.by_width else _kernel_change(coarser, before)
+    return dataclasses.replace(before, error=change.detach())
+
+
+def climb(batch: Scene, pixels: Grid, weights: Tensor, models: Mapping[str, Model], tol: float) -> Psf:
+    """The first rung of LADDER whose kernels differ from those of the next by less than the tolerance."""
+    here = by_tolerance(batch, pixels, weights, models, LADDER[0], tol)
+    for name in LADDER[1:]:
+        above = by_tolerance(batch, pixels, weights, models, name, tol)
+        with torch.no_grad():
+            gap = float(_kernel_change(above, here).max())
+        if gap <= tol and (name == "wave" or not _diffracts(batch, pixels, above)):
+            said = f"{here.model}: its kernels differ from those of {name} by {gap:.1e}, within {tol:g}"
+            return dataclasses.replace(here, reason=said)
+        here, below = above, here.model
+    return dataclasses.replace(here, reason=f"wave: {below} differs from it by {gap:.1e}, more than {tol:g}")
+
+
+def _diffracts(batch: Scene, pixels: Grid, light: Psf) -> bool:
+    """Whether somewhere neither a pixel nor the blur is twice as wide as the Airy disc: rays alike prove nothing."""
+    with torch.no_grad():
+        airy = 1.22e-3 * batch.wavelengths.max() * first_order(batch.lens).working_f_number.max()
+        blur = 2 * safe_sqrt(light.covariance[0] + light.covariance[2])
+        return bool((torch.maximum(blur, pixels.pitch) < 4 * airy).any())
+
+
+def polychromatic(found: Kernels, weights: Tensor, model: str) -> Psf:
+    """Sum over wavelengths by their weights; moments are those of the sum of the distributions."""
+    share = weights / weights.sum()
+    centroid = (share * found.centroid).sum(-1)
+    offset = found.centroid - centroid[..., None]
+    spread = torch.stack([offset[0] * offset[0], offset[0] * offset[1], offset[1] * offset[1]])
+    kernel = (share[:, None, None] * found.kernel).sum(-3)
+    centre = found.grid.centre if found.grid.centre.dim() == 1 else found.grid.centre[..., 0]
+    energy = kernel.sum((-2, -1))
+    return Psf(
+        kernel=kernel,
+        grid=dataclasses.replace(found.grid, centre=centre),
+        energy=energy,
+        error=torch.full_like(energy.detach(), torch.nan),
+        centroid=centroid,
+        covariance=(share * (found.covariance + spread)).sum(-1),
+        residual=None if found.residual is None else (share * found.residual).sum(-1),
+        model=model,
+        rays=found.rays,
+    )
+
+
+def _kernel_change(one: Psf, other: Psf) -> Tensor:
+    """Relative L1 difference (D, F) of two kernels, in units of the second's energy; 0 where both are empty."""
+    return safe_divide((one.kernel - other.kernel).abs().sum((-2, -1)), other.energy)
+
+
+def _width_change(one: Psf, other: Psf) -> Tensor:
+    """Relative difference (D, F) of σ, from the larger change of the two variances, and of the energy."""
+    width = other.covariance[0] + other.covariance[2]
+    variance = 0.5 * safe_divide((one.covariance[::2] - other.covariance[::2]).abs().sum(0), width)
+    return torch.maximum(variance, safe_divide((one.energy - other.energy).abs(), other.energy))

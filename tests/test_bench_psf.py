@@ -1,0 +1,315 @@
+"""The PSF benchmark: its direct Huygens sum, references and targets, and the command from end to end. No timings."""
+
+import csv
+import dataclasses
+import io
+import json
+import math
+
+import problems
+import pytest
+import torch
+from problems import vector
+
+from raytrace.bench import psf as bench
+from raytrace.bench import psf_cases
+from raytrace.bench.huygens import Sampling, clear_rings, direct_sum, moments, solid_angle
+from raytrace.bench.psf import PsfRow, gradient, measure, random_rows, steps, truth_of, with_all_leaves
+from raytrace.bench.psf_cases import Case, Method, cases, random_histogram
+from raytrace.bench.psf_report import judged, markdown, table, targets
+from raytrace.cli import main
+from raytrace.files import shipped
+from raytrace.formats import read_lens
+from raytrace.grid import grid
+from raytrace.psf import MODELS, diffraction, raymap
+from raytrace.psf.gaussian import kernels as gaussian_kernels
+from raytrace.scene import scene
+from raytrace.surface import Aperture
+
+
+@pytest.fixture(autouse=True)
+def threads():
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def shipped_lens(name):
+    return read_lens(shipped("lenses") / f"{name}.zmx")
+
+
+def stigmatic(diameter=1.0, focus=50.0, apertures=()):
+    """A plano-hyperbolic lens, perfect on the axis; an aperture on its plane face."""
+    surfaces = [problems.surface(None, 10.0, 1.5, apertures=apertures), problems.surface(-0.04, focus, conic=-2.25)]
+    return problems.lens(surfaces, aperture=("entrance_pupil_diameter", diameter))
+
+
+def scene_of(lens, y=0.0, distance=math.inf):
+    return scene(lens, vector(0.0, y)[:, None], vector(distance), lens.wavelengths)
+
+
+@pytest.mark.parametrize("sampling", [Sampling(12, 32, 3), Sampling(80, 0, 3)])
+def test_direct_sum_of_a_perfect_lens_peaks_as_airy(sampling):
+    """I(0) = E A/(λf)² with E = 1, A = πR²: to 4 NA² = 1e-4, a square grid to the raggedness of its rim, 0.5 %."""
+    lens = stigmatic(0.5)
+    pitch = 1e-4  # 1/300 of the Airy radius: the pixel is flat
+    kernel, rays = direct_sum(scene_of(lens), grid(pitch, 1), sampling)
+    expected = math.pi * 0.25**2 / (0.55e-3 * 50.0) ** 2 * pitch**2
+    assert rays == (384 if sampling.arms else pytest.approx(5027, abs=40))
+    assert float(kernel) == pytest.approx(expected, rel=1e-4 if sampling.arms else 5e-3)
+
+
+def test_direct_sum_of_an_annulus():
+    """A central stop of radius ε leaves (1 - ε²) of the light and of the area: the peak falls by its square."""
+    stop = (Aperture("circular", (0.2, math.inf)),)
+    window = grid(1e-4, 1)
+    ratio = direct_sum(scene_of(stigmatic(apertures=stop)), window, Sampling(12, 32, 3))[0]
+    ratio = ratio / direct_sum(scene_of(stigmatic()), window, Sampling(12, 32, 3))[0]
+    assert float(ratio) == pytest.approx((1 - 0.4**2) ** 2, rel=1e-4)
+
+
+def test_direct_sum_keeps_the_light():
+    """All light of the perfect lens within 6 Airy radii but the rings' tail, 2/(π v), v = π D r/(λ f)."""
+    kernel, _ = direct_sum(scene_of(stigmatic()), grid(0.08, 5), Sampling(16, 48, 7))
+    tail = 2 / (math.pi * math.pi * 0.2 / (0.55e-3 * 50.0))
+    assert 0.5 * tail < 1 - float(kernel.sum()) < 1.5 * tail
+
+
+def test_direct_sum_is_the_wave_models_limit():
+    """Off the axis, in coma: two quadratures, two Jacobians, exact and plane wavelets."""
+    lens = problems.double_gauss(aperture=("entrance_pupil_diameter", 8.0))
+    s = scene_of(lens, 7.0, 25e3)
+    window = grid(0.01, 3, moments(s, 16, 64).centroid)
+    found = diffraction.kernels(s, window, order=1)
+    rings, arms, nodes = bench.wave_sampling(s, window)
+    kernel, _ = direct_sum(s, window, Sampling(rings, arms, nodes + 1))
+    assert kernel.sum() > 0.3
+    assert bench.relative_l1(found.kernel[0, 0, 0], kernel) < min(1e-3, float(found.residual) + 1e-5)
+
+
+def test_rim_is_found():
+    """Rings between the edges of an annulus carry its area and none is lost."""
+    stop = (Aperture("circular", (0.2, 0.45)),)
+    s = scene_of(stigmatic(apertures=stop))
+    points, weights = clear_rings(s, 6, 16)
+    radius = 0.5 * torch.linalg.vector_norm(points, dim=0)
+    assert weights.sum() == pytest.approx((0.45**2 - 0.2**2) / 0.25, rel=1e-9)
+    assert radius.min() > 0.2
+    assert radius.max() < 0.45
+
+
+def test_solid_angle_of_a_perfect_lens():
+    """Parallel light into a perfect cone: (L, M) = -R p/f to NA², so that Ω = (R/f)²."""
+    points = vector(0.0, 0.3, -0.2, 0.5).reshape(2, 2)
+    assert torch.allclose(solid_angle(scene_of(stigmatic()), points), vector(1e-4, 1e-4), rtol=3e-4)
+
+
+def test_moments_are_those_of_many_rings():
+    lens = shipped_lens("double_gauss")
+    s = scene_of(lens, 14.0, 1e4)
+    s = dataclasses.replace(s, wavelengths=lens.wavelengths[lens.primary_wavelength][None])
+    found, fine = moments(s, 12, 48), gaussian_kernels(s, grid(1.0, 1), order=12)
+    assert torch.allclose(found.variance, fine.covariance[::2, 0, 0, 0], rtol=1e-10)
+    assert torch.allclose(found.centroid, fine.centroid[:, 0, 0, 0], atol=1e-12)
+    assert found.energy == pytest.approx(1.0, abs=1e-14)
+
+
+def test_random_histogram_is_one_histogram_however_it_is_cut():
+    case = cases([("double_gauss", shipped_lens("double_gauss"))])[0]
+    window = case.window(moments(case.scene, 6, 24).centroid)
+    whole = random_histogram(case.scene, window, 3000, piece=3000)
+    cut = random_histogram(case.scene, window, 3000, piece=1000)
+    assert (whole.kernel - cut.kernel).abs().max() < 1e-12
+    reference = raymap.reference(case.scene, window, lines=512)[0, 0, 0]
+    assert 0.1 < bench.relative_l1(whole.kernel[0, 0, 0], reference) < 0.4  # 0.8 Σ√p/√3000
+
+
+def test_usual_cases_and_others():
+    found = cases([("double_gauss", shipped_lens("double_gauss")), ("tessar", shipped_lens("tessar"))])
+    largest = float(shipped_lens("tessar").fields.y.abs().max())
+    assert [case.field for case in found] == [0.0, 14.0, 0.0, largest]
+    assert found[0].distance == 1e4
+    assert math.isinf(found[2].distance)
+    for case in found[2:]:
+        sigma = float(moments(case.scene, 8, 32).variance.sqrt().max())
+        assert 7 * sigma <= psf_cases.PIXELS * case.pitch < 2.5 * max(7 * sigma, 8 * 0.59e-3 * 4.6)
+
+
+def test_gradients_are_by_all_that_is_modelled():
+    """Curvatures, conics, coefficients and thicknesses; against a difference for one of each kind."""
+    lens = shipped_lens("phone")
+    own, leaves = with_all_leaves(lens)
+    kinds = sum(
+        getattr(surface, name) is not None
+        for surface in lens.surfaces[1:-1]
+        for name in ("curvature", "conic", "coefficients", "thickness")
+    )
+    assert len(leaves) == kinds
+    assert all(leaf.requires_grad for leaf in leaves)
+    case = Case(lens, "phone", 0.0, math.inf, 1e-3)
+    method = Method("gaussian", "4 rings", lambda s, g: MODELS["gaussian"].kernels(s, g, order=4), "gaussian")
+    found = gradient(method, case.scene, case.window(vector(0.0, 0.0)))
+    assert all(g is None or bool(torch.isfinite(g).all()) for g in found)
+    sensor = found[-1]
+    pattern = torch.cos(torch.arange(21 * 21, dtype=torch.float64))
+
+    def value(step):
+        moved = list(own.surfaces)
+        moved[-2] = dataclasses.replace(moved[-2], thickness=lens.surfaces[-2].thickness + step)
+        s = dataclasses.replace(case, lens=dataclasses.replace(lens, surfaces=tuple(moved))).scene
+        with torch.no_grad():
+            return float(method.run(s, case.window(vector(0.0, 0.0))).kernel.flatten() @ pattern)
+
+    assert float(sensor) == pytest.approx((value(1e-6) - value(-1e-6)) / 2e-6, rel=1e-5)
+
+
+def row(**others) -> PsfRow:
+    figures = {"lens": "l", "field": 0.0, "model": "drt", "sampling": "order 1", "dtype": "float64", "rays": 9}
+    return PsfRow(**(figures | {"forward_s": 0.01, "l1_error": 5e-3} | others))
+
+
+def test_targets_compare_the_quickest_that_come_as_close():
+    rows = [
+        row(sampling="order 4", forward_s=0.02, l1_error=1e-3),  # slower
+        row(),
+        row(sampling="order 0", forward_s=0.001, l1_error=0.02),  # too coarse
+        row(model="random rays", sampling="10 rays", forward_s=0.1, l1_error=0.3),
+        row(model="random rays", sampling="99 rays", forward_s=0.6, l1_error=0.01),
+        row(model="gaussian", sampling="2 rings", rays=2, sigma_error=1e-5, centroid_error=0.0),
+        row(model="gaussian", sampling="3 rings", rays=9, sigma_error=1e-7, centroid_error=0.0),
+        row(model="wave", l1_error=2e-4, forward_s=0.1),
+        row(model="direct sum, grid", forward_s=20.0, l1_error=1e-3, extrapolated=True),
+        row(model="direct sum, rings", forward_s=1.0, l1_error=1e-4),
+        row(model="drt", sampling="tol 1e-2", forward_s=1e-9, estimate=1e-2, own_error=5e-3),
+        row(model="drt", sampling="tol 1e-1", forward_s=1e-9, estimate=1e-2, own_error=5e-3),
+        row(model="wave", sampling="tol 1e-2", forward_s=1e-9, estimate=1e-2, own_error=2e-2),
+    ]
+    assert len(judged(rows)) == 2
+    found = {target.goal: (target.measured, target.met) for target in targets(rows)}
+    assert [met for _, met in found.values()] == [False, True, True, True, False, False, True]
+    words = [measured for measured, _ in found.values()]
+    assert words[0] == "9 rays"
+    assert words[1].startswith("60×: 10 ms")
+    assert words[3].startswith("200×: 100 ms (order 1, 2.0e-04) against extrapolated")
+    assert words[4].startswith("10×")
+    assert words[5:] == ["50% of 2", "50% of 2"]
+
+
+def test_table_and_report_hold_every_row():
+    rows = [row(), row(dtype="float32", l1_error=None), row(model="wave", estimate=1e-3, own_error=1e-4)]
+    read = list(csv.DictReader(io.StringIO(table(rows))))
+    assert [line["l1_error"] for line in read] == ["0.005", "", "0.005"]
+    assert list(read[0]) == [field.name for field in dataclasses.fields(PsfRow)]
+    text = markdown(rows, titles={("l", 0.0): "l, 0°"}, about={"torch threads": 1}, repeats=3)
+    assert "| drt | order 1 | 9 | 10 / 10 |" in text
+    assert "| l, 0° | wave | order 1 | float64 | 1.0e-03 | 1.0e-04 | yes | yes |" in text
+
+
+def test_random_rays_reach_the_error_they_are_asked_for(monkeypatch):
+    monkeypatch.setattr(bench, "RAYS_ERROR", 0.1)
+    monkeypatch.setattr(bench, "_PILOT", 4000)
+    case = cases([("double_gauss", shipped_lens("double_gauss"))])[0]
+    window = case.window(vector(0.0, 0.0))
+    kernels = {"rays": raymap.reference(case.scene, window, lines=512)[0, 0, 0]}
+    truth = bench.Truth(case, kernels, {"rays": window}, vector(0.0, 0.0), moments(case.scene, 6, 24).variance.sqrt())
+    found = random_rows(truth, torch.float64, 1)
+    assert 0.08 < found[-1].l1_error < 0.12
+    assert found[3].rays == pytest.approx(4000 * (found[2].l1_error / 0.1) ** 2, abs=1)  # error ∝ rays^-1/2
+
+
+def test_square_grids_are_extrapolated_by_the_power_their_error_falls_with(monkeypatch):
+    """An error of rays^-3/4 and a time of 1 s for 100 rays: 1e-3 needs 10⁴ rays and 100 s."""
+    case = Case(stigmatic(), "stigmatic", 0.0, math.inf, 0.005)
+    ones, now = torch.ones(21, 21, dtype=torch.float64), [0.0]
+
+    def direct_sum(scene, window, sampling):
+        rays = sampling.rings * (sampling.arms or sampling.rings)
+        now[0] += rays / 100
+        return ones * (1 + rays**-0.75), rays
+
+    monkeypatch.setattr(bench, "direct_sum", direct_sum)
+    monkeypatch.setattr(bench, "clock", lambda threads: lambda: now[0])
+    kernels, windows = {"wave": ones}, {"wave": case.window(vector(0.0, 0.0))}
+    truth = bench.Truth(case, kernels, windows, vector(0.0, 0.0), vector(1.0, 1.0), rings=40, arms=160, nodes=4)
+    *rings, coarse, fine, far = bench.direct_rows(truth, 1)
+    assert [line.model for line in rings] == ["direct sum, rings"] * 3
+    assert (coarse.rays, fine.rays, far.extrapolated) == (64**2, 96**2, True)
+    assert far.rays == pytest.approx(1e4, abs=2)
+    assert far.forward_s == pytest.approx(100, rel=1e-3)
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """One coarse order of each model and small direct sums."""
+    monkeypatch.setattr(psf_cases, "_ORDERS", {"gaussian": (4,), "drt": (0,), "fourier": (0,), "wave": (0,)})
+    monkeypatch.setattr(psf_cases, "_TOLERANCES", {"fourier": (0.01,)})
+    monkeypatch.setattr(bench, "_FINEST_WAVE", 1)
+    monkeypatch.setattr(bench, "_PILOT", 20_000)
+    monkeypatch.setattr(bench, "_PATIENCE", 0.05)
+    monkeypatch.setattr(bench, "_SQUARE", (16, 24))
+    monkeypatch.setattr(psf_cases, "PIXELS", 7)
+
+
+def test_command_writes_everything(few, tmp_path, capsys):
+    names = ["bench", "psf", "hubble", "--repeats", "1", "--threads", "1", "--no-peers", "--json"]
+    files = [str(tmp_path / name) for name in ("r.md", "r.csv", "r.png")]
+    assert main([*names, "-o", files[0], "--csv", files[1], "--plot", files[2]]) == 0
+    document = json.loads(capsys.readouterr().out)
+    found = {(line["model"], line["dtype"]): line for line in document["rows"]}
+    assert found["drt", "float64"]["l1_error"] < 0.01
+    assert found["gaussian", "float64"]["sigma_error"] < 0.1
+    assert found["fourier", "float32"]["both_s"] > 0
+    assert document["machine"]["torch threads"] == 1
+    assert {target["case"] for target in document["targets"]} >= {"hubble, 0"}
+    assert (tmp_path / "r.png").read_bytes().startswith(b"\x89PNG")
+    assert len((tmp_path / "r.csv").read_text().splitlines()) == 1 + len(document["rows"])
+    assert "## hubble, 0°" in (tmp_path / "r.md").read_text(encoding="utf-8")
+
+
+def test_progress_adds_up_and_refusals_are_said(few, monkeypatch):
+    def refuse(*arguments):
+        raise ValueError("too steep")
+
+    monkeypatch.setattr(bench, "direct_sum", refuse)
+    case = Case(stigmatic(), "stigmatic", 0.0, math.inf, 0.005)
+    done, said = [], []
+    rows = measure([case], repeats=1, threads=1, progress=done.append, say=said.append)
+    assert sum(done) == steps([case])
+    assert said == ["stigmatic, 0°: too steep"]
+    assert not [line for line in rows if line.model == "wave"]
+    assert truth_of(case).kernels.keys() == {"rays", "gaussian", "paraxial", "fourier"}
+
+
+def test_peer_sees_the_same_kernels():
+    """Optiland at full field, coma and all: turned or shifted by a pixel, its kernels would be off by 0.3 and more."""
+    peer = pytest.importorskip("raytrace.bench.psf_peer", reason="needs the extra [bench]", exc_type=ImportError)
+    case = cases([("double_gauss", shipped_lens("double_gauss"))])[1]
+    window = case.window(moments(case.scene, 8, 32).centroid)
+    kernels = {
+        "rays": raymap.reference(case.scene, window, lines=512)[0, 0, 0],
+        "wave": diffraction.kernels(case.scene, window).kernel[0, 0, 0].detach(),
+    }
+    truth = bench.Truth(case, kernels, dict.fromkeys(kernels, window), window.centre, vector(0.02, 0.02))
+    found = {}
+    for method in peer.peer_methods(truth):
+        if method.sampling.startswith(("100,000", "64²", "128²")):
+            kernel = method.run(case.scene, window).kernel
+            found[method.model] = bench.relative_l1(kernel, kernels[method.against])
+    assert found["Optiland histogram"] < 0.05
+    assert found["Optiland Huygens"] < 0.06
+    assert found["Optiland FFT"] < 0.12
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["trace", "tessar"], "takes no LENS"),
+        (["trace", "--csv", "x.csv"], "takes no --csv"),
+        (["psf", "--rays", "5"], "takes no --rays"),
+        (["psf", "--lens", "tessar"], "takes no --lens"),
+        (["psf", "no_such_lens", "--no-peers"], "no such lens file"),
+    ],
+)
+def test_words_of_the_other_subject_are_refused(words, said, capsys):
+    assert main(["bench", *words]) == 1
+    assert said in capsys.readouterr().err

@@ -1,0 +1,130 @@
+"""The clear pupil: areas known exactly, edges that move as they must, gaps."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from problems import double_gauss, lens, scalar, surface, vector
+
+from raytrace.psf.clear import between, clear_arms, rays_of_search
+from raytrace.psf.rays import trace_clearances
+from raytrace.scene import Scene, scene
+from raytrace.surface import Aperture
+
+RADIUS = 5.0  # of the entrance pupil, mm
+EDGE = 1e-10  # two Newton steps from an edge enclosed in 1/2048, the slope good to 1/2048 of the radius
+
+
+def arms(count: int) -> torch.Tensor:
+    angle = (torch.arange(count, dtype=torch.float64) + 0.5) * (2 * math.pi / count)
+    return torch.stack([torch.cos(angle), torch.sin(angle)])
+
+
+def window(*apertures: Aperture, diameter=2 * RADIUS) -> Scene:
+    """Apertures in the entrance pupil of a thin lens: the clear pupil is what they leave of the disc."""
+    flat = lens(
+        [surface(None, 1.0, apertures=apertures), surface(0.01, 2.0, 1.5), surface(None, 100.0)],
+        aperture=("entrance_pupil_diameter", diameter),
+    )
+    return scene(flat, vector(0.0, 0.0)[:, None], vector(math.inf), vector(0.55))
+
+
+def area(found: Scene, count: int = 256) -> torch.Tensor:
+    unit = arms(count)
+    return between(*clear_arms(found, unit), unit, rings=3)[1].sum()
+
+
+@pytest.mark.parametrize(
+    ("apertures", "expected", "allowed"),
+    [
+        ([Aperture("circular", (0.0, 4.0))], 0.64, EDGE),
+        ([Aperture("circular", (1.0, 4.0))], 0.64 - 0.04, EDGE),
+        ([Aperture("circular", (0.0, 3.0), False, (0.5, 1.0))], 0.36, EDGE),
+        ([Aperture("circular", (0.0, 2.0), True, (0.5, 1.0))], 1 - 0.16, EDGE),
+        ([Aperture("elliptic", (4.0, 2.0))], 0.32, 1e-9),
+        # Corners, and arms tangent to a disc, leave the trapezoidal rule its step squared, or that to the power 3/2.
+        ([Aperture("rectangular", (3.0, 2.0))], 24 / (25 * math.pi), 1e-4),
+        ([Aperture("circular", (0.0, 1.0), True, (1.5, 2.0))], 1 - 0.04, 1e-4),
+        (
+            [Aperture("circular", (0.0, 0.5), True, (x, y)) for x, y in ((1.5, 1.5), (2.7, 2.7))],
+            1 - 2 * 0.01,
+            3e-4,
+        ),
+    ],
+)
+def test_area_of_the_clear_pupil(apertures, expected, allowed):
+    assert float(area(window(*apertures))) == pytest.approx(expected, abs=allowed)
+
+
+def test_a_clear_pupil_is_whole_and_a_blocked_one_dark():
+    unit = arms(8)
+    inner, outer = clear_arms(window(), unit)
+    assert inner.shape == outer.shape == (1, 1, 1, 8)
+    assert bool((inner == 0).all() and (outer == 1).all())
+    for edges in clear_arms(window(Aperture("circular", (0.0, 9.0), True)), unit):
+        assert bool((edges == 0).all())
+
+
+def test_edge_is_where_the_ray_grazes_the_aperture():
+    glass = double_gauss()
+    surfaces = list(glass.surfaces)
+    surfaces[6] = dataclasses.replace(surfaces[6], apertures=(Aperture("circular", (0.0, 9.0)),))
+    found = scene(
+        dataclasses.replace(glass, surfaces=tuple(surfaces)), vector(0.0, 3.0)[:, None], vector(1e4), vector(0.53)
+    )
+    unit = arms(12)
+    _, outer = clear_arms(found, unit)
+    _, (clearance, *_) = trace_clearances(found, outer.flatten() * unit)
+    assert float(outer.max()) < 1
+    assert float(clearance.abs().max()) < 1e-10
+
+
+def test_edges_move_with_the_pupil_to_second_order():
+    """Of an opening of radius b the share b²/R² is clear: derivatives -2 b²/R³ and 6 b²/R⁴ by the pupil radius R."""
+    opening = Aperture("circular", (0.0, 3.0), False, (0.5, 0.5))
+
+    def share(radius):
+        return area(window(opening, diameter=2 * radius), 64)
+
+    radius = scalar(RADIUS)
+    assert float(torch.func.grad(share)(radius)) == pytest.approx(-2 * 9 / RADIUS**3, rel=1e-6)
+    assert float(torch.func.jacfwd(share)(radius)) == pytest.approx(-2 * 9 / RADIUS**3, rel=1e-6)
+    second = torch.autograd.functional.hessian(share, radius)
+    assert float(second) == pytest.approx(6 * 9 / RADIUS**4, rel=1e-3)
+
+
+def test_edges_of_any_shape_move():
+    """The clear share of a rectangle falls as 1/R²: its derivative is -2/R of itself."""
+
+    def share(radius):
+        return area(window(Aperture("rectangular", (3.0, 2.0)), diameter=2 * radius), 64)
+
+    radius = scalar(RADIUS).requires_grad_()
+    whole = share(radius)
+    (slope,) = torch.autograd.grad(whole, radius)
+    assert float(slope) == pytest.approx(-2 / RADIUS * float(whole.detach()), rel=1e-6)
+
+
+def test_rings_integrate_odd_powers_between_arms_of_unlike_length():
+    """∫ r³ over a disc about (c, 0) that touches the middle: powers of r in opposite arms do not cancel there."""
+    unit = arms(64)
+    outer = (2 * 0.4 * unit[0]).clamp_min(0.0)
+    points, weights = between(torch.zeros_like(outer), outer, unit, rings=4)
+    # (1/π) ∫ (2 a cos θ)⁵/5 dθ over the right half, ∫ cos⁵ = 16/15.
+    expected = 0.8**5 / 5 * (16 / 15) / math.pi
+    assert float((weights * points.square().sum(0) ** 1.5).sum()) == pytest.approx(expected, rel=1e-5)
+
+
+def test_rays_of_the_search_are_counted(monkeypatch):
+    traced = []
+    plain = trace_clearances.__globals__["trace_apertures"]
+
+    def counting(found, disc):
+        traced.append(disc.shape[-1])
+        return plain(found, disc)
+
+    monkeypatch.setattr("raytrace.psf.clear.trace_apertures", counting)
+    inner, _ = clear_arms(window(Aperture("circular", (0.0, 1.0), True, (0.0, 2.0))), arms(16))
+    assert inner.shape[-1] == 32
+    assert sum(traced) == rays_of_search(16, 32)
