@@ -96,4 +96,5 @@ def test_derivatives_in_the_heights_the_energy_and_the_pitch():
 def test_windows_off_the_axis_or_free_to_move_are_not_round():
     assert is_centred(grid(0.005, 21))
     assert not is_centred(grid(number(0.005), 21, number([0.0, 1e-9])))
+    assert is_centred(grid(number(0.005), 21, number([0.0, 1e-13])))
     assert not is_centred(grid(number(0.005), 21, number([0.0, 0.0]).requires_grad_()))

@@ -22,8 +22,8 @@ _STEPS = 64  # of the table of g in a pixel
 
 
 def is_centred(grid: Grid) -> bool:
-    """Whether every window is centred on the axis, and stays there under differentiation."""
-    return not varies(grid.centre) and bool((grid.centre == 0).all())
+    """Whether every window is centred on the axis, to a billionth of a pixel, and stays there under differentiation."""
+    return not varies(grid.centre) and bool((grid.centre.abs() <= 1e-9 * grid.pitch.abs()).all())
 
 
 def reach(grid: Grid) -> float:
