@@ -3,6 +3,7 @@
 The weights integrate over the area of the disc: Σ w f(x, y) ≈ (1/π) ∬ f dx dy.
 """
 
+import functools
 import math
 
 import numpy as np
@@ -19,11 +20,15 @@ def gauss_rings(
     the x axis, so that the pattern is symmetric in x and in y.
     """
     arms = 4 * rings if arms is None else arms
-    nodes, weights = np.polynomial.legendre.leggauss(rings)
+    nodes, weights = _leggauss(rings)
     radius = np.sqrt(0.5 * (nodes + 1))
     angle = (np.arange(arms) + 0.5) * (2 * math.pi / arms)
     points = np.stack([np.outer(radius, np.cos(angle)).ravel(), np.outer(radius, np.sin(angle)).ravel()])
     return _tensors(points, np.repeat(0.5 * weights / arms, arms), dtype, device)
+
+
+#: Finding the nodes of a rule of a hundred rings takes milliseconds.
+_leggauss = functools.lru_cache(maxsize=64)(np.polynomial.legendre.leggauss)
 
 
 def hexapolar(

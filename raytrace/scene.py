@@ -104,6 +104,11 @@ def symmetry(scene: Scene) -> str:
     return "round"
 
 
+def is_on_axis(scene: Scene) -> bool:
+    """Whether every field is on the axis, and stays there under differentiation."""
+    return not varies(scene.fields) and not bool((scene.fields != 0).any())
+
+
 def beam_share(scene: Scene) -> Tensor:
     """Share (1, F, 1) of the entrance pupil that the vignetting factors of each field leave, (1 - VCX)(1 - VCY)."""
     _, along_x, along_y = _beams(scene)

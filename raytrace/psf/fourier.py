@@ -13,6 +13,7 @@ so that the integral of |U|² over the sensor is 1 (Parseval).
 import dataclasses
 import itertools
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -20,7 +21,7 @@ from torch import Tensor
 from raytrace import zernike as polynomials
 from raytrace.grid import Grid
 from raytrace.launch import is_at_infinity, object_field
-from raytrace.paraxial import first_order, signed, system_matrix
+from raytrace.paraxial import FirstOrder, first_order, signed, system_matrix
 from raytrace.psf.dft import (
     bessel_j0,
     disc_rule,
@@ -34,7 +35,7 @@ from raytrace.psf.dft import (
 )
 from raytrace.psf.radial import is_centred, radii_of_waves, reach, unfold
 from raytrace.pupil import gauss_rings, with_rim
-from raytrace.scene import Kernels, Scene, symmetry
+from raytrace.scene import Kernels, Scene, is_on_axis, symmetry
 from raytrace.trace import media
 from raytrace.value import to, value
 
@@ -63,7 +64,8 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0, zernike: Tensor | None 
     does not exist. Raises ValueError where the window or the blur would need too many pupil points.
     """
     # Phases of hundreds of radians leave single precision three digits.
-    scene, window = (to(each, dtype=torch.float64) for each in (scene, grid))
+    single = grid.pitch.dtype != torch.float64 or scene.wavelengths.dtype != torch.float64
+    scene, window = (to(each, dtype=torch.float64) if single else each for each in (scene, grid))
     lens = paraxial(scene)
     waves = None if zernike is None else _aberrations(scene, zernike.to(torch.float64))
     centroid, covariance = _moments(lens, waves)
@@ -72,7 +74,7 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0, zernike: Tensor | None 
     else:
         kernel = _kernels(lens, window, waves, order)
     found = Kernels(kernel, grid, lens.chief + centroid, covariance, rays=0)
-    return dataclasses.replace(to(found, dtype=grid.pitch.dtype), grid=grid)
+    return dataclasses.replace(to(found, dtype=grid.pitch.dtype), grid=grid) if single else found
 
 
 def _kernels(lens: Paraxial, window: Grid, waves: Tensor | None, order: int) -> Tensor:
@@ -120,14 +122,19 @@ def paraxial(scene: Scene) -> Paraxial:
     radius = 0.5 * primary.entrance_pupil_diameter
     waves = 1e3 * radius / wavelengths  # R/λ
     defocus = math.pi * waves * radius * (n[0] / z_o + n[-1] / z_i - coloured.power)
-    # The chief ray from the centre of the entrance pupil, with the slope of the field.
-    pupil = primary.entrance_pupil_position
+    chief = defocus.new_zeros(2, *shape) if is_on_axis(scene) else _chief_ray(scene, primary, n)
+    return Paraxial(defocus.expand(shape), (waves * n[-1] / z_i).expand(shape), chief.expand(2, *shape))
+
+
+def _chief_ray(scene: Scene, primary: FirstOrder, n: Sequence[Tensor]) -> Tensor:
+    """Where the ray from the centre of the entrance pupil, with the slope of the field, meets the sensor (2, ...)."""
+    lens = scene.lens
+    pupil, distance = primary.entrance_pupil_position, lens.surfaces[0].thickness
     field = object_field(lens, scene.fields[:, None, :, None], primary)
     slope = field if is_at_infinity(lens) else -field / (distance + pupil)
-    A, B, C, D = system_matrix(surfaces, n)
+    A, B, C, D = system_matrix(lens.surfaces[1:-1], n)
     height, omega = -pupil * slope, n[0] * slope
-    chief = A * height + B * omega + sensor / n[-1] * (C * height + D * omega)
-    return Paraxial(defocus.expand(shape), (waves * n[-1] / z_i).expand(shape), chief.expand(2, *shape))
+    return A * height + B * omega + lens.surfaces[-2].thickness / n[-1] * (C * height + D * omega)
 
 
 def _intensity(x: Tensor, y: Tensor, defocus: Tensor, frequency: Tensor, waves: Tensor | None, *, order: int) -> Tensor:

@@ -8,7 +8,7 @@ from raytrace.launch import object_field
 from raytrace.numerics import safe_divide
 from raytrace.paraxial import first_order, signed, system_matrix
 from raytrace.psf.pixels import gaussian_pixels
-from raytrace.scene import Kernels, Scene
+from raytrace.scene import Kernels, Scene, is_on_axis
 from raytrace.trace import media
 
 
@@ -46,6 +46,8 @@ def blur_radius(scene: Scene) -> Tensor:
 def chief_ray_height(scene: Scene) -> Tensor:
     """Where the paraxial ray through the centre of the entrance pupil meets the sensor, (2, D, F, W) mm."""
     lens, wavelengths = scene.lens, scene.wavelengths
+    if is_on_axis(scene):
+        return wavelengths.new_zeros(2, *scene.shape)
     paraxial = first_order(lens)
     field = object_field(lens, scene.fields[:, :, None], paraxial)
     distance, pupil = lens.surfaces[0].thickness, paraxial.entrance_pupil_position
