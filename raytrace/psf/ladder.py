@@ -95,8 +95,9 @@ MODELS: dict[str, Model] = {
         margin=2.0,
         floor=1e-11,
     ),
-    # Cells halve their error with each order: no faster, whatever a lucky change says.
-    "drt": Model(raymap.kernels, range(11), first=0.6, least=0.6, most=0.6, unseen=0.15),
+    # Cells halve their error with each order: no faster, whatever a lucky change says. The table of rings that round
+    # light is read from (radial.py) is good to 1e-5.
+    "drt": Model(raymap.kernels, range(11), first=0.6, least=0.6, most=0.6, unseen=0.15, floor=1e-5),
     "wave": Model(diffraction.kernels, range(-2, 6), first=0.23, least=1e-3, most=0.5, floor=1e-7),
 }
 
