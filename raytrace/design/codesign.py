@@ -43,7 +43,8 @@ class Settings:
     model: PSF model of step 1; vary: variables of the lens; start: "paraxial" (the sensor at the paraxial image of
     `focus_distance`), "rms" (at its best focus), or a sensor distance; f_number: EFL over entrance pupil diameter, None
     for that of the file; near, far: object distances, drawn evenly; noise: standard deviation in a range of 1.
-    patch: pixels of what is restored; crops: a picture and epoch; precision: of the network, "float32" or "bfloat16".
+    patch: pixels of what is restored; crops: a picture and epoch; precision: of the network, "float32" or "bfloat16"
+    (`network.faster_precision` tells which this machine prefers).
     fields: field points in y, samples take them in turn; rate_network, rate_optics: of Adam; tol: of the PSFs.
     """
 
@@ -69,7 +70,7 @@ class Settings:
     crops: int = 4
     rate_network: float = 1e-3
     rate_optics: float = 1e-3
-    precision: str = "bfloat16"
+    precision: str = "float32"
     tol: float = 1e-2
 
 
@@ -137,6 +138,8 @@ def camera(lens: Lens, settings: Settings) -> Camera:
     """The camera of an experiment, as it begins."""
     like = lens.wavelengths
     fields = torch.stack([like.new_zeros(len(settings.fields)), like.new_tensor(settings.fields)])
+    if settings.precision not in ("float32", "bfloat16"):
+        raise ValueError(f"precision {settings.precision!r}: expected float32 or bfloat16")
     return Camera(
         Variables(lens_at_start(lens, settings), settings.vary),
         RedNet(RedNetShape(settings.depth, settings.width), seed=settings.seed).to(memory_format=torch.channels_last),

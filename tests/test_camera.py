@@ -1,0 +1,252 @@
+"""Camera and co-design: image formation, what learns and what does not, and runs from start to end."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from raytrace.design.camera import Camera
+from raytrace.design.codesign import (
+    Batches,
+    Settings,
+    absolute_error,
+    batch,
+    best_focus,
+    camera,
+    distance_in_focus,
+    lens_at_start,
+    optimise,
+    outcome,
+    run_model,
+)
+from raytrace.design.network import RedNet, RedNetShape
+from raytrace.design.spectral import camera_error, even_distances, optimise_closed_form, power_spectrum
+from raytrace.design.training import Run, Share
+from raytrace.design.variables import Variables
+from raytrace.formats import read_lens
+from raytrace.grid import grid
+from raytrace.image import blur
+from raytrace.lens import with_object_distance
+from raytrace.paraxial import paraxial_image_distance
+from raytrace.pictures import dead_leaves, split
+from raytrace.psf import psf
+
+LENS = Path(__file__).parents[1] / "lenses" / "double_gauss.zmx"
+SMALL = Settings(depth=4, width=4, patch=16, size=7, epochs=1, crops=2, batch=4)
+MICROMETRE = 1e-3
+
+
+def number(x) -> torch.Tensor:
+    return torch.tensor(x, dtype=torch.float64)
+
+
+def double_gauss():
+    return read_lens(LENS)
+
+
+class Same(torch.nn.Module):
+    """A network that restores nothing."""
+
+    def forward(self, image):
+        return image
+
+
+@pytest.mark.parametrize("model", ["paraxial", "fourier", "gaussian", "drt"])
+def test_kernels_are_those_of_the_psf_call(model):
+    """A camera plans an order and reuses rays; its kernels stay within the tolerance it was given."""
+    own = camera(double_gauss(), dataclasses.replace(SMALL, model=model, size=21))
+    distances = number([10e3, 17e3, 42e3, 50e3])
+    found = own.kernels(distances)
+    expected = psf(
+        own.variables(), model, object_distances=distances, fields=own.fields, grid=own.pixels, tol=1e-4,
+        normalise="window",
+    ).kernel[:, 0]  # fmt: skip
+    assert float(((found - expected).abs().sum((1, 2))).max()) < own.tol
+    torch.testing.assert_close(found.sum((1, 2)), torch.ones(4, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("model", ["paraxial", "fourier", "gaussian", "drt"])
+def test_derivative_in_the_sensor_through_picture_and_loss(model):
+    own = camera(double_gauss(), dataclasses.replace(SMALL, model=model, tol=1e-3))
+    own.network = Same()
+    picture = torch.rand(2, 22, 22, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    distances, noise = number([12e3, 33e3]), torch.zeros(2, 16, 16, dtype=torch.float64)
+
+    def loss(shift: float) -> torch.Tensor:
+        with torch.no_grad():
+            own.variables.sensor.fill_(shift)
+        return (own(picture, distances, noise=noise) - own.target(picture)).square().mean()
+
+    (slope,) = torch.autograd.grad(loss(0.0), own.variables.sensor)
+    step = 1e-5
+    difference = float((loss(step) - loss(-step)).detach()) / (2 * step)
+    # Kernels of `drt` are smooth in pieces, in each of which pieces of the meridian stay in their pixels.
+    assert float(slope) == pytest.approx(difference, rel=2e-2 if model == "drt" else 1e-4)
+    assert float(slope) != 0
+
+
+def test_image_is_the_picture_blurred_and_the_target_its_middle():
+    own = camera(double_gauss(), SMALL)
+    picture, distances = torch.rand(3, 22, 22), number([10e3, 20e3, 50e3])
+    torch.testing.assert_close(own.image(picture, distances), blur(picture, own.kernels(distances).float()))
+    assert own.target(picture).shape == (3, 16, 16)
+    assert torch.equal(own.target(picture), picture[:, 3:19, 3:19])
+    flat = own.image(torch.full((3, 22, 22), 0.4), distances)
+    torch.testing.assert_close(flat, torch.full((3, 16, 16), 0.4), atol=1e-6, rtol=0)
+
+
+def test_noise_is_drawn_or_given():
+    own = Camera(Variables(double_gauss(), "sensor"), Same(), pixels=grid(number(0.005), 7), noise=0.1)
+    picture, distances = torch.full((2, 70, 70), 0.5), number([2e4, 3e4])
+    drawn = own(picture, distances, generator=torch.Generator().manual_seed(0))
+    assert float((drawn - 0.5).std()) == pytest.approx(0.1, rel=0.03)
+    given = own(picture, distances, noise=torch.ones(2, 64, 64))
+    torch.testing.assert_close(given, torch.full((2, 64, 64), 0.6), atol=1e-5, rtol=0)
+
+
+def test_a_lens_user_learns_lens_and_network_in_a_few_lines():
+    """Ten steps move the sensor by about 1 µm each, and the loss falls."""
+    torch.manual_seed(0)
+    own = Camera(Variables(double_gauss(), "sensor"), RedNet(RedNetShape(4, 4)), pixels=grid(number(0.005), 7))
+    optimizer = torch.optim.Adam(own.parameters(), 1e-3)
+    pictures = torch.rand(8, 22, 22)
+    start, losses = own.variables.numbers()["sensor"], []
+    for _ in range(10):
+        restored = own(pictures, number([3e4] * 8), generator=torch.Generator().manual_seed(3))
+        loss = (restored - own.target(pictures)).abs().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < losses[0]
+    assert MICROMETRE < abs(own.variables.numbers()["sensor"] - start) < 11 * MICROMETRE
+
+
+def test_experiment_starts_where_it_is_told():
+    lens, wavelength = double_gauss(), number(0.53)
+    by_start = {s: lens_at_start(lens, Settings(start=s)) for s in ("paraxial", "rms", "58.1")}
+    places = {s: float(one.surfaces[-2].thickness) for s, one in by_start.items()}
+    assert places["paraxial"] == pytest.approx(57.8817685, abs=1e-7)
+    assert places["rms"] == pytest.approx(57.662, abs=5e-4)
+    assert places["58.1"] == 58.1
+    assert by_start["rms"].wavelengths.tolist() == [float(wavelength)]
+    slow = lens_at_start(lens, Settings(f_number=5.0))
+    assert slow.aperture.kind == "image_f_number"
+    with pytest.raises(ValueError, match="start 'middle': expected paraxial, rms or a sensor distance"):
+        lens_at_start(lens, Settings(start="middle"))
+
+
+def test_distance_in_focus_is_the_inverse_of_focusing():
+    """25 m in paraxial focus; by least RMS spot that sensor is focused elsewhere: 17 to 21 m at F/3."""
+    lens = lens_at_start(double_gauss(), Settings())
+    paraxial = distance_in_focus(lens, lambda one: paraxial_image_distance(one, one.surfaces[0].thickness))
+    assert paraxial == pytest.approx(25e3, rel=1e-6)
+    rms = distance_in_focus(lens, best_focus)
+    sharp = float(best_focus(with_object_distance(lens, rms)))
+    assert sharp == pytest.approx(float(lens.surfaces[-2].thickness), abs=1e-8)
+    assert 10e3 < rms < 25e3
+    assert distance_in_focus(lens_at_start(double_gauss(), Settings(start="57.0")), best_focus) == math.inf
+
+
+def test_samples_are_keyed_by_their_number():
+    pictures = dead_leaves(2, size=48)
+    whole = batch(pictures, SMALL, [0, 1, 2, 3], epoch=1)
+    odd = batch(pictures, SMALL, [1, 3], epoch=1)
+    assert torch.equal(whole.picture[1::2], odd.picture)
+    assert torch.equal(whole.distance[1::2], odd.distance)
+    assert torch.equal(whole.noise[1::2], odd.noise)
+    assert 10e3 <= float(whole.distance.min()) <= float(whole.distance.max()) <= 50e3
+    batches = Batches(pictures, SMALL)
+    assert torch.equal(batches(1, Share()).distance, batch(pictures, SMALL, [0, 1, 2, 3], epoch=1).distance)
+    with pytest.raises(ValueError, match="do not fill a batch of 64"):
+        Batches(pictures, dataclasses.replace(SMALL, batch=64))
+
+
+def test_losses_of_shares_add_up_to_that_of_the_batch():
+    """What two processes sum is what one computes: to 1e-12 in double precision, gradients too."""
+    own = camera(double_gauss(), SMALL).double()
+    whole = batch(dead_leaves(2, size=48), SMALL, [0, 1, 2, 3], epoch=0)
+    parts = [
+        dataclasses.replace(
+            whole, picture=whole.picture[i::2].double(), distance=whole.distance[i::2], noise=whole.noise[i::2].double()
+        )
+        for i in range(2)
+    ]
+    whole = dataclasses.replace(whole, picture=whole.picture.double(), noise=whole.noise.double())
+    (together,) = torch.autograd.grad(absolute_error(own, whole).sum(), own.variables.sensor)
+    apart = [torch.autograd.grad(absolute_error(own, part).sum(), own.variables.sensor)[0] for part in parts]
+    assert float(sum(apart)) == pytest.approx(float(together), rel=1e-12)
+
+
+def test_fields_take_turns():
+    settings = dataclasses.replace(SMALL, fields=(0.0, 14.0), model="gaussian")
+    own = camera(double_gauss(), settings)
+    own.network = Same()
+    four = batch(dead_leaves(2, size=48), settings, [0, 1, 2, 3], epoch=0)
+    assert four.field == [0, 1, 0, 1]
+    errors = absolute_error(own, four)
+    for i in range(4):
+        one = batch(dead_leaves(2, size=48), settings, [i], epoch=0)
+        torch.testing.assert_close(absolute_error(own, one)[0], errors[i], atol=2e-3, rtol=1e-4)
+    assert float((own.kernels(number([2e4]), 0) - own.kernels(number([2e4]), 1)).abs().sum()) > 0.1
+
+
+def test_a_run_of_both_steps_and_its_outcome(tmp_path):
+    train_pictures, test_pictures = split(dead_leaves(10, size=32))
+    arguments = double_gauss(), train_pictures, test_pictures, SMALL, tmp_path
+    steps = list(run_model(*arguments, about={"lens": "double_gauss"}, distances=(1e4, 3e4)))
+    assert [name for name, *_ in steps] == ["joint"] * 4 + ["refine"] * 4
+    joint = [record["sensor"] for name, _, record in steps if name == "joint"]
+    assert joint[0] == pytest.approx(57.8817685, abs=1e-6)
+    assert joint[-1] != joint[0]
+    assert len({record["sensor"] for name, _, record in steps if name == "refine"}) == 1, "the optics are frozen"
+    found = outcome(tmp_path)
+    assert found.sensor_mm == steps[-1][2]["sensor"]
+    assert 0 < found.l1_drt < 1
+    assert set(found.by_distance) == {"10000", "30000"}
+    assert list(run_model(*arguments, about={"lens": "double_gauss"}, distances=(1e4, 3e4))) == []
+
+
+def test_a_run_stopped_in_either_step_ends_as_if_it_had_not_been(tmp_path):
+    train_pictures, test_pictures = split(dead_leaves(10, size=32))
+
+    def run(folder, stop_after=None):
+        steps = run_model(double_gauss(), train_pictures, test_pictures, SMALL, folder, about={}, distances=(3e4,))
+        for taken, _ in enumerate(steps, 1):
+            if taken == stop_after:
+                return
+
+    run(tmp_path / "whole")
+    run(tmp_path / "parts", stop_after=2)
+    run(tmp_path / "parts", stop_after=6)
+    run(tmp_path / "parts")
+    assert outcome(tmp_path / "whole") == outcome(tmp_path / "parts")
+
+
+def test_training_moves_the_sensor_towards_less_loss(tmp_path):
+    """From a sensor 0.3 mm too close, Adam moves away from the lens at 1 µm a step."""
+    settings = dataclasses.replace(SMALL, start="57.3", epochs=5)
+    own = camera(double_gauss(), settings)
+    steps = list(optimise(own, split(dead_leaves(10, size=32))[0], settings, Run(tmp_path, {})))
+    assert steps[-1][1]["sensor"] > 57.3 + 5 * MICROMETRE
+
+
+def test_closed_form_finds_the_least_error_and_paraxial_and_fourier_agree():
+    """Optima over 10 to 50 m with a 1/f² spectrum: both near 34 m paraxial, Gaussian DRT closer to the lens."""
+    S = power_spectrum(dead_leaves(8, size=64), 48)
+    places = {}
+    for model in ("paraxial", "fourier", "gaussian"):
+        own = camera(double_gauss(), dataclasses.replace(SMALL, model=model, size=21))
+        course = optimise_closed_form(own, S, distances=even_distances(own, 9))
+        assert min(course) == pytest.approx(course[-1], rel=1e-6)
+        places[model] = own.variables.numbers()["sensor"]
+        with torch.no_grad():
+            here = float(camera_error(own, S, even_distances(own, 9)))
+            for shift in (-0.01, 0.01):
+                own.variables.sensor += shift
+                assert float(camera_error(own, S, even_distances(own, 9))) > here
+                own.variables.sensor -= shift
+    assert places["paraxial"] == pytest.approx(places["fourier"], abs=0.02)
+    assert places["gaussian"] < places["paraxial"] - 0.05
