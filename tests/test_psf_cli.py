@@ -118,3 +118,12 @@ def test_comparisons_that_make_no_sense_are_refused_in_one_line(capsys, words, c
     assert said.out == ""
     assert message in said.err
     assert len(said.err.splitlines()) == 1
+
+
+def test_rho_scales_the_paraxial_blur(capsys):
+    sigmas = []
+    for rho in ("0.5", "0.3"):
+        assert main(["psf", str(LENS), "--model", "paraxial", "--object-distance", "1e4", "--rho", rho, "--json"]) == 0
+        (found,) = json.loads(capsys.readouterr().out)["results"]
+        sigmas.append(found["covariance"][0][0] ** 0.5)
+    assert sigmas[1] / sigmas[0] == pytest.approx(0.6, rel=1e-12)

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from raytrace.cli.analysis_table import ANALYSES
+from raytrace.cli.codesign_table import CODESIGN
 from raytrace.cli.options import (
     aperture,
     catalog,
@@ -137,6 +138,13 @@ def _psf(parser):
         choices=("energy", "window"),
         default="energy",
         help="1 = all light through the entrance pupil (default), or each window sums to 1",
+    )
+    parser.add_argument(
+        "--rho",
+        metavar="R",
+        type=positive_finite,
+        default=0.5,
+        help="of the paraxial model: σ over the radius of the blur (default 0.5, the second moment of a uniform disc)",
     )
     output(parser, "arrays to write (.npz): psf[distance, field, y, x], pixel_pitch, energy, error, model")
     plot(parser, "the kernels")
@@ -326,4 +334,5 @@ COMMANDS = (
         "bench_commands.bench",
     ),
     *(Command(*entry) for entry in ANALYSES),
+    Command(*CODESIGN),
 )

@@ -31,6 +31,7 @@ def psf(arguments: argparse.Namespace) -> None:
         tol=arguments.tol,
         rays=arguments.rays,
         normalise=arguments.normalise,
+        rho=arguments.rho,
     )
     labels = [f"{y:g}" if x == 0 else f"{x:g},{y:g}" for x, y in fields.T.tolist()]
     if arguments.output:

@@ -1,6 +1,7 @@
 """Study: the runs of several models and seeds side by side: tables, courses and what to draw.
 
-A study is a folder of runs, `<model>-<seed>/`; finished ones are read again, never repeated.
+A study is a folder of runs, `<row>-<seed>/`; finished ones are read again, never repeated. A row is a PSF model, or
+`AFTER_PARAXIAL`: Gaussian DRT with the sensor where the paraxial run of the same seed ended.
 """
 
 import csv
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from raytrace.design.camera import Camera
 from raytrace.design.codesign import STEPS, Outcome, Settings, batch, outcome
+from raytrace.design.codesign import camera as camera_at_start
 from raytrace.files import write_atomically
 from raytrace.launch import launch
 from raytrace.lens import Lens, with_object_distance
@@ -25,6 +27,9 @@ from raytrace.trace import trace
 
 #: The paper's table: L1 after step 1, L1 with DRT PSFs after step 2, focus distance in m.
 PAPER = {"paraxial": (0.0415, 0.0504, 33.9), "fourier": (0.0408, 0.0509, 35.7), "gaussian": (0.0429, 0.0430, 27.3)}
+
+AFTER_PARAXIAL = "gaussian-after-paraxial"
+ROWS = ("paraxial", "fourier", "gaussian", "drt", AFTER_PARAXIAL)
 
 COLUMNS = ("model", "seed", "l1_joint", "l1_drt", "focus_paraxial_m", "focus_rms_m", "sensor_mm")
 
@@ -39,14 +44,22 @@ class Summary:
     deviation: dict[str, float]
 
 
-def run_folder(study: Path, settings: Settings) -> Path:
-    return Path(study) / f"{settings.model}-{settings.seed}"
+def run_folder(study: Path, row: str, seed: int) -> Path:
+    return Path(study) / f"{row}-{seed}"
+
+
+def run_settings(study: Path, row: str, seed: int, settings: Settings) -> Settings | None:
+    """The settings of one run; None where it starts from a run that is not finished."""
+    if row != AFTER_PARAXIAL:
+        return dataclasses.replace(settings, model=row, seed=seed)
+    before = outcome(run_folder(study, "paraxial", seed))
+    return before and dataclasses.replace(settings, model="gaussian", seed=seed, start=repr(before.sensor_mm))
 
 
 def outcomes(study: Path, models: Sequence[str], seeds: Sequence[int]) -> list[Outcome]:
-    """The finished runs of a study."""
-    found = [outcome(Path(study) / f"{model}-{seed}") for model in models for seed in seeds]
-    return [one for one in found if one is not None]
+    """The finished runs of a study, each with its row as its model."""
+    found = [(model, outcome(run_folder(study, model, seed))) for model in models for seed in seeds]
+    return [dataclasses.replace(one, model=model) for model, one in found if one is not None]
 
 
 def rows(found: Sequence[Outcome]) -> list[dict[str, str | float]]:
@@ -76,12 +89,42 @@ def summaries(found: Sequence[Outcome]) -> list[Summary]:
 
 def course(study: Path, model: str, seed: int, step: str = STEPS[0]) -> dict[str, list[float]]:
     """The log of one step of one run, a list for each of its columns; empty if it has not begun."""
-    path = Path(study) / f"{model}-{seed}" / step / "log.csv"
+    path = run_folder(study, model, seed) / step / "log.csv"
     if not path.exists():
         return {}
     with path.open(newline="") as file:
         read = list(csv.DictReader(file))
     return {key: [float(row[key]) for row in read] for key in (read[0] if read else ())}
+
+
+def courses(study: Path, found: Sequence[Outcome], column: str, step: str = STEPS[0]) -> dict[str, list[list[float]]]:
+    """One column of the logs of finished runs, by model, a list for each seed; models without it are left out."""
+    result: dict[str, list[list[float]]] = {}
+    for one in found:
+        values = course(study, one.model, one.seed, step).get(column)
+        if values:
+            result.setdefault(one.model, []).append(values)
+    return result
+
+
+def losses_by_distance(found: Sequence[Outcome]) -> tuple[list[float], dict[str, list[list[float]]]]:
+    """Object distances in mm and the loss with DRT PSFs after step 2 at each, by model, a list for each seed."""
+    distances = sorted({float(d) for one in found for d in one.by_distance})
+    result: dict[str, list[list[float]]] = {}
+    for one in found:
+        own = {float(d): loss for d, loss in one.by_distance.items()}
+        result.setdefault(one.model, []).append([own[d] for d in distances])
+    return distances, result
+
+
+def trained(lens: Lens, settings: Settings, folder: Path) -> Camera:
+    """The camera of a finished run as it ended, with DRT PSFs. settings: those of the run."""
+    own = camera_at_start(lens, settings)
+    state = torch.load(Path(folder) / STEPS[1] / "checkpoint.pt", map_location="cpu", weights_only=True)
+    own.load_state_dict(state["module"])
+    own.variables.requires_grad_(False)
+    own.use("drt")
+    return own
 
 
 @torch.no_grad()

@@ -1,0 +1,145 @@
+"""The arguments of `raytrace codesign`. Imports no torch."""
+
+from raytrace.cli.options import catalog, count, file_name, finite, json, positive_finite, seed_number
+
+MODELS = ("paraxial", "fourier", "gaussian", "drt")
+AFTER_PARAXIAL = "gaussian-after-paraxial"
+
+_DESCRIPTION = """\
+Learn the sensor distance (or any variables) of a lens together with a network that restores its pictures. Step 1
+learns both with the PSFs of one model; step 2 freezes the lens and goes on with the network on ray-traced (DRT)
+PSFs, as long as step 1. `compare` runs every model and seed and writes tables, figures and a page about them.
+
+A run may be stopped at any moment: the same command goes on where it was, and ends in the same numbers."""
+
+_EXAMPLES = """examples:
+  raytrace codesign double_gauss --loss spectral
+  raytrace codesign double_gauss --model gaussian --data pictures -o run
+  raytrace codesign lens.zmx --vary "sensor thickness:5,6 curvature:1-4" --f-number 4 --data pictures -o run4
+  raytrace codesign double_gauss --field 0 10 14 --normalise energy --epochs 10 -o fields --json
+  raytrace codesign compare double_gauss --data pictures --seeds 0 1 2 -o study --docs docs
+  raytrace codesign compare double_gauss --data pictures -o study --docs docs --report-only"""
+
+
+def _add_arguments(parser) -> None:
+    parser.usage = "raytrace codesign [compare] LENS [-o FOLDER] [options]"
+    parser.add_argument(
+        "words",
+        metavar="LENS",
+        type=file_name,
+        nargs="+",
+        help="lens file, or the name of a shipped lens; `compare` before it runs all models and seeds",
+    )
+    catalog(parser)
+    json(parser)
+    parser.add_argument(
+        "-o", "--output", metavar="FOLDER", type=file_name, help="folder of the run, or of all runs of compare"
+    )
+    parser.add_argument("--resume", action="store_true", help="only go on with a run that was begun in FOLDER")
+    parser.add_argument("--model", choices=MODELS, help="PSF model of step 1 (default gaussian)")
+    parser.add_argument(
+        "--loss",
+        choices=("image", "spectral"),
+        default="image",
+        help="of restored pictures (default), or in closed form: the error of the best linear filter, in seconds",
+    )
+    _pictures(parser.add_argument_group("pictures"))
+    _scene(parser.add_argument_group("lens and scene"))
+    _training(parser.add_argument_group("network and training"))
+    _compare(parser.add_argument_group("compare"))
+
+
+def _pictures(group) -> None:
+    group.add_argument(
+        "--data",
+        metavar="DIR",
+        type=file_name,
+        help="folder of pictures, in any subfolders; four fifths of them train, the others test "
+        "(default: dead leaves, discs that hide one another)",
+    )
+    group.add_argument("--limit", metavar="N", type=count, help="take N pictures, evenly from all in DIR")
+    group.add_argument("--patch", metavar="N", type=count, help="pixels across what is restored (default 64)")
+    group.add_argument("--crops", metavar="N", type=count, help="patches of a picture in an epoch (default 4)")
+
+
+def _scene(group) -> None:
+    group.add_argument(
+        "--vary",
+        metavar="LIST",
+        help='variables: sensor (default), or a list like "sensor thickness:5,6 curvature:1-4 conic:3" of surfaces',
+    )
+    group.add_argument(
+        "--start",
+        metavar="PLACE",
+        help="where the sensor begins: paraxial (default; the image of --focus-distance), rms (its least RMS spot), "
+        "or a sensor distance in mm",
+    )
+    group.add_argument("--focus-distance", metavar="MM", type=positive_finite, help="of --start (default 25000)")
+    group.add_argument("--f-number", metavar="N", type=positive_finite, help="other than the file's")
+    group.add_argument("--wavelength", metavar="UM", type=positive_finite, help="in µm (default 0.53)")
+    group.add_argument("--near", metavar="MM", type=positive_finite, help="nearest object (default 10000)")
+    group.add_argument("--far", metavar="MM", type=positive_finite, help="furthest object (default 50000)")
+    group.add_argument(
+        "--field", "--fields", metavar="Y", type=finite, nargs="+", help="field points, taken in turn (default 0)"
+    )
+    group.add_argument("--pixel", metavar="MM", type=positive_finite, help="pixel pitch (default 0.005)")
+    group.add_argument("--size", metavar="N", type=count, help="pixels across the window of the PSF (default 21)")
+    group.add_argument(
+        "--normalise",
+        choices=("window", "energy"),
+        help="each window of the PSF sums to 1 (default), or 1 = all light through the entrance pupil",
+    )
+    group.add_argument(
+        "--noise", metavar="S", type=positive_finite, help="standard deviation, of pictures from 0 to 1 (default 0.1)"
+    )
+    group.add_argument("--tol", metavar="T", type=positive_finite, help="what a PSF may err by (default 0.01)")
+
+
+def _training(group) -> None:
+    group.add_argument(
+        "--preset",
+        choices=("cpu", "paper"),
+        default="cpu",
+        help="RED-Net of 10 layers of 32 maps (default), or of 30 layers of 64 maps",
+    )
+    group.add_argument("--depth", metavar="N", type=count, help="layers, an even number; goes before --preset")
+    group.add_argument("--width", metavar="N", type=count, help="maps of a layer; goes before --preset")
+    group.add_argument("--epochs", metavar="N", type=count, help="of each step (default 30)")
+    group.add_argument("--batch", metavar="N", type=count, help="patches of a training step (default 32)")
+    group.add_argument("--seed", metavar="N", type=seed_number, help="of every draw (default 0)")
+    group.add_argument("--rate-network", metavar="R", type=positive_finite, help="Adam's, of weights (default 0.001)")
+    group.add_argument(
+        "--rate-optics", metavar="R", type=positive_finite, help="Adam's, of variables, in mm (default 0.001)"
+    )
+    group.add_argument(
+        "--precision",
+        choices=("auto", "float32", "bfloat16"),
+        default="auto",
+        help="of the network; auto (default) tries which this machine trains faster in, and keeps to it",
+    )
+
+
+def _compare(group) -> None:
+    group.add_argument(
+        "--models",
+        metavar="MODEL",
+        choices=(*MODELS, AFTER_PARAXIAL),
+        nargs="+",
+        help=f"rows of the table: {', '.join(MODELS)} (default: all), and {AFTER_PARAXIAL}: Gaussian DRT that begins "
+        "where the paraxial run ended",
+    )
+    group.add_argument("--seeds", metavar="N", type=seed_number, nargs="+", help="of the runs (default 0 1 2)")
+    group.add_argument(
+        "--docs", metavar="DOCS", type=file_name, help="folder for codesign.md and codesign/ (default: FOLDER)"
+    )
+    group.add_argument("--report-only", action="store_true", help="train nothing, write what the runs say so far")
+
+
+CODESIGN = (
+    "codesign",
+    "learn a lens and a network together",
+    _DESCRIPTION,
+    _EXAMPLES,
+    _add_arguments,
+    "codesign_commands.codesign",
+)

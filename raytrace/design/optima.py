@@ -1,0 +1,90 @@
+"""Optima of the closed form: where each PSF model would put the lens, without a network, and what DRT says of it."""
+
+import csv
+import dataclasses
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from raytrace.design.camera import Camera
+from raytrace.design.codesign import Settings, best_focus, camera, distance_in_focus
+from raytrace.design.spectral import camera_error, even_distances, optimise_closed_form
+from raytrace.files import write_atomically
+from raytrace.lens import Lens
+from raytrace.paraxial import paraxial_image_distance
+
+
+@dataclasses.dataclass(frozen=True)
+class Optimum:
+    """The lens of least closed-form error of one model.
+
+    error: mean square error of a pixel with the model's own PSFs; error_drt: of the same lens with DRT PSFs and the
+    filter that is best for them; course: the error at every evaluation. Focus distances in m as for `Outcome`.
+    """
+
+    model: str
+    sensor_mm: float
+    focus_paraxial_m: float
+    focus_rms_m: float
+    error: float
+    error_drt: float
+    variables: dict[str, float]
+    course: tuple[float, ...]
+
+
+#: Columns of `spectral.csv`.
+COLUMNS = ("model", "sensor_mm", "focus_paraxial_m", "focus_rms_m", "error", "error_drt")
+
+
+def paraxial_image(lens: Lens) -> Tensor:
+    """Sensor distance in mm of the paraxial image of the lens's object."""
+    return paraxial_image_distance(lens, lens.surfaces[0].thickness)
+
+
+def closed_form(lens: Lens, settings: Settings, spectrum: Tensor) -> Optimum:
+    """The optimum of the model of the settings. spectrum: `power_spectrum` of the pictures."""
+    own = camera(lens, settings)
+    course = optimise_closed_form(own, spectrum)
+    found = own.variables()
+    with torch.no_grad():
+        error = camera_error(own, spectrum, even_distances(own))
+        own.use("drt")
+        error_drt = camera_error(own, spectrum, even_distances(own))
+    return Optimum(
+        model=settings.model,
+        sensor_mm=float(found.surfaces[-2].thickness),
+        focus_paraxial_m=1e-3 * distance_in_focus(found, paraxial_image),
+        focus_rms_m=1e-3 * distance_in_focus(found, best_focus),
+        error=float(error),
+        error_drt=float(error_drt),
+        variables=own.variables.numbers(),
+        course=tuple(course),
+    )
+
+
+@torch.no_grad()
+def scan(own: Camera, spectrum: Tensor, sensors: Sequence[float]) -> list[float]:
+    """Closed-form error of a camera with its sensor at each of the distances in mm; "sensor" is one of its variables.
+
+    The camera is left as it was.
+    """
+    place = own.variables.get_parameter("sensor")
+    (variable,) = [one for one in own.variables.variables if one.kind == "sensor"]
+    before, found = place.clone(), []
+    for sensor in sensors:
+        place.fill_((sensor - variable.start) / variable.unit)
+        found.append(float(camera_error(own, spectrum, even_distances(own))))
+    place.copy_(before)
+    return found
+
+
+def write_optima(found: Sequence[Optimum], path: Path) -> None:
+    """The table of the optima, a row for each model."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({column: getattr(one, column) for column in COLUMNS} for one in found)
+    write_atomically(path, lambda file: file.write(text.getvalue().encode()))
