@@ -174,17 +174,22 @@ def _estimate(ladder: Model, changes: list[Tensor], found: Psf, rounding: Tensor
 
 
 def _rounding(batch: Scene, pixels: Grid, found: Psf, ladder: Model) -> Tensor:
-    """Error (D, F) by rounding: of directions, over a focal length, in units of σ or of a pixel; or the model's floor.
+    """Error (D, F) by rounding, at least the model's floor.
 
-    In float32 the measured error is 0.02 to 0.7 of it. Waves are summed in float64, whatever they start from.
+    Of rays: that of directions, over a focal length, in units of σ or of a pixel; inf for a σ that is rounding itself.
+    In float32 the measured error is 0.02 to 0.7 of it. Waves are summed in float64 whatever they start from: there it
+    is the rounding of the lens, whose image is out of focus by ε f and so blurred by ε f/2N.
     """
+    paraxial = first_order(batch.lens)
+    focal, f_number = (t.abs().reshape(-1)[:1] for t in (paraxial.effective_focal_length, paraxial.working_f_number))
+    spread = torch.finfo(found.kernel.dtype).eps * torch.where(torch.isfinite(focal), focal, 1.0)
     if found.model in ("fourier", "wave"):
-        return torch.full_like(found.energy, max(ladder.floor, torch.finfo(found.kernel.dtype).eps))
+        spread = spread / (2 * torch.where(torch.isfinite(f_number), f_number, 1.0))
     width = safe_sqrt(found.covariance[0] + found.covariance[2]) if ladder.by_width else pixels.pitch
-    focal = first_order(batch.lens).effective_focal_length.abs()
-    focal = focal.reshape(-1)[:1] if bool(torch.isfinite(focal).all()) else torch.ones_like(pixels.pitch)
-    blurred = safe_divide(torch.finfo(found.kernel.dtype).eps * focal, width)
-    return blurred.clamp_min(ladder.floor).expand(found.energy.shape)
+    error = safe_divide(spread, width)
+    if ladder.by_width:
+        error = torch.where(error > 0.3, torch.inf, error)
+    return error.clamp_min(ladder.floor).expand(found.energy.shape)
 
 
 def by_rays(batch: Scene, pixels: Grid, weights: Tensor, models: Mapping[str, Model], model: str, count: int) -> Psf:
