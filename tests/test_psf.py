@@ -220,6 +220,26 @@ def test_number_of_rays_is_kept_to():
         psf(double_gauss(), "gaussian", rays=1, **options)
 
 
+def test_an_order_repeats_what_a_tolerance_found():
+    options = {"fields": field(14.0), "object_distances": number([1e4]), "center": "chief"}
+    found = psf(double_gauss(), "gaussian", tol=1e-3, **options)
+    again = psf(double_gauss(), "gaussian", order=found.order, **options)
+    torch.testing.assert_close(again.kernel, found.kernel, atol=0, rtol=0)
+    assert again.rays == found.rays
+    assert bool(again.error.isnan().all())
+
+
+def test_rho_and_zernike_reach_their_models():
+    options = {"fields": field(0.0), "object_distances": number([1e4])}
+    plain, narrow = (psf(double_gauss(), "paraxial", rho=rho, **options) for rho in (0.5, 0.25))
+    torch.testing.assert_close(narrow.covariance, plain.covariance / 4)
+    coma = number([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2e-4])  # Noll 7
+    options["grid"] = grid(0.02, 5)
+    bent = psf(slow(double_gauss()), "fourier", zernike=coma, **options)
+    assert float((bent.kernel - bent.kernel.flip(-2)).abs().sum()) > 1e-3
+    assert float((bent.kernel - bent.kernel.flip(-1)).abs().sum()) < 1e-9
+
+
 def test_a_tighter_tolerance_takes_more_rays_and_errs_less():
     options = {"fields": field(14.0), "object_distances": number([1e4]), "center": "chief"}
     loose, tight = (psf(double_gauss(), "gaussian", tol=t, **options) for t in (0.1, 1e-8))
@@ -248,6 +268,9 @@ def test_a_tolerance_out_of_reach_is_said():
         ({"rays": 0}, "rays 0: expected"),
         ({"model": "auto", "rays": 100}, "auto chooses by a tolerance"),
         ({"model": "paraxial", "rays": 100}, "paraxial traces no rays"),
+        ({"order": 3, "tol": 0.1}, "order belongs to one model and excludes tol and rays"),
+        ({"model": "auto", "order": 3}, "order belongs to one model"),
+        ({"order": 99}, "gaussian has no order 99; expected one of 2, 3, 4"),
         ({"fields": number([1.0, 2.0, 3.0])}, r"fields of shape \(3,\); expected \(2, F\)"),
         ({"object_distances": number(1e4)}, r"object_distances of shape .* expected one axis"),
         ({"object_distances": number([1e4, math.nan])}, "object_distances .* nan"),
