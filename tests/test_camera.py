@@ -148,6 +148,8 @@ def test_distance_in_focus_is_the_inverse_of_focusing():
     assert sharp == pytest.approx(float(lens.surfaces[-2].thickness), abs=1e-8)
     assert 10e3 < rms < 25e3
     assert distance_in_focus(lens_at_start(double_gauss(), Settings(start="57.0")), best_focus) == math.inf
+    with pytest.raises(ValueError, match="in focus nearer than 500 mm"):
+        distance_in_focus(lens_at_start(double_gauss(), Settings(start="150")), best_focus)
 
 
 def test_samples_are_keyed_by_their_number():

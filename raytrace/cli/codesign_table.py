@@ -10,12 +10,13 @@ Learn the sensor distance (or any variables) of a lens together with a network t
 learns both with the PSFs of one model; step 2 freezes the lens and goes on with the network on ray-traced (DRT)
 PSFs, as long as step 1. `compare` runs every model and seed and writes tables, figures and a page about them.
 
-A run may be stopped at any moment: the same command goes on where it was, and ends in the same numbers."""
+A run may be stopped at any moment: the same command goes on where it was, and ends in the same numbers. Several
+processes share every batch: torchrun --nproc-per-node 2 -m raytrace codesign …"""
 
 _EXAMPLES = """examples:
   raytrace codesign double_gauss --loss spectral
   raytrace codesign double_gauss --model gaussian --data pictures -o run
-  raytrace codesign lens.zmx --vary "sensor thickness:5,6 curvature:1-4" --f-number 4 --data pictures -o run4
+  raytrace codesign lens.zmx --vary sensor thickness:5,6 curvature:1-4 --f-number 4 -o run4
   raytrace codesign double_gauss --field 0 10 14 --normalise energy --epochs 10 -o fields --json
   raytrace codesign compare double_gauss --data pictures --seeds 0 1 2 -o study --docs docs
   raytrace codesign compare double_gauss --data pictures -o study --docs docs --report-only"""
@@ -65,8 +66,9 @@ def _pictures(group) -> None:
 def _scene(group) -> None:
     group.add_argument(
         "--vary",
-        metavar="LIST",
-        help='variables: sensor (default), or a list like "sensor thickness:5,6 curvature:1-4 conic:3" of surfaces',
+        metavar="WHAT",
+        nargs="+",
+        help="variables: sensor (default), or several as sensor thickness:5,6 curvature:1-4 conic:3, of surfaces",
     )
     group.add_argument(
         "--start",
@@ -102,8 +104,8 @@ def _training(group) -> None:
         default="cpu",
         help="RED-Net of 10 layers of 32 maps (default), or of 30 layers of 64 maps",
     )
-    group.add_argument("--depth", metavar="N", type=count, help="layers, an even number; goes before --preset")
-    group.add_argument("--width", metavar="N", type=count, help="maps of a layer; goes before --preset")
+    group.add_argument("--depth", metavar="N", type=count, help="layers, an even number, instead of the preset's")
+    group.add_argument("--width", metavar="N", type=count, help="maps of a layer, instead of the preset's")
     group.add_argument("--epochs", metavar="N", type=count, help="of each step (default 30)")
     group.add_argument("--batch", metavar="N", type=count, help="patches of a training step (default 32)")
     group.add_argument("--seed", metavar="N", type=seed_number, help="of every draw (default 0)")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import statistics
 from collections.abc import Callable, Mapping, Sequence
 
 from raytrace.design.codesign import Outcome
@@ -29,36 +30,29 @@ class Claim:
 def claims(found: Sequence[Outcome], times: Sequence[StepTime]) -> list[Claim]:
     """All claims, over the finished runs of a study and the measured times of a step."""
     of = {summary.model: summary for summary in summaries(found)}
-    gains = _gains(found)
     return [
-        _answered(text, criterion, lambda judge=judge, given=given: judge(given))
-        for text, criterion, judge, given in (
-            ("Paraxial and Fourier optics agree", "focus within 2 m", _agree, of),
-            ("… at 34 to 36 m", "both from 33.5 to 36.5 m, paraxial conjugate", _at_34_to_36_m, of),
-            (
-                "Gaussian DRT chooses another sensor position",
-                "further from both than three deviations and than they are apart",
-                _another_place,
-                of,
-            ),
-            ("… focused nearer (27.3 m)", "nearer than both, in both definitions of focus", _nearer, of),
-            (
-                "The simple models lose much when DRT takes their place (+21 %, +25 %)",
-                "10 % or more, both",
-                _simple_lose,
-                of,
-            ),
-            ("Gaussian DRT loses little (+0.2 %)", "2 % or less", _ours_loses_little, of),
-            ("The lens of Gaussian DRT is best after step 2", "least mean loss with DRT PSFs", _wins, of),
-            ("… at all object distances", "less loss than both at each", _wins_everywhere, gains),
-            ("… most at 20 to 30 m", "there the greatest gain over the better of both", _most_at_20_to_30_m, gains),
-            (
-                "A Gaussian DRT costs less than the DRT",
-                "PSFs of a batch and their gradient",
-                _cheaper,
-                {time.model: time for time in times},
-            ),
-        )
+        _answered("Paraxial and Fourier optics agree", "focus within 2 m of each other", _agree, of),
+        _answered("… at 34 to 36 m", "both from 33.5 to 36.5 m, paraxial conjugate", _at_34_to_36_m, of),
+        _answered(
+            "Gaussian DRT chooses another sensor position",
+            "further from both than three deviations, and than they are apart",
+            _another_place,
+            of,
+        ),
+        _answered("… focused nearer (27.3 m)", "nearer than both, in both definitions of focus", _nearer, of),
+        _answered("The simple models lose much to DRT (+21 %, +25 %)", "10 % or more, both", _simple_lose, of),
+        _answered("Gaussian DRT loses little (+0.2 %)", "2 % or less", _ours_loses_little, of),
+        _answered("The lens of Gaussian DRT is best after step 2", "least mean loss with DRT PSFs", _wins, of),
+        _answered("… at all object distances", "less loss than both at each", _wins_everywhere, found),
+        _answered(
+            "… most at 20 to 30 m", "a gain over the better of both, and the greatest there", _most_at_20_to_30_m, found
+        ),
+        _answered(
+            "A Gaussian DRT costs less than the DRT",
+            "PSFs and gradient of a batch: a tenth less or better",
+            _cheaper,
+            times,
+        ),
     ]
 
 
@@ -67,9 +61,9 @@ def penalty(summary: Summary) -> float:
     return summary.mean["l1_drt"] / summary.mean["l1_joint"] - 1
 
 
-def _answered(text: str, criterion: str, judge: Callable[[], tuple[bool, str]]) -> Claim:
+def _answered(text: str, criterion: str, judge: Callable[..., tuple[bool, str]], given) -> Claim:
     try:
-        return Claim(text, criterion, *judge())
+        return Claim(text, criterion, *judge(given))
     except KeyError as missing:
         return Claim(text, criterion, None, f"no finished run of {missing.args[0]}")
 
@@ -82,7 +76,9 @@ def _agree(of: Mapping[str, Summary]) -> tuple[bool, str]:
 def _at_34_to_36_m(of: Mapping[str, Summary]) -> tuple[bool, str]:
     places = [of[model].mean["focus_paraxial_m"] for model in SIMPLE]
     rms = [of[model].mean["focus_rms_m"] for model in SIMPLE]
-    figures = f"{_metres(places[0])} and {_metres(places[1])}; by least RMS spot {_metres(rms[0])} and {_metres(rms[1])}"
+    figures = (
+        f"{_metres(places[0])} and {_metres(places[1])}; by least RMS spot {_metres(rms[0])} and {_metres(rms[1])}"
+    )
     return all(33.5 <= place <= 36.5 for place in places), figures
 
 
@@ -96,9 +92,13 @@ def _another_place(of: Mapping[str, Summary]) -> tuple[bool, str]:
     side = "nearer to" if shift < 0 else "further from"
     figures = (
         f"{1e3 * abs(shift):.0f} µm {side} the lens than the closer one; "
-        f"those are {1e3 * abs(places[0] - places[1]):.0f} µm apart, deviation over seeds {1e3 * spread:.1f} µm"
+        f"those are {1e3 * abs(places[0] - places[1]):.0f} µm apart, {_over_seeds(ours.seeds, spread)}"
     )
     return min(map(abs, shifts)) > least and shifts[0] * shifts[1] > 0, figures
+
+
+def _over_seeds(seeds: int, spread: float) -> str:
+    return f"deviation over {seeds} seeds {1e3 * spread:.1f} µm" if seeds > 1 else "one seed, no deviation known"
 
 
 def _nearer(of: Mapping[str, Summary]) -> tuple[bool, str]:
@@ -112,52 +112,49 @@ def _nearer(of: Mapping[str, Summary]) -> tuple[bool, str]:
 
 def _simple_lose(of: Mapping[str, Summary]) -> tuple[bool, str]:
     losses = [penalty(of[model]) for model in SIMPLE]
-    return min(losses) >= 0.1, f"{losses[0]:+.1%} and {losses[1]:+.1%}"
+    return min(losses) >= 0.1, f"{_percent(losses[0])} and {_percent(losses[1])}"
 
 
 def _ours_loses_little(of: Mapping[str, Summary]) -> tuple[bool, str]:
-    return penalty(of[OURS]) <= 0.02, f"{penalty(of[OURS]):+.1%}"
+    return penalty(of[OURS]) <= 0.02, f"{_percent(penalty(of[OURS]))}"
 
 
 def _wins(of: Mapping[str, Summary]) -> tuple[bool, str]:
     ours, others = of[OURS].mean["l1_drt"], [of[model].mean["l1_drt"] for model in SIMPLE]
-    figures = f"{ours:.4f} beside {others[0]:.4f} (paraxial, {others[0] / ours - 1:+.1%})"
-    return ours < min(others), f"{figures} and {others[1]:.4f} (Fourier, {others[1] / ours - 1:+.1%})"
+    figures = f"{ours:.4f} beside {others[0]:.4f} (paraxial, {_percent(others[0] / ours - 1)})"
+    return ours < min(others), f"{figures} and {others[1]:.4f} (Fourier, {_percent(others[1] / ours - 1)})"
 
 
-def _gains(found: Sequence[Outcome]) -> dict[str, dict[float, float]]:
-    """Relative gain of Gaussian DRT over each simple model, by object distance in mm; nothing where runs are missing."""
+def _gains(found: Sequence[Outcome]) -> dict[float, float]:
+    """Relative gain of Gaussian DRT over the better of the simple models, by object distance in mm."""
     distances, losses = losses_by_distance(found)
-    means = {model: [sum(column) / len(column) for column in zip(*seeds, strict=True)] for model, seeds in losses.items()}
-    if OURS not in means:
-        return {}
-    return {
-        model: {d: other / ours - 1 for d, other, ours in zip(distances, means[model], means[OURS], strict=True)}
-        for model in SIMPLE
-        if model in means
+    means = {
+        model: [statistics.fmean(column) for column in zip(*seeds, strict=True)] for model, seeds in losses.items()
     }
+    columns = zip(distances, means[OURS], *(means[model] for model in SIMPLE), strict=True)
+    return {distance: min(others) / ours - 1 for distance, ours, *others in columns}
 
 
-def _least_gains(gains: Mapping[str, Mapping[float, float]]) -> dict[float, float]:
-    first, second = (gains[model] for model in SIMPLE)
-    return {distance: min(first[distance], second[distance]) for distance in first}
+def _wins_everywhere(found: Sequence[Outcome]) -> tuple[bool, str]:
+    gains = _gains(found)
+    shown = ", ".join(f"{_percent(gain)} at {distance / 1e3:g} m" for distance, gain in gains.items())
+    return min(gains.values()) > 0, f"loss of the better of both, over its own: {shown}"
 
 
-def _wins_everywhere(gains: Mapping[str, Mapping[float, float]]) -> tuple[bool, str]:
-    least = _least_gains(gains)
-    shown = ", ".join(f"{gain:+.1%} at {distance / 1e3:g} m" for distance, gain in least.items())
-    return min(least.values()) > 0, f"the better of both has {shown}"
+def _most_at_20_to_30_m(found: Sequence[Outcome]) -> tuple[bool, str]:
+    gains = _gains(found)
+    place = max(gains, key=gains.get)
+    return gains[place] > 0 and 20e3 <= place <= 30e3, f"greatest at {place / 1e3:g} m ({_percent(gains[place])})"
 
 
-def _most_at_20_to_30_m(gains: Mapping[str, Mapping[float, float]]) -> tuple[bool, str]:
-    least = _least_gains(gains)
-    place = max(least, key=least.get)
-    return 20e3 <= place <= 30e3, f"greatest at {place / 1e3:g} m ({least[place]:+.1%})"
+def _cheaper(times: Sequence[StepTime]) -> tuple[bool, str]:
+    of = {time.model: time.psf for time in times}
+    shown = ", ".join(f"{model} {psf:.1f} ms" for model, psf in sorted(of.items(), key=lambda item: item[1]))
+    return of[OURS] < 0.9 * of["drt"], shown
 
 
-def _cheaper(times: Mapping[str, StepTime]) -> tuple[bool, str]:
-    shown = ", ".join(f"{one.model} {one.psf:.1f} ms" for one in sorted(times.values(), key=lambda one: one.psf))
-    return times[OURS].psf < times["drt"].psf, shown
+def _percent(part: float) -> str:
+    return f"{100 * part:+.1f} %"
 
 
 def _metres(distance: float) -> str:

@@ -131,6 +131,8 @@ def distance_in_focus(lens: Lens, image_distance: Callable[[Lens], Tensor]) -> f
     furthest, nearest = 1e-9, 2e-3
     if behind(furthest) >= 0:
         return math.inf
+    if behind(nearest) < 0:
+        raise ValueError(f"the sensor is in focus nearer than {1 / nearest:g} mm: too far behind the lens to be meant")
     return 1 / scipy.optimize.brentq(behind, furthest, nearest, xtol=1e-14, rtol=1e-12)
 
 

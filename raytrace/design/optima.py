@@ -48,8 +48,8 @@ def closed_form(lens: Lens, settings: Settings, spectrum: Tensor) -> Optimum:
     """The optimum of the model of the settings. spectrum: `power_spectrum` of the pictures."""
     own = camera(lens, settings)
     course = optimise_closed_form(own, spectrum)
-    found = own.variables()
     with torch.no_grad():
+        found = own.variables()
         error = camera_error(own, spectrum, even_distances(own))
         own.use("drt")
         error_drt = camera_error(own, spectrum, even_distances(own))

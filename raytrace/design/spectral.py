@@ -107,9 +107,9 @@ def optimise_closed_form(camera: Camera, spectrum: Tensor, *, distances: Tensor 
 
     start = np.array([float(parameter.detach()) for parameter in parameters])
     bounds = [_parameter_bounds(variables, variable) for variable in variables.variables]
-    # Errors are of 1e-3 and variables of millimetres: the default tolerance would stop too soon.
+    # Errors are of 1e-3 and variables of millimetres: the default tolerance (2e-9 of 1) would stop too soon.
     best = scipy.optimize.minimize(
-        error_and_gradient, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-14, "gtol": 1e-9}
+        error_and_gradient, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-11, "gtol": 1e-9}
     )
     put(best.x)
     return course

@@ -29,7 +29,18 @@ from raytrace.trace import trace
 PAPER = {"paraxial": (0.0415, 0.0504, 33.9), "fourier": (0.0408, 0.0509, 35.7), "gaussian": (0.0429, 0.0430, 27.3)}
 
 AFTER_PARAXIAL = "gaussian-after-paraxial"
-ROWS = ("paraxial", "fourier", "gaussian", "drt", AFTER_PARAXIAL)
+#: What the rows are called in tables and figures.
+NAMES = {
+    "paraxial": "paraxial",
+    "fourier": "Fourier",
+    "gaussian": "Gaussian DRT",
+    "drt": "DRT",
+    AFTER_PARAXIAL: "Gaussian DRT from paraxial",
+}
+
+ROWS = tuple(NAMES)
+
+_CHOICE = 16  # patches of which the one with most contrast is shown
 
 COLUMNS = ("model", "seed", "l1_joint", "l1_drt", "focus_paraxial_m", "focus_rms_m", "sensor_mm")
 
@@ -142,9 +153,14 @@ def blur_diameters(lens: Lens, distances: Tensor) -> Tensor:
 
 @torch.no_grad()
 def examples(camera: Camera, pictures: Pictures, settings: Settings, distances: Sequence[float]) -> dict[str, Tensor]:
-    """One test patch at several distances (Z,): "picture", "image" and "restored", each (Z, h, w)."""
-    own = batch(pictures, settings, [0], 2**20)
+    """A test patch at several distances (Z,): "picture", "image" and "restored", each (Z, h, w).
+
+    Of the first patches it is the one of most contrast: a plain one shows no blur.
+    """
+    few = list(range(min(_CHOICE, len(pictures) * settings.crops)))
+    own = batch(pictures, settings, few, 2**20)
+    chosen = int(own.picture.flatten(1).std(1).argmax())
     many = torch.tensor(distances, dtype=camera.fields.dtype)
-    picture = own.picture.expand(len(many), -1, -1)
-    image = camera.image(picture, many) + camera.noise * own.noise
+    picture = own.picture[chosen].expand(len(many), -1, -1)
+    image = camera.image(picture, many) + camera.noise * own.noise[chosen]
     return {"picture": camera.target(picture), "image": image, "restored": camera.restore(image)}

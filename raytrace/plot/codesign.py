@@ -5,17 +5,23 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
+from raytrace.design.study import NAMES
 from raytrace.plot.style import FIELD_COLOURS, GREY, INK, new_figure, styled
 
-#: What the models are called and how they are drawn: colour and dashes, to be told apart in print.
-MODELS = {
-    "paraxial": ("paraxial", FIELD_COLOURS[0], (0, (5, 2))),
-    "fourier": ("Fourier", FIELD_COLOURS[1], (0, (1, 1.2))),
-    "gaussian": ("Gaussian DRT", FIELD_COLOURS[2], "solid"),
-    "drt": ("DRT", INK, (0, (6, 1.5, 1, 1.5))),
-    "gaussian-after-paraxial": ("Gaussian DRT from paraxial", FIELD_COLOURS[3], (0, (3, 1, 1, 1, 1, 1))),
+#: How the models are drawn: colour and dashes, to be told apart in print.
+LOOKS = {
+    "paraxial": (FIELD_COLOURS[0], (0, (5, 2))),
+    "fourier": (FIELD_COLOURS[1], (0, (1, 1.2))),
+    "gaussian": (FIELD_COLOURS[2], "solid"),
+    "drt": (INK, (0, (6, 1.5, 1, 1.5))),
+    "gaussian-after-paraxial": (FIELD_COLOURS[3], (0, (3, 1, 1, 1, 1, 1))),
 }
+
+#: Object distances in m that may be marked on an axis, the roundest first.
+_MARKS = (10, 100, 20, 50, 200, 500, 30, 40, 15, 25, 70, 35, 150, 300, 60, 80, 45, 12, 1000, *range(11, 50))
 
 #: Values over steps or distances, one list for each seed.
 Curves = Mapping[str, Sequence[Sequence[float]]]
@@ -24,7 +30,7 @@ Curves = Mapping[str, Sequence[Sequence[float]]]
 @styled
 def loss_figure(joint: Curves, refined: Curves, steps_per_epoch: int) -> Figure:
     """Mean loss of every epoch, of step 1 and of step 2: means over seeds, and their range."""
-    figure = new_figure(7.2, 3.0)
+    figure = new_figure(7.2, 3.3)
     axes = figure.subplots(1, 2, sharey=True)
     for panel, curves, title in zip(
         axes, (joint, refined), ("Step 1: own PSF model", "Step 2: DRT PSFs, optics frozen"), strict=True
@@ -33,9 +39,9 @@ def loss_figure(joint: Curves, refined: Curves, steps_per_epoch: int) -> Figure:
             epochs = [_means(losses, steps_per_epoch) for losses in seeds]
             _band(panel, np.arange(1, len(epochs[0]) + 1), epochs, model)
         panel.set(title=title, xlabel="epoch")
-        panel.set_xlim(left=0)
+        panel.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     axes[0].set_ylabel("training loss (mean L¹)")
-    axes[0].legend()
+    _legend(figure, axes[0])
     return figure
 
 
@@ -45,21 +51,21 @@ def focus_figure(sensors: Curves, conjugates: tuple[Sequence[float], Sequence[fl
 
     conjugates: sensor distances in mm, ascending, and object distances in m.
     """
-    figure = new_figure(5.2, 3.2)
+    figure = new_figure(5.6, 3.5)
     panel = figure.subplots()
     for model, seeds in sensors.items():
         shortest = min(map(len, seeds))
         _band(panel, np.arange(shortest) / steps_per_epoch, [s[:shortest] for s in seeds], model)
     panel.set(xlabel="epoch", ylabel="sensor behind the last surface (mm)")
     panel.set_xlim(left=0)
-    panel.legend()
+    panel.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+    _legend(figure, panel)
     scale = panel.twinx()
     scale.set_ylim(panel.get_ylim())
-    low, high = panel.get_ylim()
-    marks = [z for z in (10, 15, 20, 25, 30, 35, 40, 50, 70, 100, 200, 500) if _between(z, conjugates, low, high)]
+    marks = _marks(conjugates, *panel.get_ylim())
     scale.set_yticks([_image(z, conjugates) for z in marks])
     scale.set_yticklabels([f"{z} m" for z in marks])
-    scale.set_ylabel("paraxial conjugate of the sensor")
+    scale.set_ylabel("object in paraxial focus")
     scale.spines["right"].set_visible(True)
     return figure
 
@@ -67,29 +73,28 @@ def focus_figure(sensors: Curves, conjugates: tuple[Sequence[float], Sequence[fl
 @styled
 def blur_figure(distances: Sequence[float], diameters: Mapping[str, Sequence[float]], pixel: float) -> Figure:
     """RMS blur diameter (mm) of the optimised lenses over object distance (mm), beside a pixel."""
-    figure = new_figure(5.2, 3.2)
+    figure = new_figure(5.6, 3.5)
     panel = figure.subplots()
     for model, values in diameters.items():
-        name, colour, dashes = _look(model)
-        panel.plot(np.asarray(distances) / 1e3, 1e3 * np.asarray(values), color=colour, linestyle=dashes, label=name)
+        panel.plot(np.asarray(distances) / 1e3, 1e3 * np.asarray(values), **_look(model))
     panel.axhline(1e3 * pixel, color=GREY, linewidth=0.7)
     panel.annotate("one pixel", (1, 1e3 * pixel), (-2, 3), ("axes fraction", "data"), "offset points", ha="right",
                    color=GREY, fontsize=7.5)  # fmt: skip
     panel.set(xlabel="object distance (m)", ylabel="RMS blur diameter, traced rays (µm)")
     panel.set_ylim(bottom=0)
-    panel.legend()
+    _legend(figure, panel)
     return figure
 
 
 @styled
 def distance_figure(distances: Sequence[float], losses: Curves) -> Figure:
     """Test loss on DRT PSFs after step 2 over object distance (mm): means over seeds, and their range."""
-    figure = new_figure(5.2, 3.2)
+    figure = new_figure(5.6, 3.5)
     panel = figure.subplots()
     for model, seeds in losses.items():
         _band(panel, np.asarray(distances) / 1e3, seeds, model, marker="o")
     panel.set(xlabel="object distance (m)", ylabel="test loss with DRT PSFs (mean L¹)")
-    panel.legend()
+    _legend(figure, panel)
     return figure
 
 
@@ -109,7 +114,7 @@ def examples_figure(rows: Mapping[str, Mapping[str, np.ndarray]], distances: Seq
             panel.set(xticks=[], yticks=[])
             for spine in panel.spines.values():
                 spine.set_visible(False)
-        panels[0].set_ylabel(_look(model)[0])
+        panels[0].set_ylabel(NAMES.get(model, model).replace(" from ", "\nfrom "))
     axes[0][0].set_title("picture", fontsize=8)
     for number, distance in enumerate(distances):
         axes[0][2 * number + 1].set_title(f"{distance / 1e3:g} m: image", fontsize=8)
@@ -122,27 +127,36 @@ def scan_figure(
     sensors: Sequence[float], errors: Mapping[str, Sequence[float]], trained: Mapping[str, float]
 ) -> Figure:
     """Closed-form error over the sensor's place (mm) for each model, its minimum, and where training ended."""
-    figure = new_figure(5.6, 3.4)
+    figure = new_figure(5.6, 3.7)
     panel = figure.subplots()
     for model, values in errors.items():
-        name, colour, dashes = _look(model)
         values = np.asarray(values)
-        panel.plot(sensors, values, color=colour, linestyle=dashes, label=name)
-        best = int(values.argmin())
+        panel.plot(sensors, values, **_look(model))
+        best, colour = int(values.argmin()), _look(model)["color"]
         panel.plot(sensors[best], values[best], "o", color=colour, markersize=4)
         if model in trained:
-            place = trained[model]
-            panel.plot(
-                place, np.interp(place, sensors, values), "D", color=colour, markerfacecolor="white", markersize=5
-            )
+            error = np.interp(trained[model], sensors, values)
+            panel.plot(trained[model], error, "D", color=colour, markerfacecolor="white", markersize=5)
     panel.set(xlabel="sensor behind the last surface (mm)", ylabel="mean square error, best linear filter")
-    panel.set_title("● least closed-form error   ◇ where training with the network ended", color=GREY, fontsize=8)
-    panel.legend()
+    marks = [Line2D([], [], color=GREY, linestyle="", marker="o", markersize=4, label="least error")]
+    if trained:
+        marks.append(
+            Line2D([], [], color=GREY, linestyle="", marker="D", markerfacecolor="white", label="end of training")
+        )
+    _legend(figure, panel, marks)
     return figure
 
 
-def _look(model: str) -> tuple[str, str, object]:
-    return MODELS.get(model, (model, INK, "solid"))
+def _legend(figure: Figure, panel: Axes, more: Sequence[Line2D] = ()) -> None:
+    """Above the axes, where no curve runs."""
+    handles = [*panel.get_legend_handles_labels()[0], *more]
+    columns = len(handles) if len(handles) <= 4 else 3
+    figure.legend(handles=handles, loc="outside upper center", ncols=columns, handlelength=3)
+
+
+def _look(model: str) -> dict:
+    colour, dashes = LOOKS.get(model, (GREY, "solid"))
+    return {"color": colour, "linestyle": dashes, "label": NAMES.get(model, model)}
 
 
 def _means(losses: Sequence[float], steps_per_epoch: int) -> np.ndarray:
@@ -151,11 +165,10 @@ def _means(losses: Sequence[float], steps_per_epoch: int) -> np.ndarray:
 
 
 def _band(panel: Axes, x: np.ndarray, seeds: Sequence[Sequence[float]], model: str, marker: str = "") -> None:
-    name, colour, dashes = _look(model)
     values = np.stack([np.asarray(seed, dtype=float) for seed in seeds])
-    panel.plot(x, values.mean(0), color=colour, linestyle=dashes, label=name, marker=marker, markersize=3)
+    panel.plot(x, values.mean(0), **_look(model), marker=marker, markersize=3)
     if len(values) > 1:
-        panel.fill_between(x, values.min(0), values.max(0), color=colour, alpha=0.18, linewidth=0)
+        panel.fill_between(x, values.min(0), values.max(0), color=_look(model)["color"], alpha=0.14, linewidth=0)
 
 
 def _image(distance: float, conjugates: tuple[Sequence[float], Sequence[float]]) -> float:
@@ -165,6 +178,12 @@ def _image(distance: float, conjugates: tuple[Sequence[float], Sequence[float]])
     return float(np.interp(distance, distances[order], sensors[order]))
 
 
-def _between(distance: float, conjugates, low: float, high: float) -> bool:
-    nearest, furthest = min(conjugates[1]), max(conjugates[1])
-    return nearest <= distance <= furthest and low <= _image(distance, conjugates) <= high
+def _marks(conjugates: tuple[Sequence[float], Sequence[float]], low: float, high: float) -> list[int]:
+    """Round object distances in m whose images lie from low to high, none closer than a twelfth of that to another."""
+    chosen: dict[int, float] = {}
+    for distance in _MARKS:
+        place = _image(distance, conjugates)
+        known = min(conjugates[1]) <= distance <= max(conjugates[1])
+        if known and low <= place <= high and all(abs(place - o) > (high - low) / 12 for o in chosen.values()):
+            chosen[distance] = place
+    return sorted(chosen)

@@ -1,0 +1,244 @@
+"""What the two forms of `raytrace codesign` share: settings, pictures, and one run with its progress."""
+
+import argparse
+import contextlib
+import dataclasses
+import hashlib
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import distributed
+from tqdm import tqdm
+
+from raytrace.cli.door import CommandError, field_points, find_lens, number, open_lens, refuse_untraceable, say
+from raytrace.design.codesign import STEPS, Outcome, Settings, camera, lens_at_start, outcome, run_model
+from raytrace.design.network import PRESETS, RedNetShape, faster_precision
+from raytrace.design.training import NotFinite, Record, share
+from raytrace.lens import Lens
+from raytrace.paraxial import paraxial_image_distance
+from raytrace.pictures import Pictures, dead_leaves, files, read, split
+
+_LEAVES = 100  # pictures, where none are given
+_DISTANCES = 9  # at which a finished run is tested
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """A lens, settings and pictures; about: what of them decides the result, for the folders of the runs."""
+
+    lens: Lens
+    name: str
+    settings: Settings
+    train: Pictures
+    test: Pictures
+    about: dict[str, str]
+    kind: str
+
+    @property
+    def steps_per_epoch(self) -> int:
+        return len(self.train) * self.settings.crops // self.settings.batch
+
+    @property
+    def distances(self) -> tuple[float, ...]:
+        """Object distances in mm at which runs are tested."""
+        return tuple(np.linspace(self.settings.near, self.settings.far, _DISTANCES).tolist())
+
+
+@contextlib.contextmanager
+def processes() -> Iterator[None]:
+    """Under torchrun, the processes that share every batch; only the first one speaks."""
+    if not distributed.is_torchelastic_launched():
+        yield
+        return
+    distributed.init_process_group("gloo")
+    try:
+        with contextlib.ExitStack() as stack:
+            if share().rank:
+                nowhere = stack.enter_context(open(os.devnull, "w"))
+                stack.enter_context(contextlib.redirect_stdout(nowhere))
+                stack.enter_context(contextlib.redirect_stderr(nowhere))
+            yield
+    finally:
+        distributed.destroy_process_group()
+
+
+def experiment(arguments: argparse.Namespace, settings: Settings) -> Experiment:
+    """Open the lens, refuse what cannot be simulated, then read the pictures."""
+    path = find_lens(arguments.lens)
+    lens = open_lens(argparse.Namespace(lens=arguments.lens, catalog=arguments.catalog))
+    if settings.near >= settings.far:
+        raise CommandError(f"--near {settings.near:g} is not nearer than --far {settings.far:g}")
+    field_points(lens, argparse.Namespace(field=settings.fields))
+    camera(lens, settings)  # refuses bad variables, starts and networks
+    refuse_untraceable(lens_at_start(lens, settings), str(path))
+    pictures = _pictures(arguments, settings)
+    train, test = split(pictures)
+    about = {
+        "lens": f"{path.stem}, sha256 {hashlib.sha256(path.read_bytes()).hexdigest()[:16]}",
+        "pictures": f"{len(pictures)}, blake2 {_digest(pictures)}",
+    }
+    return Experiment(lens, path.stem, settings, train, test, about, "pictures" if arguments.data else "dead leaves")
+
+
+def refuse_too_few(given: Experiment) -> None:
+    """Raise where the pictures to train on do not fill one batch."""
+    if not given.steps_per_epoch:
+        raise CommandError(
+            f"{len(given.train)} pictures to train on, {given.settings.crops} crops of each, do not fill one batch of "
+            f"{given.settings.batch}; give more pictures, more --crops or a smaller --batch"
+        )
+
+
+def settings_of(arguments: argparse.Namespace, begun: Path) -> Settings:
+    """Settings by the options; begun: `settings.json` of what may have been begun, whose precision "auto" keeps."""
+    preset = PRESETS[arguments.preset]
+    given: dict = {"depth": preset.depth, "width": preset.width}
+    for field in dataclasses.fields(Settings):
+        value = getattr(arguments, field.name, None)
+        if value is not None:
+            given[field.name] = value
+    if arguments.vary:
+        given["vary"] = " ".join(arguments.vary)
+    if arguments.field:
+        given["fields"] = tuple(arguments.field)
+    if arguments.precision == "auto":
+        shape = RedNetShape(given["depth"], given["width"])
+        given["precision"] = _agreed(lambda: recorded(begun).get("precision") or faster_precision(shape))
+    return Settings(**given)
+
+
+def _agreed(choose: Callable[[], str]) -> str:
+    """The choice of the first process, for all."""
+    chosen = [choose() if share().rank == 0 else ""]
+    if share().processes > 1:
+        distributed.broadcast_object_list(chosen)
+    return chosen[0]
+
+
+def recorded(path: Path) -> dict:
+    """A `settings.json`, empty if there is none."""
+    return json.loads(path.read_text()) if path.exists() else {}
+
+
+def _pictures(arguments: argparse.Namespace, settings: Settings) -> Pictures:
+    if not arguments.data:
+        count = arguments.limit or _LEAVES
+        say(f"no --data: training on {count} pictures of dead leaves, discs that hide one another")
+        size = max(256, settings.patch + settings.size - 1)
+        leaves = [dead_leaves(1, size=size, seed=seed).samples[0] for seed in _bar(range(count), "dead leaves")]
+        return Pictures(tuple(leaves), tuple(f"dead leaves {seed}" for seed in range(count)))
+    paths = files(arguments.data)
+    if arguments.limit and arguments.limit < len(paths):
+        paths = [paths[i * len(paths) // arguments.limit] for i in range(arguments.limit)]
+    return read(paths, least=settings.patch + settings.size - 1, progress=lambda given: _bar(given, "pictures"))
+
+
+def _bar(given, what: str):
+    return tqdm(given, desc=what, unit="", leave=False, disable=None)
+
+
+def _digest(pictures: Pictures) -> str:
+    found = hashlib.blake2b(digest_size=8)
+    for sample in pictures.samples:
+        found.update(repr(sample.shape).encode())
+        found.update(np.ascontiguousarray(sample))
+    return found.hexdigest()
+
+
+def train_run(given: Experiment, settings: Settings, folder: Path, label: str) -> Outcome:
+    """Both steps of one run, or what is left of them, with a bar; a run that is finished is read again."""
+    length = settings.epochs * given.steps_per_epoch
+    progress = Progress(label, length, given.steps_per_epoch, focus_of(given.lens, settings))
+    steps = run_model(
+        given.lens, given.train, given.test, settings, folder, about=given.about, distances=given.distances
+    )
+    try:
+        for name, step, record in steps:
+            progress(name, step, record)
+    except NotFinite as error:
+        raise CommandError(str(error)) from error
+    finally:
+        progress.close()
+    if progress.bar is None:
+        say(f"{label}: finished before, nothing to train")
+    return outcome(folder)
+
+
+class Progress:
+    """A bar over both steps of a run on a terminal; elsewhere a line for every epoch."""
+
+    def __init__(self, label: str, length: int, steps_per_epoch: int, focus: Callable[[float], float] | None):
+        self.label, self.length, self.steps_per_epoch, self.focus = label, length, steps_per_epoch, focus
+        self.bar: tqdm | None = None
+        self.losses: list[float] = []
+        self.first, self.since = 0, time.monotonic()
+
+    def __call__(self, name: str, step: int, record: Record) -> None:
+        place = STEPS.index(name) * self.length + step + 1
+        if self.bar is None:
+            self.first = place - 1
+            if self.first:
+                say(f"{self.label}: going on behind step {self.first} of {2 * self.length}")
+            self.bar = tqdm(total=2 * self.length, initial=self.first, unit="step", disable=None, dynamic_ncols=True)
+        self.losses.append(record["loss"])
+        if self.bar.disable:
+            if (step + 1) % self.steps_per_epoch == 0:
+                self._line(name, step, record, place)
+        else:
+            self.bar.set_description(f"{self.label}, {name}", refresh=False)
+            self.bar.set_postfix_str(f"loss {record['loss']:.4f}{self._lens(record)}", refresh=False)
+            self.bar.update()
+
+    def close(self) -> None:
+        if self.bar is not None:
+            self.bar.close()
+
+    def _line(self, name: str, step: int, record: Record, place: int) -> None:
+        left = (2 * self.length - place) * (time.monotonic() - self.since) / (place - self.first)
+        epoch, epochs = (step + 1) // self.steps_per_epoch, self.length // self.steps_per_epoch
+        loss = sum(self.losses) / len(self.losses)
+        self.losses.clear()
+        say(
+            f"{self.label}, {name}, epoch {epoch} of {epochs}: loss {loss:.4f}{self._lens(record)}, "
+            f"{tqdm.format_interval(left)} left"
+        )
+        sys.stderr.flush()
+
+    def _lens(self, record: Record) -> str:
+        if "sensor" not in record:
+            return ""
+        place = f", sensor {record['sensor']:.4f} mm"
+        return place if self.focus is None else f"{place}, focus {self.focus(record['sensor']):.1f} m"
+
+
+def conjugates(lens: Lens, settings: Settings) -> tuple[list[float], list[float]]:
+    """Sensor distances in mm, ascending, and the object distances in m whose paraxial images are there."""
+    distances = np.geomspace(settings.near / 10, settings.far * 200, 2000)
+    lens = lens_at_start(lens, settings)
+    with torch.no_grad():
+        images = paraxial_image_distance(lens, lens.wavelengths.new_tensor(distances)).tolist()
+    order = np.argsort(images)
+    return np.asarray(images)[order].tolist(), (distances[order] / 1e3).tolist()
+
+
+def focus_of(lens: Lens, settings: Settings) -> Callable[[float], float] | None:
+    """Object distance in m in paraxial focus, of a sensor distance in mm; None where more than the sensor varies."""
+    if settings.vary.split() != ["sensor"]:
+        return None
+    sensors, distances = conjugates(lens, settings)
+    return lambda sensor: float(np.interp(sensor, sensors, distances))
+
+
+def plain(value):
+    """A document for JSON: null for what is no finite number."""
+    if isinstance(value, dict):
+        return {key: plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(entry) for entry in value]
+    return number(value) if isinstance(value, float) else value

@@ -1,0 +1,273 @@
+"""`raytrace codesign`: runs that go on, studies and their page, and errors of one line."""
+
+import csv
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+import raytrace
+from raytrace.cli import codesign_setup, codesign_table, main
+from raytrace.design import study
+from raytrace.design.codesign import Settings, lens_at_start
+from raytrace.formats import read_lens
+from raytrace.paraxial import paraxial_image_distance
+from raytrace.pictures import dead_leaves
+
+_LITTLE = "--depth 4 --width 4 --patch 16 --size 7 --epochs 1 --crops 4 --batch 4 --precision float32"
+SMALL = tuple(_LITTLE.split(" "))
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory):
+    """Ten pictures of 48 pixels: eight train, 32 crops, eight steps of an epoch."""
+    folder = tmp_path_factory.mktemp("pictures")
+    for number, sample in enumerate(dead_leaves(10, size=48).samples):
+        Image.fromarray(sample).save(folder / f"{number}.png")
+    return folder
+
+
+@pytest.fixture
+def run(capsys, tmp_path, monkeypatch):
+    """Run a command line in an empty folder: exit code, standard output, standard error."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("RAYTRACE_TRACEBACK", raising=False)
+
+    def call(*arguments):
+        capsys.readouterr()
+        code = main(["codesign", *map(str, arguments)])
+        return code, *capsys.readouterr()
+
+    return call
+
+
+def read(path):
+    return json.loads(Path(path).read_text())
+
+
+def rows(path):
+    return list(csv.DictReader(Path(path).read_text().splitlines()))
+
+
+def interrupt(monkeypatch, name: str, step: int):
+    """Stop like a user at a step of one of the two steps of a run."""
+
+    def progress(self, found, number, record):
+        if (found, number) == (name, step):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(codesign_setup.Progress, "__call__", progress)
+
+
+# ---------------------------------------------------------------- one model
+
+
+def test_a_run_says_what_it_found(run, pictures):
+    code, out, err = run("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "-o", "one", "--json")
+    assert code == 0, err
+    document, kept = json.loads(out), read("one/outcome.json")
+    assert {key: document[key] for key in kept} == kept
+    assert (document["model"], document["settings"]["width"], document["settings"]["patch"]) == ("paraxial", 4, 16)
+    assert [float(d) for d in kept["by_distance"]] == [1e3 * z for z in (10, 15, 20, 25, 30, 35, 40, 45, 50)]
+    for step in ("joint", "refine"):
+        assert [int(row["step"]) for row in rows(f"one/{step}/log.csv")] == list(range(8))
+    assert re.search(r"paraxial, seed 0, joint, epoch 1 of 1: loss 0\.\d+, sensor 57\.8\d+ mm, focus 2\d\.\d m, ", err)
+    code, text, err = run("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "-o", "one", "--resume")
+    assert code == 0
+    assert "finished before, nothing to train" in err
+    assert f"after step 2, with DRT PSFs      {kept['l1_drt']:.5f}" in text
+    assert f"sensor at {kept['sensor_mm']:.4f} mm" in text
+
+
+def test_a_run_that_was_stopped_goes_on_to_the_same_end(run, pictures, monkeypatch):
+    command = ("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "--vary", "sensor", "thickness:5")
+    assert run(*command, "-o", "whole")[0] == 0
+    for step in (("joint", 5), ("refine", 3)):
+        with monkeypatch.context() as patch:
+            interrupt(patch, *step)
+            code, out, err = run(*command, "-o", "parts")
+            assert (code, out, err) == (130, "", "raytrace: error: interrupted\n")
+    code, _, err = run(*command, "-o", "parts", "--resume")
+    assert code == 0
+    assert "going on behind step 8 of 16" in err
+    for name in ("outcome.json", "joint/log.csv", "refine/log.csv"):
+        assert Path(f"parts/{name}").read_bytes() == Path(f"whole/{name}").read_bytes()
+    found = read("whole/outcome.json")
+    assert set(found["variables"]) == {"sensor", "thickness_5"}
+    code, out, err = run(*command, "--noise", "0.2", "-o", "parts")
+    assert (code, out) == (1, "")
+    assert "parts/joint holds another run: noise was 0.1, now 0.2; choose another folder" in err
+    assert len(err.splitlines()) == 1
+
+
+def test_other_pictures_are_another_run(run, pictures):
+    command = ("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "-o", "one")
+    assert run(*command)[0] == 0
+    code, _, err = run(*command, "--limit", "9")
+    assert code == 1
+    assert re.fullmatch(r"raytrace: error: one/joint holds another run: pictures was '10, .*', now '9, .*\n", err)
+
+
+def test_without_pictures_leaves_are_made(run):
+    code, out, err = run("double_gauss", "--loss", "spectral", "--model", "paraxial", "--limit", "5", "--json")
+    assert code == 0
+    assert "training on 5 pictures of dead leaves" in err
+    found = json.loads(out)
+    assert found["course"][0] > found["error"] == pytest.approx(min(found["course"]), rel=1e-6)
+    assert found["error_drt"] > found["error"]
+    assert found["focus_paraxial_m"] > 25
+
+
+def test_spectral_prints_its_course(run, pictures):
+    command = ("double_gauss", "--data", pictures, "--loss", "spectral", "--patch", "16", "--size", "7")
+    code, out, err = run(*command, "-o", "closed", "--batch", "4")
+    assert code == 0, err
+    found = read("closed/spectral.json")
+    assert len(re.findall(r"^ +\d+ +0\.\d{8}$", out, re.M)) == len(found["course"])
+    assert f"sensor at {found['sensor_mm']:.4f} mm" in out
+    assert f"{found['focus_rms_m']:.2f} m (least RMS spot)" in out
+
+
+WRONG = {
+    "folder": (["--data", "nowhere"], "nowhere: no such folder"),
+    "empty": (["--data", "."], r"\.: no pictures found"),
+    "small": (["--patch", "64"], "none of 10 pictures has 70 × 70 pixels"),
+    "variables": (["--vary", "radius:3"], "'radius:3': expected sensor, or one of thickness, curvature, conic"),
+    "surface": (["--vary", "thickness:99"], "surface 99; this lens has surfaces 1 to 11 to vary"),
+    "range": (["--near", "60000"], "--near 60000 is not nearer than --far 50000"),
+    "start": (["--start", "somewhere"], "start 'somewhere': expected paraxial, rms or a sensor distance in mm"),
+    "depth": (["--depth", "3"], "expected an even depth"),
+    "batch": (["--batch", "99"], "8 pictures to train on, 4 crops of each, do not fill one batch of 99"),
+    "resume": (["--resume"], "out: no run was begun here"),
+    "number": (["--rate-network", "1e30"], r"step \d: the loss is nan, or its gradient is none; no checkpoint"),
+    "seeds": (["--seeds", "1"], "--seeds belongs to codesign compare LENS"),
+    "field": (["--field", "95"], "a field angle is below 90 degrees"),
+}
+
+
+@pytest.mark.parametrize(("options", "message"), WRONG.values(), ids=WRONG)
+def test_errors_are_one_line(run, pictures, options, message):
+    code, out, err = run("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "-o", "out", *options)
+    assert (code, out, len(err.splitlines())) == (1, "", 1), err
+    assert re.match(f"raytrace: error: .*{message}", err)
+    assert "a defect" not in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("double_gauss",), "no folder to keep the run in: give -o FOLDER"),
+        (("comparing", "double_gauss", "-o", "out"), "expected LENS, or compare LENS"),
+        (("compare", "double_gauss", "--model", "drt", "-o", "out"), "--model belongs to codesign LENS"),
+        (("compare", "double_gauss", "--loss", "spectral", "-o", "out"), "--loss spectral belongs to codesign LENS"),
+        (("compare", "double_gauss", "--report-only", "-o", "out"), "out: no study was begun here"),
+    ],
+)
+def test_words_and_options_that_do_not_fit(run, arguments, message):
+    code, out, err = run(*arguments)
+    assert (code, out, len(err.splitlines())) == (1, "", 1), err
+    assert message in err
+
+
+@pytest.mark.slow
+def test_two_processes_find_what_one_does(run, pictures, tmp_path):
+    """Only the order of float32 sums differs: losses agree to 1e-4, and one process speaks."""
+    command = ("double_gauss", "--data", str(pictures), *SMALL, "--model", "paraxial")
+    assert run(*command, "-o", "one")[0] == 0
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    words = [*torchrun, "-m", "raytrace", "codesign", *command, "-o", str(tmp_path / "two"), "--json"]
+    environment = {**os.environ, "PYTHONPATH": str(Path(raytrace.__file__).parents[1]), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120, env=environment)
+    assert done.returncode == 0, done.stderr
+    one, two = read("one/outcome.json"), read("two/outcome.json")
+    assert json.loads(done.stdout)["l1_drt"] == two["l1_drt"]
+    for key in ("l1_joint", "l1_before", "l1_drt", "sensor_mm"):
+        assert two[key] == pytest.approx(one[key], rel=1e-4)
+    logs = [rows(f"{folder}/refine/log.csv") for folder in ("one", "two")]
+    assert len(logs[0]) == len(logs[1]) == 8
+
+
+# ---------------------------------------------------------------- compare
+
+
+def test_compare_writes_the_table_and_the_page(run, pictures):
+    """Paraxial, and Gaussian DRT begun where that ended; then the page again with a seed that is missing."""
+    after = study.AFTER_PARAXIAL
+    command = ("compare", "double_gauss", "--data", pictures, "-o", "study", "--docs", "docs")
+    code, out, err = run(*command, *SMALL, "--models", after, "paraxial", "--seeds", "3", "--json")
+    assert code == 0, err
+    kept = {model: read(f"study/{model}-3/outcome.json") for model in ("paraxial", after)}
+    table = rows("docs/codesign/table2.csv")
+    assert [row["model"] for row in table] == ["paraxial", after]
+    for row in table:
+        assert tuple(row) == ("model", "seed", "l1_joint", "l1_drt", "focus_paraxial_m", "focus_rms_m", "sensor_mm")
+        assert {key: float(row[key]) for key in list(row)[1:]} == {
+            key: kept[row["model"]][key] for key in list(row)[1:]
+        }
+    begun = read(f"study/{after}-3/joint/settings.json")
+    assert (begun["model"], float(begun["start"])) == ("gaussian", kept["paraxial"]["sensor_mm"])
+    document = json.loads(out)
+    assert [row["sensor_mm"] for row in document["rows"]] == [kept[model]["sensor_mm"] for model in kept]
+    assert (len(document["claims"]), document["missing"]) == (10, [])
+    page = Path("docs/codesign.md").read_text(encoding="utf-8")
+    for name in re.findall(r"\(codesign/(\w+\.\w+)\)", page):
+        assert Path("docs/codesign", name).read_bytes().startswith(b"\x89PNG") == name.endswith(".png")
+    assert {"loss.png", "focus.png", "blur.png", "distance.png", "examples.png", "scan.png"} <= set(
+        re.findall(r"\w+\.png", page)
+    )
+    one = kept["paraxial"]
+    assert f"| paraxial | 1 | {one['l1_joint']:.4f} | {one['l1_drt']:.4f} |" in page
+    assert "| 0.0415 | 0.0504 | 33.9 |" in page
+    optimum = rows("docs/codesign/spectral.csv")
+    assert [row["model"] for row in optimum] == ["paraxial"]
+    assert f"| {float(optimum[0]['sensor_mm']):.4f} | {one['sensor_mm']:.4f} |" in page
+    assert "no finished run of gaussian" in page
+    again(run, command, page)
+
+
+def again(run, command, page):
+    """The page of a study with a seed that is missing, and words written by hand."""
+    Path("docs/codesign.md").write_text(f"{page}\nWritten by hand.\n", encoding="utf-8")
+    code, out, err = run(*command, "--report-only", "--models", "paraxial", "--seeds", "3", "4")
+    assert code == 0, err
+    new = Path("docs/codesign.md").read_text(encoding="utf-8")
+    assert "**Unfinished: 1 of 2 runs.** Missing, by model and seed: paraxial 4." in new
+    assert new.endswith("Written by hand.\n")
+    assert page.endswith("again -->\n")
+    assert "not finished: paraxial 4" in out
+    assert len(rows("docs/codesign/table2.csv")) == 1
+    code, _, err = run(*command, *SMALL, "--noise", "0.2", "--models", "paraxial", "--seeds", "3")
+    assert code == 1
+    assert "study holds another run: noise was 0.1, now 0.2" in err
+
+
+def test_the_command_line_knows_the_rows_of_a_study():
+    """They are written twice, for the help imports no torch."""
+    assert (*codesign_table.MODELS, codesign_table.AFTER_PARAXIAL) == study.ROWS
+
+
+def test_precision_that_was_found_is_kept(run, pictures, monkeypatch):
+    """A machine that would choose otherwise the second time goes on with the first choice."""
+    monkeypatch.setattr(codesign_setup, "faster_precision", lambda shape: "float32")
+    options = [word for word in SMALL if word not in ("--precision", "float32")]
+    command = ("double_gauss", "--data", pictures, *options, "--model", "paraxial", "-o", "one", "--json")
+    first = json.loads(run(*command)[1])
+    monkeypatch.setattr(codesign_setup, "faster_precision", lambda shape: "bfloat16")
+    assert json.loads(run(*command)[1]) == first
+
+
+def test_focus_of_a_sensor_is_its_paraxial_conjugate():
+    """There and back: the paraxial image of an object, and the object of that image, to 0.01 %."""
+    lens = read_lens(codesign_setup.find_lens("double_gauss"))
+    focus = codesign_setup.focus_of(lens, Settings())
+    begun = lens_at_start(lens, Settings())
+    for distance in (12.0, 25.0, 33.9):
+        image = paraxial_image_distance(begun, torch.tensor(1e3 * distance, dtype=torch.float64))
+        assert focus(float(image)) == pytest.approx(distance, rel=1e-4)
+    assert codesign_setup.focus_of(lens, Settings(vary="sensor thickness:5")) is None

@@ -1,0 +1,265 @@
+"""Studies: tables and claims from runs whose numbers are known, the closed form's optima, pages."""
+
+import csv
+import dataclasses
+import itertools
+import json
+import math
+
+import pytest
+import torch
+
+from raytrace.design.claims import claims
+from raytrace.design.codesign import Outcome, Settings, batch, best_focus, camera, lens_at_start
+from raytrace.design.optima import closed_form, paraxial_image, scan, write_optima
+from raytrace.design.report import CAPTIONS, Report, below_the_mark, markdown
+from raytrace.design.spectral import power_spectrum
+from raytrace.design.step_time import StepTime, step_time
+from raytrace.design.study import (
+    AFTER_PARAXIAL,
+    blur_diameters,
+    courses,
+    losses_by_distance,
+    outcomes,
+    run_folder,
+    run_settings,
+    summaries,
+    write_table,
+)
+from raytrace.files import shipped
+from raytrace.formats import read_lens
+from raytrace.lens import with_object_distance, with_sensor_distance
+from raytrace.paraxial import first_order
+from raytrace.pictures import dead_leaves
+from raytrace.plot.codesign import _marks
+
+SMALL = Settings(depth=2, width=2, patch=16, size=7, epochs=1, batch=4, crops=2)
+MICROMETRE = 1e-3
+
+#: The paper's table as runs of two seeds, a thousandth above and below; sensors in its order.
+PAPER = {
+    "paraxial": (0.0415, 0.0504, 33.9, 57.78),
+    "fourier": (0.0408, 0.0509, 35.7, 57.77),
+    "gaussian": (0.0429, 0.0430, 27.3, 57.85),
+}
+
+
+@pytest.fixture(scope="module")
+def lens():
+    return read_lens(shipped("lenses") / "double_gauss.zmx")
+
+
+@pytest.fixture(scope="module")
+def pictures():
+    return dead_leaves(6, size=48)
+
+
+def run(model, seed, *, l1_joint, l1_drt, focus, sensor, by_distance=None):
+    return Outcome(
+        model=model,
+        seed=seed,
+        l1_joint=l1_joint,
+        l1_before=0.06,
+        l1_drt=l1_drt,
+        focus_paraxial_m=focus,
+        focus_rms_m=focus / 2,
+        sensor_mm=sensor,
+        variables={"sensor": sensor},
+        by_distance=by_distance or {"10000": l1_drt + 0.01, "25000": l1_drt, "50000": l1_drt + 0.002},
+    )
+
+
+def paper(**changed):
+    """Runs that say what the paper says, but for some of the models."""
+    return [
+        run(model, seed, l1_joint=joint, l1_drt=drt, focus=focus + 0.1 * sign, sensor=sensor + 1e-3 * sign)
+        for model, (joint, drt, focus, sensor) in {**PAPER, **changed}.items()
+        for seed, sign in enumerate((-1, 1))
+    ]
+
+
+def answers(found, times=()):
+    return [claim.answer for claim in claims(found, times)]
+
+
+TIMES = [StepTime("gaussian", 3.0, 1.0, 80.0), StepTime("drt", 9.0, 1.0, 80.0)]
+
+
+def test_the_papers_own_numbers_answer_yes():
+    found = paper()
+    # The greatest relative gain is where the losses are least: at 25 m.
+    assert answers(found, TIMES) == ["yes"] * 10
+    of = {claim.text: claim for claim in claims(found, TIMES)}
+    assert of["The simple models lose much to DRT (+21 %, +25 %)"].figures == "+21.4 % and +24.8 %"
+    assert of["Gaussian DRT loses little (+0.2 %)"].figures == "+0.2 %"
+    assert "33.9 m and 35.7 m" in of["Paraxial and Fourier optics agree"].figures
+
+
+@pytest.mark.parametrize(
+    ("changed", "no"),
+    [
+        ({"fourier": (0.0408, 0.0509, 38.0, 57.77)}, {0, 1}),
+        ({"gaussian": (0.0429, 0.0430, 27.3, 57.7815)}, {2}),
+        ({"gaussian": (0.0429, 0.0430, 64.0, 57.64)}, {3}),
+        ({"paraxial": (0.0480, 0.0504, 33.9, 57.78)}, {4}),
+        ({"gaussian": (0.0410, 0.0430, 27.3, 57.85)}, {5}),
+        ({"gaussian": (0.0503, 0.0506, 27.3, 57.85)}, {6, 7, 8}),
+    ],
+)
+def test_other_numbers_answer_no(changed, no):
+    found = answers(paper(**changed), TIMES)
+    assert {number for number, answer in enumerate(found) if answer == "no"} == no
+
+
+def test_gains_at_distances_are_those_over_the_better_of_both():
+    found = paper()
+    losing = {"10000": 0.07, "25000": 0.044, "50000": 0.05}
+    found = [dataclasses.replace(one, by_distance=losing) if one.model == "gaussian" else one for one in found]
+    assert answers(found)[7:9] == ["no", "yes"]
+    far = {"10000": 0.05, "25000": 0.050, "50000": 0.040}
+    found = [dataclasses.replace(one, by_distance=far) if one.model == "gaussian" else one for one in found]
+    assert answers(found)[7:9] == ["yes", "no"]
+    assert f"{100 * (0.0524 / 0.040 - 1):+.1f} % at 50 m" in claims(found, ())[7].figures
+
+
+def test_missing_runs_leave_claims_open():
+    found = [one for one in paper() if one.model != "gaussian"]
+    assert answers(found) == ["yes", "yes", "not run yet", "not run yet", "yes", *["not run yet"] * 5]
+    assert {claim.figures for claim in claims(found, TIMES)[6:9]} == {"no finished run of gaussian"}
+    assert set(answers([])) == {"not run yet"}
+
+
+def test_summaries_are_means_and_deviations_of_the_runs(tmp_path):
+    found = paper()
+    first = summaries(found)[0]
+    assert (first.model, first.seeds) == ("paraxial", 2)
+    assert first.mean["focus_paraxial_m"] == pytest.approx(33.9, rel=1e-12)
+    assert first.deviation["focus_paraxial_m"] == pytest.approx(0.1 * math.sqrt(2), rel=1e-9)
+    assert summaries(found[:1])[0].deviation["sensor_mm"] == 0
+    write_table(found, tmp_path / "table.csv")
+    with open(tmp_path / "table.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["sensor_mm"]) for row in rows] == [one.sensor_mm for one in found]
+    distances, losses = losses_by_distance(found)
+    assert distances == [1e4, 2.5e4, 5e4]
+    assert losses["fourier"] == [[0.0509 + 0.01, 0.0509, 0.0509 + 0.002]] * 2
+
+
+def keep(study, row, one):
+    folder = run_folder(study, row, one.seed)
+    (folder / "joint").mkdir(parents=True)
+    (folder / "outcome.json").write_text(json.dumps(dataclasses.asdict(one)))
+    (folder / "joint" / "log.csv").write_text(f"step,loss,sensor\n0,0.5,{one.sensor_mm}\n1,0.25,57.5\n")
+
+
+def test_a_study_reads_finished_runs_by_row(tmp_path):
+    own = run("paraxial", 1, l1_joint=0.04, l1_drt=0.05, focus=34.0, sensor=57.8)
+    assert run_settings(tmp_path, AFTER_PARAXIAL, 1, SMALL) is None
+    keep(tmp_path, "paraxial", own)
+    after = run_settings(tmp_path, AFTER_PARAXIAL, 1, SMALL)
+    assert after == dataclasses.replace(SMALL, model="gaussian", seed=1, start="57.8")
+    keep(tmp_path, AFTER_PARAXIAL, dataclasses.replace(own, model="gaussian", sensor_mm=57.6))
+    found = outcomes(tmp_path, ("paraxial", "drt", AFTER_PARAXIAL), (0, 1))
+    assert [(one.model, one.seed, one.sensor_mm) for one in found] == [("paraxial", 1, 57.8), (AFTER_PARAXIAL, 1, 57.6)]
+    assert courses(tmp_path, found, "sensor") == {"paraxial": [[57.8, 57.5]], AFTER_PARAXIAL: [[57.6, 57.5]]}
+    assert courses(tmp_path, found, "curvature_3") == courses(tmp_path, found, "loss", "refine") == {}
+
+
+# ---------------------------------------------------------------- the closed form
+
+
+@pytest.fixture(scope="module")
+def spectrum(pictures):
+    return power_spectrum(pictures, SMALL.patch + SMALL.size - 1)
+
+
+@pytest.mark.parametrize("model", ["paraxial", "gaussian"])
+def test_optimum_is_the_least_of_its_scan(lens, spectrum, model, tmp_path):
+    settings = dataclasses.replace(SMALL, model=model)
+    found = closed_form(lens, settings, spectrum)
+    own = camera(lens, settings)
+    begun = own.variables.numbers()["sensor"]
+    around = [found.sensor_mm + shift * MICROMETRE for shift in (-20, 0, 20)]
+    low, least, high = scan(own, spectrum, around)
+    assert least < min(low, high)
+    assert least == pytest.approx(found.error, rel=1e-9)
+    assert own.variables.numbers()["sensor"] == begun
+    assert found.course[0] == pytest.approx(scan(own, spectrum, [begun])[0], rel=1e-9)
+    # Both definitions of focus hold: an object there has its image on the sensor, to a nanometre.
+    lens = with_sensor_distance(lens_at_start(lens, settings), found.sensor_mm)
+    for image, distance in ((paraxial_image, found.focus_paraxial_m), (best_focus, found.focus_rms_m)):
+        place = image(with_object_distance(lens, 1e3 * distance))
+        assert float(place) == pytest.approx(found.sensor_mm, abs=1e-3 * MICROMETRE)
+    own.use("drt")
+    assert scan(own, spectrum, [found.sensor_mm])[0] == pytest.approx(found.error_drt, rel=0.02)  # the plan's tolerance
+    write_optima([found], tmp_path / "spectral.csv")
+    with open(tmp_path / "spectral.csv", newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert (row["model"], float(row["error_drt"])) == (model, found.error_drt)
+
+
+def test_blur_of_an_almost_paraxial_lens_is_that_of_similar_triangles(lens):
+    """At F/100 spots are discs of uniform light: RMS diameter = D |v - s|/(v √2), v from the exit pupil."""
+    settings = dataclasses.replace(SMALL, f_number=100.0)
+    narrow = lens_at_start(lens, settings)
+    distances = narrow.wavelengths.new_tensor([1e4, 2e4, 5e4])
+    found = blur_diameters(narrow, distances)
+    sensor = float(narrow.surfaces[-2].thickness)
+    for distance, blur in zip(distances.tolist(), found.tolist(), strict=True):
+        own = with_object_distance(narrow, distance)
+        paraxial, image = first_order(own), float(paraxial_image(own))
+        behind_pupil = image - float(paraxial.exit_pupil_position) - sensor
+        ratio = abs(image - sensor) / abs(behind_pupil)
+        expected = float(paraxial.exit_pupil_diameter) * ratio / math.sqrt(2)
+        assert blur == pytest.approx(expected, rel=0.01)  # spherical aberration, 1/1000 of that at F/3
+
+
+def test_time_of_a_step_leaves_the_camera_as_it_was(lens, pictures):
+    settings = dataclasses.replace(SMALL, model="paraxial")
+    own = camera(lens, settings)
+    before = {key: value.clone() for key, value in own.state_dict().items()}
+    found = step_time(own, batch(pictures, settings, [0, 1, 2, 3], 0), repeats=2)
+    assert min(found.psf, found.image, found.network) > 0
+    assert all(torch.equal(value, before[key]) for key, value in own.state_dict().items())
+    assert all(parameter.grad is None for parameter in own.parameters())
+
+
+# ---------------------------------------------------------------- the page
+
+
+def test_the_page_names_settings_that_are_not_usual():
+    report = Report(
+        lens="double_gauss",
+        pictures="6 pictures",
+        settings=dataclasses.replace(SMALL, f_number=4.0, fields=(0.0, 10.0), vary="sensor thickness:5"),
+        found=tuple(paper()),
+        missing=(("drt", 2),),
+        optima=(),
+        times=tuple(TIMES),
+        figures=("loss.png",),
+        machine={"cores": 2},
+    )
+    page = markdown(report, kept="By hand.")
+    command = page.splitlines()[2].strip()
+    assert command.startswith("raytrace codesign compare double_gauss --data DIR -o FOLDER --docs docs ")
+    for option in ("--f-number 4.0", "--field 0 10", "--vary sensor thickness:5", "--seeds 0 1 2", "--patch 16"):
+        assert option in command
+    assert "--noise" not in command
+    assert "| paraxial | 2 | 0.0415 ± 0.0000 | 0.0504 ± 0.0000 | +21.4 % | 33.9 ± 0.1 |" in page
+    assert "**Unfinished: 6 of 7 runs.** Missing, by model and seed: drt 2." in page
+    assert f"![{CAPTIONS['loss.png']}](codesign/loss.png)" in page
+    assert below_the_mark(page) == "By hand."
+    assert markdown(report, kept=below_the_mark(page)) == page
+
+
+def test_marks_of_the_focus_axis_are_round_and_apart():
+    """Images of a thin lens of 100 mm: 1/v = 1/f - 1/z."""
+    distances = [float(z) for z in range(5, 2000)]
+    images = [1 / (1 / 100 - 1 / (1e3 * z)) for z in distances]
+    conjugates = images[::-1], distances[::-1]
+    low, high = images[distances.index(100.0)], images[distances.index(20.0)]
+    marks = _marks(conjugates, low - 1e-6, high + 1e-6)
+    assert {20, 25, 30, 50, 100} <= set(marks)
+    assert all(20 <= z <= 100 for z in marks)
+    places = [images[distances.index(z)] for z in marks]
+    assert min(a - b for a, b in itertools.pairwise(places)) > (high - low) / 12
