@@ -19,7 +19,7 @@ CAPTIONS = {
     "focus.png": "The sensor in training, and the object distance whose paraxial image it is.",
     "blur.png": "Blur of traced rays on the axis, of the lenses as they were learned.",
     "distance.png": "Loss of test pictures with DRT PSFs after step 2, over object distance.",
-    "examples.png": "One test patch as the sensor sees it and restored, with DRT PSFs after step 2.",
+    "examples.png": "A patch of dead leaves as the sensor sees it and restored, with DRT PSFs after step 2.",
     "scan.png": "The closed form over the sensor's place: without a network, without drawn noise.",
 }
 
