@@ -7,11 +7,10 @@ import torch
 from torch import Tensor
 
 from raytrace import zernike
-from raytrace.launch import vignette
 from raytrace.numerics import dot, safe_divide, safe_sqrt
 from raytrace.paraxial import first_order
 from raytrace.rays import Rays
-from raytrace.scene import Scene, trace_scene
+from raytrace.scene import Scene, beam_share, trace_scene
 from raytrace.trace import media
 from raytrace.value import value
 
@@ -100,7 +99,7 @@ def wavefront(scene: Scene, pupil: Tensor, weights: Tensor | None = None) -> Wav
     opd = torch.where(rays.valid, path - at_chief(path), 0.0)
     direction = towards_centre(rays, centre, radius)
     landing = torch.where(usable, rays.position[:2] - centre[:2], 0.0)
-    energy = torch.where(rays.valid[..., 1:], weights * _open_area(scene), 0.0)
+    energy = torch.where(rays.valid[..., 1:], weights * beam_share(scene)[..., None], 0.0)
     return Wavefront(
         opd=opd[..., 1:],
         direction=direction[..., 1:],
@@ -174,11 +173,3 @@ def _reference_radius(scene: Scene, centre: Tensor) -> Tensor:
     depth = (-side * position)[..., None]
     x, y, z = centre / depth
     return (depth * torch.sqrt(x * x + y * y + (1 + side * z) ** 2)).expand(*centre.shape[1:])
-
-
-def _open_area(scene: Scene) -> Tensor:
-    """Share (F, 1, 1) of the pupil's area that vignetting factors leave: (1 - VCX)(1 - VCY)."""
-    corners = scene.fields.new_tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    x, y = vignette(scene.lens, scene.fields[:, :, None, None], corners)
-    ax, ay, bx, by = x[..., 1] - x[..., 0], y[..., 1] - y[..., 0], x[..., 2] - x[..., 0], y[..., 2] - y[..., 0]
-    return (ax * by - ay * bx).abs()[..., None]

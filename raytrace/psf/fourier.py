@@ -13,15 +13,13 @@ so that the integral of |U|² over the sensor is 1 (Parseval).
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from raytrace import zernike as polynomials
 from raytrace.grid import Grid
-from raytrace.launch import is_at_infinity, object_field
-from raytrace.paraxial import FirstOrder, first_order, signed, system_matrix
+from raytrace.paraxial import first_order, signed
 from raytrace.psf.dft import (
     bessel_j0,
     disc_rule,
@@ -33,9 +31,10 @@ from raytrace.psf.dft import (
     sub_pixels,
     to_grid,
 )
+from raytrace.psf.paraxial import chief_ray_height
 from raytrace.psf.radial import is_centred, radii_of_waves, reach, unfold
 from raytrace.pupil import gauss_rings, with_rim
-from raytrace.scene import Kernels, Scene, is_on_axis, symmetry
+from raytrace.scene import Kernels, Scene, symmetry
 from raytrace.trace import media
 from raytrace.value import to, value
 
@@ -122,19 +121,8 @@ def paraxial(scene: Scene) -> Paraxial:
     radius = 0.5 * primary.entrance_pupil_diameter
     waves = 1e3 * radius / wavelengths  # R/λ
     defocus = math.pi * waves * radius * (n[0] / z_o + n[-1] / z_i - coloured.power)
-    chief = defocus.new_zeros(2, *shape) if is_on_axis(scene) else _chief_ray(scene, primary, n)
+    chief = chief_ray_height(scene)
     return Paraxial(defocus.expand(shape), (waves * n[-1] / z_i).expand(shape), chief.expand(2, *shape))
-
-
-def _chief_ray(scene: Scene, primary: FirstOrder, n: Sequence[Tensor]) -> Tensor:
-    """Where the ray from the centre of the entrance pupil, with the slope of the field, meets the sensor (2, ...)."""
-    lens = scene.lens
-    pupil, distance = primary.entrance_pupil_position, lens.surfaces[0].thickness
-    field = object_field(lens, scene.fields[:, None, :, None], primary)
-    slope = field if is_at_infinity(lens) else -field / (distance + pupil)
-    A, B, C, D = system_matrix(lens.surfaces[1:-1], n)
-    height, omega = -pupil * slope, n[0] * slope
-    return A * height + B * omega + lens.surfaces[-2].thickness / n[-1] * (C * height + D * omega)
 
 
 def _intensity(x: Tensor, y: Tensor, defocus: Tensor, frequency: Tensor, waves: Tensor | None, *, order: int) -> Tensor:
