@@ -1,5 +1,6 @@
 """Results as tables: every analysis names its columns, and one row is one number of its curves. Loads pandas."""
 
+import abc
 from collections.abc import Sequence
 
 import numpy as np
@@ -8,14 +9,14 @@ import torch
 from torch import Tensor
 
 
-class Tabular:
+class Tabular(abc.ABC):
     """A result that can be written as a table."""
 
     __slots__ = ()
 
+    @abc.abstractmethod
     def columns(self) -> dict[str, Tensor]:
         """Columns by name, broadcast against one another; NaN where no ray arrives."""
-        raise NotImplementedError
 
     def to_frame(self) -> pd.DataFrame:
         """A table with a row for every point of every curve."""
