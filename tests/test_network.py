@@ -43,6 +43,25 @@ def test_skips_carry_the_mirrored_layer_past_the_middle():
         assert float((network(picture) - picture).std()) < 1e-9
 
 
+def test_a_decoder_layer_is_the_deconvolution_that_holds_its_weights():
+    """Two layers: x + D(ReLU(E(x))), with value and gradients of torch's ConvTranspose2d."""
+    network = RedNet(RedNetShape(2, 5)).double()
+    encode, decode = network.encoder[0], network.decoder[0]
+    torch.manual_seed(0)
+    torch.nn.init.normal_(decode.weight)
+    torch.nn.init.normal_(decode.bias)
+    picture = torch.rand(2, 1, 7, 9, dtype=torch.float64)
+
+    def value_and_gradients(restored):
+        return restored, *torch.autograd.grad(restored.square().sum(), list(network.parameters()))
+
+    ours, expected = (
+        value_and_gradients(network(picture)),
+        value_and_gradients(picture + decode(encode(picture).relu())),
+    )
+    torch.testing.assert_close(ours, expected, rtol=1e-12, atol=1e-12)
+
+
 def test_it_learns_to_remove_noise():
     """Ten steps on one noisy picture reduce its error by a fifth."""
     torch.manual_seed(0)

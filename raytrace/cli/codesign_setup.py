@@ -103,8 +103,9 @@ def settings_of(arguments: argparse.Namespace, begun: Path) -> Settings:
         value = getattr(arguments, field.name, None)
         if value is not None:
             given[field.name] = value
-    if arguments.vary:
-        given["vary"] = " ".join(arguments.vary)
+    for words in ("vary", "bounds"):
+        if getattr(arguments, words):
+            given[words] = " ".join(getattr(arguments, words))
     if arguments.field:
         given["fields"] = tuple(arguments.field)
     if arguments.precision == "auto":

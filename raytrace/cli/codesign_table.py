@@ -71,10 +71,16 @@ def _scene(group) -> None:
         help="variables: sensor (default), or several as sensor thickness:5,6 curvature:1-4 conic:3, of surfaces",
     )
     group.add_argument(
+        "--bounds",
+        metavar="NAME:LOW,HIGH",
+        nargs="+",
+        help="of variables: sensor:57.5,58 thickness_5:8,12 curvature_3:-0.04,0 (mm, 1/mm)",
+    )
+    group.add_argument(
         "--start",
         metavar="PLACE",
         help="where the sensor begins: paraxial (default; the image of --focus-distance), rms (its least RMS spot), "
-        "or a sensor distance in mm",
+        "spectral (the optimum of the closed form), or a sensor distance in mm",
     )
     group.add_argument("--focus-distance", metavar="MM", type=positive_finite, help="of --start (default 25000)")
     group.add_argument("--f-number", metavar="N", type=positive_finite, help="other than the file's")
@@ -93,6 +99,9 @@ def _scene(group) -> None:
     )
     group.add_argument(
         "--noise", metavar="S", type=positive_finite, help="standard deviation, of pictures from 0 to 1 (default 0.1)"
+    )
+    group.add_argument(
+        "--rho", metavar="R", type=positive_finite, help="of the paraxial model: σ over the blur radius (default 0.5)"
     )
     group.add_argument("--tol", metavar="T", type=positive_finite, help="what a PSF may err by (default 0.01)")
 

@@ -24,7 +24,7 @@ class Camera(nn.Module):
     object_distances: smallest and largest, mm; fields: (2, F) in the lens's kind of field, on the axis by default.
     pixels: the window of the PSF, 21 × 21 of 5 µm by default; normalise: "window" or "energy", as for `psf`.
     noise: standard deviation of the sensor's noise. tol: what the kernels may err by: the order of the PSF model is
-    chosen once, for the lens as it is at the first call (`plan`).
+    chosen once, for the lens as it is at the first call (`plan`). rho: of the paraxial model.
     network_dtype: torch.bfloat16 runs the network alone in it (autocast); the optics keep the lens's dtype.
     The object is taken to be flat at one distance, and upright: magnification and its sign change no loss.
     """
@@ -41,6 +41,7 @@ class Camera(nn.Module):
         normalise: str = "window",
         noise: float = 0.1,
         tol: float = 1e-2,
+        rho: float = 0.5,
         network_dtype: torch.dtype | None = None,
     ):
         super().__init__()
@@ -49,7 +50,7 @@ class Camera(nn.Module):
         like = variables.lens.wavelengths
         self.fields = like.new_zeros(2, 1) if fields is None else fields
         self.pixels = grid(like.new_tensor(0.005), 21) if pixels is None else pixels
-        self.normalise, self.noise, self.tol, self.network_dtype = normalise, noise, tol, network_dtype
+        self.normalise, self.noise, self.tol, self.rho, self.network_dtype = normalise, noise, tol, rho, network_dtype
         self._order: int | None = None
         self._memo = Memo(object_distances=object_distances)
 
@@ -86,6 +87,7 @@ class Camera(nn.Module):
             grid=self.pixels,
             center="axis" if bool((fields == 0).all()) else "chief",
             normalise=self.normalise,
+            rho=self.rho,
             memo=self._memo,
             **work,
         )

@@ -21,7 +21,7 @@ from torch import Tensor
 from raytrace.design.camera import Camera
 from raytrace.design.network import RedNet, RedNetShape
 from raytrace.design.training import Record, Run, Share, train
-from raytrace.design.variables import Variables
+from raytrace.design.variables import Variables, parse_bounds
 from raytrace.files import write_atomically
 from raytrace.focus import focus
 from raytrace.grid import grid
@@ -40,17 +40,21 @@ STEPS = ("joint", "refine")
 class Settings:
     """All that decides the result of a run. Lengths in mm but for the wavelength in µm; angles in degrees.
 
-    model: PSF model of step 1; vary: variables of the lens; start: "paraxial" (the sensor at the paraxial image of
-    `focus_distance`), "rms" (at its best focus), or a sensor distance; f_number: EFL over entrance pupil diameter, None
-    for that of the file; near, far: object distances, drawn evenly; noise: standard deviation in a range of 1.
+    model: PSF model of step 1; vary: variables of the lens; bounds: of some of them, "sensor:57.5,58 thickness_5:8,12".
+    start: "paraxial" (the sensor at the paraxial image of `focus_distance`), "rms" (at its best focus), "spectral"
+    (from the paraxial image to the optimum of the closed form), or a sensor distance; f_number: EFL over entrance pupil
+    diameter, None for that of the file; near, far: object distances, drawn evenly; noise: standard deviation in a range
+    of 1.
     patch: pixels of what is restored; crops: a picture and epoch; precision: of the network, "float32" or "bfloat16"
     (`network.faster_precision` tells which this machine prefers).
-    fields: field points in y, samples take them in turn; rate_network, rate_optics: of Adam; tol: of the PSFs.
+    fields: field points in y, samples take them in turn; rate_network, rate_optics: of Adam; tol: of the PSFs; rho: of
+    the paraxial model, σ over the radius of the blur.
     """
 
     model: str = "gaussian"
     seed: int = 0
     vary: str = "sensor"
+    bounds: str = ""
     start: str = "paraxial"
     focus_distance: float = 25e3
     f_number: float | None = None
@@ -72,6 +76,7 @@ class Settings:
     rate_optics: float = 1e-3
     precision: str = "float32"
     tol: float = 1e-2
+    rho: float = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,14 +111,14 @@ def lens_at_start(lens: Lens, settings: Settings) -> Lens:
         lens = dataclasses.replace(lens, aperture=number)
     lens = with_object_distance(lens, settings.focus_distance)
     paraxial = paraxial_image_distance(lens, wavelength.new_tensor(settings.focus_distance))
-    if settings.start == "paraxial":
+    if settings.start in ("paraxial", "spectral"):
         return with_sensor_distance(lens, paraxial.detach())
     if settings.start == "rms":
         return with_sensor_distance(lens, best_focus(with_sensor_distance(lens, paraxial)).detach())
     try:
         return with_sensor_distance(lens, float(settings.start))
     except ValueError as error:
-        raise ValueError(f"start {settings.start!r}: expected paraxial, rms or a sensor distance in mm") from error
+        raise ValueError(f"start {settings.start!r}: expected paraxial, rms, spectral or a sensor distance in mm") from error
 
 
 def best_focus(lens: Lens) -> Tensor:
@@ -143,7 +148,7 @@ def camera(lens: Lens, settings: Settings) -> Camera:
     if settings.precision not in ("float32", "bfloat16"):
         raise ValueError(f"precision {settings.precision!r}: expected float32 or bfloat16")
     return Camera(
-        Variables(lens_at_start(lens, settings), settings.vary),
+        Variables(lens_at_start(lens, settings), settings.vary, bounds=parse_bounds(settings.bounds)),
         RedNet(RedNetShape(settings.depth, settings.width), seed=settings.seed).to(memory_format=torch.channels_last),
         model=settings.model,
         object_distances=(settings.near, settings.far),
@@ -152,6 +157,7 @@ def camera(lens: Lens, settings: Settings) -> Camera:
         normalise=settings.normalise,
         noise=settings.noise,
         tol=settings.tol,
+        rho=settings.rho,
         network_dtype=torch.bfloat16 if settings.precision == "bfloat16" else None,
     )
 
@@ -228,7 +234,10 @@ def optimise(
     groups += [{"params": optics, "lr": settings.rate_optics}] if optics else []
 
     def loss(step: int, share: Share) -> tuple[Tensor, Record]:
-        return absolute_error(camera, batches(step, share)).sum() / pixels, camera.variables.numbers()
+        error = absolute_error(camera, batches(step, share)).sum() / pixels
+        if share.rank == 0 and optics:  # once: gradients are summed over processes
+            error = error + camera.variables.violation()
+        return error, camera.variables.numbers()
 
     yield from train(
         camera,

@@ -111,6 +111,21 @@ def parse(lens: Lens, vary: str) -> tuple[Variable, ...]:
     return tuple(found.values())
 
 
+def parse_bounds(text: str) -> dict[str, tuple[float, float]]:
+    """Bounds by name of a list like "sensor:57.5,58 curvature_3:-0.1,0". Raises BadVariables saying what is wrong."""
+    found = {}
+    for word in text.split():
+        name, _, ends = word.partition(":")
+        try:
+            low, high = (float(end) for end in ends.split(","))
+        except ValueError as error:
+            raise BadVariables(f"{word!r}: expected a variable and its bounds, like thickness_5:8,12") from error
+        if not low < high:
+            raise BadVariables(f"{word!r}: {low:g} is not less than {high:g}")
+        found[name] = (low, high)
+    return found
+
+
 def _numbers(word: str, numbers: str) -> list[int]:
     found: list[int] = []
     for part in numbers.split(","):
