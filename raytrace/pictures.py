@@ -80,21 +80,21 @@ def split(pictures: Pictures, *, share: float = 0.8, seed: int = 0) -> tuple[Pic
     )
 
 
-def dead_leaves(count: int, *, size: int = 256, seed: int = 0) -> Pictures:
+def dead_leaves(count: int, *, size: int = 256, seed: int = 0, smallest: float = 1.0) -> Pictures:
     """Opaque discs of radii ∝ r⁻³ over one another until nothing shows through: natural statistics without a file.
 
-    Lee, Mumford and Huang, Int. J. Comput. Vis. 41, 2001: occlusion alone gives the spectra of natural pictures.
+    smallest: radius in pixels; larger ones make smoother pictures. Lee, Mumford and Huang, Int. J. Comput. Vis. 41, 2001: occlusion alone gives the spectra of natural pictures.
     """
     return Pictures(
-        tuple(_leaves(size, draws(seed, number, _LEAVES)) for number in range(count)),
+        tuple(_leaves(size, draws(seed, number, _LEAVES), smallest) for number in range(count)),
         tuple(f"dead leaves {number}" for number in range(count)),
     )
 
 
-def _leaves(size: int, random: np.random.Generator) -> np.ndarray:
+def _leaves(size: int, random: np.random.Generator, smallest: float) -> np.ndarray:
     picture, bare = np.zeros((size, size), np.uint8), np.ones((size, size), bool)
     while bare.any():
-        for radius, x, y, shade in _leaf_batch(size, random):
+        for radius, x, y, shade in _leaf_batch(size, random, smallest):
             rows = slice(max(0, int(y - radius)), min(size, int(y + radius) + 2))
             columns = slice(max(0, int(x - radius)), min(size, int(x + radius) + 2))
             open_here = bare[rows, columns]
@@ -106,9 +106,9 @@ def _leaves(size: int, random: np.random.Generator) -> np.ndarray:
     return picture
 
 
-def _leaf_batch(size: int, random: np.random.Generator) -> Iterable[tuple]:
+def _leaf_batch(size: int, random: np.random.Generator, smallest: float) -> Iterable[tuple]:
     """Radius, place and shade of the next leaves, the topmost first; of density ∝ r⁻³, so that 1/r² is even."""
-    count, smallest, largest = 4096, 1.0, size / 2
+    count, largest = 4096, size / 2
     radius = 1 / np.sqrt(random.uniform(largest**-2, smallest**-2, count))
     x, y = random.uniform(-1, 1, (2, count)) * (size / 2 + radius) + size / 2
     return zip(radius.tolist(), x.tolist(), y.tolist(), random.integers(0, 256, count).tolist(), strict=True)

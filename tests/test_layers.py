@@ -17,15 +17,17 @@ FLOORS = {
     "pupil": 0,
     "zernike": 0,
     "files": 0,
-    "image": 0,
     "pictures": 0,
     # 1: the nouns
+    "image": 1,
     "grid": 1,
     "glass": 1,
     "rays": 1,
     "asphere": 1,
     # 2
     "agf": 2,
+    "deconvolve": 2,
+    "superresolution": 2,
     "surface": 2,
     # 3
     "catalog": 3,
@@ -70,7 +72,7 @@ FLOORS = {
 }
 
 #: Folders that stand on one floor as a whole; inside them imports only have to run one way (no cycle).
-FAMILIES = {"psf": 10, "analysis": 11, "design": 13, "plot": 14, "bench": 15, "cli": 16}
+FAMILIES = {"psf": 10, "analysis": 11, "wave": 12, "design": 13, "plot": 14, "bench": 15, "cli": 16}
 
 #: What only these files may import.
 RESERVED = {
