@@ -99,12 +99,13 @@ def fabricated(height: Tensor, period: Tensor | None, levels: int = 0) -> Tensor
     """Heights modulo a period, and lowered to the step below: floor(h/H·L)·H/L. The gradient is that of the height."""
     if period is None:
         return height
-    wrapped = height - period * torch.floor((height / period).detach())
+    # A height at a step to rounding is that step: sixteen levels read from a file stay as they are.
+    slack = 1e-4 / levels if levels else 0.0
+    wrapped = height - period * torch.floor((height / period).detach() + slack)
     if not levels:
         return wrapped
     step = (period / levels).detach()
-    # A height at a step to rounding is that step: sixteen levels read from a file stay as they are.
-    stepped = torch.floor((wrapped / step).detach() + 1e-6).clamp(max=levels - 1) * step
+    stepped = torch.floor((wrapped / step).detach() + 1e-4).clamp(max=levels - 1) * step
     return wrapped + (stepped - wrapped).detach()
 
 

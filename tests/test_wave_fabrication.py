@@ -1,0 +1,175 @@
+"""Fabrication: sampling at the size of features, wrapping, tolerance and roughness."""
+
+import math
+
+import pytest
+import torch
+from torch.autograd import gradcheck
+
+from raytrace.catalog import find_glass
+from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike, height, period
+from raytrace.wave.fabrication import as_made, as_pixels, as_rings, roughness, with_tolerance, wrapped
+
+SILICA = find_glass("F_SILICA")
+
+
+def number(x):
+    return torch.tensor(x, dtype=torch.float64)
+
+
+def lens(radius=0.5):
+    return Element(EvenPowers(number([-0.03, 2e-3])), number(radius), SILICA)
+
+
+def seeded(seed):
+    return torch.Generator().manual_seed(seed)
+
+
+def test_rings_hold_the_height_at_their_middle():
+    rings = as_rings(lens(), 0.02)
+    assert len(rings.profile.heights) == 25
+    r = (torch.arange(25).double() + 0.5) * 0.02
+    assert (rings.profile.heights - height(lens(), r, 0 * r)).abs().max() < 1e-15
+    assert (height(rings, r, 0 * r) - height(lens(), r, 0 * r)).abs().max() < 1e-15
+
+
+@pytest.mark.parametrize("pitch", [0.02, 0.021, 0.25, 3.0])
+def test_features_cover_the_aperture_and_no_more(pitch):
+    count = len(as_rings(lens(), pitch).profile.heights)
+    assert (count - 1) * pitch < 0.5 <= count * pitch * (1 + 1e-6)
+    rows, columns = as_pixels(lens(), pitch).profile.heights.shape
+    assert rows == columns
+    assert (rows - 1) * pitch < 1.0 <= rows * pitch * (1 + 1e-6)
+
+
+def test_pixels_hold_the_height_at_their_middle_also_without_symmetry():
+    comatic = Element(Zernike(number([0, 1e-3, 2e-3, 0, 0, 3e-3, 1e-3, -1e-3])), number(0.5), SILICA)
+    for pitch in (0.05, 0.048):  # an even and an odd number across
+        pixels = as_pixels(comatic, pitch)
+        count = len(pixels.profile.heights)
+        x = (torch.arange(count).double() - 0.5 * (count - 1)) * pitch
+        y, x = torch.meshgrid(x, x, indexing="ij")
+        assert (height(pixels, x, y) - height(comatic, x, y)).abs().max() < 1e-15
+
+
+def test_pixels_cannot_become_rings():
+    with pytest.raises(ValueError, match="a profile of Pixels is not radial"):
+        as_rings(as_pixels(lens(), 0.1), 0.1)
+
+
+def test_sampling_and_wrapping_commute():
+    x = torch.linspace(-0.35, 0.35, 101, dtype=torch.float64)
+    first = as_rings(wrapped(lens(), 0.55, levels=16), 0.02)
+    second = wrapped(as_rings(lens(), 0.02), 0.55, levels=16)
+    assert torch.equal(height(first, x, 0.9 * x), height(second, x, 0.9 * x))
+    assert torch.equal(first.period, period(SILICA, 0.55))
+
+
+def test_sixteen_steps_keep_sinc2_of_the_light():
+    """The phase error of L even steps is uniform over 2π/L: |mean e^(iδ)|² = sinc²(1/L), 0.98720 for 16."""
+    ramp = Element(EvenPowers(number([-0.1])), number(0.5), SILICA)
+    r = 0.5 * torch.sqrt((torch.arange(200_000, dtype=torch.float64) + 0.5) / 200_000)
+    top = period(SILICA, 0.55)
+    for levels in (2, 4, 8, 16):
+        lost = height(wrapped(ramp, 0.55, levels=levels), r, 0 * r) - height(ramp, r, 0 * r)
+        phase = 2 * math.pi * lost / top
+        kept = phase.cos().mean() ** 2 + phase.sin().mean() ** 2
+        expected = (math.sin(math.pi / levels) * levels / math.pi) ** 2
+        assert abs(float(kept) - expected) < 3e-3  # 21 zones, the last one not whole
+
+
+def test_tolerance_is_uniform_keyed_and_leaves_the_element():
+    made = wrapped(as_rings(lens(2.5), 0.0005), 0.55, levels=16)
+    off = with_tolerance(made, 20e-6, generator=seeded(3))
+    x = made.profile.heights
+    r = (torch.arange(len(x)).double() + 0.5) * made.profile.pitch
+    error = height(off, r, 0 * r) - height(made, r, 0 * r)
+    assert error.abs().max() <= 20e-6
+    assert error.abs().max() > 19.9e-6
+    assert abs(float(error.std()) / 20e-6 * math.sqrt(3) - 1) < 0.03  # 5000 draws: 1 % standard error
+    assert abs(float(error.mean())) < 1e-6
+    again = with_tolerance(made, 20e-6, generator=seeded(3))
+    assert torch.equal(again.profile.heights, off.profile.heights)
+    other = with_tolerance(made, 20e-6, generator=seeded(4))
+    assert not torch.equal(other.profile.heights, off.profile.heights)
+    assert (off.period, off.levels) == (None, 0)  # what is off a step is not put back on it
+
+
+def test_no_tolerance_is_the_element_as_made():
+    made = wrapped(as_pixels(lens(), 0.02), 0.55, levels=16)
+    off = with_tolerance(made, 0.0, generator=seeded(0))
+    x = torch.linspace(-0.4, 0.4, 57, dtype=torch.float64)
+    assert torch.equal(height(off, x, -x), height(made, x, -x))
+
+
+def test_a_smooth_profile_has_no_features_to_be_off():
+    for function in (as_made, lambda element: with_tolerance(element, 20e-6)):
+        with pytest.raises(ValueError, match="use as_rings or as_pixels first"):
+            function(lens())
+
+
+def test_as_made_is_the_same_element_with_its_heights_written_out():
+    element = wrapped(as_rings(lens(), 0.02), 0.55, levels=16)
+    made = as_made(element)
+    x = torch.linspace(-0.4, 0.4, 57, dtype=torch.float64)
+    assert torch.equal(height(made, x, -x), height(element, x, -x))
+    assert len(torch.unique(made.profile.heights)) > 8
+    assert (made.profile.heights >= 0).all()
+    assert (made.profile.heights < element.period).all()
+    assert (made.period, made.levels) == (None, 0)
+
+
+def test_gradients_pass_sampling_steps_and_tolerance():
+    c = number([-0.03, 2e-3]).requires_grad_()
+    smooth = Element(EvenPowers(c), number(0.5), SILICA)
+    made = with_tolerance(wrapped(as_rings(smooth, 0.02), 0.55, levels=16), 2e-5, generator=seeded(1))
+    weights = torch.arange(25, dtype=torch.float64)
+    found = torch.autograd.grad((made.profile.heights * weights).sum(), c)[0]
+    r2 = ((torch.arange(25).double() + 0.5) * 0.02).double() ** 2
+    assert (found - torch.stack([(weights * r2).sum(), (weights * r2**2).sum()])).abs().max() < 1e-6
+
+
+def test_float32_stays_float32():
+    single = Element(EvenPowers(torch.tensor([-0.03])), torch.tensor(0.5), SILICA)
+    for made in (as_rings(single, 0.02), as_pixels(single, 0.02)):
+        off = with_tolerance(wrapped(made, 0.55, levels=16), 2e-5, generator=seeded(0))
+        assert off.profile.heights.dtype == off.profile.pitch.dtype == torch.float32
+
+
+# -- roughness --------------------------------------------------------------------------------------------------------
+
+
+def test_a_tilted_plane_is_not_rough_and_a_parabola_is_evenly():
+    y, x = torch.meshgrid(torch.arange(6).double(), torch.arange(8).double(), indexing="ij")
+    assert roughness(2 * x - 3 * y + 1) < 1e-13
+    # Σ over 8 neighbours of (x + i)² is 6 more than 8 x²
+    assert abs(float(roughness(x**2)) - 6) < 1e-13
+    assert abs(float(roughness(0.5 * x**2 + y**2)) - 9) < 1e-13
+
+
+def test_one_high_pixel_is_rough_by_itself_and_its_neighbours():
+    h = torch.zeros(7, 9, dtype=torch.float64)
+    h[3, 4] = 1.0
+    assert abs(float(roughness(h)) - (8 + 8) / 35) < 1e-14  # 5 × 7 inner points
+    border = torch.zeros(7, 9, dtype=torch.float64)
+    border[0, 0] = 1.0
+    assert abs(float(roughness(border)) - 1 / 35) < 1e-14
+
+
+def test_roughness_goes_over_batches_and_has_a_gradient():
+    maps = torch.rand(3, 5, 6, dtype=torch.float64, generator=seeded(2))
+    assert torch.allclose(roughness(maps), torch.stack([roughness(h) for h in maps]), atol=0, rtol=1e-14)
+    assert gradcheck(roughness, [maps[0].clone().requires_grad_()])
+
+
+@pytest.mark.parametrize("shape", [(2, 9), (9,), ()])
+def test_roughness_needs_inner_points(shape):
+    with pytest.raises(ValueError, match="3 × 3"):
+        roughness(torch.zeros(shape))
+
+
+def test_rings_of_one_are_a_plate():
+    plate = as_rings(lens(), 5.0)
+    assert isinstance(plate.profile, Rings)
+    assert len(plate.profile.heights) == 1
+    assert isinstance(as_pixels(lens(), 5.0).profile, Pixels)
