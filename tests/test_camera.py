@@ -1,6 +1,8 @@
 """Camera and co-design: image formation, what learns and what does not, and runs from start to end."""
 
 import dataclasses
+import itertools
+import json
 import math
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import torch
 from raytrace.design.camera import Camera
 from raytrace.design.codesign import (
     Batches,
+    Outcome,
     Settings,
     absolute_error,
     batch,
@@ -20,11 +23,12 @@ from raytrace.design.codesign import (
     optimise,
     outcome,
     run_model,
+    write_outcome,
 )
 from raytrace.design.network import RedNet, RedNetShape
 from raytrace.design.spectral import camera_error, even_distances, optimise_closed_form, power_spectrum
 from raytrace.design.training import Run, Share
-from raytrace.design.variables import Variables
+from raytrace.design.variables import BadVariables, Variables
 from raytrace.formats import read_lens
 from raytrace.grid import grid
 from raytrace.image import blur
@@ -134,7 +138,7 @@ def test_experiment_starts_where_it_is_told():
     assert by_start["rms"].wavelengths.tolist() == [float(wavelength)]
     slow = lens_at_start(lens, Settings(f_number=5.0))
     assert slow.aperture.kind == "image_f_number"
-    with pytest.raises(ValueError, match="start 'middle': expected paraxial, rms or a sensor distance"):
+    with pytest.raises(ValueError, match="start 'middle': expected paraxial, rms, spectral or a sensor distance"):
         lens_at_start(lens, Settings(start="middle"))
 
 
@@ -225,6 +229,122 @@ def test_a_run_stopped_in_either_step_ends_as_if_it_had_not_been(tmp_path):
     run(tmp_path / "parts", stop_after=6)
     run(tmp_path / "parts")
     assert outcome(tmp_path / "whole") == outcome(tmp_path / "parts")
+
+
+def test_focus_at_infinity_is_null_in_the_file_of_an_outcome(tmp_path):
+    """JSON knows no infinity; read back it is one again."""
+    found = Outcome("gaussian", 0, 0.1, 0.2, 0.3, math.inf, 31.5, 57.1, {"sensor": 57.1}, {"10000": 0.4})
+    write_outcome(found, tmp_path)
+    document = json.loads((tmp_path / "outcome.json").read_text(), parse_constant=pytest.fail)
+    assert (document["focus_paraxial_m"], document["focus_rms_m"]) == (None, 31.5)
+    assert outcome(tmp_path) == found
+
+
+@pytest.mark.parametrize(
+    ("vary", "bounds"),
+    [("sensor", ""), ("sensor curvature:3", "sensor:57.4,58 curvature_3:0.0278,0.02785")],
+)
+def test_a_run_begins_at_the_optimum_of_the_closed_form(tmp_path, vary, bounds):
+    """The first row of the log is the lens before its first step."""
+    settings = dataclasses.replace(SMALL, start="spectral", vary=vary, bounds=bounds, model="paraxial")
+    pictures = split(dead_leaves(10, size=32))
+    own = camera(double_gauss(), settings)
+    begun = own.variables.numbers()
+    course = optimise_closed_form(own, power_spectrum(pictures[0], 22, crops=settings.crops))
+    assert course[-1] < 0.999 * course[0]
+    assert all(value != begun[name] for name, value in own.variables.numbers().items())
+    _, step, record = next(run_model(double_gauss(), *pictures, settings, tmp_path, about={}, distances=()))
+    assert step == 0
+    assert {name: record[name] for name in begun} == own.variables.numbers()
+
+
+def test_a_run_begun_by_the_closed_form_goes_on_to_the_same_end(tmp_path):
+    """Stopped before its first checkpoint it begins there again; behind one it goes on from that."""
+    settings = dataclasses.replace(SMALL, start="spectral", model="paraxial")
+    pictures = split(dead_leaves(10, size=32))
+
+    def run(folder, stop_after=99):
+        steps = run_model(double_gauss(), *pictures, settings, folder, about={}, distances=())
+        return [record for _, (*_, record) in zip(range(stop_after), steps, strict=False)]
+
+    run(tmp_path / "whole")
+    for stop_after in (2, 6, 99):
+        run(tmp_path / "parts", stop_after)
+    assert outcome(tmp_path / "whole") == outcome(tmp_path / "parts")
+    for name in ("joint/log.csv", "refine/log.csv"):
+        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "parts" / name).read_bytes()
+
+
+def test_a_run_that_goes_on_keeps_the_order_of_its_psfs(tmp_path, monkeypatch):
+    """The order is planned for the lens as it begins, not for the one of the checkpoint."""
+    planned, plan = [], Camera.plan
+
+    def recording(own):
+        order = plan(own)
+        planned.append((own.model, own.variables.numbers()["sensor"]))
+        return order
+
+    monkeypatch.setattr(Camera, "plan", recording)
+    train_pictures, test_pictures = split(dead_leaves(10, size=32))
+    for _ in range(2):
+        arguments = double_gauss(), train_pictures, test_pictures, SMALL, tmp_path
+        next(s for s in run_model(*arguments, about={}, distances=()) if s[0] == "refine")  # stopped behind step 1
+    assert planned[0] == planned[2] == ("gaussian", pytest.approx(57.8817685, abs=1e-6))
+    assert planned[1] == planned[3] != ("drt", planned[0][1])
+
+
+def test_bounds_hold_in_training_and_in_the_closed_form(tmp_path):
+    """From the paraxial start both go towards the lens: to the bound, and no further."""
+    settings = dataclasses.replace(SMALL, bounds="sensor:57.88,58", epochs=2)
+    pictures = split(dead_leaves(10, size=32))[0]
+    steps = list(optimise(camera(double_gauss(), settings), pictures, settings, Run(tmp_path, {})))
+    free = dataclasses.replace(settings, bounds="")
+    beyond = list(optimise(camera(double_gauss(), free), pictures, free, Run(tmp_path / "free", {})))
+    assert beyond[-1][1]["sensor"] < 57.8793
+    assert steps[-1][1]["sensor"] == pytest.approx(57.88, abs=1e-9)
+    own = camera(double_gauss(), settings)
+    optimise_closed_form(own, power_spectrum(pictures, 22))
+    assert own.variables.numbers()["sensor"] == pytest.approx(57.88, abs=1e-9)
+    with pytest.raises(BadVariables, match="bounds for thickness_5, not among the variables: sensor"):
+        camera(double_gauss(), dataclasses.replace(SMALL, bounds="thickness_5:1,2"))
+
+
+def test_a_lens_that_cannot_be_built_costs_loss_and_is_pushed_back(tmp_path):
+    """An air space of -0.2 mm lacks 0.25 mm: 0.0625 mm² of loss, and a slope that opens it."""
+    lens = double_gauss()
+    surfaces = list(lens.surfaces)
+    surfaces[2] = dataclasses.replace(surfaces[2], thickness=number(-0.2))
+    squeezed = dataclasses.replace(lens, surfaces=tuple(surfaces))
+    settings = dataclasses.replace(SMALL, vary="thickness:2")
+    own = camera(squeezed, settings)
+    pictures = split(dead_leaves(10, size=32))[0]
+    with torch.no_grad():
+        image = float(absolute_error(own, batch(pictures, settings, [0, 1, 2, 3], 0)).sum()) / (4 * 16**2)
+    lacking = float(own.variables.violation().detach())
+    assert lacking >= 0.25**2
+    steps = list(optimise(own, pictures, settings, Run(tmp_path, {})))
+    assert steps[0][1]["loss"] == pytest.approx(image + lacking, rel=1e-6)
+    places = [record["thickness_2"] for _, record in steps]
+    assert all(after > before for before, after in itertools.pairwise(places))
+    # In the closed form too: buildable again, but for what a gain of image is worth against the square.
+    own = camera(squeezed, settings)
+    optimise_closed_form(own, power_spectrum(pictures, 22))
+    assert float(own.variables.violation().detach()) < 1e-3
+
+
+def test_rho_is_of_the_paraxial_model_alone():
+    """σ = ρε: the second moment of a kernel grows with ρ², less that of the pixel; other models do not know it."""
+    distances = number([20e3])
+    for model in ("paraxial", "fourier", "gaussian", "drt"):
+        narrow, wide = (
+            camera(double_gauss(), dataclasses.replace(SMALL, size=21, model=model, rho=rho)).kernels(distances)
+            for rho in (0.3, 0.6)
+        )
+        assert torch.equal(narrow, wide) == (model != "paraxial")
+        if model == "paraxial":
+            x = torch.arange(-10, 11, dtype=torch.float64)
+            blurs = [float((kernel[0].sum(0) * x**2).sum().detach()) - 1 / 12 for kernel in (narrow, wide)]
+            assert blurs[1] / blurs[0] == pytest.approx(4, rel=1e-3)  # the window holds all but the tails
 
 
 def test_training_moves_the_sensor_towards_less_loss(tmp_path):

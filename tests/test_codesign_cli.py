@@ -1,6 +1,7 @@
 """`raytrace codesign`: runs that go on, studies and their page, and errors of one line."""
 
 import csv
+import functools
 import json
 import os
 import re
@@ -92,7 +93,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_end(run, pictures, monkeypat
         with monkeypatch.context() as patch:
             interrupt(patch, *step)
             code, out, err = run(*command, "-o", "parts")
-            assert (code, out, err) == (130, "", "raytrace: error: interrupted\n")
+            assert (code, out, err.splitlines()[-1]) == (130, "", "raytrace: error: interrupted")
     code, _, err = run(*command, "-o", "parts", "--resume")
     assert code == 0
     assert "going on behind step 8 of 16" in err
@@ -124,6 +125,46 @@ def test_without_pictures_leaves_are_made(run):
     assert found["focus_paraxial_m"] > 25
 
 
+def test_a_run_begins_where_the_closed_form_ends(run, pictures):
+    """One command: the log of the training begins where `--loss spectral` ends."""
+    command = ("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "--rho", "0.3", "-o", "one")
+    assert run(*command, "--loss", "spectral")[0] == 0
+    code, _, err = run(*command, "--start", "spectral")
+    assert code == 0, err
+    assert float(rows("one/joint/log.csv")[0]["sensor"]) == read("one/spectral.json")["sensor_mm"]
+    # The sensor's bounds reach both.
+    bounded = (*command[:-1], "two", "--bounds", "sensor:57.85,58")
+    assert run(*bounded, "--loss", "spectral")[0] == run(*bounded, "--start", "spectral")[0] == 0
+    assert read("two/spectral.json")["sensor_mm"] == pytest.approx(57.85, abs=1e-9)
+    assert min(float(row["sensor"]) for row in rows("two/joint/log.csv")) >= 57.85 - 1e-9
+    assert read("one/spectral.json")["sensor_mm"] < 57.84
+
+
+def test_spectral_at_infinity_is_valid_json(run, pictures):
+    """A sensor kept 0.4 mm nearer than the focal plane: null in the file and in --json, "infinity" in words."""
+    command = ("double_gauss", "--data", pictures, "--loss", "spectral", "--patch", "16", "--size", "7")
+    bounded = (*command, "--model", "paraxial", "--start", "57.1", "--bounds", "sensor:57,57.1", "-o", "closed")
+    code, out, err = run(*bounded, "--json")
+    assert code == 0, err
+    kept = Path("closed/spectral.json").read_text()
+    for document in (json.loads(text, parse_constant=pytest.fail) for text in (out, kept)):
+        assert document["focus_paraxial_m"] is document["focus_rms_m"] is None
+    assert "in focus: infinity (paraxial), infinity (least RMS spot)" in run(*bounded)[1]
+
+
+def test_tests_are_told(run, pictures, monkeypatch, capsys):
+    """Off a terminal a line for the tests behind each step; on one the bar counts their batches."""
+    command = ("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "-o")
+    err = run(*command, "one")[2]
+    assert err.splitlines().count("raytrace: paraxial, seed 0: testing") == 2
+    drawn = functools.partial(codesign_setup.tqdm, mininterval=0)
+    monkeypatch.setattr(codesign_setup, "tqdm", lambda *a, **k: drawn(*a, **{**k, "disable": False}))
+    monkeypatch.setattr(codesign_setup.tqdm, "format_interval", lambda left: "00:00", raising=False)
+    err = run(*command, "two")[2]
+    assert "paraxial, seed 0, testing: " in err
+    assert "batch 2 of 2" in err
+
+
 def test_spectral_prints_its_course(run, pictures):
     command = ("double_gauss", "--data", pictures, "--loss", "spectral", "--patch", "16", "--size", "7")
     code, out, err = run(*command, "-o", "closed", "--batch", "4")
@@ -141,12 +182,17 @@ WRONG = {
     "variables": (["--vary", "radius:3"], "'radius:3': expected sensor, or one of thickness, curvature, conic"),
     "surface": (["--vary", "thickness:99"], "surface 99; this lens has surfaces 1 to 11 to vary"),
     "range": (["--near", "60000"], "--near 60000 is not nearer than --far 50000"),
-    "start": (["--start", "somewhere"], "start 'somewhere': expected paraxial, rms or a sensor distance in mm"),
+    "start": (
+        ["--start", "somewhere"],
+        "start 'somewhere': expected paraxial, rms, spectral or a sensor distance in mm",
+    ),
     "depth": (["--depth", "3"], "expected an even depth"),
     "batch": (["--batch", "99"], "8 pictures to train on, 4 crops of each, do not fill one batch of 99"),
     "resume": (["--resume"], "out: no run was begun here"),
     "number": (["--rate-network", "1e30"], r"step \d: the loss is nan, or its gradient is none; no checkpoint"),
     "seeds": (["--seeds", "1"], "--seeds belongs to codesign compare LENS"),
+    "bounds": (["--bounds", "sensor:58"], "'sensor:58': expected a variable and its bounds, like thickness_5:8,12"),
+    "bounded": (["--bounds", "thickness_5:8,12"], "bounds for thickness_5, not among the variables: sensor"),
     "field": (["--field", "95"], "a field angle is below 90 degrees"),
 }
 
@@ -163,7 +209,7 @@ def test_errors_are_one_line(run, pictures, options, message):
     ("arguments", "message"),
     [
         (("double_gauss",), "no folder to keep the run in: give -o FOLDER"),
-        (("comparing", "double_gauss", "-o", "out"), "expected LENS, or compare LENS"),
+        (("comparing", "double_gauss", "-o", "out"), "expected LENS, compare LENS or sweep LENS"),
         (("compare", "double_gauss", "--model", "drt", "-o", "out"), "--model belongs to codesign LENS"),
         (("compare", "double_gauss", "--loss", "spectral", "-o", "out"), "--loss spectral belongs to codesign LENS"),
         (("compare", "double_gauss", "--report-only", "-o", "out"), "out: no study was begun here"),
@@ -214,7 +260,7 @@ def test_compare_writes_the_table_and_the_page(run, pictures):
     assert (begun["model"], float(begun["start"])) == ("gaussian", kept["paraxial"]["sensor_mm"])
     document = json.loads(out)
     assert [row["sensor_mm"] for row in document["rows"]] == [kept[model]["sensor_mm"] for model in kept]
-    assert (len(document["claims"]), document["missing"]) == (10, [])
+    assert (len(document["claims"]), document["missing"]) == (11, [])
     page = Path("docs/codesign.md").read_text(encoding="utf-8")
     for name in re.findall(r"\(codesign/(\w+\.\w+)\)", page):
         assert Path("docs/codesign", name).read_bytes().startswith(b"\x89PNG") == name.endswith(".png")
@@ -225,7 +271,8 @@ def test_compare_writes_the_table_and_the_page(run, pictures):
     assert f"| paraxial | 1 | {one['l1_joint']:.4f} | {one['l1_drt']:.4f} |" in page
     assert "| 0.0415 | 0.0504 | 33.9 |" in page
     optimum = rows("docs/codesign/spectral.csv")
-    assert [row["model"] for row in optimum] == ["paraxial"]
+    assert [row["model"] for row in optimum] == ["paraxial", after]
+    assert [one["model"] for one in document["closed_form"]] == ["paraxial", after]
     assert f"| {float(optimum[0]['sensor_mm']):.4f} | {one['sensor_mm']:.4f} |" in page
     assert "no finished run of gaussian" in page
     again(run, command, page)

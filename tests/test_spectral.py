@@ -3,7 +3,9 @@
 import pytest
 import torch
 
-from raytrace.design.spectral import blind_filter, errors, errors_knowing, power_spectrum, transfer_functions
+from raytrace.deconvolve import blind_filter, errors, errors_knowing
+from raytrace.design.spectral import power_spectrum
+from raytrace.image import transfer_functions
 from raytrace.pictures import dead_leaves
 
 SIZE = 24

@@ -18,7 +18,7 @@ from raytrace.design.training import NotFinite, OtherSettings, Run, Share, train
 PATHS = [os.path.dirname(__file__), str(Path(raytrace.__file__).parents[1])]
 
 
-def fit(folder, steps, *, every=5, stop_at=None, poison=None):
+def fit(folder, steps, *, every=5, seconds=60.0, stop_at=None, poison=None):
     """Adam on a small regression whose samples are keyed by their number; returns the weights."""
     module = torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.Tanh(), torch.nn.Linear(4, 1)).double()
     generator = torch.Generator().manual_seed(0)
@@ -35,7 +35,7 @@ def fit(folder, steps, *, every=5, stop_at=None, poison=None):
         return total * (float("nan") if step == poison else 1.0), {"weight": float(module[0].bias[0].detach())}
 
     run = Run(folder, {"rate": 1e-2})
-    for step, _ in train(module, optimizer, loss, steps=steps, run=run, every=every):
+    for step, _ in train(module, optimizer, loss, steps=steps, run=run, every=every, seconds=seconds):
         if stop_at is not None and step == stop_at:
             return None
     return [p.detach().clone() for p in module.parameters()]
@@ -52,6 +52,16 @@ def test_a_run_that_was_stopped_goes_on_bit_by_bit(tmp_path):
     assert [row["step"] for row in rows] == list(range(23))
     assert rows[-1]["loss"] < rows[0]["loss"]
     assert set(rows[0]) == {"step", "loss", "weight"}
+
+
+def test_checkpoints_by_time_change_no_number(tmp_path):
+    """With no time between checkpoints there is one behind every step: a run stopped at 7 goes on there."""
+    whole = fit(tmp_path / "whole", 12, every=100)
+    fit(tmp_path / "parts", 12, every=100, seconds=0.0, stop_at=7)
+    assert Run(tmp_path / "parts", {"rate": 1e-2}).load()["step"] == 8
+    parts = fit(tmp_path / "parts", 12, every=100)
+    assert all(torch.equal(a, b) for a, b in zip(whole, parts, strict=True))
+    assert (tmp_path / "whole/log.csv").read_bytes() == (tmp_path / "parts/log.csv").read_bytes()
 
 
 def test_a_killed_process_leaves_a_run_that_goes_on(tmp_path):

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from raytrace.design.variables import BadVariables, Variables, edge_thickness, violation
+from raytrace.design.variables import BadVariables, Variables, edge_thickness, parse_bounds, violation
 from raytrace.formats import read_lens
 from raytrace.lens import with_sensor_distance
 from raytrace.surface import sag
@@ -101,6 +101,29 @@ def test_bounds_hold_after_a_step():
 def test_what_cannot_be_varied_is_refused(vary, message):
     with pytest.raises(BadVariables, match=message):
         Variables(double_gauss(), vary)
+
+
+def test_bounds_are_read_by_name():
+    assert parse_bounds("sensor:57.5,58 curvature_3:-0.1,0") == {"sensor": (57.5, 58.0), "curvature_3": (-0.1, 0.0)}
+    assert parse_bounds("") == {}
+    assert parse_bounds("sensor:57.5,inf")["sensor"][1] == float("inf")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("sensor", "'sensor': expected a variable and its bounds, like thickness_5:8,12"),
+        ("sensor:57", "'sensor:57': expected a variable and its bounds"),
+        ("sensor:57,58,59", "'sensor:57,58,59': expected a variable and its bounds"),
+        ("conic_1:-1,0 sensor:57,x", "'sensor:57,x': expected a variable and its bounds"),
+        ("sensor:58,57.5", "'sensor:58,57.5': 58 is not less than 57.5"),
+        ("sensor:58,58", "'sensor:58,58': 58 is not less than 58"),
+        ("sensor:nan,58", "'sensor:nan,58': nan is not less than 58"),
+    ],
+)
+def test_bounds_that_cannot_be_read_are_refused(text, message):
+    with pytest.raises(BadVariables, match=message):
+        parse_bounds(text)
 
 
 def test_a_real_lens_can_be_built_and_a_squeezed_one_cannot():

@@ -1,4 +1,4 @@
-"""`raytrace codesign`: one model; `codesign compare` is in a file of its own."""
+"""`raytrace codesign`: one model; `codesign compare` and `codesign sweep` are in files of their own."""
 
 import argparse
 import dataclasses
@@ -7,33 +7,55 @@ import json
 import math
 from pathlib import Path
 
-from raytrace.cli.codesign_setup import Experiment, experiment, plain, processes, refuse_too_few, settings_of, train_run
+from raytrace.cli.codesign_setup import (
+    Experiment,
+    experiment,
+    plain,
+    processes,
+    refuse_too_few,
+    settings_of,
+    settings_without_network,
+    train_run,
+)
 from raytrace.cli.door import CommandError, print_json, say
 from raytrace.design.codesign import STEPS, Outcome
 from raytrace.design.optima import Optimum, closed_form
 from raytrace.design.spectral import power_spectrum
 from raytrace.files import write_atomically
 
-#: Options that only one of the two forms knows.
-_OF_COMPARE = ("models", "seeds", "docs", "report_only")
-_OF_ONE = ("model", "seed")
+#: The forms of the command by their word, and the options that only some of them know.
+_FORMS = {
+    "": "codesign LENS",
+    "compare": "codesign compare LENS",
+    "sweep": "codesign sweep LENS",
+}
+_BELONG = {
+    "models": ("compare",),
+    "seeds": ("compare",),
+    "report_only": ("compare",),
+    "docs": ("compare", "sweep"),
+    "model": ("",),
+    "seed": ("",),
+    "resume": ("", "compare"),
+}
 
 
 def codesign(arguments: argparse.Namespace) -> None:
-    """One model, or with the word `compare` all of them."""
+    """One model; with the word `compare` all of them; with `sweep` the closed form by what the paper leaves open."""
     *before, arguments.lens = arguments.words
-    if before not in ([], ["compare"]):
-        raise CommandError(f"{' '.join(arguments.words)}: expected LENS, or compare LENS")
-    for name in _OF_ONE if before else _OF_COMPARE:
-        if getattr(arguments, name) not in (None, False):
+    form = before[0] if before else ""
+    if len(before) > 1 or form not in _FORMS:
+        raise CommandError(f"{' '.join(arguments.words)}: expected LENS, compare LENS or sweep LENS")
+    for name, forms in _BELONG.items():
+        if form not in forms and getattr(arguments, name) not in (None, False):
             raise CommandError(
-                f"--{name.replace('_', '-')} belongs to codesign " + ("LENS" if before else "compare LENS")
+                f"--{name.replace('_', '-')} belongs to {' and '.join(_FORMS[known] for known in forms)}"
             )
-    if before and arguments.loss == "spectral":
-        raise CommandError("--loss spectral belongs to codesign LENS; compare reports the closed form by itself")
+    if form and arguments.loss == "spectral":
+        raise CommandError("--loss spectral belongs to codesign LENS; compare and sweep use the closed form anyway")
     work = _spectral if arguments.loss == "spectral" else _train
-    if before:
-        work = importlib.import_module("raytrace.cli.codesign_compare").compare
+    if form:
+        work = getattr(importlib.import_module(f"raytrace.cli.codesign_{form}"), form)
     with processes():
         work(arguments)
 
@@ -82,7 +104,7 @@ def _metres(distance: float) -> str:
 
 
 def _spectral(arguments: argparse.Namespace) -> None:
-    settings = settings_of(argparse.Namespace(**{**vars(arguments), "precision": "float32"}), Path())
+    settings = settings_without_network(arguments)
     given = experiment(arguments, settings)
     found = closed_form(given.lens, settings, spectrum_of(given))
     document = plain({"settings": dataclasses.asdict(settings), **given.about, **dataclasses.asdict(found)})

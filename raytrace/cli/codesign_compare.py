@@ -24,7 +24,7 @@ from raytrace.cli.codesign_table import MODELS
 from raytrace.cli.door import CommandError, print_json, say
 from raytrace.design.claims import claims
 from raytrace.design.codesign import STEPS, Outcome, Settings, batch, camera, lens_at_start, outcome
-from raytrace.design.optima import Optimum, closed_form, scan, write_optima
+from raytrace.design.optima import Optimum, closed_forms, scan, write_optima
 from raytrace.design.report import CAPTIONS, Report, below_the_mark, markdown
 from raytrace.design.step_time import StepTime, step_time
 from raytrace.design.study import (
@@ -122,7 +122,7 @@ def _report(given: Experiment, study: Path, models: Sequence[str], seeds: Sequen
     own = [dataclasses.replace(given.settings, model=model) for model in simulated]
     say("the closed form, and the time of a step, of every model")
     spectrum = spectrum_of(given)
-    optima = [closed_form(given.lens, settings, spectrum) for settings in own]
+    optima = closed_forms(given.lens, given.settings, spectrum, models)
     times = [_time(given, settings) for settings in own]
     drawn = _training_figures(given, study, found) | _lens_figures(given, study, found)
     drawn |= _scan_figure(given, spectrum, optima, found)
@@ -136,6 +136,7 @@ def _report(given: Experiment, study: Path, models: Sequence[str], seeds: Sequen
         times=tuple(times),
         figures=tuple(name for name in CAPTIONS if name in drawn),
         machine=machine(),
+        sweep=(docs / "codesign_sweep.md").exists(),
     )
     _write(report, drawn, docs)
     return report
@@ -211,6 +212,7 @@ def _scan_figure(
     errors = {
         one.model: scan(camera(given.lens, dataclasses.replace(given.settings, model=one.model)), spectrum, sensors)
         for one in optima
+        if one.model in MODELS
     }
     return {"scan.png": figures.scan_figure(sensors, errors, ends)}
 

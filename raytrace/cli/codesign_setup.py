@@ -1,4 +1,4 @@
-"""What the two forms of `raytrace codesign` share: settings, pictures, and one run with its progress."""
+"""What the forms of `raytrace codesign` share: settings, pictures, and one run with its progress."""
 
 import argparse
 import contextlib
@@ -8,7 +8,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -114,6 +114,11 @@ def settings_of(arguments: argparse.Namespace, begun: Path) -> Settings:
     return Settings(**given)
 
 
+def settings_without_network(arguments: argparse.Namespace) -> Settings:
+    """Settings by the options, for work that trains no network: nothing is tried out."""
+    return settings_of(argparse.Namespace(**{**vars(arguments), "precision": "float32"}), Path())
+
+
 def _agreed(choose: Callable[[], str]) -> str:
     """The choice of the first process, for all."""
     chosen = [choose() if share().rank == 0 else ""]
@@ -132,15 +137,16 @@ def _pictures(arguments: argparse.Namespace, settings: Settings) -> Pictures:
         count = arguments.limit or _LEAVES
         say(f"no --data: training on {count} pictures of dead leaves, discs that hide one another")
         size = max(256, settings.patch + settings.size - 1)
-        leaves = [dead_leaves(1, size=size, seed=seed).samples[0] for seed in _bar(range(count), "dead leaves")]
+        leaves = [dead_leaves(1, size=size, seed=seed).samples[0] for seed in bar(range(count), "dead leaves")]
         return Pictures(tuple(leaves), tuple(f"dead leaves {seed}" for seed in range(count)))
     paths = files(arguments.data)
     if arguments.limit and arguments.limit < len(paths):
         paths = [paths[i * len(paths) // arguments.limit] for i in range(arguments.limit)]
-    return read(paths, least=settings.patch + settings.size - 1, progress=lambda given: _bar(given, "pictures"))
+    return read(paths, least=settings.patch + settings.size - 1, progress=lambda given: bar(given, "pictures"))
 
 
-def _bar(given, what: str):
+def bar(given, what: str):
+    """The given things behind a bar, on a terminal."""
     return tqdm(given, desc=what, unit="", leave=False, disable=None)
 
 
@@ -157,7 +163,14 @@ def train_run(given: Experiment, settings: Settings, folder: Path, label: str) -
     length = settings.epochs * given.steps_per_epoch
     progress = Progress(label, length, given.steps_per_epoch, focus_of(given.lens, settings))
     steps = run_model(
-        given.lens, given.train, given.test, settings, folder, about=given.about, distances=given.distances
+        given.lens,
+        given.train,
+        given.test,
+        settings,
+        folder,
+        about=given.about,
+        distances=given.distances,
+        progress=progress.testing,
     )
     try:
         for name, step, record in steps:
@@ -178,7 +191,7 @@ class Progress:
         self.label, self.length, self.steps_per_epoch, self.focus = label, length, steps_per_epoch, focus
         self.bar: tqdm | None = None
         self.losses: list[float] = []
-        self.first, self.since = 0, time.monotonic()
+        self.first, self.since, self.is_testing = 0, time.monotonic(), False
 
     def __call__(self, name: str, step: int, record: Record) -> None:
         place = STEPS.index(name) * self.length + step + 1
@@ -187,6 +200,7 @@ class Progress:
             if self.first:
                 say(f"{self.label}: going on behind step {self.first} of {2 * self.length}")
             self.bar = tqdm(total=2 * self.length, initial=self.first, unit="step", disable=None, dynamic_ncols=True)
+        self.is_testing = False
         self.losses.append(record["loss"])
         if self.bar.disable:
             if (step + 1) % self.steps_per_epoch == 0:
@@ -195,6 +209,19 @@ class Progress:
             self.bar.set_description(f"{self.label}, {name}", refresh=False)
             self.bar.set_postfix_str(f"loss {record['loss']:.4f}{self._lens(record)}", refresh=False)
             self.bar.update()
+
+    def testing(self, batches: Sequence[int]) -> Iterator[int]:
+        """The batches of a test one by one, counted on the bar; elsewhere one line for all tests behind a step."""
+        is_drawn = self.bar is not None and not self.bar.disable
+        if not (is_drawn or self.is_testing):
+            say(f"{self.label}: testing")
+            sys.stderr.flush()
+        self.is_testing = True
+        for place, first in enumerate(batches, 1):
+            if is_drawn:
+                self.bar.set_description(f"{self.label}, testing", refresh=False)
+                self.bar.set_postfix_str(f"batch {place} of {len(batches)}")
+            yield first
 
     def close(self) -> None:
         if self.bar is not None:

@@ -1,6 +1,6 @@
 """The arguments of `raytrace codesign`. Imports no torch."""
 
-from raytrace.cli.options import catalog, count, file_name, finite, json, positive_finite, seed_number
+from raytrace.cli.options import catalog, count, file_name, finite, json, positive_finite, seed_number, window
 
 MODELS = ("paraxial", "fourier", "gaussian", "drt")
 AFTER_PARAXIAL = "gaussian-after-paraxial"
@@ -8,7 +8,8 @@ AFTER_PARAXIAL = "gaussian-after-paraxial"
 _DESCRIPTION = """\
 Learn the sensor distance (or any variables) of a lens together with a network that restores its pictures. Step 1
 learns both with the PSFs of one model; step 2 freezes the lens and goes on with the network on ray-traced (DRT)
-PSFs, as long as step 1. `compare` runs every model and seed and writes tables, figures and a page about them.
+PSFs, as long as step 1. `compare` runs every model and seed and writes tables, figures and a page about them;
+`sweep` finds the optima of the closed form at several apertures, ρ, noises, normalisations and starts.
 
 A run may be stopped at any moment: the same command goes on where it was, and ends in the same numbers. Several
 processes share every batch: torchrun --nproc-per-node 2 -m raytrace codesign …"""
@@ -16,20 +17,23 @@ processes share every batch: torchrun --nproc-per-node 2 -m raytrace codesign �
 _EXAMPLES = """examples:
   raytrace codesign double_gauss --loss spectral
   raytrace codesign double_gauss --model gaussian --data pictures -o run
+  raytrace codesign double_gauss --start spectral --bounds sensor:57,58 --data pictures -o begun_in_closed_form
   raytrace codesign lens.zmx --vary sensor thickness:5,6 curvature:1-4 --f-number 4 -o run4
   raytrace codesign double_gauss --field 0 10 14 --normalise energy --epochs 10 -o fields --json
   raytrace codesign compare double_gauss --data pictures --seeds 0 1 2 -o study --docs docs
-  raytrace codesign compare double_gauss --data pictures -o study --docs docs --report-only"""
+  raytrace codesign compare double_gauss --data pictures -o study --docs docs --report-only
+  raytrace codesign sweep double_gauss --data pictures --docs docs"""
 
 
 def _add_arguments(parser) -> None:
-    parser.usage = "raytrace codesign [compare] LENS [-o FOLDER] [options]"
+    parser.usage = "raytrace codesign [compare | sweep] LENS [-o FOLDER] [options]"
     parser.add_argument(
         "words",
         metavar="LENS",
         type=file_name,
         nargs="+",
-        help="lens file, or the name of a shipped lens; `compare` before it runs all models and seeds",
+        help="lens file, or the name of a shipped lens; before it `compare` runs all models and seeds, "
+        "`sweep` finds optima of the closed form",
     )
     catalog(parser)
     json(parser)
@@ -47,7 +51,7 @@ def _add_arguments(parser) -> None:
     _pictures(parser.add_argument_group("pictures"))
     _scene(parser.add_argument_group("lens and scene"))
     _training(parser.add_argument_group("network and training"))
-    _compare(parser.add_argument_group("compare"))
+    _compare(parser.add_argument_group("compare and sweep"))
 
 
 def _pictures(group) -> None:
@@ -90,18 +94,9 @@ def _scene(group) -> None:
     group.add_argument(
         "--field", "--fields", metavar="Y", type=finite, nargs="+", help="field points, taken in turn (default 0)"
     )
-    group.add_argument("--pixel", metavar="MM", type=positive_finite, help="pixel pitch (default 0.005)")
-    group.add_argument("--size", metavar="N", type=count, help="pixels across the window of the PSF (default 21)")
-    group.add_argument(
-        "--normalise",
-        choices=("window", "energy"),
-        help="each window of the PSF sums to 1 (default), or 1 = all light through the entrance pupil",
-    )
+    window(group, normalise="window")
     group.add_argument(
         "--noise", metavar="S", type=positive_finite, help="standard deviation, of pictures from 0 to 1 (default 0.1)"
-    )
-    group.add_argument(
-        "--rho", metavar="R", type=positive_finite, help="of the paraxial model: σ over the blur radius (default 0.5)"
     )
     group.add_argument("--tol", metavar="T", type=positive_finite, help="what a PSF may err by (default 0.01)")
 
@@ -141,7 +136,10 @@ def _compare(group) -> None:
     )
     group.add_argument("--seeds", metavar="N", type=seed_number, nargs="+", help="of the runs (default 0 1 2)")
     group.add_argument(
-        "--docs", metavar="DOCS", type=file_name, help="folder for codesign.md and codesign/ (default: FOLDER)"
+        "--docs",
+        metavar="DOCS",
+        type=file_name,
+        help="folder of the page and of codesign/, for compare and sweep (default: FOLDER)",
     )
     group.add_argument("--report-only", action="store_true", help="train nothing, write what the runs say so far")
 

@@ -22,7 +22,9 @@ from raytrace.cli.options import (
     ray_aiming,
     sampling,
     wavelength,
+    window,
 )
+from raytrace.cli.wave_table import WAVE
 
 
 @dataclass(frozen=True)
@@ -120,10 +122,8 @@ def _psf(parser):
     )
     conditions(parser, several="one row of kernels each")
     fields(parser)
-    parser.add_argument(
-        "--pixel", metavar="MM", type=positive_finite, default=0.005, help="pixel pitch (default 0.005)"
-    )
-    parser.add_argument("--size", metavar="N", type=count, default=21, help="pixels across the window (default 21)")
+    window(parser, normalise="energy")
+    parser.set_defaults(pixel=0.005, size=21, normalise="energy", rho=0.5)
     parser.add_argument(
         "--center",
         choices=("axis", "chief", "centroid"),
@@ -133,19 +133,6 @@ def _psf(parser):
     choice = parser.add_mutually_exclusive_group()
     choice.add_argument("--tol", metavar="T", type=positive_finite, help="bound on the estimated error (default 0.01)")
     choice.add_argument("--rays", metavar="N", type=count, help="rays per kernel instead of a tolerance")
-    parser.add_argument(
-        "--normalise",
-        choices=("energy", "window"),
-        default="energy",
-        help="1 = all light through the entrance pupil (default), or each window sums to 1",
-    )
-    parser.add_argument(
-        "--rho",
-        metavar="R",
-        type=positive_finite,
-        default=0.5,
-        help="of the paraxial model: σ over the radius of the blur (default 0.5, the second moment of a uniform disc)",
-    )
     output(parser, "arrays to write (.npz): psf[distance, field, y, x], pixel_pitch, energy, error, model")
     plot(parser, "the kernels")
 
@@ -160,7 +147,7 @@ def _glass(parser):
 
 
 def _bench(parser):
-    parser.add_argument("what", choices=("trace", "psf"), help="what to measure")
+    parser.add_argument("what", choices=("trace", "psf", "codesign"), help="what to measure")
     parser.add_argument(
         "lenses",
         metavar="LENS",
@@ -179,6 +166,9 @@ def _bench(parser):
     parser.add_argument("--no-peers", action="store_true", help="leave out Optiland even if it is installed")
     output(parser, "report to write (.md)")
     parser.add_argument("--csv", metavar="FILE", type=file_name, help="psf: table to write, one line a figure")
+    parser.add_argument(
+        "--docs", metavar="DOCS", type=file_name, help="codesign: folder for codesign_accuracy.md and codesign/"
+    )
     plot(parser, "speed over number of rays, or time over error,")
 
 
@@ -325,14 +315,17 @@ COMMANDS = (
         "bench",
         "measure speed against error",
         "Measure, forward and backward, in float32 and float64: the trace against a high-precision reference, or every "
-        "PSF model at every sampling against converged ones (minutes). With the extra [bench] Optiland runs beside it.",
+        "PSF model at every sampling against converged ones (minutes), or what learns lenses in co-design: few rays "
+        "beside many, and the models beside DRT (minutes). With the extra [bench] Optiland runs beside the first two.",
         """examples:
   raytrace bench trace
   raytrace bench psf -o speed_vs_error.md --csv speed_vs_error.csv --plot speed_vs_error.png
-  raytrace bench trace --rays 1000 100000 -o bench.md --plot bench.png""",
+  raytrace bench trace --rays 1000 100000 -o bench.md --plot bench.png
+  raytrace bench codesign --docs docs""",
         _bench,
         "bench_commands.bench",
     ),
     *(Command(*entry) for entry in ANALYSES),
     Command(*CODESIGN),
+    Command(*WAVE),
 )

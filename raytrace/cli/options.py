@@ -166,3 +166,24 @@ def plot(parser: argparse.ArgumentParser, what: str) -> None:
 
 def output(parser: argparse.ArgumentParser, what: str) -> None:
     parser.add_argument("-o", "--output", metavar="FILE", type=file_name, help=what)
+
+
+def window(group, *, normalise: str) -> None:
+    """--pixel, --size, --normalise, --rho of a PSF: None where not given, for the command to fill in.
+
+    normalise: what the command takes then, for the help.
+    """
+    group.add_argument("--pixel", metavar="MM", type=positive_finite, help="pixel pitch (default 0.005)")
+    group.add_argument("--size", metavar="N", type=count, help="pixels across the window of the PSF (default 21)")
+    group.add_argument(
+        "--normalise",
+        choices=("energy", "window"),
+        help="what is 1: all light through the entrance pupil (energy), or the light in each window (window); "
+        f"default {normalise}",
+    )
+    group.add_argument(
+        "--rho",
+        metavar="R",
+        type=positive_finite,
+        help="of the paraxial model: σ over the radius of the blur (default 0.5, the second moment of a uniform disc)",
+    )

@@ -9,7 +9,7 @@ Every sample is keyed by its number: crop, object distance and noise are the sam
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from torch import Tensor
 
 from raytrace.design.camera import Camera
 from raytrace.design.network import RedNet, RedNetShape
+from raytrace.design.spectral import optimise_closed_form, power_spectrum
 from raytrace.design.training import Record, Run, Share, train
 from raytrace.design.variables import Variables, parse_bounds
 from raytrace.files import write_atomically
@@ -34,6 +35,7 @@ _SAMPLE = 10  # last number of the key of what a sample draws
 _TEST_EPOCH = 2**20  # test samples are those of an epoch that no training reaches
 _RINGS = 12  # of the pupil, where focus is found
 STEPS = ("joint", "refine")
+_INFINITE = ("focus_paraxial_m", "focus_rms_m")  # of an outcome; null in its file
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,7 +120,9 @@ def lens_at_start(lens: Lens, settings: Settings) -> Lens:
     try:
         return with_sensor_distance(lens, float(settings.start))
     except ValueError as error:
-        raise ValueError(f"start {settings.start!r}: expected paraxial, rms, spectral or a sensor distance in mm") from error
+        raise ValueError(
+            f"start {settings.start!r}: expected paraxial, rms, spectral or a sensor distance in mm"
+        ) from error
 
 
 def best_focus(lens: Lens) -> Tensor:
@@ -250,11 +254,22 @@ def optimise(
     )
 
 
+#: Wraps the batches of a test, for a bar.
+Progress = Callable[[Sequence[int]], Iterable[int]]
+
+
 @torch.no_grad()
-def held_out_error(camera: Camera, pictures: Pictures, settings: Settings, *, distance: float | None = None) -> float:
+def held_out_error(
+    camera: Camera,
+    pictures: Pictures,
+    settings: Settings,
+    *,
+    distance: float | None = None,
+    progress: Progress = iter,
+) -> float:
     """Mean |restored - picture| of all test samples, at drawn object distances or at one."""
     count, total = len(pictures) * settings.crops, 0.0
-    for first in range(0, count, settings.batch):
+    for first in progress(range(0, count, settings.batch)):
         found = batch(pictures, settings, list(range(first, min(first + settings.batch, count))), _TEST_EPOCH)
         if distance is not None:
             found = dataclasses.replace(found, distance=torch.full_like(found.distance, distance))
@@ -271,50 +286,66 @@ def run_model(
     *,
     about: dict,
     distances: tuple[float, ...],
+    progress: Progress = iter,
 ) -> Iterator[tuple[str, int, Record]]:
     """Both steps of one model and seed, a training step at a time: (step's name, its number, what it reports).
 
-    folder: of this run, resumed if begun; about: what else decides the result (lens file, pictures). The outcome is
-    written to `outcome.json` there at the end, and read by `outcome`.
+    folder: of this run, resumed if begun; about: what else decides the result (lens file, pictures); progress: wraps
+    the batches of every test. The outcome is written to `outcome.json` there at the end, and read by `outcome`.
     """
     folder = Path(folder)
     if (folder / "outcome.json").exists():
         Run(folder / STEPS[0], {**dataclasses.asdict(settings), **about, "step": STEPS[0]})  # refuses other settings
         return
     own = camera(lens, settings)
+    own.plan()  # before a checkpoint moves the lens: a run that goes on has the PSFs of one that never stopped
     for step, record in _steps(own, train_pictures, settings, folder, about, STEPS[0]):
         yield STEPS[0], step, record
-    l1_joint = held_out_error(own, test_pictures, settings)
+    l1_joint = held_out_error(own, test_pictures, settings, progress=progress)
     own.variables.requires_grad_(False)
     own.use("drt")
-    l1_before = held_out_error(own, test_pictures, settings)
+    l1_before = held_out_error(own, test_pictures, settings, progress=progress)
     for step, record in _steps(own, train_pictures, settings, folder, about, STEPS[1]):
         yield STEPS[1], step, record
     found = own.variables()
-    outcome = Outcome(
+    result = Outcome(
         model=settings.model,
         seed=settings.seed,
         l1_joint=l1_joint,
         l1_before=l1_before,
-        l1_drt=held_out_error(own, test_pictures, settings),
+        l1_drt=held_out_error(own, test_pictures, settings, progress=progress),
         focus_paraxial_m=1e-3 * distance_in_focus(found, _paraxial_image),
         focus_rms_m=1e-3 * distance_in_focus(found, best_focus),
         sensor_mm=float(found.surfaces[-2].thickness),
         variables=own.variables.numbers(),
-        by_distance={f"{d:g}": held_out_error(own, test_pictures, settings, distance=d) for d in distances},
+        by_distance={
+            f"{d:g}": held_out_error(own, test_pictures, settings, distance=d, progress=progress) for d in distances
+        },
     )
-    text = json.dumps(dataclasses.asdict(outcome), indent=1)
-    write_atomically(folder / "outcome.json", lambda file: file.write(text.encode()))
+    write_outcome(result, folder)
+
+
+def write_outcome(found: Outcome, folder: Path) -> None:
+    """Write `outcome.json`; a focus at infinity is null there."""
+    document = dataclasses.asdict(found)
+    document |= {key: None for key in _INFINITE if math.isinf(document[key])}
+    write_atomically(Path(folder) / "outcome.json", lambda file: file.write(json.dumps(document, indent=1).encode()))
 
 
 def outcome(folder: Path) -> Outcome | None:
     """What a finished run found, None for one that is not."""
     path = Path(folder) / "outcome.json"
-    return Outcome(**json.loads(path.read_text())) if path.exists() else None
+    if not path.exists():
+        return None
+    document = json.loads(path.read_text())
+    return Outcome(**{**document, **{key: math.inf for key in _INFINITE if document[key] is None}})
 
 
 def _steps(own: Camera, pictures: Pictures, settings: Settings, folder: Path, about: dict, name: str):
     run = Run(folder / name, {**dataclasses.asdict(settings), **about, "step": name})
+    if settings.start == "spectral" and name == STEPS[0] and not run.checkpoint.exists():
+        size = settings.patch + settings.size - 1
+        optimise_closed_form(own, power_spectrum(pictures, size, crops=settings.crops, seed=settings.seed))
     yield from optimise(own, pictures, settings, run)
 
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from raytrace.design.camera import Camera
 from raytrace.design.codesign import Settings, best_focus, camera, distance_in_focus
 from raytrace.design.spectral import camera_error, even_distances, optimise_closed_form
+from raytrace.design.study import AFTER_PARAXIAL
 from raytrace.files import write_atomically
 from raytrace.lens import Lens
 from raytrace.paraxial import paraxial_image_distance
@@ -19,7 +20,7 @@ from raytrace.paraxial import paraxial_image_distance
 
 @dataclasses.dataclass(frozen=True)
 class Optimum:
-    """The lens of least closed-form error of one model.
+    """The lens of least closed-form error of one model, or of one row of a study.
 
     error: mean square error of a pixel with the model's own PSFs; error_drt: of the same lens with DRT PSFs and the
     filter that is best for them; course: the error at every evaluation. Focus distances in m as for `Outcome`.
@@ -63,6 +64,20 @@ def closed_form(lens: Lens, settings: Settings, spectrum: Tensor) -> Optimum:
         variables=own.variables.numbers(),
         course=tuple(course),
     )
+
+
+def closed_forms(lens: Lens, settings: Settings, spectrum: Tensor, rows: Sequence[str]) -> list[Optimum]:
+    """The optimum of every row of a study. `AFTER_PARAXIAL`: of Gaussian DRT, begun where paraxial optics end."""
+    found: dict[str, Optimum] = {}
+    for row in sorted(rows, key=lambda row: row == AFTER_PARAXIAL):  # the last of them
+        own = dataclasses.replace(settings, model=row)
+        if row == AFTER_PARAXIAL:
+            before = found.get("paraxial") or closed_form(
+                lens, dataclasses.replace(settings, model="paraxial"), spectrum
+            )
+            own = dataclasses.replace(settings, model="gaussian", start=repr(before.sensor_mm))
+        found[row] = dataclasses.replace(closed_form(lens, own, spectrum), model=row)
+    return [found[row] for row in rows]
 
 
 @torch.no_grad()

@@ -13,6 +13,9 @@ from raytrace.design.study import NAMES, PAPER, Summary, summaries
 #: What stands below this line is written by hand: a report that is made again keeps it.
 KEPT = "<!-- kept when this page is made again -->"
 
+#: What leads to the page of the sweep.
+SWEEP = "At other apertures, ρ, noise, normalisations and starts: [codesign_sweep.md](codesign_sweep.md)."
+
 #: Figures of the page, by file name: what each shows.
 CAPTIONS = {
     "loss.png": "Loss in training, mean of every epoch; bands: range over seeds.",
@@ -26,7 +29,11 @@ CAPTIONS = {
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """All that a page says. missing: (row, seed) of runs that are not finished; figures: file names that exist."""
+    """All that a page says.
+
+    missing: (row, seed) of runs that are not finished; figures: file names that exist; sweep: whether there is a page
+    of one beside this.
+    """
 
     lens: str
     pictures: str
@@ -37,6 +44,7 @@ class Report:
     times: tuple[StepTime, ...]
     figures: tuple[str, ...]
     machine: Mapping[str, str | int]
+    sweep: bool = False
 
 
 def markdown(report: Report, *, folder: str = "codesign", kept: str = "") -> str:
@@ -68,11 +76,11 @@ def below_the_mark(page: str) -> str:
 def _command(report: Report) -> str:
     rows = list(dict.fromkeys([one.model for one in report.found] + [row for row, _ in report.missing]))
     seeds = sorted({one.seed for one in report.found} | {seed for _, seed in report.missing})
-    words = [f"--models {' '.join(rows)}", f"--seeds {' '.join(map(str, seeds))}", *_options(report.settings)]
+    words = [f"--models {' '.join(rows)}", f"--seeds {' '.join(map(str, seeds))}", *options(report.settings)]
     return f"    raytrace codesign compare {report.lens} --data DIR -o FOLDER --docs docs {' '.join(words)}"
 
 
-def _options(settings: Settings) -> list[str]:
+def options(settings: Settings) -> list[str]:
     """The settings that are not the default ones, as options of the command."""
     usual, found = Settings(), []
     for field in dataclasses.fields(Settings):
@@ -91,6 +99,7 @@ def _experiment(report: Report) -> str:
     start = {
         "paraxial": f"the paraxial image of {s.focus_distance / 1e3:g} m",
         "rms": f"the least RMS spot of an object at {s.focus_distance / 1e3:g} m",
+        "spectral": "the optimum of the closed form",
     }.get(s.start, f"{s.start} mm")
     where = "the axis" if s.fields == (0.0,) else "the fields " + ", ".join(f"{y:g}" for y in s.fields)
     light = {"window": "the window", "energy": "the light through the pupil"}[s.normalise]
@@ -137,7 +146,7 @@ def _table(found: Sequence[Outcome]) -> str:
             )
         )
     return (
-        f"{_rows(header, rows)}\n\nMean ± standard deviation over seeds, of test pictures; every model of a seed sees "
+        f"{table(header, rows)}\n\nMean ± standard deviation over seeds, of test pictures; every model of a seed sees "
         "the same crops, distances and noise. Focus is the object distance from vertex 1 whose image is on the sensor: "
         "the paraxial one, or that of least RMS spot; the paper does not say which is its own. Rows one by one: "
         "[table2.csv](codesign/table2.csv)."
@@ -153,7 +162,7 @@ def _paper(model: str) -> tuple[str, ...]:
 
 def _claims(report: Report) -> str:
     rows = [(one.text, f"**{one.answer}**", one.figures, one.criterion) for one in claims(report.found, report.times)]
-    return _rows(("claim", "here", "figures", "yes if"), rows)
+    return table(("claim", "here", "figures", "yes if"), rows)
 
 
 def _closed_form(report: Report) -> str:
@@ -167,17 +176,18 @@ def _closed_form(report: Report) -> str:
             NAMES.get(one.model, one.model),
             f"{one.sensor_mm:.4f}",
             _spread(trained[one.model], "sensor_mm", 4) if one.model in trained else "–",
-            _number(one.focus_paraxial_m, 1),
-            _number(one.focus_rms_m, 1),
+            shown(one.focus_paraxial_m, 1),
+            shown(one.focus_rms_m, 1),
             f"{one.error:.6f}",
             f"{one.error_drt:.6f}",
         )
         for one in report.optima
     ]
-    return (
-        f"{_rows(header, rows)}\n\nMean square error of a pixel behind the best linear filter that does not know the "
+    text = (
+        f"{table(header, rows)}\n\nMean square error of a pixel behind the best linear filter that does not know the "
         "object distance, for pictures of this power spectrum: [spectral.csv](codesign/spectral.csv)."
     )
+    return f"{text} {SWEEP}" if report.sweep else text
 
 
 def _times(report: Report) -> str:
@@ -186,19 +196,21 @@ def _times(report: Report) -> str:
         for one in report.times
     ]
     about = ", ".join(f"{key} {value}" for key, value in report.machine.items())
-    table = _rows(("model", "PSFs (ms)", "image (ms)", "network (ms)"), rows)
-    return f"{table}\n\nA batch, forward and backward, median of several: {about}."
+    parts = table(("model", "PSFs (ms)", "image (ms)", "network (ms)"), rows)
+    return f"{parts}\n\nA batch, forward and backward, median of several: {about}."
 
 
 def _spread(one: Summary, column: str, digits: int) -> str:
-    mean, deviation = _number(one.mean[column], digits), _number(one.deviation[column], digits)
+    mean, deviation = shown(one.mean[column], digits), shown(one.deviation[column], digits)
     return f"{mean} ± {deviation}" if one.seeds > 1 else mean
 
 
-def _number(value: float, digits: int) -> str:
+def shown(value: float, digits: int) -> str:
+    """A number with so many digits behind the point; ∞, and – for none."""
     return f"{value:.{digits}f}" if math.isfinite(value) else "∞" if math.isinf(value) else "–"
 
 
-def _rows(header: Sequence, rows: Iterable[Sequence]) -> str:
+def table(header: Sequence, rows: Iterable[Sequence]) -> str:
+    """A table of Markdown."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)

@@ -13,6 +13,7 @@ import dataclasses
 import io
 import json
 import math
+import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
@@ -133,15 +134,17 @@ def train(
     steps: int,
     run: Run,
     every: int = 100,
+    seconds: float = 60.0,
     after_step: Callable[[], None] = lambda: None,
 ) -> Iterator[tuple[int, Record]]:
     """Take the steps that are left, one for each item taken from this iterator: (step, what it reports).
 
     loss: (step, share of this process) -> its part of the loss of the batch, to be summed over processes, and numbers
-    for the log (of the first process); every: steps between checkpoints; after_step: a projection, say.
+    for the log (of the first process); every, seconds: steps and time between checkpoints, whichever passes first;
+    after_step: a projection, say.
     Raises NotFinite at a loss or a gradient that is no number, before it is stepped into.
     """
-    step, mine = _resume(module, optimizer, run), share()
+    step, mine, kept_at = _resume(module, optimizer, run), share(), time.monotonic()
     rows: list[tuple[int, Record]] = []
     parameters = [p for p in module.parameters() if p.requires_grad]
     while step < steps:
@@ -160,11 +163,12 @@ def train(
         record = {"loss": total, **record}
         rows.append((step, record))
         step += 1
-        if mine.rank == 0 and (step % every == 0 or step == steps):
+        due = step % every == 0 or step == steps or time.monotonic() - kept_at >= seconds
+        if mine.rank == 0 and due:
             # The log first: rows beyond a checkpoint are dropped on resuming, missing ones could not be made up.
             run.append(rows)
             run.save({"step": step, "module": module.state_dict(), "optimizer": optimizer.state_dict()})
-            rows = []
+            rows, kept_at = [], time.monotonic()
         yield step - 1, record
 
 

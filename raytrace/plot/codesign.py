@@ -1,4 +1,7 @@
-"""Figures of a co-design study: loss and focus in training, blur and loss over object distance, restored pictures."""
+"""Figures of a co-design study: loss and focus in training, blur and loss over object distance, restored pictures.
+
+And of the closed form: its error over the sensor's place, and its optima by what the paper leaves open.
+"""
 
 from collections.abc import Mapping, Sequence
 
@@ -8,7 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from raytrace.design.study import NAMES
+from raytrace.design.study import NAMES, PAPER
+from raytrace.design.sweep import FACTORS, Factor, Reading
 from raytrace.plot.style import FIELD_COLOURS, GREY, INK, new_figure, styled
 
 #: How the models are drawn: colour and dashes, to be told apart in print.
@@ -22,6 +26,14 @@ LOOKS = {
 
 #: Object distances in m that may be marked on an axis, the roundest first.
 _MARKS = (10, 100, 20, 50, 200, 500, 30, 40, 15, 25, 70, 35, 150, 300, 60, 80, 45, 12, 1000, *range(11, 50))
+
+#: What the panels of a sweep are called, and by how many points numbers of the paper are moved that would touch.
+_TITLES = {
+    "f_number": "aperture", "rho": "ρ (of paraxial)", "noise": "noise", "normalise": "PSFs normalised to",
+    "start": "start",
+}  # fmt: skip
+_SWEEP_MARKS = (10, 100, 20, 50, 30, 15, 25, 40, 70, 35, 200, 18, 12, 14, 16, 22)
+_LIFT = {"paraxial": -3, "fourier": 3}
 
 #: Values over steps or distances, one list for each seed.
 Curves = Mapping[str, Sequence[Sequence[float]]]
@@ -147,10 +159,63 @@ def scan_figure(
     return figure
 
 
+@styled
+def sweep_figure(found: Sequence[Reading]) -> Figure:
+    """Focus of the closed form's optima: a column of panels for each factor, a row for each definition of focus.
+
+    Distances stand as they do behind the lens, evenly in 1/z, so that infinity has a place.
+    """
+    groups = {factor: [one for one in found if one.factor == factor.name] for factor in FACTORS}
+    groups = {factor: own for factor, own in groups.items() if own}
+    figure = new_figure(9.6, 5.0)
+    axes = figure.subplots(2, len(groups), sharey="row", width_ratios=[1 + len(own) for own in groups.values()])
+    for panels, column, label in zip(
+        axes, ("focus_paraxial_m", "focus_rms_m"), ("paraxial conjugate (m)", "least RMS spot (m)"), strict=True
+    ):
+        for panel, (factor, own) in zip(panels, groups.items(), strict=True):
+            for model in factor.models:
+                values = [-1 / getattr(one.of[model], column) for one in own]
+                panel.plot(values, marker="o", markersize=3.5, **_look(model))
+            for model, (*_, paper) in PAPER.items():
+                panel.axhline(-1 / paper, color=_look(model)["color"], linewidth=0.6, alpha=0.7, zorder=0)
+            panel.set_xticks(range(len(own)), [_sweep_tick(factor, one.value) for one in own])
+            panel.set_xlim(-0.5, len(own) - 0.5)
+            panel.tick_params(axis="y", left=panel is panels[0], length=2.5)
+            panel.spines["left"].set_visible(panel is panels[0])
+        panels[0].set_ylabel(f"object in focus,\n{label}")
+        _distance_ticks(panels[0])
+        for model, (*_, paper) in PAPER.items():
+            # Right of the last panel, in the colour of its line.
+            panels[-1].annotate(
+                f"{paper:g}", (1, -1 / paper), (3, _LIFT.get(model, 0)), ("axes fraction", "data"), "offset points",
+                va="center", fontsize=7, color=_look(model)["color"], annotation_clip=False,
+            )  # fmt: skip
+    for panel, factor in zip(axes[0], groups, strict=True):
+        panel.set_title(_TITLES[factor.name])
+    _legend(figure, axes[0][0], [Line2D([], [], color=GREY, linewidth=0.6, label="the paper's")])
+    return figure
+
+
+def _sweep_tick(factor: Factor, value: str) -> str:
+    return factor.text.format(value) if factor.name == "f_number" else value
+
+
+def _distance_ticks(panel: Axes) -> None:
+    """Marks of object distances in m on an axis of -1/z, none so close to another that their numbers would touch."""
+    low, high = panel.get_ylim()
+    chosen: list[float] = []
+    for distance in (np.inf, *_SWEEP_MARKS):
+        place = -1 / distance
+        if low <= place <= high and all(abs(place + 1 / other) > (high - low) / 15 for other in chosen):
+            chosen.append(distance)
+    panel.set_yticks([-1 / z for z in chosen], ["∞" if np.isinf(z) else f"{z:g}" for z in chosen])
+    panel.set_ylim(low, high)
+
+
 def _legend(figure: Figure, panel: Axes, more: Sequence[Line2D] = ()) -> None:
     """Above the axes, where no curve runs."""
     handles = [*panel.get_legend_handles_labels()[0], *more]
-    columns = len(handles) if len(handles) <= 4 else 3
+    columns = len(handles) if len(handles) <= 4 or figure.get_figwidth() > 9 else 3
     figure.legend(handles=handles, loc="outside upper center", ncols=columns, handlelength=3)
 
 

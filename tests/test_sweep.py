@@ -1,0 +1,219 @@
+"""The sweep of the closed form: what is varied, what the answer says of known optima, table, page and command."""
+
+import csv
+import dataclasses
+import json
+import math
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from raytrace.cli import codesign_table, main
+from raytrace.design import sweep as module
+from raytrace.design.codesign import Settings
+from raytrace.design.optima import closed_form
+from raytrace.design.report import KEPT, below_the_mark
+from raytrace.design.spectral import power_spectrum
+from raytrace.design.sweep import (
+    COLUMNS,
+    COMBINED,
+    DEFAULT,
+    MODELS,
+    Row,
+    cases,
+    distinct,
+    readings,
+    sweep,
+    write_sweep,
+)
+from raytrace.design.sweep_page import answers, page
+from raytrace.files import shipped
+from raytrace.formats import read_lens
+from raytrace.pictures import dead_leaves
+from raytrace.plot.codesign import sweep_figure
+
+SMALL = Settings(depth=2, width=2, patch=16, size=7, crops=2)
+
+
+def row(factor, value, model, paraxial, rms, *, error_drt=0.01, sensor=57.8):
+    return Row(factor, value, model, sensor, paraxial, rms, 0.009, error_drt)
+
+
+def known(**gaussian):
+    """A default and one other reading (F/4); gaussian: both focus distances of Gaussian DRT by reading."""
+    default, other = gaussian["default"], gaussian["other"]
+    return [
+        row(DEFAULT, "as set", "paraxial", 34.0, 20.0, error_drt=0.012, sensor=57.81),
+        row(DEFAULT, "as set", "fourier", 35.0, 21.0, error_drt=0.0125, sensor=57.80),
+        row(DEFAULT, "as set", "gaussian", *default, error_drt=0.011, sensor=57.71),
+        row(DEFAULT, "as set", "drt", 60.0, 25.0, error_drt=0.010, sensor=57.72),
+        row("f_number", "4", "paraxial", 33.0, 22.0, error_drt=0.012, sensor=57.85),
+        row("f_number", "4", "fourier", 33.0, 22.0, error_drt=0.012, sensor=57.84),
+        row("f_number", "4", "gaussian", *other, error_drt=0.010, sensor=57.75),
+        row("f_number", "4", "drt", 50.0, 25.0, error_drt=0.010, sensor=57.76),
+    ]
+
+
+def test_every_factor_is_varied_alone_and_three_together():
+    base = dataclasses.replace(SMALL, tol=0.02)
+    found = cases(base)
+    usual = {f.name: getattr(base, f.name) for f in dataclasses.fields(Settings)}
+    seen = {}
+    for case in found:
+        changed = {name for name, value in usual.items() if getattr(case.settings, name) != value and name != "model"}
+        if case.factor == COMBINED:
+            assert changed <= {"f_number", "noise", "normalise"}
+        else:
+            assert changed <= {case.factor}
+            seen.setdefault((case.factor, case.settings.model), []).append(case.value)
+    assert seen["f_number", "gaussian"] == ["3", "4", "5", "6.5"]
+    assert seen["rho", "paraxial"] == ["0.3", "0.5", "0.7"]
+    assert {model for factor, model in seen if factor == "rho"} == {"paraxial"}
+    assert seen["noise", "drt"] == ["0.01", "0.1"]
+    assert seen["normalise", "fourier"] == ["window", "energy"]
+    assert seen["start", "paraxial"] == ["paraxial", "rms"]
+    assert len({case.settings for case in found if case.factor == COMBINED}) == 4 * 2 * 2 * 4
+
+
+def test_rows_are_the_optima_and_none_is_sought_twice(monkeypatch, tmp_path):
+    """Two factors of a small window: the rows against `closed_form` itself."""
+    monkeypatch.setattr(module, "MODELS", ("gaussian",))
+    factors = [dataclasses.replace(one, models=("gaussian",)) for one in module.FACTORS if one.name != "rho"]
+    factors = [one for one in factors if one.name in ("noise", "start")]
+    factors = [one if one.name == "start" else dataclasses.replace(one, values=(0.01,)) for one in factors]
+    sought = []
+    monkeypatch.setattr(module, "closed_form", lambda *given: sought.append(given[1]) or closed_form(*given))
+    lens = read_lens(shipped("lenses") / "double_gauss.zmx")
+    spectrum = power_spectrum(dead_leaves(4, size=48), 22)
+    rows = sweep(lens, SMALL, spectrum, factors=factors)
+    assert len(sought) == len(set(sought)) == 3  # default, less noise, start at the best spot
+    expected = closed_form(lens, dataclasses.replace(SMALL, noise=0.01), spectrum)
+    (found,) = (one for one in rows if one.value == "0.01" and one.factor == "noise")
+    assert (found.sensor_mm, found.error_drt) == (expected.sensor_mm, expected.error_drt)
+    # Less noise, less error; and the optimum is no matter of the start: to a micrometre.
+    default, less, begun, best = rows
+    assert less.error < default.error
+    assert (begun.value, best.value) == ("paraxial", "rms")
+    assert best.sensor_mm == pytest.approx(begun.sensor_mm, abs=1e-3)
+    assert begun.sensor_mm == default.sensor_mm
+    write_sweep(rows, tmp_path / "sweep.csv")
+    with open(tmp_path / "sweep.csv", newline="") as file:
+        read = list(csv.DictReader(file))
+    assert tuple(read[0]) == COLUMNS == (
+        "factor", "value", "model", "sensor_mm", "focus_paraxial_m", "focus_rms_m", "error", "error_drt",
+    )  # fmt: skip
+    assert [float(one["sensor_mm"]) for one in read] == [one.sensor_mm for one in rows]
+
+
+def test_a_factor_that_does_not_reach_a_model_leaves_it_as_it_was():
+    rows = [*known(default=(100.0, 31.0), other=(55.0, 30.0)), row("rho", "0.3", "paraxial", 31.0, 18.0)]
+    found = {one.text: one for one in readings(rows)}
+    assert list(found) == ["as set", "F/4", "ρ 0.3"]
+    assert found["ρ 0.3"].of["gaussian"] is found["as set"].of["gaussian"]
+    assert found["ρ 0.3"].of["paraxial"].focus_paraxial_m == 31.0
+    assert found["as set"].penalty("paraxial") == pytest.approx(0.2)
+    assert found["F/4"].penalty("gaussian") == 0
+    repeated = [*rows, *(dataclasses.replace(one, factor="noise", value="0.1") for one in rows[:4])]
+    assert [one.text for one in distinct(readings(repeated))] == ["as set", "F/4", "ρ 0.3"]
+
+
+def test_the_papers_numbers_answer_yes_by_the_definition_that_has_them():
+    by_paraxial = answers(readings(known(default=(100.0, 31.0), other=(27.0, 30.0))))
+    assert [one.appears for one in by_paraxial] == [True, False, False]
+    one = by_paraxial[0]
+    assert (one.readings, one.nearer, one.closest, one.pair) == (2, 1, "F/4", (33.0, 27.0))
+    assert (one.least, one.greatest) == (-6.0, 66.0)
+    by_own = answers(readings(known(default=(math.inf, 28.0), other=(55.0, 30.0))))
+    assert [one.appears for one in by_own] == [False, False, True]
+    assert by_own[0].greatest == math.inf  # the default, at infinity
+    assert by_own[2].closest == "as set"
+    neither = answers(readings(known(default=(100.0, 31.0), other=(55.0, 30.0))))
+    assert [one.appears for one in neither] == [False] * 3
+    assert [one.nearer for one in neither] == [0, 0, 2]
+
+
+def test_the_page_answers_and_keeps_what_was_written_below():
+    rows = known(default=(math.inf, 31.0), other=(55.0, 30.0))
+    text = page(rows, SMALL, lens="double_gauss", pictures="6 pictures", kept="By hand.")
+    command = text.splitlines()[2].strip()
+    assert command.startswith("raytrace codesign sweep double_gauss --data DIR --docs docs ")
+    assert "--patch 16" in command
+    assert "**No.** In no reading do both numbers appear within 2 m of the paper's" in text
+    assert "nearer one only when focus is each model's own (in 2 of 2 readings)" in text
+    assert "| as set | 34.0 / 20.0 | 35.0 / 21.0 | ∞ / 31.0 | 60.0 / 25.0 | -100 |" in text
+    assert "| F/4 | +20.0 % | +20.0 % | +0.0 % | +0.0 % |" in text
+    assert "| Gaussian DRT loses 2 % or less | 1 of 2 | +0.0 % to +10.0 % |" in text
+    assert below_the_mark(text) == "By hand."
+    yes = page(known(default=(27.0, 31.0), other=(55.0, 30.0)), SMALL, lens="", pictures="")
+    assert "**Yes.** Both numbers appear when focus is the paraxial conjugate." in yes
+
+
+def test_the_figure_has_a_panel_for_each_factor_and_definition_and_a_place_for_infinity():
+    rows = [*known(default=(100.0, 31.0), other=(math.inf, 30.0)), row("rho", "0.3", "paraxial", 31.0, 18.0)]
+    figure = sweep_figure(readings(rows))
+    assert len(figure.axes) == 4
+    aperture = figure.axes[0]
+    assert [text.get_text() for text in aperture.get_xticklabels()] == ["F/4"]
+    ((gaussian,),) = (line.get_ydata() for line in aperture.lines if line.get_label() == "Gaussian DRT")
+    assert gaussian == 0  # -1/∞
+    assert "∞" in [text.get_text() for text in aperture.get_yticklabels()]
+    assert [line.get_label() for line in figure.axes[1].lines if not line.get_label().startswith("_")] == ["paraxial"]
+
+
+@pytest.fixture
+def quick(monkeypatch, tmp_path):
+    """The command with optima that cost nothing, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("RAYTRACE_TRACEBACK", raising=False)
+
+    def instantly(lens, settings, spectrum):
+        assert spectrum.dtype == torch.float64
+        far = settings.model == "gaussian" and settings.noise == 0.01
+        return module.Optimum(settings.model, 57.8, math.inf if far else 33.0, 20.0, 0.01, 0.01, {}, ())
+
+    monkeypatch.setattr(module, "closed_form", instantly)
+
+
+def test_the_command_writes_table_figure_and_page(quick, capsys):
+    command = ["codesign", "sweep", "double_gauss", "--limit", "2", "--docs", "docs"]
+    assert main([*command, "--json"]) == 0
+    out, err = capsys.readouterr()
+    document = json.loads(out, parse_constant=pytest.fail)
+    assert len(document["rows"]) == len(cases(Settings()))
+    assert {one["focus_paraxial_m"] for one in document["rows"] if one["value"] == "0.01"} == {33.0, None}
+    assert [one["appears"] for one in document["answers"]] == [False] * 3
+    assert err.endswith("raytrace: written: docs/codesign_sweep.md\n")
+    text = Path("docs/codesign_sweep.md").read_text(encoding="utf-8")
+    with open("docs/codesign/sweep.csv", newline="") as file:
+        assert len(list(csv.DictReader(file))) == len(document["rows"])
+    for name in re.findall(r"\((codesign/sweep\.\w+)\)", text):
+        assert (Path("docs") / name).stat().st_size > 0
+    Path("docs/codesign_sweep.md").write_text(f"{text}\nBy hand.\n", encoding="utf-8")
+    assert main(command) == 0
+    assert "the paraxial conjugate: Gaussian DRT focused nearer than paraxial in 0 of" in capsys.readouterr().out
+    assert Path("docs/codesign_sweep.md").read_text(encoding="utf-8") == f"{text.rstrip()}\nBy hand.\n"
+    assert KEPT in text
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([], "no folder to write to: give --docs DOCS or -o FOLDER"),
+        (["--model", "drt", "-o", "out"], "--model belongs to codesign LENS"),
+        (["--models", "drt", "-o", "out"], "--models belongs to codesign compare LENS"),
+        (["--resume", "-o", "out"], "--resume belongs to codesign LENS and codesign compare LENS"),
+        (["--loss", "spectral", "-o", "out"], "--loss spectral belongs to codesign LENS"),
+    ],
+)
+def test_words_and_options_that_do_not_fit(quick, capsys, options, message):
+    assert main(["codesign", "sweep", "double_gauss", "--limit", "2", *options]) == 1
+    out, err = capsys.readouterr()
+    assert (out, len(err.splitlines())) == ("", 1), err
+    assert message in err
+
+
+def test_models_are_those_of_the_command_line():
+    """They are written twice, for the help imports no torch."""
+    assert codesign_table.MODELS == MODELS
