@@ -103,6 +103,11 @@ def bessel_j0(x: Tensor) -> Tensor:
     return _J0.apply(x)
 
 
+def bessel_j1(x: Tensor) -> Tensor:
+    """J₁ with its derivatives (those of torch.special detach silently)."""
+    return _J1.apply(x)
+
+
 def rings_and_arms(phase: float, order: int) -> tuple[int, int]:
     """Gauss rings and arms that integrate waves whose phase varies by `phase` radians along a pupil radius.
 

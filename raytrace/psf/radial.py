@@ -110,8 +110,13 @@ def _wave_rule(rows: int, columns: int, nodes: int, count: int) -> tuple[np.ndar
     node, weight = (a / 2 for a in np.polynomial.legendre.leggauss(nodes))
     places = _distinct(rows, columns)[0]
     x, y = (places[:, axis, None] + node for axis in (0, 1))
-    turn = np.arccos(np.minimum(np.hypot(x[:, :, None], y[:, None, :]) / corner, 1.0))
-    pixels = np.stack([np.einsum("uab,a,b->u", np.cos(m * turn), weight, weight) for m in terms], -1)
+    # T_2m by its recurrence in T_2: a tenth of the time of as many cosines.
+    twice = 2 * (2 * np.minimum(np.hypot(x[:, :, None], y[:, None, :]) / corner, 1.0) ** 2 - 1)
+    previous, current = 0.5 * twice, np.ones_like(twice)  # T_-2 = T_2, T_0
+    pixels = np.empty((len(places), count))
+    for m in range(count):
+        pixels[:, m] = np.einsum("uab,a,b->u", current, weight, weight, optimize=True)
+        previous, current = current, twice * current - previous
     return corner * np.cos(angle), pixels @ series
 
 
