@@ -1,0 +1,231 @@
+"""`raytrace wave psf` and `raytrace wave focus`."""
+
+import argparse
+import math
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+from tqdm import tqdm
+
+from raytrace import plot
+from raytrace.cli.door import CommandError, number, print_json, say
+from raytrace.cli.wave_setup import elements, kernels, scene
+from raytrace.design.focusing import Learned, Setting, learn_to_focus
+from raytrace.files import write_atomically
+from raytrace.grid import Grid, centres
+from raytrace.plot import SUFFIXES
+from raytrace.plot import wave as figures
+from raytrace.plot.style import object_text
+from raytrace.wave.caustic import caustic
+from raytrace.wave.exchange import FORMATS, write_heights
+from raytrace.wave.psf import WavePsf
+from raytrace.wave.scene import WaveScene, is_smooth
+
+_PLANES = 121  # of a caustic
+_SHOWN = (0, 5, 10, 20, 40, 80, 160)  # steps of learning that the figure shows
+
+
+def psf(arguments: argparse.Namespace) -> None:
+    """Kernels over depth × wavelength: print, draw, save."""
+    arrays, pictures = _outputs(arguments.output)
+    more = {name: getattr(arguments, name) for name in ("heights", "caustic", "encircled") if getattr(arguments, name)}
+    for name, path in more.items():
+        _refuse_suffix(f"--{name}", path, tuple(SUFFIXES))
+    parts = elements(arguments)
+    seen = scene(arguments, parts)
+    found = kernels(seen, engine=arguments.engine, samples=arguments.samples, tol=arguments.tol)
+    for path in arrays:
+        write_atomically(path, lambda file: save(found, arguments.element, file))
+    for path in pictures:
+        plot.save(figures.psf_figure(found, title=_title(arguments)), path)
+    for name, path in more.items():
+        plot.save(_FIGURES[name](arguments, seen, found), path)
+    if arguments.json:
+        print_json(_document(found, arguments))
+    else:
+        _print(found, arguments)
+    for path in (*arguments.output, *more.values()):
+        say(f"written: {path}")
+
+
+def _heights(arguments: argparse.Namespace, seen: WaveScene, found: WavePsf) -> Figure:
+    """Of the element of most detail: one that is wrapped or sampled, else the first."""
+    part = next((element for element in seen.elements if not is_smooth(element)), seen.elements[0])
+    return figures.height_figure(part, title=_title(arguments))
+
+
+def _caustic(arguments: argparse.Namespace, seen: WaveScene, found: WavePsf) -> Figure:
+    """Planes from four fifths of the sensor distance to six fifths; light up to a tenth of the aperture."""
+    z = seen.sensor_distance
+    distances, half = z * torch.linspace(0.8, 1.2, _PLANES, dtype=z.dtype), 0.05 * arguments.aperture
+    planes = tqdm(distances, desc="planes", disable=None)
+    light = torch.cat([caustic(seen, plane[None], half=half) for plane in planes], -2)
+    return figures.caustic_figure(
+        light,
+        distances,
+        half=half,
+        wavelengths=arguments.wavelength,
+        depths=arguments.depth,
+        sensor=arguments.sensor,
+        title=_title(arguments),
+    )
+
+
+def _encircled(arguments: argparse.Namespace, seen: WaveScene, found: WavePsf) -> Figure:
+    return figures.encircled_figure(found, title=_title(arguments))
+
+
+_FIGURES = {"heights": _heights, "caustic": _caustic, "encircled": _encircled}
+
+
+def _outputs(paths: list[str]) -> tuple[list[str], list[str]]:
+    """Names of arrays and of figures, by suffix."""
+    for path in paths:
+        _refuse_suffix("-o", path, (".npz", *SUFFIXES))
+    arrays = [path for path in paths if Path(path).suffix.lower() == ".npz"]
+    return arrays, [path for path in paths if path not in arrays]
+
+
+def _refuse_suffix(option: str, path: str, known: tuple[str, ...]) -> None:
+    if Path(path).suffix.lower() not in known:
+        raise CommandError(f"{option} {path}: expected a name that ends in {', '.join(known)}")
+
+
+def save(found: WavePsf, element: str, file) -> None:
+    """Write the arrays of `-o`: psf[depth, wavelength, y, x] and what belongs to it."""
+    np.savez_compressed(
+        file,
+        psf=found.kernel.detach().numpy(),
+        pixel_pitch=float(found.pitch),
+        centre=found.grid.centre.detach().numpy(),
+        energy=found.energy.detach().numpy(),
+        depths=found.depths.detach().numpy(),
+        wavelengths=found.wavelengths.detach().numpy(),
+        engine=found.engine,
+        samples=found.plan.samples,
+        error=found.error,
+        element=element,
+    )
+
+
+def half_energy_radius(kernel: Tensor, window: Grid) -> Tensor:
+    """Radius (...) mm about the axis that holds half of all light through the aperture; inf where the window does not.
+
+    Pixels count by the distance of their centres: good to half a pixel.
+    """
+    x, y = centres(window)
+    distance, order = torch.sqrt(x * x + (y * y)[:, None]).flatten().sort()
+    held = kernel.flatten(-2)[..., order].cumsum(-1)
+    inside = (held < 0.5).sum(-1)
+    radius = distance[inside.clamp(max=len(distance) - 1)]
+    return torch.where(inside < len(distance), radius, math.inf)
+
+
+def _document(found: WavePsf, arguments: argparse.Namespace) -> dict:
+    """What `raytrace wave psf --json` writes; an infinite depth is null."""
+    radius = half_energy_radius(found.kernel, found.grid)
+    results = [
+        {
+            "depth": number(depth),
+            "wavelength": number(wavelength),
+            "energy": number(found.energy[d, w]),
+            "peak": number(found.kernel[d, w].max()),
+            "half_energy_radius": number(radius[d, w]),
+        }
+        for d, depth in enumerate(found.depths)
+        for w, wavelength in enumerate(found.wavelengths)
+    ]
+    return {
+        "element": arguments.element,
+        "engine": found.engine,
+        "samples": found.plan.samples,
+        "error": number(found.error),
+        "pixel_pitch": number(found.pitch),
+        "size": found.grid.rows,
+        "exact": arguments.exact,
+        "results": results,
+    }
+
+
+def _title(arguments: argparse.Namespace) -> str:
+    name = Path(arguments.element).name
+    return f"{name}, ⌀ {arguments.aperture:g} mm, sensor at {arguments.sensor:g} mm"
+
+
+def _print(found: WavePsf, arguments: argparse.Namespace) -> None:
+    print(_title(arguments))
+    print(
+        f"{found.engine} engine, {found.plan.samples} samples, predicted error {found.error:.1e}; "
+        f"{found.grid.columns} × {found.grid.rows} pixels of {1e3 * float(found.pitch):g} µm"
+    )
+    print(f"{'object':>12} {'wavelength':>11} {'energy':>8} {'peak':>10} {'half-energy':>12}")
+    print(f"{'':>12} {'µm':>11} {'window':>8} {'pixel':>10} {'radius, µm':>12}")
+    radius = half_energy_radius(found.kernel, found.grid)
+    for d, depth in enumerate(found.depths.tolist()):
+        for w, wavelength in enumerate(found.wavelengths.tolist()):
+            half = float(radius[d, w])
+            print(
+                f"{object_text(depth):>12} {wavelength:>11g} {float(found.energy[d, w]):>8.4f} "
+                f"{float(found.kernel[d, w].max()):>10.6f} {f'{1e3 * half:.2f}' if math.isfinite(half) else '–':>12}"
+            )
+
+
+def focus(arguments: argparse.Namespace) -> None:
+    """A flat plate learns to be a lens: print, draw, save."""
+    if arguments.plot:
+        _refuse_suffix("--plot", arguments.plot, tuple(SUFFIXES))
+    if arguments.output:
+        _refuse_suffix("-o", arguments.output, tuple(FORMATS))
+    setting = Setting(
+        method=arguments.method, samples=arguments.samples, seed=arguments.seed, collimator=arguments.collimator
+    )
+    began = time.perf_counter()
+    with tqdm(total=arguments.steps, desc="learning", unit="step", disable=None) as bar:
+
+        def progress(step: int, ratio: float) -> None:
+            bar.set_postfix_str(f"peak {ratio:.3f} of the ideal lens's")
+            bar.update(min(1, step))
+
+        found = learn_to_focus(setting, steps=arguments.steps, frames=_SHOWN, progress=progress)
+    seconds = time.perf_counter() - began
+    if arguments.output:
+        write_heights(found.element.profile, arguments.output)
+    if arguments.plot:
+        plot.save(figures.focus_figure(found, title=_goal(found)), arguments.plot)
+    if arguments.json:
+        print_json(_course(found) | {"seconds": seconds})
+    else:
+        _print_course(found, seconds)
+    for path in filter(None, (arguments.output, arguments.plot)):
+        say(f"written: {path}")
+
+
+def _course(found: Learned) -> dict:
+    """What `raytrace wave focus --json` writes, but for the seconds."""
+    return {
+        "peak_ratio": found.peak_ratios[-1],
+        "initial_peak_ratio": found.peak_ratios[0],
+        "steps": found.steps,
+        "residual_waves": found.residual,
+        "flat_pixels_peak_ratio": found.flat_ratio,
+        "flat_pixels_best": found.flat_bound,
+        "method": found.setting.method,
+        "collimator": found.setting.collimator,
+        "loss": found.losses[-1] if found.losses else None,
+    }
+
+
+def _goal(found: Learned) -> str:
+    words = "A flat plate learns to collimate" if found.setting.collimator else "A flat plate learns to focus"
+    return f"{words}: {found.setting.samples}² heights, peak {found.peak_ratios[-1]:.3f} of the ideal lens's"
+
+
+def _print_course(found: Learned, seconds: float) -> None:
+    print(_goal(found))
+    print(f"from {found.peak_ratios[0]:.4f} in {found.steps} steps, {seconds:.1f} s")
+    print(f"phase that is left: {found.residual:.4f} waves RMS")
+    print(f"if its pixels are flat: {found.flat_ratio:.3f}, of the {found.flat_bound:.3f} that such pixels can reach")

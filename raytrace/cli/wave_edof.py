@@ -1,0 +1,235 @@
+"""`raytrace wave edof` and `raytrace wave table`: elements of extended depth of field, learned and compared."""
+
+import argparse
+import dataclasses
+import json
+import math
+from collections.abc import Iterable
+from pathlib import Path
+
+import torch
+from tqdm import tqdm
+
+from raytrace.cli.door import CommandError, number, print_json, say
+from raytrace.design.edof import Quality, World, periodic, quality, scene, spectrum
+from raytrace.design.edof_page import CAPTIONS, markdown
+from raytrace.design.edof_table import NAMES, TALK, Content, records, restored_scene, table_of, write_records
+from raytrace.design.edof_training import EdofCamera, Settings, begin, learn_element
+from raytrace.design.report import below_the_mark
+from raytrace.design.training import NotFinite, OtherSettings
+from raytrace.files import write_atomically
+from raytrace.pictures import NoPictures, Pictures, dead_leaves, files, read, split
+from raytrace.plot import edof as drawn
+from raytrace.plot.style import save
+from raytrace.wave.element import Element
+from raytrace.wave.exchange import write_heights
+from raytrace.wave.fabrication import as_made, as_pixels
+from raytrace.wave.psf import psf
+
+_WIDE = 512  # pixels of a period that is restored
+_LEAVES = 40  # pictures of dead leaves
+#: Contents of dead leaves: name -> smallest radius, pixels.
+LEAVES = {"sharp leaves": 2.5, "smooth leaves": 8.0}
+
+
+def edof(arguments: argparse.Namespace) -> None:
+    """Learn one element, or go on with it; then say what it is worth."""
+    world, settings = World(), _settings(arguments)
+    train, test = _pictures(arguments)
+    folder = Path(arguments.output)
+    camera = _learn(settings, world, train, folder, f"{settings.kind}, seed {settings.seed}")
+    with torch.no_grad():
+        elements = camera.variables()
+        found = psf(scene(elements, world))
+        own = quality(
+            elements, world, train=periodic(train, _WIDE), test=periodic(test, _WIDE), seed=settings.seed, found=found
+        )
+    document = {"settings": dataclasses.asdict(settings), "world": dataclasses.asdict(world), **_plain(own)}
+    write_atomically(folder / "outcome.json", lambda file: file.write(json.dumps(document, indent=1).encode()))
+    profile = as_made(elements[0]).profile if settings.kind == "rings" else as_pixels(elements[0], world.pixel).profile
+    write_heights(profile, folder / "heights.npy")
+    if arguments.plot:
+        save(drawn.element_figure(elements, found, own, world), arguments.plot)
+    if arguments.json:
+        print_json(document)
+    else:
+        _print_quality(own, world)
+    say(f"written: {folder / 'outcome.json'}, {folder / 'heights.npy'}")
+
+
+def table(arguments: argparse.Namespace) -> None:
+    """Every row on every content; the page where --docs asks for it."""
+    unknown = set(arguments.rows or ()) - set(NAMES)
+    if unknown:
+        raise CommandError(f"--rows {' '.join(sorted(unknown))}: expected {', '.join(NAMES)}")
+    world = World()
+    contents, train = _contents(arguments)
+    learned = _learned(arguments, world, train)
+    found = table_of(contents, world, learned, rows=arguments.rows, progress=lambda given: _bar(given, "rows"))
+    if arguments.docs:
+        _write_page(Path(arguments.docs), found, learned, world, arguments)
+    if arguments.json:
+        print_json(
+            {
+                "rows": [
+                    {k: v if isinstance(v, str) else number(v) if v is not None else None for k, v in record.items()}
+                    for record in records(found)
+                ]
+            }
+        )
+    else:
+        _print_table(found)
+
+
+def _settings(arguments: argparse.Namespace) -> Settings:
+    kind = arguments.element
+    return Settings(
+        kind=kind,
+        glass=arguments.glass or ("F_SILICA" if kind == "rings" else "PMMA"),
+        terms=arguments.terms or (36 if kind == "zernike" else 7),
+        levels=arguments.levels or 0,
+        loss=arguments.loss,
+        restoration=arguments.filter if arguments.loss == "images" else "blind",
+        optimizer=arguments.optimizer,
+        schedule=arguments.schedule,
+        rate=arguments.rate,
+        steps=arguments.steps,
+        starts=arguments.starts,
+        tolerance=arguments.tolerance or 0.0,
+        seed=arguments.seed,
+    )
+
+
+def _learn(settings: Settings, world: World, train: Pictures, folder: Path, label: str) -> EdofCamera:
+    """A learned camera, trained as far as is left, with a bar."""
+    S = spectrum(periodic(train, settings.size))
+    try:
+        camera, run = begin(settings, world, S, folder, progress=lambda given: _bar(given, f"{label}: starts"))
+        bar, last = None, None
+        for step, record in learn_element(camera, train, settings, run):
+            bar = bar or tqdm(total=settings.steps, initial=step, desc=label, unit="step", disable=None)
+            bar.set_postfix_str(f"loss {record['loss']:.6f}", refresh=False)
+            bar.update()
+            last = record
+        if bar is not None:
+            bar.close()
+            say(f"{label}: loss {last['loss']:.6f} after {settings.steps} steps")
+        else:
+            say(f"{label}: finished before, nothing to learn")
+    except (NotFinite, OtherSettings) as error:
+        raise CommandError(str(error)) from error
+    return camera
+
+
+def _pictures(arguments: argparse.Namespace) -> tuple[Pictures, Pictures]:
+    """To learn from, and to restore."""
+    if not arguments.data:
+        return split(dead_leaves(_LEAVES, size=_WIDE // 2, seed=arguments.seed, smallest=LEAVES["sharp leaves"]))
+    return split(_from_folder(arguments))
+
+
+def _from_folder(arguments: argparse.Namespace) -> Pictures:
+    try:
+        paths = files(arguments.data)
+        paths = [paths[i * len(paths) // arguments.limit] for i in range(min(arguments.limit, len(paths)))]
+        return read(list(dict.fromkeys(paths)), least=_WIDE // 2, progress=lambda given: _bar(given, "pictures"))
+    except NoPictures as error:
+        raise CommandError(str(error)) from error
+
+
+def _contents(arguments: argparse.Namespace) -> tuple[list[Content], Pictures]:
+    """All contents of the table, and the pictures that elements are learned from: sharp leaves."""
+    made = {
+        name: dead_leaves(_LEAVES, size=_WIDE // 2, seed=arguments.seed, smallest=smallest)
+        for name, smallest in _bar(LEAVES.items(), "dead leaves")
+    }
+    learn_from = split(made["sharp leaves"])[0]
+    if arguments.data:
+        made["pictures"] = _from_folder(arguments)
+    parts = {name: split(pictures) for name, pictures in made.items()}
+    contents = [Content(name, *(periodic(part, _WIDE) for part in both)) for name, both in parts.items()]
+    return contents, learn_from
+
+
+def _learned(arguments: argparse.Namespace, world: World, train: Pictures) -> dict[str, tuple[Element, ...]]:
+    """The learned rows that are asked for."""
+    common = {"steps": arguments.steps, "starts": arguments.starts, "seed": arguments.seed}
+    wanted = {
+        "learned-smooth": Settings(kind="smooth", glass="PMMA", **common),
+        "learned": Settings(kind="rings", **common),
+        "learned-16": Settings(kind="rings", levels=16, **common),
+    }
+    asked = {name: own for name, own in wanted.items() if arguments.rows is None or name in arguments.rows}
+    if asked and not arguments.output:
+        say("learned rows are left out: give -o FOLDER, where they are kept")
+        return {}
+    found = {}
+    for name, settings in asked.items():
+        camera = _learn(settings, world, train, Path(arguments.output) / name, NAMES[name])
+        with torch.no_grad():
+            found[name] = camera.variables()
+    return found
+
+
+def _write_page(docs: Path, found, learned, world: World, arguments: argparse.Namespace) -> None:
+    folder = docs / "wave"
+    folder.mkdir(parents=True, exist_ok=True)
+    write_records(found, folder / "table.csv")
+    made = _figures(found, learned, world, arguments.seed)
+    for name, figure in made.items():
+        save(figure, folder / name)
+    page = docs / "wave_edof.md"
+    kept = below_the_mark(page.read_text()) if page.exists() else ""
+    data = f"--data DIR --limit {arguments.limit} " if arguments.data else ""
+    command = f"raytrace wave table {data}-o FOLDER --docs docs"
+    text = markdown(found, learned, world, command=command, figures=[n for n in CAPTIONS if n in made], kept=kept)
+    write_atomically(page, lambda file: file.write(text.encode()))
+    say(f"written: {page}")
+
+
+def _figures(found, learned, world: World, seed: int) -> dict:
+    """Figures of the page, by file name. Only dead leaves are shown."""
+    made = {"depth.png": drawn.depth_figure(found, world)}
+    first = next(iter(found.values()))
+    if "fresnel" in first:
+        made["gain.png"] = drawn.gain_figure(found)
+    for name in ("learned", "learned-smooth"):
+        if name in learned:
+            kernels = psf(scene(learned[name], world))
+            made[f"{name}.png"] = drawn.element_figure(learned[name], kernels, first[name], world)
+    rows = [name for name in ("fresnel", "singlet", "ideal", "cubic-refractive", "learned") if name in first]
+    made["scene.png"] = drawn.scene_figure(*restored_scene(rows, learned, world, seed=seed))
+    return made
+
+
+def _print_quality(own: Quality, world: World) -> None:
+    print(f"{'object at':>12} {'Wiener':>9} {'blind':>9}   PSNR of restored pictures, dB")
+    for i, depth in enumerate(world.depths):
+        name = "infinity" if math.isinf(depth) else f"{depth / 1e3:.3g} m"
+        print(f"{name:>12} {own.by_depth['wiener'][i]:>9.2f} {own.by_depth['blind'][i]:>9.2f}")
+    print(f"{'mean':>12} {own.mean['wiener']:>9.2f} {own.mean['blind']:>9.2f}")
+    print(f"{'spread':>12} {own.spread['wiener']:>9.2f} {own.spread['blind']:>9.2f}")
+    lowest = min(min(row) for row in own.energy)
+    print(f"light inside the window of {world.size} × {world.size} pixels: {lowest:.3f} or more")
+
+
+def _print_table(found) -> None:
+    for content in found:
+        print(f"{content}: PSNR of restored pictures, dB (gain over the Fresnel lens)")
+        print(f"{'':>32} {'Wiener':>14} {'blind':>14} {'spread':>7} {'talk':>14}")
+        for record in (r for r in records(found) if r["content"] == content):
+            talk = f"{record['talk']:.2f} ({record['talk'] - TALK['fresnel']:+.2f})" if record["talk"] else ""
+            cells = [
+                f"{record[f]:.2f}" + ("" if record[f"gain_{f}"] is None else f" ({record[f'gain_{f}']:+.2f})")
+                for f in ("wiener", "blind")
+            ]
+            print(f"{NAMES[record['row']]:>32} {cells[0]:>14} {cells[1]:>14} {record['spread_blind']:>7.2f} {talk:>14}")
+        print()
+
+
+def _plain(own: Quality) -> dict:
+    return dataclasses.asdict(own)
+
+
+def _bar(given: Iterable, what: str):
+    return tqdm(list(given), desc=what, leave=False, disable=None)

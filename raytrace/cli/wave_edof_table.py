@@ -1,0 +1,97 @@
+"""The arguments of `raytrace wave edof` and `raytrace wave table`. Imports no torch."""
+
+import argparse
+
+from raytrace.cli.options import count, file_name, json, plot, positive_finite, seed_number
+
+KINDS = ("rings", "smooth", "zernike")
+
+_EDOF_DESCRIPTION = """\
+Learn a phase element that shows scenes from 0.5 m to infinity, in three colours, behind one linear filter: 5 mm
+aperture, sensor at 35.5 mm. rings: free heights of 2 µm rings of fused silica; smooth: seven polynomials of the radius
+in PMMA; zernike: Noll's polynomials on a PMMA lens, without symmetry.
+
+--loss spectral is the expected error of the best blind filter in closed form: deterministic, no pictures drawn.
+--loss images draws pictures, depths and noise as the original did, with the filter in the loop. Both begin from the
+best of several random starts of the smooth element. A run may be stopped at any moment; the same command goes on."""
+
+_EDOF_EXAMPLES = """examples:
+  raytrace wave edof -o rings --plot rings.png
+  raytrace wave edof --element smooth --starts 8 -o smooth --json
+  raytrace wave edof --element rings --levels 16 -o etched
+  raytrace wave edof --element zernike --loss images --filter towards --optimizer adadelta --rate 1 -o original
+  raytrace wave edof --data pictures --steps 300 -o run"""
+
+_TABLE_DESCRIPTION = """\
+PSNR of restored pictures over 0.5 m to infinity for every baseline and for learned elements, behind two filters: the
+Wiener filter of the 1 m kernel with the best constant, and the best linear one that knows no depth. On dead leaves of
+two sizes, and on real pictures with --data. What is learned is kept in FOLDER and read again."""
+
+_TABLE_EXAMPLES = """examples:
+  raytrace wave table --json
+  raytrace wave table --rows fresnel singlet achromat
+  raytrace wave table --data pictures -o learned --docs docs"""
+
+
+def _pictures(group) -> None:
+    group.add_argument(
+        "--data",
+        metavar="DIR",
+        type=file_name,
+        help="folder of pictures of 256 × 256 pixels or more; four fifths make the filters, the others are restored "
+        "(default: dead leaves)",
+    )
+    group.add_argument("--limit", metavar="N", type=count, default=80, help="take N of them, evenly (default 80)")
+    group.add_argument("--seed", metavar="N", type=seed_number, default=0, help="of every draw (default 0)")
+
+
+def _edof(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--element", choices=KINDS, default="rings", help="what is learned (default rings)")
+    parser.add_argument("--glass", metavar="NAME", help="default F_SILICA for rings, else PMMA")
+    parser.add_argument(
+        "--terms", metavar="N", type=count, help="polynomials of the smooth element (default 7), or Noll's last (36)"
+    )
+    parser.add_argument("--levels", metavar="N", type=count, help="etched in so many steps of a wave while learned")
+    parser.add_argument(
+        "--tolerance", metavar="MM", type=positive_finite, help="errors of height, drawn at every step (default none)"
+    )
+    group = parser.add_argument_group("learning")
+    group.add_argument("--loss", choices=("spectral", "images"), default="spectral", help="default spectral")
+    group.add_argument(
+        "--filter",
+        choices=("blind", "towards"),
+        default="blind",
+        help="of --loss images: the best blind one (default), or the original's, towards the measurement",
+    )
+    group.add_argument("--optimizer", choices=("adam", "sgd", "adadelta"), default="adam", help="default adam")
+    group.add_argument("--schedule", choices=("cosine", "linear", "constant"), default="cosine", help="default cosine")
+    group.add_argument("--rate", metavar="R", type=positive_finite, default=0.02, help="µm a step (default 0.02)")
+    group.add_argument("--steps", metavar="N", type=count, default=120, help="default 120")
+    group.add_argument("--starts", metavar="N", type=count, default=4, help="random starts (default 4)")
+    _pictures(parser.add_argument_group("pictures"))
+    parser.add_argument("-o", "--output", metavar="FOLDER", type=file_name, help="folder of the run", required=True)
+    json(parser)
+    plot(parser, "height map, PSFs over depth and colour, PSNR over depth")
+
+
+def _table(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--rows", metavar="ROW", nargs="+", help="only these (default: all)")
+    parser.add_argument("--steps", metavar="N", type=count, default=120, help="of learning (default 120)")
+    parser.add_argument("--starts", metavar="N", type=count, default=4, help="random starts (default 4)")
+    _pictures(parser.add_argument_group("pictures"))
+    parser.add_argument("-o", "--output", metavar="FOLDER", type=file_name, help="folder of learned elements")
+    parser.add_argument("--docs", metavar="DOCS", type=file_name, help="folder for wave_edof.md and wave/")
+    json(parser)
+
+
+EDOF = (
+    ("edof", "learn an element of extended depth of field", _EDOF_DESCRIPTION, _EDOF_EXAMPLES, _edof, "wave_edof.edof"),
+    (
+        "table",
+        "compare elements of extended depth of field",
+        _TABLE_DESCRIPTION,
+        _TABLE_EXAMPLES,
+        _table,
+        "wave_edof.table",
+    ),
+)

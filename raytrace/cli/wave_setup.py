@@ -1,0 +1,153 @@
+"""What the subcommands of `raytrace wave` share: the element that the arguments name, its scene, and PSFs of it."""
+
+import argparse
+import dataclasses
+import difflib
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from raytrace.catalog import find_glass
+from raytrace.cli.door import CommandError, catalogs
+from raytrace.glass import check_wavelengths
+from raytrace.grid import grid
+from raytrace.wave.aim import Aim
+from raytrace.wave.aim import aim as aim_of
+from raytrace.wave.baselines import BASELINES, baseline
+from raytrace.wave.element import Element, Rings
+from raytrace.wave.exchange import FORMATS, read_heights
+from raytrace.wave.fabrication import wrapped
+from raytrace.wave.plan import Plan, plan
+from raytrace.wave.psf import WavePsf, psf
+from raytrace.wave.scene import WaveScene
+
+#: Named elements that are wrapped, and may be made in steps.
+STEPPED = ("fresnel", "multifocal", "cubic", "achromat", "hybrid")
+_WAVELENGTH = 0.55
+_PIECE = 1e9  # bytes: what would take more is computed kernel by kernel
+_MOST = 0.9  # of the machine's memory
+
+
+def aim(arguments: argparse.Namespace) -> Aim:
+    """What a named element is made for."""
+    return aim_of(
+        radius=0.5 * arguments.aperture,
+        sensor=arguments.sensor,
+        focus=arguments.focus,
+        wavelength=arguments.design_wavelength or _WAVELENGTH,
+        exact=arguments.exact,
+    )
+
+
+def elements(arguments: argparse.Namespace) -> tuple[Element, ...]:
+    """The elements in contact that --element names: a baseline, or a height map."""
+    name = arguments.element
+    if name in BASELINES:
+        return _named(arguments)
+    if Path(name).suffix.lower() in FORMATS:
+        return (_from_file(arguments),)
+    near = difflib.get_close_matches(name, BASELINES, n=2, cutoff=0.5)
+    did_you_mean = f"; did you mean {' or '.join(near)}?" if near else ""
+    raise CommandError(
+        f"--element {name}: neither a named element ({', '.join(BASELINES)}) nor a height map "
+        f"({', '.join(FORMATS)}){did_you_mean}"
+    )
+
+
+def _named(arguments: argparse.Namespace) -> tuple[Element, ...]:
+    for option in ("glass", "pitch", "span"):
+        if getattr(arguments, option) is not None:
+            raise CommandError(f"--{option} belongs to a height map; the element {arguments.element} has its own")
+    if not arguments.levels:
+        return baseline(arguments.element, aim(arguments))
+    if arguments.element not in STEPPED:
+        raise CommandError(f"--levels: the element {arguments.element} is smooth; expected one of {', '.join(STEPPED)}")
+    return baseline(arguments.element, aim(arguments), levels=arguments.levels)
+
+
+def _from_file(arguments: argparse.Namespace) -> Element:
+    """A height map in the aperture; wrapped where a design wavelength or steps are given."""
+    path = arguments.element
+    glass = find_glass(arguments.glass or "PMMA", user=catalogs(arguments))
+    profile = read_heights(path, pitch=arguments.pitch, span=tuple(arguments.span) if arguments.span else None)
+    profile = dataclasses.replace(profile, heights=profile.heights.double(), pitch=profile.pitch.double())
+    counts = (2 * len(profile.heights),) if isinstance(profile, Rings) else profile.heights.shape
+    across = min(counts) * float(profile.pitch)
+    # What is cut to whole features may miss the rim by one of them.
+    if across + 2 * float(profile.pitch) < arguments.aperture:
+        raise CommandError(
+            f"{path}: the heights are {across:.6g} mm across, less than the aperture of {arguments.aperture:g} mm; "
+            f"give --aperture {across:.6g}"
+        )
+    radius = torch.tensor(0.5 * arguments.aperture, dtype=torch.float64)
+    element = Element(profile, radius, glass)
+    if arguments.design_wavelength or arguments.levels:
+        element = wrapped(element, arguments.design_wavelength or _WAVELENGTH, levels=arguments.levels or 0)
+    return element
+
+
+def check_colours(parts: Sequence[Element], wavelengths: Sequence[float]) -> None:
+    """Raises CommandError for a wavelength (µm) outside what a material is known for: thin elements live by n - 1."""
+    for glass in {element.glass.name: element.glass for element in parts}.values():
+        if glass.formula == "constant":
+            continue
+        check_wavelengths(glass, wavelengths)
+        low, high = glass.wavelength_range or (0.0, math.inf)
+        outside = [wavelength for wavelength in wavelengths if not low <= wavelength <= high]
+        if outside:
+            listed = ", ".join(f"{wavelength:g}" for wavelength in outside)
+            raise CommandError(f"{glass.name} is known from {low:g} to {high:g} µm, not at {listed} µm")
+
+
+def scene(arguments: argparse.Namespace, parts: Sequence[Element]) -> WaveScene:
+    """The scene of --depth, --wavelength, --pixel, --size and the camera's arguments."""
+    check_colours(parts, arguments.wavelength)
+    return WaveScene(
+        elements=tuple(parts),
+        sensor_distance=_double(arguments.sensor),
+        depths=_double(arguments.depth),
+        wavelengths=_double(arguments.wavelength),
+        grid=grid(_double(arguments.pixel), arguments.size),
+        exact=arguments.exact,
+    )
+
+
+@torch.no_grad()
+def kernels(found: WaveScene, *, engine: str, samples: int | None, tol: float) -> WavePsf:
+    """PSFs of a scene; where all at once would take too much memory, one after the other, with a bar.
+
+    Raises CommandError where one alone is more than the machine has.
+    """
+    chosen = plan(found, engine=engine, samples=samples, tol=tol)
+    count = len(found.depths) * len(found.wavelengths)
+    available = _MOST * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if chosen.memory / count > available:
+        raise CommandError(
+            f"{chosen.samples} samples take {chosen.memory / count / 1e9:.0f} GB a kernel, more than this machine has; "
+            "take fewer by --samples or --tol, or a smaller window"
+        )
+    if chosen.memory < _PIECE:
+        return psf(found, plan=chosen)
+    return _one_by_one(found, chosen)
+
+
+def _one_by_one(found: WaveScene, chosen: Plan) -> WavePsf:
+    rows = []
+    with tqdm(total=len(found.depths) * len(found.wavelengths), desc="kernels", disable=None) as bar:
+        for depth in found.depths.split(1):
+            row = []
+            for wavelength in found.wavelengths.split(1):
+                one = dataclasses.replace(found, depths=depth, wavelengths=wavelength)
+                row.append(psf(one, plan=chosen).kernel)
+                bar.update(1)
+            rows.append(torch.cat(row, 1))
+    return WavePsf(torch.cat(rows), found.depths, found.wavelengths, found.grid, chosen)
+
+
+def _double(numbers) -> Tensor:
+    return torch.tensor(numbers, dtype=torch.float64)

@@ -1,0 +1,67 @@
+"""The page of extended depth of field, as Markdown."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+from raytrace.design.edof import Quality, World
+from raytrace.design.edof_table import NAMES, TALK
+from raytrace.design.report import KEPT
+from raytrace.wave.element import Element
+
+CAPTIONS = {
+    "gain.png": "Gains over the Fresnel lens, by content and filter, beside the talk's.",
+    "depth.png": "PSNR over depth behind the best filter that does not know it.",
+    "scene.png": "A scene of dead leaves at three depths as each element's camera restores it (blind filter).",
+    "learned.png": "The learned element: rings of fused silica, its kernels over depth and colour, its PSNR.",
+    "learned-smooth.png": "The learned smooth element of PMMA.",
+}
+
+
+def markdown(
+    found: Mapping[str, Mapping[str, Quality]],
+    learned: Mapping[str, Sequence[Element]],
+    world: World,
+    *,
+    command: str,
+    figures: Sequence[str],
+    kept: str = "",
+) -> str:
+    """The page: command, world, tables, figures; `kept` below the mark."""
+    depths = ", ".join("infinity" if math.isinf(d) else f"{d / 1e3:.3g} m" for d in world.depths)
+    colours = ", ".join(f"{1e3 * w:.0f}" for w in world.wavelengths)
+    parts = [
+        "# Extended depth of field with one phase element",
+        f"    {command}",
+        f"Aperture {2 * world.radius:g} mm, sensor at {world.sensor_distance:g} mm, {colours} nm, objects at {depths}; "
+        f"pixels of {1e3 * world.pixel:g} µm, kernels of {world.size} × {world.size} pixels, light beyond them spread "
+        f"evenly as haze; noise of standard deviation {world.noise:g}. All lenses are made for "
+        f"{world.design / 1e3:g} m at 550 nm. Filters are made for pictures other than those restored. Learned "
+        "elements know only the spectrum of sharp dead leaves.",
+    ]
+    for content, rows in found.items():
+        parts += [f"## {content[0].upper()}{content[1:]}", _table(rows)]
+    parts.append(
+        "Mean PSNR over depths in dB, in brackets the gain over the Fresnel lens. Worst: the worst depth, spread: the "
+        "best less the worst, both of the blind filter. The talk: Sitzmann et al., SIGGRAPH 2018, of other pictures. "
+        "All figures: [table.csv](wave/table.csv)."
+    )
+    parts += [f"![{CAPTIONS[name]}](wave/{name})\n\n*{CAPTIONS[name]}*" for name in figures]
+    return "\n\n".join(parts) + f"\n\n{KEPT}\n{kept}"
+
+
+def _table(rows: Mapping[str, Quality]) -> str:
+    lines = [
+        "| element | Wiener, 1 m | best blind | worst | spread | light in window | the talk |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    base = rows.get("fresnel")
+    for name, own in rows.items():
+        cells = []
+        for filter in ("wiener", "blind"):
+            gain = f" ({own.mean[filter] - base.mean[filter]:+.2f})" if base and own is not base else ""
+            cells.append(f"{own.mean[filter]:.2f}{gain}")
+        talk = f"{TALK[name]:.2f} ({TALK[name] - TALK['fresnel']:+.2f})" if name in TALK else "–"
+        worst, light = min(own.by_depth["blind"]), min(min(row) for row in own.energy)
+        cells += [f"{worst:.2f}", f"{own.spread['blind']:.2f}", f"{light:.2f}", talk]
+        lines.append(f"| {' | '.join([NAMES[name], *cells])} |")
+    return "\n".join(lines)

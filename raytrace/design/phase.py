@@ -1,0 +1,91 @@
+"""Phase variables: the heights of a thin element as parameters of a module."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike
+from raytrace.zernike import noll, polynomials
+
+#: Of each kind of profile, the field that holds its numbers.
+NUMBERS = {Pixels: "heights", Rings: "heights", Zernike: "coefficients", EvenPowers: "coefficients"}
+
+
+class PhaseVariables(nn.Module):
+    """An element whose numbers are learned, alone or with others in contact.
+
+        numbers = start + unit · B c      c = `change`, from zero;   without a basis B = 1
+
+    element: where it starts; unit: mm of a change of 1, a micrometre by default, so that rates of learning read in µm.
+    basis: (numbers..., K), what the K changes add to its heights or coefficients: `radial_basis`, say.
+    others: elements in contact that stay as they are. tolerance: heights err by up to so many mm, evenly, by `draw`.
+    """
+
+    def __init__(
+        self,
+        element: Element,
+        *,
+        unit: float = 1e-3,
+        basis: Tensor | None = None,
+        others: Sequence[Element] = (),
+        tolerance: float = 0.0,
+    ):
+        super().__init__()
+        self.element, self.unit, self.others, self.tolerance = element, unit, tuple(others), tolerance
+        self.start = getattr(element.profile, NUMBERS[type(element.profile)])
+        self.basis = basis
+        shape = self.start.shape if basis is None else basis.shape[-1:]
+        if basis is not None and basis.shape[:-1] != self.start.shape:
+            raise ValueError(
+                f"a basis of {tuple(basis.shape)} for numbers of {tuple(self.start.shape)}: expected "
+                f"{(*self.start.shape, 'K')}"
+            )
+        self.change = nn.Parameter(torch.zeros(shape, dtype=self.start.dtype, device=self.start.device))
+
+    def numbers(self) -> Tensor:
+        """Heights or coefficients as they are now, mm."""
+        change = self.change if self.basis is None else self.basis @ self.change
+        return self.start + self.unit * change
+
+    def forward(self, *, draw: torch.Generator | None = None) -> tuple[Element, ...]:
+        """The element as it is now, and those in contact; draw: errors of fabrication are drawn from it."""
+        numbers = self.numbers()
+        if draw is not None and self.tolerance:
+            error = torch.rand(numbers.shape, generator=draw, dtype=numbers.dtype, device=numbers.device)
+            numbers = numbers + self.tolerance * (2 * error - 1)
+        profile = dataclasses.replace(self.element.profile, **{NUMBERS[type(self.element.profile)]: numbers})
+        return (dataclasses.replace(self.element, profile=profile), *self.others)
+
+
+def radial_powers(radius: Tensor, terms: int) -> Tensor:
+    """The same polynomials as even powers of r in mm: (terms, terms), a column each, for `EvenPowers` profiles.
+
+    Z_n0 = √(n + 1) Σ_s (-1)^s (n - s)!/(s! ((n/2 - s)!)²) (r/R)^(n - 2s);   piston is left out
+    """
+    found = torch.zeros(terms, terms, dtype=torch.float64)
+    for k in range(1, terms + 1):
+        for s in range(k):
+            share = math.factorial(2 * k - s) / (math.factorial(s) * math.factorial(k - s) ** 2)
+            found[k - s - 1, k - 1] = (-1) ** s * math.sqrt(2 * k + 1) * share
+    power = radius.detach() ** (-2.0 * torch.arange(1, terms + 1, dtype=torch.float64).to(radius))
+    return power[:, None] * found.to(radius)
+
+
+def radial_basis(element: Element, terms: int) -> Tensor:
+    """Zernike polynomials without angle, n = 2, 4, …, 2·terms, at the middles of an element's rings: (R, terms)."""
+    profile = element.profile
+    middle = (torch.arange(len(profile.heights), dtype=profile.heights.dtype) + 0.5) * profile.pitch
+    # Beyond the aperture polynomials grow without bound, and no light comes.
+    r = (middle / element.radius).clamp(max=1.0)
+    return polynomials([(2 * k, 0) for k in range(1, terms + 1)], r, torch.zeros_like(r)).T
+
+
+def zernike_basis(element: Element, terms: Sequence[int]) -> Tensor:
+    """Noll's polynomials of these numbers at the middles of an element's pixels: (rows, columns, K)."""
+    heights, pitch = element.profile.heights, element.profile.pitch
+    y, x = ((torch.arange(n, dtype=heights.dtype) - 0.5 * (n - 1)) * pitch / element.radius for n in heights.shape)
+    far = torch.sqrt(x * x + y[:, None] ** 2).clamp_min(1.0)
+    return polynomials([noll(j) for j in terms], x / far, y[:, None] / far).movedim(0, -1)

@@ -1,0 +1,233 @@
+"""Extended depth of field: haze, closed form against restored pictures, learning, resuming, the order of the table."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from raytrace.deconvolve import blind_filter, errors, psnr, wiener
+from raytrace.design.edof import (
+    World,
+    best_gamma,
+    best_of_starts,
+    expected_error,
+    mirrored,
+    periodic,
+    quality,
+    restored,
+    scene,
+    spectrum,
+    transfer,
+)
+from raytrace.design.edof_table import Content, elements_of, records, table_of
+from raytrace.design.edof_training import EdofCamera, Settings, begin, learn_element, scheduled
+from raytrace.design.phase import PhaseVariables, radial_basis, radial_powers, zernike_basis
+from raytrace.design.training import OtherSettings
+from raytrace.pictures import dead_leaves
+from raytrace.wave.aim import aim
+from raytrace.wave.baselines import baseline
+from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, height
+from raytrace.wave.psf import psf
+from raytrace.zernike import polynomials
+
+#: One colour, three depths, a window of 0.47 mm: a step takes milliseconds.
+SMALL = World(depths=(500.0, 1000.0, math.inf), wavelengths=(0.55,), size=64, pixel=0.00738)
+LEAVES = dead_leaves(8, size=64, seed=5, smallest=2.5)
+PICTURES = periodic(LEAVES, 128)
+S = spectrum(PICTURES)
+QUICK = Settings(kind="smooth", terms=4, starts=1, start_steps=5, steps=12, size=128, rate=0.05)
+
+
+def test_light_beyond_the_window_comes_back_as_haze():
+    """A picture of one shade keeps it; without haze it would darken by what misses the window."""
+    H = transfer(psf(scene(baseline("fresnel", aim()), World(depths=(1000.0,), size=32))), 64)
+    assert torch.allclose(H[..., 0, 0].real, torch.ones(1, 3, dtype=torch.float64), atol=1e-12)
+    flat = torch.full((1, 64, 64), 0.3, dtype=torch.float64)
+    seen, _ = restored(H[0], torch.ones_like(H[0]), flat, torch.zeros(1, 3, 64, 64, dtype=torch.float64))
+    torch.testing.assert_close(seen, flat[:, None].expand_as(seen), atol=1e-12, rtol=0)
+
+
+def test_periodic_pictures_have_no_seam_and_their_spectrum_adds_up():
+    picture = periodic(LEAVES, 128)[0]
+    assert torch.equal(picture, picture.flip(0))
+    assert torch.equal(picture[:, 0], picture[:, -1])
+    assert float(S.mean()) == pytest.approx(float(PICTURES.square().mean()), rel=1e-12)
+    with pytest.raises(ValueError, match="64 × 64 pixels, expected 100"):
+        periodic(LEAVES, 200)
+
+
+def test_the_closed_form_is_the_error_of_restored_pictures():
+    """Within 1 %: pictures of just this spectrum, noise drawn for each."""
+    elements = baseline("singlet", aim())
+    H = transfer(psf(scene(elements, SMALL)), 128)
+    random = torch.Generator().manual_seed(0)
+    noise = SMALL.noise * torch.randn(24, 1, 128, 128, generator=random, dtype=torch.float64)
+    many = PICTURES.repeat(3, 1, 1)
+    for G in (blind_filter(H, S, SMALL.noise), wiener(H[1], 0.01)):
+        expected = errors(H, S, SMALL.noise, filter=G)[:, 0]
+        found = [(restored(H_z, G, many, noise)[1] - many[:, None]).square().mean() for H_z in H]
+        torch.testing.assert_close(torch.stack(found), expected, rtol=0.01, atol=0)
+    own = quality(elements, SMALL, train=PICTURES, test=PICTURES)
+    predicted = psnr(errors(H, S, SMALL.noise).mean(1))
+    np.testing.assert_allclose(own.by_depth["blind"], predicted.numpy(), atol=0.1)
+    assert own.spread["blind"] == pytest.approx(max(own.by_depth["blind"]) - min(own.by_depth["blind"]))
+
+
+def test_the_best_gamma_is_no_worse_than_its_neighbours():
+    H = transfer(psf(scene(baseline("singlet", aim()), SMALL)), 128)
+    best = best_gamma(H, S, SMALL.noise, H[1])
+
+    def error(gamma):
+        return float(errors(H, S, SMALL.noise, filter=wiener(H[1], gamma)).mean())
+
+    assert error(best) <= min(error(0.8 * best), error(1.25 * best))
+
+
+def test_learning_gains_two_decibels_over_the_lens_it_begins_with():
+    """Thirty evaluations of the closed form, one colour (sharp lens at 1 m to extended depth of field)."""
+    lens = baseline("singlet", aim())[0]
+    powers = lens.profile.coefficients.new_zeros(5)
+    powers[:1] = lens.profile.coefficients
+    smooth = Element(EvenPowers(powers), lens.radius, lens.glass)
+    before = expected_error(transfer(psf(scene([smooth], SMALL)), 128), S, SMALL.noise)
+    best = best_of_starts(
+        lambda: PhaseVariables(smooth, basis=radial_powers(smooth.radius, 5)),
+        SMALL,
+        S,
+        starts=2,
+        spread=0.3,
+        steps=30,
+    )
+    after = expected_error(transfer(psf(scene(best(), SMALL)), 128), S, SMALL.noise)
+    assert float(psnr(after.detach()) - psnr(before.detach())) > 2
+
+
+@pytest.mark.parametrize("change", [{}, {"loss": "images", "restoration": "towards", "optimizer": "sgd", "rate": 0.5}])
+def test_a_run_that_is_broken_off_ends_as_if_it_had_not_been(tmp_path, change):
+    settings = dataclasses.replace(QUICK, **change)
+    ends = []
+    for name, stop in (("whole", None), ("broken", 7)):
+        for _ in range(1 if stop is None else 2):
+            camera, run = begin(settings, SMALL, S, tmp_path / name)
+            for step, _record in learn_element(camera, LEAVES, settings, run, every=5):
+                if step == stop:
+                    stop = None
+                    break
+        ends.append([p.detach().clone() for p in camera.parameters()])
+        assert [row["step"] for row in run.rows()] == list(range(settings.steps))
+    assert all(torch.equal(a, b) for a, b in zip(*ends, strict=True))
+    with pytest.raises(OtherSettings, match="rate was"):
+        begin(dataclasses.replace(settings, rate=0.01), SMALL, S, tmp_path / "whole")
+
+
+def test_pictures_teach_the_filter_of_the_original(tmp_path):
+    """Weight and target depth move with the heights, and the loss of the same draws falls."""
+    settings = dataclasses.replace(QUICK, loss="images", restoration="towards", steps=25, batch=4)
+    camera, run = begin(settings, SMALL, S, tmp_path / "run")
+    first = [float(camera.v), float(camera.t), camera.variables.change.detach().clone()]
+    losses = [record["loss"] for _, record in learn_element(camera, LEAVES, settings, run)]
+    assert float(camera.v) != first[0]
+    assert float(camera.t) != first[1]
+    assert not torch.equal(camera.variables.change, first[2])
+    assert np.mean(losses[-8:]) < np.mean(losses[:8])
+
+
+@pytest.mark.parametrize(("kind", "levels"), [("rings", 0), ("rings", 16), ("zernike", 0)])
+def test_every_kind_of_element_is_learned(tmp_path, kind, levels):
+    settings = dataclasses.replace(
+        QUICK, kind=kind, levels=levels, terms=11 if kind == "zernike" else 4, pitch=0.02, steps=6, spread=0.05
+    )
+    camera, run = begin(settings, SMALL, S, tmp_path / "run")
+    with torch.no_grad():
+        before = float(expected_error(camera.transfer(), S, SMALL.noise))
+    for _ in learn_element(camera, LEAVES, settings, run):
+        pass
+    with torch.no_grad():
+        after = float(expected_error(camera.transfer(), S, SMALL.noise))
+    assert after < before
+    (element, *_) = camera.variables()
+    if levels:
+        heights = torch.unique(torch.round(made_heights(element) / (float(element.period) / levels)).long())
+        assert len(heights) <= levels
+
+
+def made_heights(element):
+    r = (torch.arange(len(element.profile.heights), dtype=torch.float64) + 0.5) * element.profile.pitch
+    return height(element, r, torch.zeros_like(r)).detach()
+
+
+def test_schedules_are_functions_of_the_step():
+    assert scheduled("cosine", 0) == 1
+    assert scheduled("cosine", 1) == pytest.approx(0)
+    assert scheduled("linear", 0.25) == 0.75
+    assert scheduled("constant", 0.9) == 1
+
+
+def test_bases_are_zernike_polynomials():
+    r = torch.linspace(0, 2.5, 9, dtype=torch.float64)
+    powers = radial_powers(torch.tensor(2.5, dtype=torch.float64), 6)
+    orders = [(2 * k, 0) for k in range(1, 7)]
+    values = polynomials(orders, r / 2.5, torch.zeros_like(r))
+    constant = polynomials(orders, torch.zeros(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64))
+    series = (r[:, None] ** (2 * torch.arange(1, 7))) @ powers
+    torch.testing.assert_close(series, (values - constant).T, atol=1e-10, rtol=0)
+
+    like = torch.tensor(2.5, dtype=torch.float64)
+    rings = Element(Rings(torch.zeros(50, dtype=torch.float64), like / 50), like, baseline("singlet", aim())[0].glass)
+    middle = (torch.arange(50, dtype=torch.float64) + 0.5) / 50
+    torch.testing.assert_close(radial_basis(rings, 3), polynomials(orders[:3], middle, 0 * middle).T)
+    pixels = dataclasses.replace(rings, profile=Pixels(torch.zeros(4, 6, dtype=torch.float64), like / 3))
+    basis = zernike_basis(pixels, [2, 3])
+    assert basis.shape == (4, 6, 2)
+    # Tilt in x grows along a row, tilt in y along a column.
+    assert bool((basis[1, :, 0].diff() > 0).all())
+    assert bool((basis[:, 2, 1].diff() > 0).all())
+
+
+def test_heights_err_within_their_tolerance():
+    lens = baseline("fresnel", aim(), pitch=0.05)[0]
+    variables = PhaseVariables(lens, tolerance=2e-5)
+    draw = torch.Generator().manual_seed(1)
+    error = variables(draw=draw)[0].profile.heights - variables()[0].profile.heights
+    assert float(error.abs().max()) <= 2e-5
+    assert float(error.std()) == pytest.approx(2e-5 / math.sqrt(3), rel=0.2)
+    with pytest.raises(ValueError, match="a basis of"):
+        PhaseVariables(lens, basis=torch.zeros(3, 2, dtype=torch.float64))
+
+
+def test_mirrored():
+    found = mirrored(np.array([[1, 2], [3, 4]]))
+    assert found.tolist() == [[1, 2, 2, 1], [3, 4, 4, 3], [3, 4, 4, 3], [1, 2, 2, 1]]
+
+
+def test_the_table_says_what_it_knows():
+    content = Content("leaves", PICTURES[:6], PICTURES[6:])
+    found = table_of([content], SMALL, {}, rows=["fresnel", "singlet"])
+    rows = {record["row"]: record for record in records(found)}
+    assert rows["fresnel"]["gain_blind"] == 0
+    assert rows["fresnel"]["talk"] == 17.95
+    assert rows["singlet"]["gain_blind"] == pytest.approx(rows["singlet"]["blind"] - rows["fresnel"]["blind"])
+
+
+@pytest.mark.slow
+def test_the_order_of_the_talk(tmp_path):
+    """Fresnel < multifocal < cubic < hybrid, achromat < learned, in three colours (facts: only those two may swap)."""
+    world = World(size=128, pixel=0.00738)
+    pictures = periodic(dead_leaves(12, size=128, seed=1, smallest=2.5), 256)
+    content = Content("leaves", pictures[:8], pictures[8:])
+    spectrum_ = spectrum(content.train)
+    settings = Settings(steps=60, starts=2)
+    camera, run = begin(settings, world, spectrum_, tmp_path / "run")
+    for _ in learn_element(camera, LEAVES, settings, run):
+        pass
+    with torch.no_grad():
+        learned = {"learned": camera.variables()}
+    names = ["fresnel", "multifocal", "cubic", "hybrid", "achromat", "learned"]
+    assert elements_of("cubic", world, spectrum_)
+    found = table_of([content], world, learned, rows=names)["leaves"]
+    blind = {name: found[name].mean["blind"] for name in names}
+    assert blind["fresnel"] < blind["multifocal"] < blind["cubic"] < min(blind["hybrid"], blind["achromat"])
+    assert max(blind["hybrid"], blind["achromat"]) + 2 < blind["learned"]
+    assert isinstance(camera, EdofCamera)
