@@ -33,7 +33,7 @@ from raytrace.wave.psf import psf
 from raytrace.zernike import polynomials
 
 #: One colour, three depths, a window of 0.47 mm: a step takes milliseconds.
-SMALL = World(depths=(500.0, 1000.0, math.inf), wavelengths=(0.55,), size=64, pixel=0.00738)
+SMALL = World(depths=(500.0, 1000.0, math.inf), wavelengths=(0.55,), size=63, pixel=0.00738)
 LEAVES = dead_leaves(8, size=64, seed=5, smallest=2.5)
 PICTURES = periodic(LEAVES, 128)
 S = spectrum(PICTURES)
@@ -42,7 +42,7 @@ QUICK = Settings(kind="smooth", terms=4, starts=1, start_steps=5, steps=12, size
 
 def test_light_beyond_the_window_comes_back_as_haze():
     """A picture of one shade keeps it; without haze it would darken by what misses the window."""
-    H = transfer(psf(scene(baseline("fresnel", aim()), World(depths=(1000.0,), size=32))), 64)
+    H = transfer(psf(scene(baseline("fresnel", aim()), World(depths=(1000.0,), size=31))), 64)
     assert torch.allclose(H[..., 0, 0].real, torch.ones(1, 3, dtype=torch.float64), atol=1e-12)
     flat = torch.full((1, 64, 64), 0.3, dtype=torch.float64)
     seen, _ = restored(H[0], torch.ones_like(H[0]), flat, torch.zeros(1, 3, 64, 64, dtype=torch.float64))
@@ -76,13 +76,14 @@ def test_the_closed_form_is_the_error_of_restored_pictures():
 
 
 def test_the_best_gamma_is_no_worse_than_its_neighbours():
+    """For the kernel at 0.5 m, whose zeros must not be inverted."""
     H = transfer(psf(scene(baseline("singlet", aim()), SMALL)), 128)
-    best = best_gamma(H, S, SMALL.noise, H[1])
+    best = best_gamma(H, S, SMALL.noise, H[0])
 
     def error(gamma):
-        return float(errors(H, S, SMALL.noise, filter=wiener(H[1], gamma)).mean())
+        return float(errors(H, S, SMALL.noise, filter=wiener(H[0], gamma)).mean())
 
-    assert error(best) <= min(error(0.8 * best), error(1.25 * best))
+    assert error(best) < min(error(0.8 * best), error(1.25 * best))
 
 
 def test_learning_gains_two_decibels_over_the_lens_it_begins_with():
@@ -214,7 +215,7 @@ def test_the_table_says_what_it_knows():
 @pytest.mark.slow
 def test_the_order_of_the_talk(tmp_path):
     """Fresnel < multifocal < cubic < hybrid, achromat < learned, in three colours (facts: only those two may swap)."""
-    world = World(size=128, pixel=0.00738)
+    world = World(size=127, pixel=0.00738)
     pictures = periodic(dead_leaves(12, size=128, seed=1, smallest=2.5), 256)
     content = Content("leaves", pictures[:8], pictures[8:])
     spectrum_ = spectrum(content.train)

@@ -33,7 +33,7 @@ class World:
     """Where the camera works. Lengths in mm, wavelengths in µm.
 
     depths: of the scenes; design: the depth whose kernel the Wiener filter inverts; pixel, size: of the window of the
-    kernels; noise: standard deviation of the sensor's, for pictures in [0, 1].
+    kernels, an odd number, so that no picture is shifted; noise: standard deviation, for pictures in [0, 1].
     """
 
     radius: float = 2.5
@@ -42,7 +42,7 @@ class World:
     design: float = 1000.0
     wavelengths: tuple[float, ...] = (0.46, 0.55, 0.64)
     pixel: float = 0.00369
-    size: int = 256
+    size: int = 255
     noise: float = 0.01
     exact: bool = False
 
