@@ -6,6 +6,8 @@ and sends the few rays that fail to a bracketed search. It is one opaque operato
 `torch.compile` accept the data-dependent search inside; derivatives are attached by the caller.
 """
 
+from collections.abc import Callable, Sequence
+
 import torch
 from torch import Tensor
 
@@ -15,6 +17,9 @@ _NEWTON_STEPS = 24
 _BISECTIONS = 64
 _SAMPLES = 96
 _ACCEPTED_RESIDUAL = 64.0  # units of the rounding error of the terms of F
+
+#: (x, y) -> D, D_x, D_y (...) of what a sag has beside the asphere, and a bound on |D|.
+Extra = tuple[Callable[[Tensor, Tensor], Sequence[Tensor]], Tensor]
 
 
 def sag_and_derivatives(
@@ -71,6 +76,19 @@ def asphere_root(
 
 @torch.library.impl("raytrace::asphere_root", "CompositeExplicitAutograd")
 def _(foot: Tensor, direction: Tensor, curvature: Tensor, conic: Tensor, coefficients: Tensor, rim: float):
+    return search(foot, direction, curvature, conic, coefficients, rim)
+
+
+def search(
+    foot: Tensor,
+    direction: Tensor,
+    curvature: Tensor,
+    conic: Tensor,
+    coefficients: Tensor,
+    rim: float,
+    extra: Extra | None = None,
+) -> tuple[Tensor, Tensor]:
+    """What `asphere_root` does, outside of transforms; with `extra`, on a sag that is not symmetric about the axis."""
     batch = torch.broadcast_shapes(
         foot.shape[1:], direction.shape[1:], curvature.shape, conic.shape, coefficients.shape[1:]
     )
@@ -80,13 +98,13 @@ def _(foot: Tensor, direction: Tensor, curvature: Tensor, conic: Tensor, coeffic
     # A coefficient axis without batch is kept short: `polynomial` broadcasts it.
     a = coefficients[:, None] if coefficients.dim() == 1 else _expand(coefficients, batch).flatten(1)
 
-    t, residual_small, forward, radius = _newton(p, d, c, k, a, _start(p, d, c, k, rim))
+    t, residual_small, forward, radius = _newton(p, d, c, k, a, _start(p, d, c, k, rim), extra)
     converged = residual_small & forward
     good = converged & (radius <= rim)
     if not bool(good.all()):
         few = ~good
         subset = a if a.shape[1] == 1 else a[:, few]
-        t_few, found = _bracketed(p[:, few], d[:, few], c[few], k[few], subset, rim)
+        t_few, found = _bracketed(p[:, few], d[:, few], c[few], k[few], subset, rim, extra)
         t = t.clone()
         t[few] = torch.where(found, t_few, t[few])
         good[few] = found | converged[few]
@@ -110,17 +128,21 @@ def _(foot, direction, curvature, conic, coefficients, rim):
 @torch.library.register_vmap("raytrace::asphere_root")
 def _(info, in_dims, foot, direction, curvature, conic, coefficients, rim):
     """Move the mapped axis in front of the batch axes, and give every mapped argument the same batch rank."""
-    tensors = (foot, direction, curvature, conic, coefficients)
+    return asphere_root(*aligned((foot, direction, curvature, conic, coefficients), in_dims[:5]), rim), (0, 0)
+
+
+def aligned(tensors: Sequence[Tensor], in_dims: Sequence[int | None]) -> list[Tensor]:
+    """Foot, direction, curvature, conic, coefficients with the mapped axis in front of all batch axes."""
     leading = (1, 1, 0, 0, 1)  # component or term axis before the batch axes
-    mapped = [dim is not None for dim in in_dims[:5]]
+    mapped = [dim is not None for dim in in_dims]
     ranks = [x.dim() - lead - m for x, lead, m in zip(tensors, leading, mapped, strict=True)]
-    aligned = []
-    for x, lead, dim, rank in zip(tensors, leading, in_dims[:5], ranks, strict=True):
+    found = []
+    for x, lead, dim, rank in zip(tensors, leading, in_dims, ranks, strict=True):
         if dim is not None:
             x = x.movedim(dim, lead)
             x = x.reshape(*x.shape[: lead + 1], *(1,) * (max(ranks) - rank), *x.shape[lead + 1 :])
-        aligned.append(x)
-    return asphere_root(*aligned, rim), (0, 0)
+        found.append(x)
+    return found
 
 
 def _start(p: Tensor, d: Tensor, c: Tensor, k: Tensor, rim: float) -> Tensor:
@@ -141,7 +163,7 @@ def _start(p: Tensor, d: Tensor, c: Tensor, k: Tensor, rim: float) -> Tensor:
     return torch.where(usable & (radius <= rim), t, plane)
 
 
-def _residual(p, d, c, k, a, t):
+def _residual(p, d, c, k, a, t, extra=None):
     """F = z - S(r²), F' = dF/dt, the rounding scale of F, and r² at t."""
     x, y, z = p[0] + t * d[0], p[1] + t * d[1], p[2] + t * d[2]
     u = x * x + y * y
@@ -150,28 +172,33 @@ def _residual(p, d, c, k, a, t):
     scale = z.abs() + (c * u).abs() + u * polynomial(a.abs(), u) + p[2].abs() + (t * d[2]).abs()
     scale = scale + 2 * dS.abs() * (u + radial.abs() * t.abs())
     inside_domain = 1 - (1 + k) * c * c * u > 0
-    return z - S, d[2] - 2 * dS * radial, scale, u, inside_domain
+    F, dF = z - S, d[2] - 2 * dS * radial
+    if extra is not None:
+        (D, D_x, D_y), bound = extra[0](x, y), extra[1]
+        F, dF = F - D, dF - (D_x * d[0] + D_y * d[1])
+        scale = scale + bound + (D_x.abs() + D_y.abs()) * (x.abs() + y.abs() + t.abs())
+    return F, dF, scale, u, inside_domain
 
 
-def _newton(p, d, c, k, a, t):
+def _newton(p, d, c, k, a, t, extra=None):
     """Newton's method with each ray frozen once converged, so that no ray's result depends on its neighbours."""
     rounding = torch.finfo(p.dtype).eps
     active = torch.ones_like(t, dtype=torch.bool)
     for _ in range(_NEWTON_STEPS):
-        F, dF, scale, _, _ = _residual(p, d, c, k, a, t)
+        F, dF, scale, _, _ = _residual(p, d, c, k, a, t, extra)
         usable = (dF != 0) & torch.isfinite(F)
         step = torch.where(usable, F / torch.where(usable, dF, 1.0), 0.0)
         t = torch.where(active, t - step, t)
         active = active & usable & (F.abs() > rounding * scale)
         if not bool(active.any()):
             break
-    F, dF, scale, u, inside_domain = _residual(p, d, c, k, a, t)
+    F, dF, scale, u, inside_domain = _residual(p, d, c, k, a, t, extra)
     small = (F.abs() <= _ACCEPTED_RESIDUAL * rounding * scale) & inside_domain & torch.isfinite(t)
     forward = dF * torch.where(d[2] < 0, -1.0, 1.0) > 0
     return t, small, forward, torch.sqrt(u)
 
 
-def _bracketed(p, d, c, k, a, rim):
+def _bracketed(p, d, c, k, a, rim, extra=None):
     """First crossing in the direction of propagation on the stretch of ray inside rim and sag range (1-D batch)."""
     big = torch.finfo(p.dtype).max ** 0.25
     L, M, N = d
@@ -197,6 +224,7 @@ def _bracketed(p, d, c, k, a, rim):
     fraction = torch.linspace(0, 1, 65, dtype=p.dtype, device=p.device)[:, None]
     heights = sag_and_derivatives((fraction * radius) ** 2 * (1 - 1e-7), c, k, a[:, None] if a.dim() == 2 else a)[0]
     margin = (heights.amax(0) - heights.amin(0)) * 0.05 + torch.finfo(p.dtype).tiny
+    margin = margin if extra is None else margin + extra[1]
     low, high = heights.amin(0) - margin, heights.amax(0) + margin
     steep = N.abs() > 1e-9
     safe_N = torch.where(steep, N, 1.0)
@@ -207,11 +235,11 @@ def _bracketed(p, d, c, k, a, rim):
 
     s = torch.where(N < 0, -1.0, 1.0).to(N.dtype)
     width = (last - first) / _SAMPLES
-    before = s * _residual(p, d, c, k, a, first)[0]
+    before = s * _residual(p, d, c, k, a, first, extra)[0]
     left, found = first, torch.zeros_like(possible)
     for i in range(1, _SAMPLES + 1):
         t = first + i * width
-        after = s * _residual(p, d, c, k, a, t)[0]
+        after = s * _residual(p, d, c, k, a, t, extra)[0]
         crossing = (before <= 0) & (after > 0) & ~found
         left = torch.where(crossing, t - width, left)
         found = found | crossing
@@ -219,9 +247,9 @@ def _bracketed(p, d, c, k, a, rim):
     right = left + width
     for _ in range(_BISECTIONS):
         middle = 0.5 * (left + right)
-        below = s * _residual(p, d, c, k, a, middle)[0] <= 0
+        below = s * _residual(p, d, c, k, a, middle, extra)[0] <= 0
         left, right = torch.where(below, middle, left), torch.where(below, right, middle)
     t = 0.5 * (left + right)
-    t_polished, small, forward, _ = _newton(p, d, c, k, a, t)
+    t_polished, small, forward, _ = _newton(p, d, c, k, a, t, extra)
     stayed = small & forward & ((t_polished - t).abs() <= width.abs())
     return torch.where(stayed, t_polished, t), found & possible

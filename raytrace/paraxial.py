@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from raytrace.departure import numbers, sag_of
 from raytrace.lens import Lens
 from raytrace.surface import Surface
 from raytrace.trace import media
@@ -52,9 +53,17 @@ class FirstOrder:
 
 
 def vertex_curvature(surface: Surface) -> Tensor:
-    """c + 2 a₁ in 1/mm: the r² term of an asphere bends the vertex like a curvature."""
+    """c + 2 a₁ + (D_xx + D_yy)/2 in 1/mm: the r² term of an asphere bends the vertex like a curvature.
+
+    A departure D may bend it differently along x and y: this is the mean. Its tilt at the vertex is left out.
+    """
     total = torch.zeros_like(surface.thickness) if surface.curvature is None else surface.curvature
-    return total if surface.coefficients is None else total + 2 * surface.coefficients[0]
+    total = total if surface.coefficients is None else total + 2 * surface.coefficients[0]
+    if surface.departure is None:
+        return total
+    centre = torch.zeros_like(surface.thickness)
+    bend = sag_of(numbers(surface.departure), centre, centre)
+    return total + 0.5 * (bend.xx + bend.yy)
 
 
 def signed(surfaces: Sequence[Surface], indices: Sequence[Tensor]) -> list[Tensor]:

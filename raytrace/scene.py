@@ -88,8 +88,11 @@ def symmetry(scene: Scene) -> str:
     """What the light of every field has in common with its images: "round", "mirror" or "none".
 
     "round": symmetric about the axis, a meridian of the pupil stands for all of it; "mirror": symmetric in x, the half
-    of x > 0 stands for the other. Fields and vignetting factors to be differentiated have none: moving one breaks it.
+    of x > 0 stands for the other. Fields and vignetting factors to be differentiated have none: moving one breaks it;
+    nor has a lens with a departure, whatever its numbers are.
     """
+    if any(surface.departure is not None for surface in scene.lens.surfaces):
+        return "none"
     apertures = [aperture for surface in scene.lens.surfaces for aperture in surface.apertures]
     moving = [scene.fields, scene.lens.fields.vignetting, *(c for aperture in apertures for c in aperture.centre)]
     if any(varies(number) for number in moving):

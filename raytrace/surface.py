@@ -1,17 +1,21 @@
-"""Surface: sag, normal and intersection of a rotationally symmetric refracting or reflecting surface.
+"""Surface: sag, normal and intersection of a refracting or reflecting surface.
 
-    z(r) = c r² / (1 + √(1 - (1+k) c² r²)) + Σ_j a_j r^(2j),  j = 1, 2, …
+    z = c r² / (1 + √(1 - (1+k) c² r²)) + Σ_j a_j r^(2j) + D(x, y),  j = 1, 2, …
+
+Rotationally symmetric but for the departure D, which few surfaces have.
 
 Every function works in the frame of the surface's vertex, components first, for any batch shape.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from raytrace.asphere import asphere_root, sag_and_derivatives
+from raytrace.asphere import aligned, asphere_root, sag_and_derivatives, search
+from raytrace.departure import Departure, covers, numbers, sag_of, size_of
 from raytrace.glass import AIR, Glass
 from raytrace.numerics import differentiating, dot
 from raytrace.value import value
@@ -41,6 +45,8 @@ class Surface:
     curvature: c, 1/mm; None is a plane for good (put a tensor of 0 to differentiate a plane's curvature).
     conic: k; None is a sphere.
     coefficients: (m, ...) a_1, a_2, … of r², r⁴, … in mm^(1-2j); None if not aspheric.
+    departure: what the sag has beside; None if nothing. Any kind counts as not rotationally symmetric. A height at the
+        vertex belongs to the thickness before: paraxial optics takes D(0, 0) and the slopes there for 0.
     glass: the medium behind the surface; MIRROR reflects and keeps the medium before it.
     semi_diameter: mm, as stored in the file; it never clips a ray (only `apertures` do), but bounds the search for
         the first crossing with an asphere that a ray may cross more than once.
@@ -52,6 +58,7 @@ class Surface:
     curvature: Tensor | None = None
     conic: Tensor | None = None
     coefficients: Tensor | None = None
+    departure: Departure | None = None
     glass: Glass = AIR
     semi_diameter: float | None = None
     apertures: tuple[Aperture, ...] = ()
@@ -63,15 +70,27 @@ class Surface:
 
     @property
     def is_plane(self) -> bool:
-        """True if the surface has neither curvature nor aspheric terms to model."""
-        return self.curvature is None and self.coefficients is None
+        """True if the surface has neither curvature nor aspheric terms nor a departure to model."""
+        return self.curvature is None and self.coefficients is None and self.departure is None
 
 
 def sag(surface: Surface, radius_squared: Tensor) -> Tensor:
-    """Sag z in mm at r² (...) in mm²; the radicand is clamped at 0 beyond the edge of a closed conic."""
+    """Sag z in mm at r² (...) in mm²; the radicand is clamped at 0 beyond the edge of a closed conic.
+
+    Raises ValueError for a surface with a departure, whose sag the radius does not tell: see `sag_at`.
+    """
+    if surface.departure is not None:
+        raise ValueError("the sag of a surface with a departure depends on x and y: use sag_at(surface, x, y)")
     if surface.is_plane:
         return torch.zeros_like(radius_squared)
     return sag_and_derivatives(radius_squared, surface.curvature, surface.conic, surface.coefficients, 0)[0]
+
+
+def sag_at(surface: Surface, x: Tensor, y: Tensor) -> Tensor:
+    """Sag z in mm at points (...) mm of any surface."""
+    symmetric = dataclasses.replace(surface, departure=None)
+    z = sag(symmetric, x * x + y * y)
+    return z if surface.departure is None else z + sag_of(numbers(surface.departure), x, y, highest=0).z
 
 
 def intersect(surface: Surface, position: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
@@ -106,6 +125,8 @@ def meet(surface: Surface, position: Sequence[Tensor], direction: Sequence[Tenso
     """`intersect` by components, with the cosine that comes with it; arguments are triples of (...)."""
     if surface.is_plane:
         return _meet_plane(position, direction)
+    if surface.departure is not None:
+        return _meet_departure(surface, position, direction)
     if surface.coefficients is not None:
         return _meet_asphere(surface, position, direction)
     return _meet_conic(surface, position, direction)
@@ -119,6 +140,8 @@ def normal(surface: Surface, hit: Sequence[Tensor]) -> tuple[tuple[Tensor, Tenso
     x, y, z = hit
     if surface.is_plane:
         return (torch.zeros_like(x), torch.zeros_like(x), torch.ones_like(x)), 1.0
+    if surface.departure is not None:
+        return _tilted_normal(surface, sag_of(numbers(surface.departure), x, y, highest=1), x, y)
     if surface.coefficients is not None:
         radius_squared = x * x + y * y
         slope = 2 * sag_and_derivatives(radius_squared, surface.curvature, surface.conic, surface.coefficients, 1)[1]
@@ -254,6 +277,88 @@ def _meet_asphere(surface: Surface, position, direction) -> Meeting:
     hit = tuple(torch.addcmul(a, step, d, value=-1) for a, d in zip((x, y, z), (L, M, N), strict=True))
     n, norm_squared = normal(surface, hit)
     return Meeting(hit, dot(n, (L, M, N)), met, (n, norm_squared))
+
+
+def _meet_departure(surface: Surface, position, direction) -> Meeting:
+    """As `_meet_asphere`, with F(t) = z - S(x² + y²) - D(x, y)."""
+    c, k, a = surface.curvature, surface.conic, surface.coefficients
+    shape, scale = departure = numbers(surface.departure)
+    zero, rim = shape.new_zeros(()), float("inf") if surface.semi_diameter is None else surface.semi_diameter
+    foot = _foot(position, direction)
+    t, met = torch.ops.raytrace.departure_root(
+        torch.stack(torch.broadcast_tensors(*(p.detach() for p in foot))),
+        torch.stack(torch.broadcast_tensors(*(d.detach() for d in direction))),
+        zero if c is None else c.detach(),
+        zero if k is None else k.detach(),
+        zero[None] if a is None else a.detach(),
+        shape.detach(),
+        scale.detach(),
+        rim,
+    )
+    L, M, N = (torch.where(met, d, at) for d, at in zip(direction, (0.0, 0.0, 1.0), strict=True))
+    foot = [torch.where(met, p, 0.0) for p in foot]
+    x, y, z = (torch.addcmul(p, t, d) for p, d in zip(foot, (L, M, N), strict=True))
+    S, dS, d2S = sag_and_derivatives(x * x + y * y, c, k, a)
+    D = sag_of(departure, x, y)
+    radial = x * L + y * M
+    dF = N - 2 * dS * radial - (D.x * L + D.y * M)
+    d2F = -(4 * d2S * radial * radial + 2 * dS * (L * L + M * M))
+    d2F = d2F - (D.xx * L * L + 2 * D.xy * L * M + D.yy * M * M)
+    step = _step(z - S - D.z, dF, d2F, t.dtype == torch.float64)
+    hit = tuple(torch.addcmul(a, step, d, value=-1) for a, d in zip((x, y, z), (L, M, N), strict=True))
+    n, norm_squared = _tilted_normal(surface, sag_of(departure, *hit[:2], highest=1), *hit[:2])
+    return Meeting(hit, dot(n, (L, M, N)), met, (n, norm_squared))
+
+
+def _tilted_normal(surface: Surface, D, x: Tensor, y: Tensor):
+    """`normal` where the departure has slopes: (-z_x, -z_y, 1)."""
+    _, dS, _ = sag_and_derivatives(x * x + y * y, surface.curvature, surface.conic, surface.coefficients, 1)
+    z_x, z_y = 2 * dS * x + D.x, 2 * dS * y + D.y
+    return (-z_x, -z_y, torch.ones_like(z_x)), 1 + z_x * z_x + z_y * z_y
+
+
+# As `asphere_root`, with the numbers of a departure.
+torch.library.define(
+    "raytrace::departure_root",
+    "(Tensor foot, Tensor direction, Tensor curvature, Tensor conic, Tensor coefficients, Tensor shape, Tensor scale,"
+    " float rim) -> (Tensor, Tensor)",
+)
+
+
+@torch.library.impl("raytrace::departure_root", "CompositeExplicitAutograd")
+def _(foot, direction, curvature, conic, coefficients, shape, scale, rim):
+    departure = shape, scale
+
+    def slopes(x: Tensor, y: Tensor) -> Sequence[Tensor]:
+        return sag_of(departure, x, y, highest=1)[:3]
+
+    extra = slopes, size_of(departure)
+    t, met = search(foot, direction, curvature, conic, coefficients, rim, extra)
+    x, y = (p.double() + t.double() * d.double() for p, d in zip(foot[:2], direction[:2], strict=True))
+    met = met & covers(departure, x, y)
+    return torch.where(met, t, 0.0), met
+
+
+@torch.library.register_fake("raytrace::departure_root")
+def _(foot, direction, curvature, conic, coefficients, shape, scale, rim):
+    batch = torch.broadcast_shapes(
+        foot.shape[1:], direction.shape[1:], curvature.shape, conic.shape, coefficients.shape[1:]
+    )
+    return foot.new_empty(batch), foot.new_empty(batch, dtype=torch.bool)
+
+
+@torch.library.register_vmap("raytrace::departure_root")
+def _(info, in_dims, foot, direction, curvature, conic, coefficients, shape, scale, rim):
+    """Mapped rays and bases go through together; departures that differ one by one."""
+    tensors = foot, direction, curvature, conic, coefficients, shape, scale
+    root = torch.ops.raytrace.departure_root
+    if in_dims[5] is None and in_dims[6] is None:
+        return root(*aligned(tensors[:5], in_dims[:5]), shape, scale, rim), (0, 0)
+    each = [
+        root(*(x if at is None else x.select(at, i) for x, at in zip(tensors, in_dims[:7], strict=True)), rim)
+        for i in range(info.batch_size)
+    ]
+    return tuple(torch.stack(found) for found in zip(*each, strict=True)), (0, 0)
 
 
 def _step(F: Tensor, dF: Tensor, d2F: Tensor, polish: bool) -> Tensor:

@@ -24,6 +24,7 @@ FLOORS = {
     "glass": 1,
     "rays": 1,
     "asphere": 1,
+    "departure": 1,
     # 2
     "agf": 2,
     "deconvolve": 2,

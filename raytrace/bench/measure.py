@@ -91,6 +91,8 @@ def surfaces_of(lens: Lens) -> int:
 
 def reference_of(lens: Lens) -> tuple[list[ReferenceSurface], float]:
     """The lens in front of surface 1 and behind, for `trace_reference`: its surfaces and the first index."""
+    if any(surface.departure is not None for surface in lens.surfaces):
+        raise ValueError("the reference traces conics and even aspheres: this lens has a departure from them")
     indices = [float(index) for index in media(lens, lens.wavelengths[lens.primary_wavelength])]
     surfaces = [
         reference_surface(

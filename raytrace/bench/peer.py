@@ -104,6 +104,8 @@ class Optiland:
             if surface.curvature is not None and float(surface.curvature) != 0:
                 numbers["radius"] = 1 / float(surface.curvature)
                 numbers["conic"] = 0.0 if surface.conic is None else float(surface.conic)
+            if surface.departure is not None:
+                raise ValueError(f"surface {number} departs from a conic and even terms; this peer is not given it")
             kind = "standard"
             if surface.coefficients is not None:
                 kind, numbers["coefficients"] = "even_asphere", surface.coefficients.tolist()

@@ -14,6 +14,7 @@ from raytrace.formats.writing import (
     is_listed,
     listed_name,
     one_line,
+    refuse_departure,
     thickness,
 )
 from raytrace.glass import Glass, mil_glass
@@ -87,6 +88,7 @@ def rows(lens: Lens, file: str) -> dict[str, list[str]]:
 
 
 def _row(lens: Lens, number: int, surface: Surface, place: Place) -> dict[str, str]:
+    refuse_departure(surface, place)
     last = len(lens.surfaces) - 1
     asphere = "standard" if surface.coefficients is None else "even asphere"
     kinds = {0: "object", lens.stop: "stop" if surface.coefficients is None else "stop, even asphere", last: "image"}

@@ -11,6 +11,7 @@ from raytrace.catalog import AmbiguousGlass, UnknownGlass, find_glass
 from raytrace.formats.source import LensFileError, Place
 from raytrace.glass import Glass
 from raytrace.lens import Lens
+from raytrace.surface import Surface
 
 
 def exact(number: Tensor | float, what: str, place: Place) -> str:
@@ -48,6 +49,13 @@ def one_line(text: str, what: str, place: Place) -> str:
     if not text.isprintable() and not text.replace("\t", " ").isprintable():
         raise LensFileError(f"{what} holds a line break or a control character, and cannot be written", place)
     return text.strip()
+
+
+def refuse_departure(surface: Surface, place: Place) -> None:
+    """Raise LensFileError for a surface with a departure: the formats hold conics and even aspheres."""
+    if surface.departure is not None:
+        kind = type(surface.departure).__name__
+        raise LensFileError(f"the surface departs from a conic and even terms ({kind}), which no file holds", place)
 
 
 def is_air(glass: Glass) -> bool:

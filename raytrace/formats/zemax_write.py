@@ -4,7 +4,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from raytrace.formats.source import LensFileError, Place
-from raytrace.formats.writing import catalogs_needed, exact, exact_list, is_air, listed_name, one_line, thickness
+from raytrace.formats.writing import (
+    catalogs_needed,
+    exact,
+    exact_list,
+    is_air,
+    listed_name,
+    one_line,
+    refuse_departure,
+    thickness,
+)
 from raytrace.formats.zemax_keywords import APERTURES, FIELD_KINDS
 from raytrace.formats.zemax_system import NOTE_PIECE
 from raytrace.glass import Glass, mil_glass
@@ -101,6 +110,7 @@ def _notes(notes: Sequence[str], place: Place) -> list[str]:
 
 
 def _surface(lens: Lens, number: int, surface: Surface, place: Place) -> list[str]:
+    refuse_departure(surface, place)
     curvature = "0.0" if surface.curvature is None else exact(surface.curvature, "curvature", place)
     semi_diameter = surface.semi_diameter
     if number == lens.stop and lens.aperture.kind == "float_by_stop":

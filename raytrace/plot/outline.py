@@ -14,7 +14,7 @@ from raytrace.launch import launch, stop_radius
 from raytrace.lens import Lens
 from raytrace.plot.style import array
 from raytrace.pupil import fan
-from raytrace.surface import Surface, intersect, sag
+from raytrace.surface import Surface, intersect, sag_at
 from raytrace.trace import media, steps
 
 _POINTS = 181  # of a surface's profile: smooth at any size of print
@@ -60,9 +60,9 @@ def edge_radius(surface: Surface) -> float:
 
 
 def depth(surface: Surface, radius: np.ndarray) -> np.ndarray:
-    """Sag (...) mm at a radius (...) mm."""
+    """Sag (...) mm at a radius (...) mm, of either sign, in the y-z plane."""
     radius = torch.as_tensor(radius, dtype=surface.thickness.dtype, device=surface.thickness.device)
-    return array(sag(surface, radius * radius))
+    return array(sag_at(surface, torch.zeros_like(radius), radius))
 
 
 def heights(*radii: float) -> np.ndarray:
@@ -116,7 +116,7 @@ def element(
         z = []
         for surface, vertex, radius, own in zip((front, back), (z_front, z_back), radii, along_sag, strict=True):
             reach = min(rim, edge_radius(surface)) if own else radius
-            z.append(vertex + depth(surface, np.minimum(np.abs(y), reach)))
+            z.append(vertex + depth(surface, np.clip(y, -reach, reach)))
         gap = direction * (z[1] - z[0])
         if (gap >= 0).all():
             break
