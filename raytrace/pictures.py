@@ -83,7 +83,8 @@ def split(pictures: Pictures, *, share: float = 0.8, seed: int = 0) -> tuple[Pic
 def dead_leaves(count: int, *, size: int = 256, seed: int = 0, smallest: float = 1.0) -> Pictures:
     """Opaque discs of radii ∝ r⁻³ over one another until nothing shows through: natural statistics without a file.
 
-    smallest: radius in pixels; larger ones make smoother pictures. Lee, Mumford and Huang, Int. J. Comput. Vis. 41, 2001: occlusion alone gives the spectra of natural pictures.
+    smallest: radius in pixels; larger ones make smoother pictures. Lee, Mumford and Huang (Int. J. Comput. Vis. 41,
+    2001): occlusion alone gives the spectra of natural pictures.
     """
     return Pictures(
         tuple(_leaves(size, draws(seed, number, _LEAVES), smallest) for number in range(count)),

@@ -78,7 +78,7 @@ class Memo:
     def front(self, bundle: Bundle, *, recorded: bool) -> _Front:
         """The rays as far as no variable reaches, from memory or traced now; recorded: with their crossings."""
         distance = bundle[0].surfaces[0].thickness
-        if self._range is not None and self._covers(distance):
+        if self._range is not None and self._covers(distance) and _one_pupil(bundle[3]):
             front = self._find_or_trace(_at_nodes(bundle, self._range), recorded, judge=_is_smooth)
             if front.smooth:
                 return _at_distances(front, _weights(distance, self._range))
@@ -124,6 +124,11 @@ def cross_bundle(bundle: Bundle, memo: Memo | None = None) -> list[Crossing]:
 def _launched(bundle: Bundle) -> Rays:
     lens, field, wavelength, pupil = bundle
     return rays_of_field(lens, field, vignette(lens, field, pupil), wavelength=wavelength)
+
+
+def _one_pupil(pupil: Tensor) -> bool:
+    """Whether all object distances have the same pupil points; where rays are lost each may have its own."""
+    return pupil.dim() == 2 or pupil.shape[1] == 1
 
 
 def _rest(bundle: Bundle, front: _Front, memo: Memo) -> dict:

@@ -372,3 +372,27 @@ def test_closed_form_finds_the_least_error_and_paraxial_and_fourier_agree():
                 own.variables.sensor -= shift
     assert places["paraxial"] == pytest.approx(places["fourier"], abs=0.02)
     assert places["gaussian"] < places["paraxial"] - 0.05
+
+
+def test_off_the_axis_the_window_follows_the_chief_ray_with_its_derivative():
+    """A kernel at 14° against central differences: the chief ray moves by 0.25 mm per mm of the sensor."""
+    own = camera(read_lens(LENS), Settings(model="gaussian", fields=(0.0, 14.0), start="57.66"))
+    distances = number([1.2e4, 2e4, 4e4])
+    sensor, pattern = own.variables.get_parameter("sensor"), torch.cos(torch.arange(441.0, dtype=torch.float64))
+
+    def value():
+        return (own.kernels(distances, 1).flatten(1) @ pattern).sum()
+
+    (slope,) = torch.autograd.grad(value(), sensor)
+    ends = []
+    with torch.no_grad():
+        for place in (1e-4, -1e-4):
+            sensor.fill_(place)
+            ends.append(value())
+    torch.testing.assert_close(slope, (ends[0] - ends[1]) / 2e-4, rtol=1e-4, atol=0)
+
+
+def test_models_without_distortion_are_centred_on_their_own_image():
+    own = camera(read_lens(LENS), Settings(model="paraxial", fields=(0.0, 14.0)))
+    distances = number([1.2e4, 2e4, 4e4])
+    torch.testing.assert_close(own.kernels(distances, 1), own.kernels(distances, 0))

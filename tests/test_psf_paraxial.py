@@ -1,5 +1,6 @@
 """Paraxial PSF: blur of a defocused thin lens."""
 
+import dataclasses
 import math
 
 import pytest
@@ -9,7 +10,7 @@ from problems import double_gauss, fields, lens, scalar, surface, vector
 from raytrace.grid import Grid, grid
 from raytrace.lens import with_sensor_distance
 from raytrace.paraxial import paraxial_image_distance
-from raytrace.psf import paraxial
+from raytrace.psf import paraxial, psf
 from raytrace.scene import scene
 
 INF = math.inf
@@ -75,3 +76,16 @@ def test_derivatives():
     numbers = [number.requires_grad_() for number in numbers]
     assert torch.autograd.gradcheck(kernel, numbers, atol=1e-6)
     assert torch.autograd.gradgradcheck(kernel, numbers, atol=1e-5)
+
+
+def test_a_nearly_empty_window_has_finite_derivatives():
+    """The tail of a Gaussian 29 σ away holds 1e-180 of the light: its kernel sums to 1, its derivatives are numbers."""
+    system = double_gauss()
+    place = torch.tensor([[0.0], [2.4]], dtype=torch.float64, requires_grad=True)
+    pixels = dataclasses.replace(grid(scalar(0.005), 5), centre=place[:, :, None])
+    found = psf(system, "paraxial", fields=system.wavelengths.new_zeros(2, 1), grid=pixels, normalise="window")
+    assert 0 < float(found.energy.detach()) < 1e-160
+    assert float(found.kernel.detach().sum()) == pytest.approx(1)
+    (slope,) = torch.autograd.grad(found.kernel[..., 0, 0].sum(), place)
+    assert bool(torch.isfinite(slope).all())
+    assert float(slope[1]) != 0

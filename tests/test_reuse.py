@@ -8,6 +8,7 @@ import torch
 
 from raytrace.formats import read_lens
 from raytrace.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
+from raytrace.psf import psf
 from raytrace.pupil import gauss_rings
 from raytrace.reuse import Memo, cross_bundle, trace_bundle
 from raytrace.surface import Aperture
@@ -206,3 +207,17 @@ def test_distances_beyond_the_range_or_with_rays_lost_on_the_way_are_traced():
     found = trace_bundle(bundles, memo)
     assert torch.equal(found.valid, expected.valid)
     torch.testing.assert_close(found.position, expected.position, atol=0, rtol=0)
+
+
+def test_over_a_range_of_distances_lost_rays_change_nothing():
+    """Where the stop clips, every object distance has pupil points of its own."""
+    lens, distances = double_gauss(), number([1.2e4, 2e4, 4e4])
+    surfaces = list(lens.surfaces)
+    surfaces[lens.stop] = dataclasses.replace(surfaces[lens.stop], apertures=(Aperture("circular", (0.0, 6.0)),))
+    clipped = dataclasses.replace(lens, surfaces=tuple(surfaces))
+
+    def kernels(memo):
+        axis = lens.wavelengths.new_zeros(2, 1)
+        return psf(clipped, "gaussian", fields=axis, object_distances=distances, order=4, memo=memo).kernel
+
+    torch.testing.assert_close(kernels(Memo(object_distances=(1e4, 5e4))), kernels(None))

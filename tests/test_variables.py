@@ -144,3 +144,13 @@ def test_a_real_lens_can_be_built_and_a_squeezed_one_cannot():
 
 def test_a_telescope_of_mirrors_can_be_built():
     assert float(violation(read_lens(LENSES / "hubble.zmx"))) == 0
+
+
+def test_elements_either_side_of_a_stop_may_not_touch():
+    """Each air space beside the stop is buildable, the two elements would overlap by 3 mm beyond its rim."""
+    variables = Variables(double_gauss(), "thickness:5,6")
+    with torch.no_grad():
+        variables.get_parameter("thickness_5").fill_(2.4882 - 14.253)
+        variables.get_parameter("thickness_6").fill_(2.1247 - 12.4281)
+    assert float(variables.violation().detach()) > 1
+    assert float(violation(double_gauss())) == 0

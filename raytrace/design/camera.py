@@ -5,6 +5,7 @@ restored = camera(pictures, object_distances)
 (restored - camera.target(pictures)).abs().mean().backward()
 """
 
+import dataclasses
 import warnings
 
 import torch
@@ -13,8 +14,10 @@ from torch import Tensor, nn
 from raytrace.design.variables import Variables
 from raytrace.grid import Grid, grid
 from raytrace.image import add_noise, blur
+from raytrace.lens import Lens
 from raytrace.psf import NotConverged, psf
 from raytrace.reuse import Memo
+from raytrace.scene import scene, trace_scene
 
 
 class Camera(nn.Module):
@@ -79,18 +82,30 @@ class Camera(nn.Module):
         return self._psf(object_distances, self.fields[:, field : field + 1], order=order).kernel[:, 0]
 
     def _psf(self, distances: Tensor, fields: Tensor, **work):
+        # These know of a field only where its image lies: about their own chief ray it is the image on the axis, while
+        # the traced chief ray is as far from it as the lens distorts.
+        fields = torch.zeros_like(fields) if self.model in ("paraxial", "fourier") else fields
+        lens, distances = self.variables(), distances.to(self.fields.dtype)
         return psf(
-            self.variables(),
+            lens,
             self.model,
             fields=fields,
-            object_distances=distances.to(self.fields.dtype),
-            grid=self.pixels,
-            center="axis" if bool((fields == 0).all()) else "chief",
+            object_distances=distances,
+            grid=self._window(lens, fields, distances),
             normalise=self.normalise,
             rho=self.rho,
             memo=self._memo,
             **work,
         )
+
+    def _window(self, lens: Lens, fields: Tensor, distances: Tensor) -> Grid:
+        """The pixels around the chief ray: they follow it with its derivatives, for where a picture lies is no loss."""
+        if bool((fields == 0).all()):
+            return self.pixels
+        primary = lens.wavelengths[lens.primary_wavelength][None]
+        rays = trace_scene(scene(lens, fields, distances, primary, self._memo), fields.new_zeros(2, 1))
+        chief = rays.position[:2, ..., 0].expand(2, len(distances), fields.shape[1], len(lens.wavelengths))
+        return dataclasses.replace(self.pixels, centre=self.pixels.centre[:, None, None, None] + chief)
 
     def image(self, picture: Tensor, object_distances: Tensor, field: int = 0) -> Tensor:
         """What falls on the sensor, without noise: (B, H - margin, W - margin)."""

@@ -156,7 +156,10 @@ def _variable(lens: Lens, kind: str, number: int, word: str) -> Variable:
 
 
 def violation(lens: Lens) -> Tensor:
-    """Σ (what a thickness lacks)² in mm², over the centres and edges of all elements and air spaces; 0 is buildable."""
+    """Σ (what a thickness lacks)² in mm², over the centres and edges of all elements and air spaces; 0 is buildable.
+
+    Elements either side of a stop are also kept from touching beyond its rim.
+    """
     total, side = torch.zeros_like(lens.surfaces[-2].thickness), 1
     for before, after in zip(lens.surfaces[1:-1], lens.surfaces[2:], strict=True):
         side = -side if before.is_mirror else side
@@ -166,7 +169,28 @@ def violation(lens: Lens) -> Tensor:
             lacks.append(edge - side * edge_thickness(before, after))
         for lack in lacks:
             total = total + lack.clamp_min(0).square()
+    for lack in _beyond_stops(lens):
+        total = total + lack.clamp_min(0).square()
     return total
+
+
+def _beyond_stops(lens: Lens) -> list[Tensor]:
+    """What air spaces lack at the edge, from element to element, across surfaces with air on both sides."""
+    surfaces, lacks, first = lens.surfaces, [], 1
+    if any(surface.is_mirror for surface in surfaces):
+        return []
+    for number in range(2, len(surfaces) - 1):
+        in_air, stands_in_air = _is_air(surfaces[number - 1]), _is_air(surfaces[number])
+        if not in_air:
+            first = number
+        elif not stands_in_air:
+            before, after = surfaces[first], surfaces[number]
+            if number - first > 1 and _is_air(before) and before.semi_diameter and after.semi_diameter:
+                gap = sum(surface.thickness for surface in surfaces[first:number])
+                whole = edge_thickness(dataclasses.replace(before, thickness=gap), after)
+                lacks.append(_LEAST_AIR[1] - whole)
+            first = number
+    return lacks
 
 
 def edge_thickness(before: Surface, after: Surface) -> Tensor:

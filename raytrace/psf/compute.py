@@ -77,9 +77,16 @@ def psf(
     if found.rays and not bool((found.energy > 0).any()) and not bool((found.covariance != 0).any()):
         raise EmptyPsf("no ray reaches the sensor: the lens is blocked or the field is outside its reach")
     if normalise == "window":
-        kernel = safe_divide(found.kernel, found.energy[..., None, None])
-        found = dataclasses.replace(found, kernel=kernel, normalised="window")
+        found = dataclasses.replace(found, kernel=_of_its_window(found.kernel), normalised="window")
     return found
+
+
+def _of_its_window(kernel: Tensor) -> Tensor:
+    """Kernels (..., rows, columns) that sum to 1, or are 0; over their brightest pixel first: where a window holds next
+    to no light, the square of its sum, by which a derivative is divided, would be no number.
+    """
+    scaled = safe_divide(kernel, kernel.detach().amax((-2, -1), keepdim=True))
+    return safe_divide(scaled, scaled.sum((-2, -1), keepdim=True))
 
 
 def _check(model: str, center: str, normalise: str, *, tol: float | None, rays: int | None, order: int | None) -> None:

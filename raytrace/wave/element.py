@@ -1,6 +1,8 @@
 """Element: a thin phase element, its height over the aperture.
 
-    path(x, y, λ) = (n(λ) - 1) h(x, y)      beside air; thicker is later, so that a converging lens is thickest at its axis
+    path(x, y, λ) = (n(λ) - 1) h(x, y)
+
+beside air. Thicker is later: a converging element is thickest on its axis.
 
 Free heights are pixels or rings, flat each; smooth ones Zernike polynomials or even powers of the radius. Elements in
 contact add their paths.
