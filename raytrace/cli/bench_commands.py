@@ -10,22 +10,34 @@ from types import ModuleType
 import torch
 from tqdm import tqdm
 
-from raytrace.bench import psf, psf_report
+from raytrace.bench import codesign_accuracy, codesign_report, psf, psf_report
 from raytrace.bench.measure import Row, calls, field_rays, measure, surfaces_of
 from raytrace.bench.psf_cases import USUAL, cases
 from raytrace.bench.report import machine, markdown
+from raytrace.cli import wave_bench
 from raytrace.cli.door import CommandError, open_lens, print_json, say
 from raytrace.files import write_atomically
 from raytrace.lens import Lens
 
 
 def bench(arguments: argparse.Namespace) -> None:
-    """Speed beside error, and beside a peer's if there is one: of the trace or of the PSFs."""
-    other = {"trace": ("lenses", "csv"), "psf": ("lens", "rays")}[arguments.what]
+    """Speed beside error, and beside a peer's if there is one: of the trace, or of PSFs: of lenses, co-design or waves."""
+    other = {
+        "trace": ("lenses", "csv", "docs"),
+        "psf": ("lens", "rays", "docs"),
+        "codesign": ("lenses", "lens", "rays", "output", "csv", "plot", "threads"),
+        "wave": ("lenses", "lens", "rays", "output", "csv", "plot", "threads"),
+    }[arguments.what]
     for name in other:
         if getattr(arguments, name):
             word = "LENS" if name == "lenses" else f"--{name}"
             raise CommandError(f"bench {arguments.what} takes no {word}")
+    if arguments.what == "codesign":
+        _bench_codesign(arguments)
+        return
+    if arguments.what == "wave":
+        wave_bench.bench_wave(arguments)
+        return
     peer = None if arguments.no_peers else _peer()
     before = torch.get_num_threads()
     threads = arguments.threads or before
@@ -71,6 +83,34 @@ def _bench_psf(arguments: argparse.Namespace, peer: ModuleType | None, threads: 
     if arguments.json:
         goals = [dataclasses.asdict(target) for target in psf_report.targets(rows)]
         print_json({"repeats": arguments.repeats, "machine": about, "targets": goals, "rows": mappings})
+    else:
+        print(report, end="")
+
+
+def _bench_codesign(arguments: argparse.Namespace) -> None:
+    chosen, fields, sensors = codesign_accuracy.entrants(), codesign_accuracy.FIELDS, codesign_accuracy.SENSORS
+    scenes = {"fields": fields, "sensors": sensors, "samples": codesign_accuracy.SAMPLES}
+    total = codesign_accuracy.steps(chosen, fields=len(fields), sensors=len(sensors), repeats=arguments.repeats)
+    with tqdm(total=total, desc="measuring", disable=None) as bar:
+        rows, gaps = codesign_accuracy.measure(
+            _open("double_gauss"), chosen=chosen, repeats=arguments.repeats, progress=bar.update, **scenes
+        )
+    about = machine() | {"torch threads": 1}
+    mappings = [[dataclasses.asdict(row) for row in found] for found in (rows, gaps)]
+    page = Path(arguments.docs) / "codesign_accuracy.md" if arguments.docs else None
+    kept = page.read_text(encoding="utf-8").partition(codesign_report.KEPT)[2].strip() if page and page.exists() else ""
+    report = codesign_report.markdown(rows, gaps, about=about, repeats=arguments.repeats, kept=kept)
+    if page:
+        folder = page.parent / "codesign"
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, found in (("accuracy.csv", rows), ("model_error.csv", gaps)):
+            write_atomically(folder / name, lambda file, found=found: file.write(codesign_report.table(found).encode()))
+        plot = importlib.import_module("raytrace.plot.accuracy")
+        figure = plot.accuracy_figure(*mappings, sensors[-1])
+        importlib.import_module("raytrace.plot.style").save(figure, folder / "accuracy.png")
+        write_atomically(page, lambda file: file.write(report.encode()))
+    if arguments.json:
+        print_json({"repeats": arguments.repeats, "machine": about, "rows": mappings[0], "models": mappings[1]})
     else:
         print(report, end="")
 

@@ -147,7 +147,7 @@ def _glass(parser):
 
 
 def _bench(parser):
-    parser.add_argument("what", choices=("trace", "psf", "codesign"), help="what to measure")
+    parser.add_argument("what", choices=("trace", "psf", "codesign", "wave"), help="what to measure")
     parser.add_argument(
         "lenses",
         metavar="LENS",
@@ -167,7 +167,10 @@ def _bench(parser):
     output(parser, "report to write (.md)")
     parser.add_argument("--csv", metavar="FILE", type=file_name, help="psf: table to write, one line a figure")
     parser.add_argument(
-        "--docs", metavar="DOCS", type=file_name, help="codesign: folder for codesign_accuracy.md and codesign/"
+        "--docs",
+        metavar="DOCS",
+        type=file_name,
+        help="codesign, wave: folder for codesign_accuracy.md and codesign/, or wave_bench.md and wave/",
     )
     plot(parser, "speed over number of rays, or time over error,")
 
@@ -316,12 +319,14 @@ COMMANDS = (
         "measure speed against error",
         "Measure, forward and backward, in float32 and float64: the trace against a high-precision reference, or every "
         "PSF model at every sampling against converged ones (minutes), or what learns lenses in co-design: few rays "
-        "beside many, and the models beside DRT (minutes). With the extra [bench] Optiland runs beside the first two.",
+        "beside many, and the models beside DRT (minutes), or every engine of wave PSFs beside the transfer function "
+        "it replaces (a minute). With the extra [bench] Optiland runs beside the first two.",
         """examples:
   raytrace bench trace
   raytrace bench psf -o speed_vs_error.md --csv speed_vs_error.csv --plot speed_vs_error.png
   raytrace bench trace --rays 1000 100000 -o bench.md --plot bench.png
-  raytrace bench codesign --docs docs""",
+  raytrace bench codesign --docs docs
+  raytrace bench wave --docs docs""",
         _bench,
         "bench_commands.bench",
     ),
