@@ -13,7 +13,8 @@ from tqdm import tqdm
 from raytrace.cli.door import CommandError, number, print_json, say
 from raytrace.design.edof import Quality, World, periodic, quality, scene, spectrum
 from raytrace.design.edof_page import CAPTIONS, markdown
-from raytrace.design.edof_table import NAMES, TALK, Content, records, restored_scene, table_of, write_records
+from raytrace.design.edof_scene import deep, flat
+from raytrace.design.edof_table import NAMES, TALK, Content, records, table_of, write_records
 from raytrace.design.edof_training import EdofCamera, Settings, begin, learn_element
 from raytrace.design.report import below_the_mark
 from raytrace.design.training import NotFinite, OtherSettings
@@ -198,7 +199,8 @@ def _figures(found, learned, world: World, seed: int) -> dict:
             kernels = psf(scene(learned[name], world))
             made[f"{name}.png"] = drawn.element_figure(learned[name], kernels, first[name], world)
     rows = [name for name in ("fresnel", "singlet", "ideal", "cubic-refractive", "learned") if name in first]
-    made["scene.png"] = drawn.scene_figure(*restored_scene(rows, learned, world, seed=seed))
+    made["scene.png"] = drawn.scene_figure(*flat(rows, learned, world, seed=seed))
+    made["deep.png"] = drawn.deep_figure(deep(rows, learned, world, seed=seed))
     return made
 
 

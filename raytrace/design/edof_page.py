@@ -12,6 +12,7 @@ CAPTIONS = {
     "gain.png": "Gains over the Fresnel lens, by content and filter, beside the talk's.",
     "depth.png": "PSNR over depth behind the best filter that does not know it.",
     "scene.png": "A scene of dead leaves at three depths as each element's camera restores it (blind filter).",
+    "deep.png": "A scene from 0.5 m (below) to infinity (above) in nine layers, near leaves hiding far ones.",
     "learned.png": "The learned element: rings of fused silica, its kernels over depth and colour, its PSNR.",
     "learned-smooth.png": "The learned smooth element of PMMA.",
 }

@@ -7,18 +7,13 @@ its pictures, filters and prescriptions are its own, so that gains over its Fres
 import csv
 import dataclasses
 import io
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-import torch
 from torch import Tensor
 
-from raytrace.deconvolve import blind_filter, psnr
-from raytrace.design.edof import Quality, World, expected_error, mirrored, quality, scene, spectrum, transfer
+from raytrace.design.edof import Quality, World, expected_error, quality, scene, spectrum, transfer
 from raytrace.files import write_atomically
-from raytrace.pictures import dead_leaves, draws
 from raytrace.wave.aim import Aim, aim
 from raytrace.wave.baselines import baseline
 from raytrace.wave.element import Element
@@ -53,8 +48,6 @@ NAMES = {name: title for name, title, *_ in ROWS}
 
 #: Strengths of cubic plates in waves that are tried; the best in closed form is taken.
 STRENGTHS = (5.0, 10.0, 15.0, 20.0, 30.0, 40.0)
-
-_SCENE = 99  # key of the scene that is shown
 
 COLUMNS = ("content", "row", "wiener", "blind", "gain_wiener", "gain_blind", "spread_blind", "worst_blind", "talk")
 
@@ -104,40 +97,6 @@ def table_of(
         for content in contents:
             found[content.name][name] = quality(elements, world, train=content.train, test=content.test, found=kernels)
     return found
-
-
-@torch.no_grad()
-def restored_scene(
-    rows: Sequence[str], learned: Mapping[str, Sequence[Element]], world: World, *, seed: int = 0
-) -> tuple[dict[str, dict[str, tuple[np.ndarray, float]]], np.ndarray]:
-    """By row and depth a restored part (h, w, 3) of a coloured scene of dead leaves with its PSNR; and the scene.
-
-    Behind the best blind filter of each row; red, green and blue are the wavelengths from long to short.
-    """
-    size, part = 512, slice(40, 200)
-    leaves = dead_leaves(1, size=size // 2, seed=seed + _SCENE, smallest=4.0).samples[0]
-    # A colour for every shade of grey: leaves end at one place in all colours.
-    colours = draws(seed, _SCENE).uniform(0.05, 0.95, (len(world.wavelengths), 256))
-    picture = torch.as_tensor(np.stack([mirrored(colour[leaves]) for colour in colours]))
-    S = spectrum(picture)
-    random = torch.Generator().manual_seed(seed)
-    noise = world.noise * torch.randn(picture.shape, generator=random, dtype=picture.dtype)
-    found = {}
-    for name in rows:
-        elements = learned[name] if name in learned else elements_of(name, world, S)
-        H = transfer(psf(scene(elements, world)), size)
-        G = blind_filter(H, S, world.noise)
-        found[name] = {}
-        for d in (0, len(H) // 2, len(H) - 1):
-            seen = torch.fft.ifft2(torch.fft.fft2(picture) * H[d]).real + noise
-            estimate = torch.fft.ifft2(torch.fft.fft2(seen) * G).real
-            ratio = float(psnr((estimate - picture).square().mean()))
-            found[name][_depth(world.depths[d])] = estimate.flip(0)[:, part, part].movedim(0, -1).numpy(), ratio
-    return found, picture.flip(0)[:, part, part].movedim(0, -1).numpy()
-
-
-def _depth(depth: float) -> str:
-    return "infinity" if math.isinf(depth) else f"{depth / 1e3:.3g} m"
 
 
 def records(found: Mapping[str, Mapping[str, Quality]]) -> list[dict]:

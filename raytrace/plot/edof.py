@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from raytrace.design.edof import Quality, World
+from raytrace.design.edof_scene import Deep
 from raytrace.design.edof_table import NAMES, TALK
 from raytrace.plot.style import FIELD_COLOURS, GREY, INK, array, new_figure, styled, wavelength_colours
 from raytrace.wave.element import Element, height
@@ -92,6 +93,28 @@ def scene_figure(columns: Mapping[str, Mapping[str, tuple[np.ndarray, float]]], 
             image, ratio = cells[name]
             _show(axes[line, column], image, NAMES.get(row, row) if line == 0 else "")
             axes[line, column].set_xlabel(f"{ratio:.1f} dB", fontsize=7.5, labelpad=2)
+    return figure
+
+
+@styled
+def deep_figure(found: Deep) -> Figure:
+    """A scene in depth: above what the sensors saw, below what was restored; in front the scene and its depth."""
+    figure = new_figure(1.9 * (len(found.seen) + 1), 4.3)
+    axes = figure.subplots(2, len(found.seen) + 1, squeeze=False)
+    _show(axes[0, 0], found.picture, "scene")
+    shades = axes[1, 0].imshow(found.dioptres, cmap="cividis")
+    axes[1, 0].set(xticks=[], yticks=[])
+    axes[1, 0].set_title("depth", fontsize=7.5)
+    bar = figure.colorbar(shades, ax=axes[1, 0], location="bottom", fraction=0.06, pad=0.04)
+    marks = [mark for mark in (0, 0.5, 1, 1.5, 2) if found.dioptres.min() <= mark <= found.dioptres.max()]
+    bar.set_ticks(marks, labels=["∞" if mark == 0 else f"{1 / mark:.2g} m" for mark in marks], fontsize=6.5)
+    for column, name in enumerate(found.seen, 1):
+        _show(axes[0, column], found.seen[name], NAMES.get(name, name))
+        image, ratio = found.restored[name]
+        _show(axes[1, column], image, "")
+        axes[1, column].set_xlabel(f"{ratio:.1f} dB", fontsize=7.5, labelpad=2)
+    axes[0, 1].set_ylabel("sensor", fontsize=8)
+    axes[1, 1].set_ylabel("restored", fontsize=8)
     return figure
 
 
