@@ -135,6 +135,23 @@ def test_pictures_teach_the_filter_of_the_original(tmp_path):
     assert np.mean(losses[-8:]) < np.mean(losses[:8])
 
 
+def test_a_network_learns_behind_the_filter(tmp_path):
+    """It begins as nothing at all, and both it and the element move."""
+    settings = dataclasses.replace(QUICK, loss="images", restoration="network", steps=4, batch=2)
+    camera, run = begin(settings, SMALL, S, tmp_path / "run")
+    with torch.no_grad():
+        noise = torch.zeros(2, 1, 128, 128, dtype=torch.float64)
+        both = camera(PICTURES[:2], torch.tensor([0, 2]), noise)
+        camera.network, network = None, camera.network
+        torch.testing.assert_close(both, camera(PICTURES[:2], torch.tensor([0, 2]), noise), atol=1e-6, rtol=0)
+        camera.network = network
+    before = [p.detach().clone() for p in (network.decoder[-1].weight, camera.variables.change)]
+    for _ in learn_element(camera, LEAVES, settings, run):
+        pass
+    for old, new in zip(before, (network.decoder[-1].weight, camera.variables.change), strict=True):
+        assert not torch.equal(old, new)
+
+
 @pytest.mark.parametrize(("kind", "levels"), [("rings", 0), ("rings", 16), ("zernike", 0)])
 def test_every_kind_of_element_is_learned(tmp_path, kind, levels):
     settings = dataclasses.replace(

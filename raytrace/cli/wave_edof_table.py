@@ -59,9 +59,10 @@ def _edof(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--loss", choices=("spectral", "images"), default="spectral", help="default spectral")
     group.add_argument(
         "--filter",
-        choices=("blind", "towards"),
+        choices=("blind", "towards", "network"),
         default="blind",
-        help="of --loss images: the best blind one (default), or the original's, towards the measurement",
+        help="of --loss images: the best blind one (default), the original's, towards the measurement, or the blind one "
+        "and a RED-Net behind it",
     )
     group.add_argument("--optimizer", choices=("adam", "sgd", "adadelta"), default="adam", help="default adam")
     group.add_argument("--schedule", choices=("cosine", "linear", "constant"), default="cosine", help="default cosine")

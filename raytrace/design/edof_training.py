@@ -4,8 +4,8 @@
     pictures      mean (x̂ - x)² of pictures at drawn depths with drawn noise, behind a filter that is learned with them
 
 The filter is the best blind one for the kernels as they are, or that of Sitzmann et al. (ACM Trans. Graph. 37, 2018):
-towards the measurement, for the kernel at a depth that is learned, with a weight that is learned. Steps, logs and
-checkpoints are those of `training`.
+towards the measurement, for the kernel at a depth that is learned, with a weight that is learned. Or a network restores
+what the blind filter leaves. Steps, logs and checkpoints are those of `training`.
 """
 
 import dataclasses
@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from raytrace.catalog import find_glass
 from raytrace.deconvolve import blind_filter, towards_measurement
 from raytrace.design.edof import World, best_of_starts, expected_error, mirrored, restored, scene, transfer
+from raytrace.design.network import RedNet, RedNetShape
 from raytrace.design.phase import PhaseVariables, radial_powers
 from raytrace.design.training import Record, Run, Share, train
 from raytrace.files import write_atomically
@@ -33,9 +34,11 @@ from raytrace.wave.reuse import Memo
 
 KINDS = ("smooth", "rings", "zernike")
 LOSSES = ("spectral", "images")
-RESTORATIONS = ("blind", "towards")
+RESTORATIONS = ("blind", "towards", "network")
+_NETWORK = RedNetShape(6, 16)  # behind the blind filter, the same for every colour
 OPTIMIZERS = ("adam", "sgd", "adadelta")
 SCHEDULES = ("cosine", "linear", "constant")
+_NETWORK_RATE = 1e-3
 _SAMPLE, _START = 20, 21  # last numbers of the keys of what is drawn
 
 
@@ -77,11 +80,20 @@ class EdofCamera(nn.Module):
     """A learned element, a world and a filter.
 
     spectrum: S (n, n) of the pictures. v, t: square roots of the weight γ and of the design depth in m of the filter
-    "towards" the measurement, learned with it.
+    "towards" the measurement, learned with it. network: (B, 1, n, n) -> the same, any module, behind the blind filter.
     """
 
-    def __init__(self, variables: PhaseVariables, world: World, spectrum: Tensor, *, restoration: str = "blind"):
+    def __init__(
+        self,
+        variables: PhaseVariables,
+        world: World,
+        spectrum: Tensor,
+        *,
+        restoration: str = "blind",
+        network: nn.Module | None = None,
+    ):
         super().__init__()
+        self.network = network
         self.variables, self.world, self.restoration = variables, world, restoration
         self.register_buffer("spectrum", spectrum, persistent=False)
         if restoration == "towards":
@@ -97,7 +109,7 @@ class EdofCamera(nn.Module):
 
     def filter(self, H: Tensor) -> Tensor:
         """G (W, n, n)."""
-        if self.restoration == "blind":
+        if self.restoration != "towards":
             return blind_filter(H, self.spectrum, self.world.noise)
         at_target = dataclasses.replace(scene(self.variables(), self.world), depths=1e3 * self.t.square().reshape(1))
         found = psf(at_target, plan=self._plan)
@@ -106,7 +118,13 @@ class EdofCamera(nn.Module):
     def forward(self, pictures: Tensor, depth: Tensor, noise: Tensor, *, draw: torch.Generator | None = None) -> Tensor:
         """Restored colours (B, W, n, n) of pictures (B, n, n) at depths of these numbers (B,); noise: added."""
         H = self.transfer(draw=draw)
-        return restored(H[depth], self.filter(H), pictures, noise)[1]
+        estimate = restored(H[depth], self.filter(H), pictures, noise)[1]
+        if self.network is None:
+            return estimate
+        single = next(self.network.parameters()).dtype
+        return (
+            self.network(estimate.flatten(0, 1)[:, None].to(single))[:, 0].to(estimate).unflatten(0, estimate.shape[:2])
+        )
 
 
 def start(
@@ -161,6 +179,8 @@ def learn_element(
     groups = [{"params": list(camera.variables.parameters()), "lr": settings.rate}]
     if camera.restoration == "towards":
         groups.append({"params": [camera.v, camera.t], "lr": 0.1 * settings.rate})
+    if camera.network is not None:
+        groups.append({"params": list(camera.network.parameters()), "lr": _NETWORK_RATE})
     optimizer = _optimizer(settings, groups)
     rates = [group["lr"] for group in groups]
 
@@ -241,4 +261,5 @@ def begin(
         variables = start(settings, world, spectrum, progress=progress)
         found = {"start": variables.start, "change": variables.change.detach()}
         write_atomically(kept, lambda file: torch.save(found, file))
-    return EdofCamera(variables, world, spectrum, restoration=settings.restoration), run
+    network = RedNet(_NETWORK, seed=settings.seed) if settings.restoration == "network" else None
+    return EdofCamera(variables, world, spectrum, restoration=settings.restoration, network=network), run
