@@ -21,7 +21,7 @@ from raytrace.lens import Lens
 
 
 def bench(arguments: argparse.Namespace) -> None:
-    """Speed beside error, and beside a peer's if there is one: of the trace, or of PSFs: of lenses, co-design or waves."""
+    """Speed beside error, and beside a peer's if there is one: of the trace, or of the PSFs of lenses or waves."""
     other = {
         "trace": ("lenses", "csv", "docs"),
         "psf": ("lens", "rays", "docs"),

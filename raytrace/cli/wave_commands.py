@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
@@ -52,13 +51,13 @@ def psf(arguments: argparse.Namespace) -> None:
         say(f"written: {path}")
 
 
-def _heights(arguments: argparse.Namespace, seen: WaveScene, found: WavePsf) -> Figure:
+def _heights(arguments: argparse.Namespace, seen: WaveScene, found: WavePsf):
     """Of the element of most detail: one that is wrapped or sampled, else the first."""
     part = next((element for element in seen.elements if not is_smooth(element)), seen.elements[0])
     return figures.height_figure(part, title=_title(arguments))
 
 
-def _caustic(arguments: argparse.Namespace, seen: WaveScene, found: WavePsf) -> Figure:
+def _caustic(arguments: argparse.Namespace, seen: WaveScene, found: WavePsf):
     """Planes from four fifths of the sensor distance to six fifths; light up to a tenth of the aperture."""
     z = seen.sensor_distance
     distances, half = z * torch.linspace(0.8, 1.2, _PLANES, dtype=z.dtype), 0.05 * arguments.aperture
@@ -75,7 +74,7 @@ def _caustic(arguments: argparse.Namespace, seen: WaveScene, found: WavePsf) -> 
     )
 
 
-def _encircled(arguments: argparse.Namespace, seen: WaveScene, found: WavePsf) -> Figure:
+def _encircled(arguments: argparse.Namespace, seen: WaveScene, found: WavePsf):
     return figures.encircled_figure(found, title=_title(arguments))
 
 
@@ -183,7 +182,10 @@ def focus(arguments: argparse.Namespace) -> None:
     setting = Setting(
         method=arguments.method, samples=arguments.samples, seed=arguments.seed, collimator=arguments.collimator
     )
-    began = time.perf_counter()
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # arrays are small: a second thread would only wait
+    torch.optim.SGD([torch.zeros(1)], 1.0)  # torch loads its compiler with the first optimiser: no part of learning
+    began, busy = time.perf_counter(), time.process_time()
     with tqdm(total=arguments.steps, desc="learning", unit="step", disable=None) as bar:
 
         def progress(step: int, ratio: float) -> None:
@@ -191,13 +193,14 @@ def focus(arguments: argparse.Namespace) -> None:
             bar.update(min(1, step))
 
         found = learn_to_focus(setting, steps=arguments.steps, frames=_SHOWN, progress=progress)
-    seconds = time.perf_counter() - began
+    seconds, busy = time.perf_counter() - began, time.process_time() - busy
+    torch.set_num_threads(threads)
     if arguments.output:
         write_heights(found.element.profile, arguments.output)
     if arguments.plot:
         plot.save(figures.focus_figure(found, title=_goal(found)), arguments.plot)
     if arguments.json:
-        print_json(_course(found) | {"seconds": seconds})
+        print_json(_course(found) | {"seconds": seconds, "processor_seconds": busy})
     else:
         _print_course(found, seconds)
     for path in filter(None, (arguments.output, arguments.plot)):

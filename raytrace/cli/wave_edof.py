@@ -11,7 +11,7 @@ import torch
 from tqdm import tqdm
 
 from raytrace.cli.door import CommandError, number, print_json, say
-from raytrace.design.edof import Quality, World, periodic, quality, scene, spectrum
+from raytrace.design.edof import Quality, World, kernels, periodic, quality, spectrum
 from raytrace.design.edof_page import CAPTIONS, markdown
 from raytrace.design.edof_scene import deep, flat
 from raytrace.design.edof_table import NAMES, TALK, Content, records, table_of, write_records
@@ -25,7 +25,6 @@ from raytrace.plot.style import save
 from raytrace.wave.element import Element
 from raytrace.wave.exchange import write_heights
 from raytrace.wave.fabrication import as_made, as_pixels
-from raytrace.wave.psf import psf
 
 _WIDE = 512  # pixels of a period that is restored
 _LEAVES = 40  # pictures of dead leaves
@@ -41,7 +40,7 @@ def edof(arguments: argparse.Namespace) -> None:
     camera = _learn(settings, world, train, folder, f"{settings.kind}, seed {settings.seed}")
     with torch.no_grad():
         elements = camera.variables()
-        found = psf(scene(elements, world))
+        found = kernels(elements, world)
         own = quality(
             elements, world, train=periodic(train, _WIDE), test=periodic(test, _WIDE), seed=settings.seed, found=found
         )
@@ -196,8 +195,8 @@ def _figures(found, learned, world: World, seed: int) -> dict:
         made["gain.png"] = drawn.gain_figure(found)
     for name in ("learned", "learned-smooth"):
         if name in learned:
-            kernels = psf(scene(learned[name], world))
-            made[f"{name}.png"] = drawn.element_figure(learned[name], kernels, first[name], world)
+            found_kernels = kernels(learned[name], world)
+            made[f"{name}.png"] = drawn.element_figure(learned[name], found_kernels, first[name], world)
     rows = [name for name in ("fresnel", "singlet", "ideal", "cubic-refractive", "learned") if name in first]
     made["scene.png"] = drawn.scene_figure(*flat(rows, learned, world, seed=seed))
     made["deep.png"] = drawn.deep_figure(deep(rows, learned, world, seed=seed))

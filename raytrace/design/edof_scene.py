@@ -13,12 +13,11 @@ import torch
 from torch import Tensor
 
 from raytrace.deconvolve import blind_filter, psnr, restore
-from raytrace.design.edof import World, mirrored, scene, spectrum, transfer
+from raytrace.design.edof import World, kernels, mirrored, spectrum, transfer
 from raytrace.design.edof_table import elements_of
 from raytrace.image import blur_layers, depth_masks
 from raytrace.pictures import dead_leaves, draws
 from raytrace.wave.element import Element
-from raytrace.wave.psf import psf
 
 _KEY = 99  # of what is drawn
 _LAYERS = 9  # of a deep scene, even in dioptres
@@ -57,7 +56,7 @@ def flat(
     found: dict[str, dict[str, tuple[np.ndarray, float]]] = {}
     for name in rows:
         elements = learned[name] if name in learned else elements_of(name, world, S)
-        H = transfer(psf(scene(elements, world)), size)
+        H = transfer(kernels(elements, world), size)
         G = blind_filter(H, S, world.noise)
         found[name] = {}
         for d in (0, len(H) // 2, len(H) - 1):
@@ -85,7 +84,7 @@ def deep(rows: Sequence[str], learned: Mapping[str, Sequence[Element]], world: W
     for name in rows:
         elements = learned[name] if name in learned else elements_of(name, world, S)
         depths = [math.inf if plane == 0 else 1e3 / plane for plane in planes.tolist()]
-        found = psf(scene(elements, world, depths=depths))
+        found = kernels(elements, world, depths=depths)
         # What misses the window comes back as haze, even over the scene.
         haze = (1 - found.energy.mean(0))[:, None, None] * picture.mean((-2, -1), keepdim=True)
         image = blur_layers(picture, masks, found.kernel) + haze

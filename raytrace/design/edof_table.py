@@ -12,12 +12,11 @@ from pathlib import Path
 
 from torch import Tensor
 
-from raytrace.design.edof import Quality, World, expected_error, quality, scene, spectrum, transfer
+from raytrace.design.edof import Quality, World, expected_error, kernels, quality, spectrum, transfer
 from raytrace.files import write_atomically
 from raytrace.wave.aim import Aim, aim
 from raytrace.wave.baselines import baseline
 from raytrace.wave.element import Element
-from raytrace.wave.psf import psf
 
 #: PSNR in dB as the talk gives it, by our name of the row.
 TALK = {
@@ -47,7 +46,7 @@ ROWS: tuple[tuple[str, str, str | None, dict], ...] = (
 NAMES = {name: title for name, title, *_ in ROWS}
 
 #: Strengths of cubic plates in waves that are tried; the best in closed form is taken.
-STRENGTHS = (5.0, 10.0, 15.0, 20.0, 30.0, 40.0)
+STRENGTHS = (5.0, 10.0, 15.0, 20.0, 30.0)
 
 COLUMNS = ("content", "row", "wiener", "blind", "gain_wiener", "gain_blind", "spread_blind", "worst_blind", "talk")
 
@@ -66,17 +65,19 @@ def aim_of(world: World) -> Aim:
 
 
 def elements_of(name: str, world: World, S: Tensor) -> tuple[Element, ...]:
-    """A baseline; of cubic plates the strength that is best for pictures of spectrum S (n, n)."""
+    """A baseline; of cubic plates the strength that is best for pictures of spectrum S (n, n), on the PMMA lens."""
     made_for = aim_of(world)
     (kind,) = [kind for row, _, kind, _ in ROWS if row == name]
     if not name.startswith("cubic"):
         return baseline(kind, made_for)
-    tried = [baseline(kind, made_for, strength=strength) for strength in STRENGTHS]
-    return min(tried, key=lambda own: _closed_form(own, world, S))
+    strength = min(
+        STRENGTHS, key=lambda own: _closed_form(baseline("cubic-refractive", made_for, strength=own), world, S)
+    )
+    return baseline(kind, made_for, strength=strength)
 
 
 def _closed_form(elements: Sequence[Element], world: World, S: Tensor) -> float:
-    return float(expected_error(transfer(psf(scene(elements, world)), S.shape[-1]), S, world.noise))
+    return float(expected_error(transfer(kernels(elements, world), S.shape[-1]), S, world.noise))
 
 
 def table_of(
@@ -93,9 +94,11 @@ def table_of(
     S = spectrum(contents[0].train)
     for name in progress(wanted):
         elements = learned[name] if name in learned else elements_of(name, world, S)
-        kernels = psf(scene(elements, world))
+        found_kernels = kernels(elements, world)
         for content in contents:
-            found[content.name][name] = quality(elements, world, train=content.train, test=content.test, found=kernels)
+            found[content.name][name] = quality(
+                elements, world, train=content.train, test=content.test, found=found_kernels
+            )
     return found
 
 

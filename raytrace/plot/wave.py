@@ -1,0 +1,304 @@
+"""Waves as pictures: kernels over depth and colour, heights, caustics, encircled energy, and how a lens was learned."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.colors import Colormap, LinearSegmentedColormap, LogNorm, PowerNorm, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import NullFormatter
+from torch import Tensor
+
+from raytrace.design.focusing import Learned
+from raytrace.grid import centres
+from raytrace.plot.style import (
+    FAINT,
+    GREY,
+    INK,
+    array,
+    field_colour,
+    new_figure,
+    number_text,
+    round_length,
+    styled,
+    wavelength_colours,
+)
+from raytrace.wave.element import Element, Pixels, Rings, height
+from raytrace.wave.psf import WavePsf
+
+_GAMMA = 0.4  # of brightness in kernels: a haze of a hundredth of the peak is still seen
+_DECADES = 4.0  # of light in a caustic
+_ACROSS = 700  # points across a disc of heights
+#: Of the benchmark: number of the colour, marker and name, by engine.
+_ENGINES = {
+    "pupil": (0, "o", "pupil matrix DFT"),
+    "radial": (1, "s", "ring integrals"),
+    "fresnel": (4, "D", "Fresnel transfer, band limit"),
+    "angular_spectrum": (3, "v", "angular spectrum"),
+    "the talk's": (2, "*", "as in the talk"),
+}
+
+
+@styled
+def psf_figure(found: WavePsf, *, title: str = "") -> Figure:
+    """Kernels over depth (rows) and wavelength (columns), each from black to its own peak in its own colour.
+
+    With several wavelengths a last column shows them together, as a camera would see a white point: each with its own
+    share of the light, on one scale for the row. Below each: the light inside the window and in the brightest pixel.
+    """
+    kernels, energy = array(found.kernel), array(found.energy)
+    wavelengths = found.wavelengths.tolist()
+    colours, together = wavelength_colours(wavelengths), len(wavelengths) > 1
+    columns = len(wavelengths) + together
+    figure = new_figure(max(3.4, 1.75 * columns + 0.6), 1.95 * len(kernels) + 0.8)
+    axes = figure.subplots(len(kernels), columns, squeeze=False)
+    for row, depth in enumerate(found.depths.tolist()):
+        for column, wavelength in enumerate(wavelengths):
+            panel, kernel = axes[row][column], kernels[row, column]
+            norm = PowerNorm(_GAMMA, vmin=0.0, vmax=kernel.max())
+            panel.imshow(kernel, origin="lower", cmap=_dark(colours[column]), norm=norm, interpolation="nearest")
+            panel.set_xlabel(f"{100 * energy[row, column]:.1f} %, peak {kernel.max():.2g}", fontsize=7, color=GREY)
+            if row == 0:
+                panel.set_title(f"{1e3 * wavelength:g} nm", color=colours[column])
+        if together:
+            axes[row][-1].imshow(_mixed(kernels[row], wavelengths), origin="lower", interpolation="nearest")
+            if row == 0:
+                axes[row][-1].set_title("together")
+        axes[row][0].set_ylabel(_depth(depth))
+    for panel in axes.flat:
+        _framed(panel)
+    _bar(axes[-1][0], found)
+    figure.suptitle(title, fontweight="bold", fontsize=10)
+    figure.supxlabel(
+        f"{found.grid.columns} × {found.grid.rows} pixels of {1e3 * float(found.pitch):g} µm; brightness ∝ light^"
+        f"{_GAMMA:g}; share of the light inside the window",
+        fontsize=7.5,
+        color=GREY,
+    )
+    return figure
+
+
+@styled
+def height_figure(element: Element, *, title: str = "") -> Figure:
+    """The height of an element as it is made: the disc, its profile along x, and the profile at the rim."""
+    R = float(element.radius)
+    figure = new_figure(7.6, 3.1)
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.15, 1.6))
+    disc, whole, rim = (figure.add_subplot(grid[place]) for place in (np.s_[:, 0], np.s_[0, 1], np.s_[1, 1]))
+    line = torch.linspace(-R, R, _ACROSS, dtype=element.radius.dtype)
+    with torch.no_grad():
+        heights = 1e3 * array(height(element, line.expand(_ACROSS, -1), line[:, None].expand(-1, _ACROSS)))
+    x = array(line)
+    heights[np.hypot(x, x[:, None]) > R] = np.nan
+    shown = disc.imshow(heights, origin="lower", extent=(-R, R, -R, R), cmap="cividis", interpolation="nearest")
+    disc.set(xlabel="x, mm", ylabel="y, mm")
+    figure.colorbar(shown, ax=disc, label="height, µm", shrink=0.85)
+    _profile(whole, element, -R, R)
+    feature = float(element.profile.pitch) if isinstance(element.profile, Rings | Pixels) else R / 500
+    _profile(rim, element, R - min(0.3 * R, 40 * feature), R)
+    rim.set_xlabel("x, mm  (above: the whole diameter; here: the rim)")
+    figure.suptitle(title, fontweight="bold", fontsize=10)
+    return figure
+
+
+@styled
+def caustic_figure(
+    light: Tensor,
+    distances: Tensor,
+    *,
+    half: float,
+    wavelengths: Sequence[float],
+    depths: Sequence[float],
+    sensor: float,
+    title: str = "",
+) -> Figure:
+    """Light (D, W, Z, X) per mm² of `wave.caustic` over the distance behind the element, logarithmic.
+
+    A row for each depth, a column for each wavelength; one scale for all; the sensor is a line.
+    """
+    values, z = array(light), array(distances)
+    colours = wavelength_colours(wavelengths)
+    figure = new_figure(2.5 * len(wavelengths) + 0.9, 1.5 * len(depths) + 0.9)
+    axes = figure.subplots(len(depths), len(wavelengths), squeeze=False, sharex=True, sharey=True)
+    extent = (z[0], z[-1], -1e3 * half, 1e3 * half)
+    norm = LogNorm(values.max() / 10**_DECADES, values.max(), clip=True)
+    for row, depth in enumerate(depths):
+        for column, wavelength in enumerate(wavelengths):
+            panel = axes[row][column]
+            shown = panel.imshow(
+                values[row, column].T, origin="lower", extent=extent, aspect="auto", norm=norm, cmap="magma",
+                interpolation="bilinear",
+            )  # fmt: skip
+            panel.axvline(sensor, color="white", linewidth=0.8, linestyle=(0, (4, 3)))
+            if row == 0:
+                panel.set_title(f"{1e3 * wavelength:g} nm", color=colours[column])
+        axes[row][0].set_ylabel(f"{_depth(depth)}\nx, µm")
+    figure.colorbar(shown, ax=axes, label="share of the light per mm²", shrink=0.9, pad=0.01)
+    figure.supxlabel("distance behind the element, mm; dashes: the sensor", fontsize=8.5)
+    figure.suptitle(title, fontweight="bold", fontsize=10)
+    return figure
+
+
+@styled
+def encircled_figure(found: WavePsf, *, title: str = "") -> Figure:
+    """Share of the light within a radius of the axis: a panel for each depth, a curve for each wavelength."""
+    x, y = (array(line) for line in centres(found.grid))
+    radius = np.hypot(x, y[:, None]).ravel()
+    order = np.argsort(radius, kind="stable")
+    edge = 1e3 * float(found.pitch) * min(found.grid.shape) / 2
+    wavelengths, depths = found.wavelengths.tolist(), found.depths.tolist()
+    figure = new_figure(max(3.4, 2.2 * len(depths) + 0.6), 2.6)
+    axes = figure.subplots(1, len(depths), sharey=True, squeeze=False)[0]
+    for d, (panel, depth) in enumerate(zip(axes, depths, strict=True)):
+        for w, colour in enumerate(wavelength_colours(wavelengths)):
+            held = np.cumsum(array(found.kernel[d, w]).ravel()[order])
+            panel.plot(
+                np.append(0, 1e3 * radius[order]),
+                np.append(0, held),
+                color=colour,
+                linewidth=1.2,
+                label=f"{1e3 * wavelengths[w]:g} nm",
+            )
+        panel.set(title=_depth(depth), xlim=(0, edge), ylim=(0, 1.02), xlabel="radius, µm")
+        panel.grid(True, color=FAINT, linewidth=0.5)
+    axes[0].set_ylabel("share of the light")
+    axes[-1].legend(loc="lower right")
+    figure.suptitle(title, fontweight="bold", fontsize=10)
+    return figure
+
+
+@styled
+def focus_figure(found: Learned, *, title: str = "") -> Figure:
+    """How a plate became a lens: height, PSF and image after some steps, the ideal lens beside them; and the curve."""
+    frames, setting = found.frames, found.setting
+    figure = new_figure(1.45 * len(frames) + 0.9, 6.6)
+    grid = figure.add_gridspec(4, len(frames), height_ratios=(1, 1, 1, 0.85))
+    axes = np.array([[figure.add_subplot(grid[r, c]) for c in range(len(frames))] for r in range(3)])
+    top = float(frames[-1].kernel.max())
+    wave = 1e6 * found.wave
+    for column, frame in enumerate(frames):
+        heights, kernel = 1e6 * array(frame.heights), array(frame.kernel)
+        half = 0.5 * setting.samples - 0.5
+        outside = np.hypot(*np.ogrid[-half : half + 1, -half : half + 1]) > 0.5 * setting.samples
+        # A whole wave more or less is the same lens, and so is any height that all have in common.
+        middle = heights[setting.samples // 2, setting.samples // 2]
+        axes[0][column].imshow(
+            np.where(outside, np.nan, (heights - middle) % wave), origin="lower", cmap="twilight", vmin=0, vmax=wave,
+            interpolation="nearest",
+        )  # fmt: skip
+        axes[1][column].imshow(
+            np.maximum(kernel, 1e-6 * top), origin="lower", cmap="magma", norm=LogNorm(1e-5 * top, top, clip=True)
+        )
+        axes[2][column].imshow(array(frame.image), cmap="gray", vmin=0, vmax=1, interpolation="nearest")
+        axes[0][column].set_title("ideal lens" if frame.step < 0 else f"step {frame.step}")
+        axes[1][column].set_xlabel(f"peak {number_text(frame.peak_ratio, 3)}", fontsize=7.5, color=GREY)
+    for panel in axes.flat:
+        _framed(panel)
+    for row, label in enumerate((f"height, 0 … {wave:.0f} nm", "PSF, logarithmic", "image")):
+        axes[row][0].set_ylabel(label)
+    _course(figure.add_subplot(grid[3, :]), found)
+    figure.suptitle(title, fontweight="bold", fontsize=10)
+    return figure
+
+
+def _course(panel: Axes, found: Learned) -> None:
+    """Peak ratio and loss over the steps."""
+    panel.plot(found.peak_ratios, color=field_colour(0), linewidth=1.3)
+    panel.axhline(1, color=GREY, linewidth=0.6)
+    panel.set(xlabel="step", ylim=(0, 1.05), xlim=(0, max(1, found.steps)))
+    panel.set_ylabel("peak / ideal peak", color=field_colour(0))
+    loss = panel.twinx()
+    loss.plot(np.arange(len(found.losses)), found.losses, color=field_colour(2), linewidth=1.0)
+    loss.set_yscale("log")
+    loss.yaxis.set_minor_formatter(NullFormatter())
+    loss.set_ylabel("mean square error", color=field_colour(2))
+    loss.spines["right"].set_visible(True)
+
+
+def _profile(panel: Axes, element: Element, first: float, last: float) -> None:
+    """h(x) at y = 0 as a line."""
+    x = torch.linspace(first, last, 4001, dtype=element.radius.dtype)
+    with torch.no_grad():
+        values = 1e3 * array(height(element, x, torch.zeros_like(x)))
+    panel.plot(array(x), values, color=field_colour(0), linewidth=0.7)
+    panel.set(xlim=(first, last), ylabel="height, µm")
+    panel.grid(True, color=FAINT, linewidth=0.5)
+
+
+def _dark(colour: str | tuple[float, float, float]) -> Colormap:
+    """From black through a colour to white: what is as bright as the peak is white, as on film."""
+    return LinearSegmentedColormap.from_list("light", [(0.0, "black"), (0.72, to_rgb(colour)), (1.0, "white")])
+
+
+def _mixed(kernels: np.ndarray, wavelengths: Sequence[float]) -> np.ndarray:
+    """Kernels (W, rows, columns) as one picture (rows, columns, 3): the longest wavelengths red, the shortest blue."""
+    order = np.argsort(wavelengths)[::-1]
+    place = np.linspace(0, 2, len(order))
+    channels = np.stack([np.clip(1 - np.abs(place - c), 0, None) for c in range(3)])  # (3, W)
+    picture = np.tensordot(channels / channels.sum(1, keepdims=True).clip(1e-9), kernels[order], 1)
+    peak = picture.max()
+    return np.moveaxis((np.clip(picture, 0, None) / (peak if peak > 0 else 1)) ** _GAMMA, 0, -1)
+
+
+def _framed(panel: Axes) -> None:
+    panel.set_xticks([])
+    panel.set_yticks([])
+    for spine in panel.spines.values():
+        spine.set_visible(True)
+        spine.set_color(GREY)
+
+
+def _bar(panel: Axes, found: WavePsf) -> None:
+    """A bar of a round length in the corner of a kernel."""
+    pitch, columns = float(found.pitch), found.grid.columns
+    length = round_length(0.35 * pitch * columns)
+    x, y = 0.06 * columns, 0.08 * found.grid.rows
+    panel.plot([x, x + length / pitch], [y, y], color="white", linewidth=1.6, solid_capstyle="butt")
+    panel.annotate(
+        f"{1e3 * length:g} µm", (x, y), (0, 3), textcoords="offset points", color="white", fontsize=7, va="bottom"
+    )
+
+
+def _depth(distance: float) -> str:
+    if math.isinf(distance):
+        return "point at ∞"
+    return f"point at {distance / 1000:.3g} m" if distance >= 100 else f"point at {distance:g} mm"
+
+
+@styled
+def bench_figure(rows: Sequence[Mapping]) -> Figure:
+    """Time over error of wave engines, forward and with the gradient: rows of the benchmark as mappings.
+
+    Full marks are float64, open ones float32; crosses are refused samplings.
+    """
+    figure = new_figure(7.6, 3.6)
+    axes = figure.subplots(1, 2, sharex=True, sharey=True)
+    for panel, key, name in zip(axes, ("forward_s", "both_s"), ("forward", "forward and gradient"), strict=True):
+        for engine, (number, marker, label) in _ENGINES.items():
+            for dtype in ("float64", "float32"):
+                own = [row for row in rows if (row["engine"], row["dtype"]) == (engine, dtype) and not row["refused"]]
+                look = {
+                    "color": field_colour(number),
+                    "marker": marker,
+                    "markersize": 9 if marker == "*" else 5,
+                    "linewidth": 0.9,
+                    "markerfacecolor": field_colour(number) if dtype == "float64" else "white",
+                    "linestyle": "-" if dtype == "float64" else ":",
+                }
+                place = [row["error"] for row in own], [1e3 * row[key] for row in own]
+                panel.plot(*place, label=label if dtype == "float64" else None, **look)
+        refused = [row for row in rows if row["refused"]]
+        place = [row["error"] for row in refused], [1e3 * row[key] for row in refused]
+        panel.plot(*place, "x", color=field_colour(7), label="refused by the plan")
+        panel.set(xscale="log", yscale="log", title=name, xlabel="relative L² error of the kernel")
+        panel.grid(True, color=FAINT, linewidth=0.5)
+        panel.set_axisbelow(True)
+    axes[0].set_ylabel("time of one kernel, ms")
+    handles = [*axes[0].get_legend_handles_labels()[0]]
+    for face, words in ((INK, "float64"), ("white", "float32")):
+        handles.append(Line2D([], [], marker="o", linestyle="", color=INK, markerfacecolor=face, label=words))
+    figure.legend(handles=handles, loc="outside lower center", ncols=4)
+    return figure

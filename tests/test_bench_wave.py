@@ -1,0 +1,108 @@
+"""The benchmark of wave PSFs: its references, its opponent and its page. No timings."""
+
+import csv
+import dataclasses
+import io
+import math
+
+import pytest
+import torch
+
+from raytrace.bench import wave as bench
+from raytrace.bench.wave import ERROR, TALK, WaveRow, agreement, bench_scene, gradient, measure, reference, target
+from raytrace.bench.wave_report import KEPT, markdown, table
+from raytrace.plot.wave import bench_figure
+
+SMALL = 64  # pixels of 3.69 µm: all of the blur but its rim
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return bench_scene(size=SMALL)
+
+
+def error(entrant):
+    kernel = entrant.prepare()(bench._coefficients(entrant.dtype)).double()
+    return float((kernel - entrant.truth).norm() / entrant.truth.norm())
+
+
+def test_two_converged_references_agree(scene, monkeypatch):
+    """Ring integrals and a matrix DFT: nothing in common but the scene."""
+    monkeypatch.setattr(bench, "_OTHER", {"samples": 400, "nodes": 6})
+    assert agreement(scene) < 3e-5
+
+
+def test_the_talks_method_comes_to_the_same_waves(scene):
+    """At 3.125 µm a sample, just below λz/(D + blur): right to the staircase of its rim, 1e-3 of the light."""
+    entrant = bench.talks(scene, torch.float64, samples=1600)
+    assert "padded to 2396²" in entrant.sampling
+    assert error(entrant) < 2e-3
+
+
+def test_engines_are_as_good_as_predicted_and_refused_ones_are_wrong(scene):
+    truth = reference(scene)
+    good = bench._entrant(scene, truth, torch.float64, "pupil", samples=160)
+    assert error(good) < 2 * good.predicted
+    wrong = bench._coarse(scene, truth, 40)
+    assert wrong.refused
+    assert error(wrong) > 0.5
+    with pytest.raises(ValueError, match="not refused"):
+        bench._coarse(scene, truth, 160)
+
+
+def test_all_take_the_same_gradient(scene):
+    """Of the kernel by the lens's coefficient: two engines, one number, to the errors of their kernels."""
+    truth, start = reference(scene), bench._coefficients(torch.float64)
+    found = [
+        gradient(bench._entrant(scene, truth, torch.float64, engine, **how).prepare(), start)
+        for engine, how in (("pupil", {"samples": 256, "nodes": 7}), ("radial", {"tol": 1e-6}))
+    ]
+    assert float(found[0]) == pytest.approx(float(found[1]), rel=1e-3)
+
+
+def row(engine="pupil", error=1e-4, forward=1e-3, both=2e-3, **more):
+    given = {"sampling": "128²", "dtype": "float64", "samples": 128, "predicted": 1e-3, "cold_s": 5e-3}
+    return WaveRow(engine=engine, error=error, forward_s=forward, both_s=both, **(given | more))
+
+
+ROWS = [
+    row(),
+    row(error=2 * ERROR, both=1e-4),
+    row(error=2.4, both=1e-4, refused=True, predicted=math.nan),
+    row("radial", error=1e-6, forward=5e-4, both=1e-3, sampling="95 radii"),
+    row(TALK, forward=0.5, both=1.0, predicted=None),
+    row(TALK, forward=0.3, both=0.15, predicted=None, dtype="float32"),
+]
+
+
+def test_target_is_judged_by_the_fastest_within_the_error():
+    found = target(ROWS)
+    assert [one.best.engine for one in found] == ["radial", "pupil"]
+    assert [(one.forward, one.both, one.met) for one in found] == [
+        (pytest.approx(600), pytest.approx(150), True),
+        (pytest.approx(300), pytest.approx(75), False),
+    ]
+    assert found[0].opponent.dtype == "float32"
+
+
+def test_page_and_table_hold_the_figures():
+    page = markdown(ROWS, agreement=3e-6, about={"processor": "one"}, repeats=5, kept="words of a reader")
+    assert page.endswith(f"{KEPT}\nwords of a reader\n")
+    assert "| ring integrals | 95 radii, float64 | 1.0e-06 | 600 × | 150 × | yes |" in page
+    assert "| *pupil matrix DFT* | *128²* | *float64* | *2.4* | *–* |" in page
+    lines = list(csv.DictReader(io.StringIO(table(ROWS))))
+    assert [float(line["both_s"]) for line in lines] == [one.both_s for one in ROWS]
+    assert lines[-1]["predicted"] == ""
+    figure = bench_figure([dataclasses.asdict(one) for one in ROWS])
+    assert len(figure.axes) == 2
+
+
+def test_measure_counts_its_progress(scene):
+    truth = reference(scene)
+    done = []
+    entrant = bench._entrant(scene, truth, torch.float32, "radial", tol=1e-3)
+    (found,) = measure([entrant], repeats=2, progress=done.append)
+    assert sum(done) == 3
+    assert found.error < 1e-3
+    assert found.dtype == "float32"
+    assert min(found.forward_s, found.both_s, found.cold_s) > 0

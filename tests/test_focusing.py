@@ -1,0 +1,92 @@
+"""A flat plate that learns to be a lens from pictures alone; its ideal, its bound, and what it refuses."""
+
+import math
+
+import pytest
+import torch
+
+from raytrace.design.focusing import (
+    Setting,
+    _behind,
+    best_kernel,
+    draw,
+    ideal_heights,
+    learn_to_focus,
+    plate,
+    residual_phase,
+    sampled,
+    scene_of,
+)
+from raytrace.pictures import dead_leaves
+from raytrace.wave.psf import psf
+
+AIRY = 1.2197 * 0.55e-3 * 25
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_peak_of_the_ideal_lens_is_airys():
+    """πR²/(λz)² per mm², times a pixel of a quarter of the Airy radius: 1 - v²/4 on the mean of v², 3 %."""
+    setting = Setting()
+    airy = math.pi * 0.5**2 / (0.55e-3 * 25) ** 2 * setting.pixel**2
+    kernel = best_kernel(setting)
+    mean_v2 = (math.pi / (0.55e-3 * 25)) ** 2 * 2 * setting.pixel**2 / 12
+    assert float(kernel.max()) == pytest.approx(airy * (1 - mean_v2 / 4), rel=2e-3)
+    assert kernel.argmax() == kernel.numel() // 2
+
+
+@pytest.mark.parametrize("collimator", [False, True])
+def test_ideal_heights_are_the_ideal_lens(collimator):
+    """Heights of the continuous lens at the middles of the pixels: the same kernel, and no phase left."""
+    setting = Setting(collimator=collimator)
+    elements = (plate(setting, ideal_heights(setting)), *_behind(setting))
+    kernel = psf(scene_of(setting, elements), plan=sampled(setting, elements)).kernel[0, 0]
+    assert float(kernel.max() / best_kernel(setting).max()) == pytest.approx(1, abs=2e-3)
+    assert residual_phase(setting, elements) < 1e-6
+
+
+@pytest.mark.parametrize("collimator", [False, True])
+def test_learns_a_lens_from_a_flat_plate(collimator):
+    """The law of the issue: at least 0.98 of the ideal peak within 300 steps, from next to nothing."""
+    found = learn_to_focus(Setting(collimator=collimator), steps=300, enough=0.99, frames=(0,))
+    assert found.peak_ratios[0] < 0.01
+    assert found.peak_ratios[-1] >= 0.98
+    assert found.steps < 300
+    assert len(found.peak_ratios) == found.steps + 1
+    assert found.losses[-1] < 0.2 * found.losses[0]
+    # Marechal: exp(-(2πσ)²) of the peak is left.
+    assert found.peak_ratios[-1] == pytest.approx(math.exp(-((2 * math.pi * found.residual) ** 2)), abs=0.01)
+    assert [frame.step for frame in found.frames] == [0, found.steps, -1]
+
+
+def test_flat_pixels_lose_what_they_bend():
+    """sinc² of the waves across a pixel, a/λz · r: mean over the disc ∫ sinc², 0.878 of the peak, field by field."""
+    setting = Setting()
+    pitch = setting.diameter / setting.samples
+    r = (torch.arange(2000, dtype=torch.float64) + 0.5) / 2000 * 0.5
+    angle = (torch.arange(256, dtype=torch.float64) + 0.5) / 256 * 2 * math.pi
+    across = [r[:, None] * t * pitch / (0.55e-3 * 25) for t in (torch.cos(angle), torch.sin(angle))]
+    amplitude = (torch.sinc(across[0]) * torch.sinc(across[1])).mean(1)
+    expected = float((amplitude * r).sum() / r.sum()) ** 2
+    found = learn_to_focus(setting, steps=0)
+    assert found.flat_bound == pytest.approx(expected, abs=4e-3)
+    assert found.steps == 0
+
+
+def test_the_same_seed_is_the_same_course():
+    small = Setting(samples=32, size=17, patch=16, batch=1)
+    courses = [learn_to_focus(small, steps=3).losses for _ in range(2)]
+    assert courses[0] == courses[1]
+    leaves = dead_leaves(2, size=80)
+    assert not torch.equal(draw(leaves, small, 0), draw(leaves, small, 1))
+
+
+def test_an_even_window_is_refused():
+    with pytest.raises(ValueError, match="no pixel at its middle: expected an odd size"):
+        learn_to_focus(Setting(size=64))

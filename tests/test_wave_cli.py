@@ -1,0 +1,187 @@
+"""`raytrace wave psf` and `focus`: fixed forms, arrays and JSON against the library, files, and how they refuse."""
+
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from raytrace.cli import main, wave_table
+from raytrace.grid import grid
+from raytrace.wave.aim import aim
+from raytrace.wave.baselines import BASELINES, baseline
+from raytrace.wave.exchange import write_heights
+from raytrace.wave.fabrication import as_rings
+from raytrace.wave.plan import ENGINES
+from raytrace.wave.psf import psf
+from raytrace.wave.scene import WaveScene
+
+FORM = ["--focus", "1000", "--depth", "500", "1000", "inf", "--wavelength", "0.46", "0.55", "0.64"]
+FORM += ["--pixel", "0.00369", "--size", "128"]
+SMALL = ["--depth", "1000", "--wavelength", "0.55", "--size", "16"]
+
+
+@pytest.fixture
+def run(capsys, tmp_path, monkeypatch):
+    """Run a subcommand in an empty folder: exit code, standard output, standard error."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("RAYTRACE_TRACEBACK", raising=False)
+
+    def call(*arguments):
+        capsys.readouterr()
+        code = main(["wave", *map(str, arguments)])
+        return code, *capsys.readouterr()
+
+    return call
+
+
+def tensor(numbers):
+    return torch.tensor(numbers, dtype=torch.float64)
+
+
+def library(elements, depths, wavelengths, size=128):
+    return psf(WaveScene(elements, tensor(35.5), tensor(depths), tensor(wavelengths), grid(tensor(0.00369), size)))
+
+
+def test_fixed_form_gives_the_librarys_kernels(run, tmp_path):
+    code, out, err = run("psf", "--element", "singlet", *FORM, "--json", "-o", "psf.npz", "psf.png")
+    assert code == 0, err
+    found = library(baseline("singlet", aim()), [500.0, 1000.0, math.inf], [0.46, 0.55, 0.64])
+    with np.load(tmp_path / "psf.npz") as arrays:
+        np.testing.assert_allclose(arrays["psf"], found.kernel.numpy(), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(arrays["energy"], arrays["psf"].sum((-2, -1)), atol=1e-12)
+        assert arrays["pixel_pitch"] == 0.00369
+        assert arrays["depths"].tolist() == [500.0, 1000.0, math.inf]
+        assert arrays["wavelengths"].tolist() == [0.46, 0.55, 0.64]
+        assert (str(arrays["engine"]), float(arrays["error"])) == ("radial", found.error)
+        assert arrays["centre"].tolist() == [0.0, 0.0]
+        # Centred on the axis: an even window has no pixel of its own there.
+        np.testing.assert_allclose(arrays["psf"], arrays["psf"][..., ::-1, ::-1], atol=1e-9)
+    document = json.loads(out)
+    assert [(r["depth"], r["wavelength"]) for r in document["results"][-2:]] == [(None, 0.55), (None, 0.64)]
+    assert document["results"][4]["energy"] == pytest.approx(float(found.energy[1, 1]), abs=1e-12)
+    # Blur of a disc: half of the light within a/√2 (2.5 mm · 35.5 mm · 1 dioptre), to the pixel.
+    assert document["results"][1]["half_energy_radius"] == pytest.approx(2.5 * 35.5e-3 / math.sqrt(2), abs=0.00369)
+    assert (tmp_path / "psf.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_names_and_engines_are_those_of_the_library():
+    assert tuple(BASELINES) == wave_table.ELEMENTS
+    assert ("auto", *ENGINES) == wave_table.ENGINES
+
+
+@pytest.mark.parametrize("element", ["ideal", "singlet", "fresnel", "multifocal", "hybrid", "multifocal-refractive"])
+def test_named_elements(run, element):
+    code, out, err = run("psf", "--element", element, *SMALL, "--aperture", "1", "--json")
+    assert code == 0, err
+    document = json.loads(out)
+    assert document["element"] == element
+    assert 0 < document["results"][0]["energy"] <= 1
+
+
+def test_an_element_of_a_file_is_the_element_that_was_written(run, tmp_path):
+    """A kinoform in 16 steps as heights not yet wrapped: glass, wave and steps come from the command line."""
+    (lens,) = baseline("fresnel", aim(radius=0.5), levels=16)
+    write_heights(as_rings(lens, 0.002).profile, tmp_path / "rings.npy")
+    arguments = ("--aperture", "1", *SMALL, "--json")
+    made = ("--glass", "F_SILICA", "--design-wavelength", "0.55", "--levels", "16")
+    code, out, err = run("psf", "--element", "rings.npy", *made, *arguments)
+    assert code == 0, err
+    named = json.loads(run("psf", "--element", "fresnel", "--levels", "16", *arguments)[1])
+    assert json.loads(out)["results"][0]["peak"] == pytest.approx(named["results"][0]["peak"], rel=1e-6)
+    whole = json.loads(run("psf", "--element", "rings.npy", "--glass", "F_SILICA", *arguments)[1])
+    assert whole["results"][0]["peak"] != pytest.approx(named["results"][0]["peak"], rel=1e-4)
+
+
+def test_exact_spheres_and_paraboloids_differ(run):
+    peaks = [
+        json.loads(run("psf", "--element", "ideal", *SMALL, "--json", *more)[1])["results"][0]["peak"]
+        for more in ((), ("--exact",))
+    ]
+    assert 1e-4 < abs(peaks[0] / peaks[1] - 1) < 0.05
+
+
+def test_text_and_the_other_figures(run, tmp_path):
+    names = {"--heights": "h.png", "--encircled": "e.svg"}
+    words = [word for pair in names.items() for word in pair]
+    code, out, err = run("psf", "--element", "fresnel", "--aperture", "1", *SMALL, "-o", "k.pdf", *words)
+    assert code == 0, err
+    assert "radial engine" in out
+    assert "1000 mm" in out
+    for name in ("k.pdf", *names.values()):
+        assert (tmp_path / name).stat().st_size > 2000
+        assert f"written: {name}" in err
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (["--element", "singlett"], 1, "did you mean singlet?"),
+        (["--element", "none.npy"], 1, "none.npy: cannot be read: No such file"),
+        (["--engine", "pupil", "--samples", "48", "--depth", "500"], 1, "repeat the image every"),
+        (["--engine", "radial", "--element", "cubic"], 1, "radial engine needs round elements"),
+        (["--wavelength", "0.3"], 1, "PMMA is known from 0.365 to 1.06 µm, not at 0.3"),
+        (["--levels", "16"], 1, "the element singlet is smooth"),
+        (["--glass", "F_SILICA"], 1, "--glass belongs to a height map"),
+        (["-o", "psf.txt"], 1, "psf.txt: expected a name that ends in .npz"),
+        (["--caustic", "psf.npz"], 1, "psf.npz: expected a name that ends in .png"),
+        (["-o", "no/psf.npz"], 1, "no/psf.npz: cannot be written"),
+        (["--depth", "0"], 2, "not above 0"),
+        (["--wavelength", "green"], 2, "not a number"),
+        (["--engine", "best"], 2, "invalid choice"),
+        (["--size", "0"], 2, "not above 0"),
+    ],
+)
+def test_errors_are_one_line(run, tmp_path, words, code, message):
+    found, out, err = run("psf", *words)
+    assert (found, out) == (code, "")
+    assert message in err
+    assert "Traceback" not in err
+    assert err.splitlines()[-1].startswith("raytrace: error: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_small_file_names_its_aperture(run, tmp_path):
+    write_heights(as_rings(baseline("fresnel", aim(radius=0.5))[0], 0.002).profile, tmp_path / "small.npy")
+    code, _, err = run("psf", "--element", "small.npy")
+    assert code == 1
+    assert "less than the aperture of 5 mm; give --aperture 1" in err
+
+
+def test_focus_prints_what_became_of_the_plate(run, tmp_path):
+    code, out, err = run("focus", "--steps", "4", "--json", "-o", "lens.npy", "--plot", "focus.png")
+    assert code == 0, err
+    document = json.loads(out)
+    assert document["initial_peak_ratio"] < 0.01 < document["peak_ratio"] < 0.5
+    assert document["steps"] == 4
+    assert document["seconds"] > 0
+    assert 0.85 < document["flat_pixels_best"] < 0.9
+    assert np.load(tmp_path / "lens.npy").shape == (128, 128)
+    assert (tmp_path / "focus.png").read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.parametrize("name", [entry[0] for entry in wave_table.SUBCOMMANDS])
+def test_help_teaches_by_example(run, name):
+    from raytrace.cli import build_parser
+
+    code, out, err = run(name, "--help")
+    assert (code, err) == (0, "")
+    examples = out.split("examples:")[1].strip().splitlines()
+    assert len(examples) >= 2
+    for line in examples:
+        words = line.split("|")[0].split()
+        assert words[:3] == ["raytrace", "wave", name]
+        assert build_parser().parse_args(words[1:]).subcommand == name
+
+
+def test_parsing_loads_no_torch():
+    code = (
+        "import sys; from raytrace.cli import main; main(['wave', 'psf', '--help']);"
+        "sys.exit(bool({'torch', 'numpy', 'matplotlib', 'tqdm'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[1], capture_output=True, timeout=120)
+    assert done.returncode == 0
