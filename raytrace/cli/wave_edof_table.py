@@ -61,8 +61,8 @@ def _edof(parser: argparse.ArgumentParser) -> None:
         "--filter",
         choices=("blind", "towards", "network"),
         default="blind",
-        help="of --loss images: the best blind one (default), the original's, towards the measurement, or the blind one "
-        "and a RED-Net behind it",
+        help="of --loss images: the best blind one (default), the original's, towards the measurement, or the blind "
+        "one and a RED-Net behind it",
     )
     group.add_argument("--optimizer", choices=("adam", "sgd", "adadelta"), default="adam", help="default adam")
     group.add_argument("--schedule", choices=("cosine", "linear", "constant"), default="cosine", help="default cosine")
