@@ -27,6 +27,7 @@ FLOORS = {
     "departure": 1,
     # 2
     "agf": 2,
+    "glass_table": 2,
     "deconvolve": 2,
     "superresolution": 2,
     "surface": 2,

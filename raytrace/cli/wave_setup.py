@@ -14,7 +14,8 @@ from tqdm import tqdm
 
 from raytrace.catalog import find_glass
 from raytrace.cli.door import CommandError, catalogs
-from raytrace.glass import check_wavelengths
+from raytrace.glass import Glass, check_wavelengths
+from raytrace.glass_table import from_table
 from raytrace.grid import grid
 from raytrace.wave.aim import Aim
 from raytrace.wave.aim import aim as aim_of
@@ -60,7 +61,7 @@ def elements(arguments: argparse.Namespace) -> tuple[Element, ...]:
 
 
 def _named(arguments: argparse.Namespace) -> tuple[Element, ...]:
-    for option in ("glass", "pitch", "span"):
+    for option in ("glass", "index", "pitch", "span"):
         if getattr(arguments, option) is not None:
             raise CommandError(f"--{option} belongs to a height map; the element {arguments.element} has its own")
     if not arguments.levels:
@@ -73,7 +74,7 @@ def _named(arguments: argparse.Namespace) -> tuple[Element, ...]:
 def _from_file(arguments: argparse.Namespace) -> Element:
     """A height map in the aperture; wrapped where a design wavelength or steps are given."""
     path = arguments.element
-    glass = find_glass(arguments.glass or "PMMA", user=catalogs(arguments))
+    glass = _glass(arguments)
     profile = read_heights(path, pitch=arguments.pitch, span=tuple(arguments.span) if arguments.span else None)
     profile = dataclasses.replace(profile, heights=profile.heights.double(), pitch=profile.pitch.double())
     counts = (2 * len(profile.heights),) if isinstance(profile, Rings) else profile.heights.shape
@@ -89,6 +90,17 @@ def _from_file(arguments: argparse.Namespace) -> Element:
     if arguments.design_wavelength or arguments.levels:
         element = wrapped(element, arguments.design_wavelength or _WAVELENGTH, levels=arguments.levels or 0)
     return element
+
+
+def _glass(arguments: argparse.Namespace) -> Glass:
+    if arguments.index is None:
+        return find_glass(arguments.glass or "PMMA", user=catalogs(arguments))
+    if arguments.glass:
+        raise CommandError("--glass and --index both name the material: give one of them")
+    try:
+        return from_table(arguments.wavelength, arguments.index)
+    except ValueError as error:
+        raise CommandError(f"--index: {error}") from error
 
 
 def check_colours(parts: Sequence[Element], wavelengths: Sequence[float]) -> None:

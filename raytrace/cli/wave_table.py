@@ -7,6 +7,7 @@ import argparse
 
 from raytrace.cli.options import catalog, count, file_name, json, output, plot, positive, positive_finite, seed_number
 from raytrace.cli.wave_edof_table import EDOF
+from raytrace.cli.wave_superres_table import SUPERRES
 
 #: The names that `--element` takes beside files: those of wave.baselines.
 ELEMENTS = (
@@ -77,6 +78,13 @@ def element(parser: argparse.ArgumentParser) -> None:
         "--levels", metavar="N", type=count, help="steps of a wave's height, of wrapped elements (default any height)"
     )
     group.add_argument("--glass", metavar="NAME", help="material of a file's element (default PMMA)")
+    group.add_argument(
+        "--index",
+        metavar="N",
+        type=positive_finite,
+        nargs="+",
+        help="refractive index of a file's element at each --wavelength, instead of --glass",
+    )
     group.add_argument("--pitch", metavar="MM", type=positive_finite, help="of a file that does not say it")
     group.add_argument(
         "--span", metavar="MM", type=float, nargs=2, help="heights of black and white of a picture that does not say"
@@ -212,7 +220,6 @@ _FOCUS_EXAMPLES = """examples:
   raytrace wave focus --method adam --plot focus.png -o lens.npy
   raytrace wave focus --collimator --steps 200"""
 
-# Entries of other files go below: give each its add_arguments in a table without torch, as codesign_table is one.
 SUBCOMMANDS = (
     (
         "psf",
@@ -231,7 +238,7 @@ SUBCOMMANDS = (
         "wave_commands.focus",
     ),
     *EDOF,
-    # superres, quantise: ("superres", …, "wave_superres.superres"), …
+    *SUPERRES,
 )
 
 

@@ -1,0 +1,144 @@
+"""What fabrication costs: the law of kinoforms, steps of height, and learning with steps in the loop."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from raytrace.catalog import find_glass
+from raytrace.design.edof import World, expected_error, periodic, quality, scene, spectrum, transfer
+from raytrace.design.quantise import (
+    WAYS,
+    Judge,
+    efficiency,
+    law,
+    learn_on,
+    made,
+    read,
+    steps_of,
+    tolerances_of,
+    whole,
+)
+from raytrace.pictures import dead_leaves
+from raytrace.wave.aim import aim
+from raytrace.wave.baselines import baseline
+from raytrace.wave.element import Element, EvenPowers, Rings, period
+from raytrace.wave.psf import psf
+
+#: Small, and quick: 1 mm, f/20, one colour, three depths.
+WORLD = World(radius=0.5, sensor_distance=20.0, depths=(200.0, 400.0, math.inf), design=400.0, wavelengths=(0.5, 0.6),
+              size=48, noise=0.01)  # fmt: skip
+PICTURES = periodic(dead_leaves(6, size=64), 96)
+
+
+def fresnel(pitch: float = 0.002) -> Element:
+    made_for = aim(radius=WORLD.radius, sensor=WORLD.sensor_distance, focus=WORLD.design)
+    (element,) = baseline("fresnel", made_for, pitch=pitch)
+    return element
+
+
+def judge() -> Judge:
+    return Judge(WORLD, spectrum(PICTURES))
+
+
+def bumpy() -> Element:
+    """The lens and half a wave more: nothing that a step would not change."""
+    element = whole(fresnel(0.01))
+    r = torch.arange(len(element.profile.heights), dtype=torch.float64)
+    heights = element.profile.heights + 0.3e-3 * torch.sin(0.4 * r)
+    return dataclasses.replace(element, profile=dataclasses.replace(element.profile, heights=heights))
+
+
+@pytest.mark.parametrize("levels", [2, 3, 4, 8, 16, 64])
+def test_a_kinoform_keeps_the_law(levels):
+    """Steps as narrow as they come, 5 mm at f/7.1: sinc²(1/L) to 2e-4."""
+    (lens,) = baseline("singlet", aim())
+    assert efficiency(made(lens, levels, wrap=True), World()) == pytest.approx(law(levels), abs=2e-4)
+
+
+def test_any_height_keeps_all_light_and_rings_some():
+    """A flat ring of width w at a slope of s waves/mm keeps sinc²(s w); over the area of f/7.1 rings, 0.890 of it."""
+    (lens,), (rings,) = (baseline(name, aim()) for name in ("singlet", "fresnel"))
+    assert efficiency(made(lens, 0, wrap=True), World()) == pytest.approx(1.0, abs=1e-9)
+    r = 2.5 * torch.sqrt((torch.arange(100_000, dtype=torch.float64) + 0.5) / 100_000)
+    slope = r * (1 / 1000 + 1 / 35.5) / 0.55e-3
+    expected = float(torch.sinc(slope * 0.002).mean() ** 2)
+    assert efficiency(rings, World()) == pytest.approx(expected, abs=2e-3)
+    assert law(0) == 1.0
+
+
+@pytest.mark.parametrize("levels", [2, 16])
+def test_made_has_its_levels(levels):
+    element = bumpy()
+    step = float(period(element.glass, 0.55)) / levels
+    high = made(element, levels, wrap=False).profile.heights
+    torch.testing.assert_close(high / step, torch.round(high / step), atol=1e-9, rtol=0)
+    below = element.profile.heights - high
+    assert float(below.min()) > -1e-3 * step
+    assert float(below.max()) < step
+    assert made(element, levels, wrap=True).levels == levels
+    assert made(element, 0, wrap=False) is not element
+    torch.testing.assert_close(made(element, 0, wrap=False).profile.heights, element.profile.heights, rtol=0, atol=0)
+
+
+def test_judge_is_the_closed_form_of_edof():
+    element, own = fresnel(), judge()
+    found = psf(scene((element,), WORLD))
+    expected = expected_error(transfer(found, 96), spectrum(PICTURES), WORLD.noise)
+    torch.testing.assert_close(own.error(element), expected, rtol=1e-4, atol=0)
+    shown = quality((element,), WORLD, train=PICTURES, test=PICTURES).mean["blind"]
+    assert own.restored(element, PICTURES) == pytest.approx(shown, abs=0.02)  # noise drawn there, expected here
+
+
+def test_a_wrap_at_its_own_wavelength_costs_nothing():
+    mono = dataclasses.replace(WORLD, wavelengths=(0.55,))
+    own, element = Judge(mono, spectrum(PICTURES)), bumpy()
+    wrapped, not_wrapped = (own.closed(made(element, 0, wrap=wrap)) for wrap in (True, False))
+    assert wrapped == pytest.approx(not_wrapped, abs=1e-9)
+    colours = judge()
+    assert colours.closed(made(element, 0, wrap=True)) < colours.closed(made(element, 0, wrap=False)) - 0.05
+
+
+def test_steps_in_the_loop_are_no_worse_than_steps_afterwards():
+    own, stepped = judge(), made(bumpy(), 2, wrap=True)
+    trained = learn_on(stepped, own, steps=4, rate=0.05)
+    assert own.closed(trained) > own.closed(stepped) + 0.01
+    assert trained.levels == 2
+    assert own.closed(learn_on(stepped, own, steps=0)) == own.closed(stepped)
+
+
+def test_rows_of_every_way_and_level():
+    own = judge()
+    rows, elements = steps_of("bumpy", bumpy(), own, PICTURES, levels=(2, 64), ways=tuple(WAYS), steps=2)
+    assert [(row.made, row.levels) for row in rows] == [(way, n) for way in WAYS for n in (0, 2, 64)]
+    by = {(row.made, row.levels): row for row in rows}
+    for way in ("whole", "wrapped", "looped"):
+        assert by[way, 64].closed == pytest.approx(by[way, 0].closed, abs=0.02)
+        assert by[way, 2].closed < by[way, 0].closed
+    assert by["looped", 0].closed >= by["wrapped", 0].closed
+    for n in (0, 2, 64):
+        assert by["trained", n].closed >= by["looped", n].closed
+    assert own.closed(elements["trained", 2]) == by["trained", 2].closed
+
+
+def test_errors_of_height_cost_little_and_repeat():
+    own = judge()
+    element = made(bumpy(), 16, wrap=True)
+    rows = tolerances_of("bumpy", "wrapped", element, own, nm=(0.0, 20.0, 200.0), count=3)
+    again = tolerances_of("bumpy", "wrapped", element, own, nm=(0.0, 20.0, 200.0), count=3)
+    assert rows == again
+    assert rows[0].least == rows[0].greatest == pytest.approx(own.closed(element), abs=1e-9)
+    assert abs(rows[1].mean - rows[0].mean) < 0.3
+    assert abs(rows[2].mean - rows[0].mean) > 10 * abs(rows[1].mean - rows[0].mean)
+
+
+def test_what_is_no_run_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"no settings.json; expected the folder of a run"):
+        read(tmp_path, spectrum(PICTURES))
+
+
+def test_radial_elements_only():
+    assert isinstance(whole(fresnel()).profile, Rings)
+    smooth = Element(EvenPowers(torch.zeros(1, dtype=torch.float64)), torch.tensor(0.5), find_glass("PMMA"))
+    assert whole(smooth).period is None
