@@ -11,6 +11,7 @@ import torch
 from tqdm import tqdm
 
 from raytrace.cli.door import CommandError, number, print_json, say
+from raytrace.cli.wave_edof_table import STARTS, STEPS
 from raytrace.design.edof import Quality, World, kernels, periodic, quality, spectrum
 from raytrace.design.edof_page import CAPTIONS, markdown
 from raytrace.design.edof_scene import deep, flat
@@ -181,7 +182,12 @@ def _write_page(docs: Path, found, learned, world: World, arguments: argparse.Na
     page = docs / "wave_edof.md"
     kept = below_the_mark(page.read_text()) if page.exists() else ""
     data = f"--data DIR --limit {arguments.limit} " if arguments.data else ""
-    command = f"raytrace wave table {data}-o FOLDER --docs docs"
+    effort = "".join(
+        f"--{name} {getattr(arguments, name)} "
+        for name, usual in (("starts", STARTS), ("steps", STEPS))
+        if getattr(arguments, name) != usual
+    )
+    command = f"raytrace wave table {data}{effort}-o FOLDER --docs docs"
     text = markdown(found, learned, world, command=command, figures=[n for n in CAPTIONS if n in made], kept=kept)
     write_atomically(page, lambda file: file.write(text.encode()))
     say(f"written: {page}")

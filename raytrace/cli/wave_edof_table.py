@@ -5,6 +5,7 @@ import argparse
 from raytrace.cli.options import count, file_name, json, plot, positive_finite, seed_number
 
 KINDS = ("rings", "smooth", "zernike")
+STEPS, STARTS = 120, 4
 
 _EDOF_DESCRIPTION = """\
 Learn a phase element that shows scenes from 0.5 m to infinity, in three colours, behind one linear filter: 5 mm
@@ -67,8 +68,8 @@ def _edof(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--optimizer", choices=("adam", "sgd", "adadelta"), default="adam", help="default adam")
     group.add_argument("--schedule", choices=("cosine", "linear", "constant"), default="cosine", help="default cosine")
     group.add_argument("--rate", metavar="R", type=positive_finite, default=0.02, help="µm a step (default 0.02)")
-    group.add_argument("--steps", metavar="N", type=count, default=120, help="default 120")
-    group.add_argument("--starts", metavar="N", type=count, default=4, help="random starts (default 4)")
+    group.add_argument("--steps", metavar="N", type=count, default=STEPS, help=f"default {STEPS}")
+    group.add_argument("--starts", metavar="N", type=count, default=STARTS, help=f"random starts (default {STARTS})")
     _pictures(parser.add_argument_group("pictures"))
     parser.add_argument("-o", "--output", metavar="FOLDER", type=file_name, help="folder of the run", required=True)
     json(parser)
@@ -77,8 +78,8 @@ def _edof(parser: argparse.ArgumentParser) -> None:
 
 def _table(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rows", metavar="ROW", nargs="+", help="only these (default: all)")
-    parser.add_argument("--steps", metavar="N", type=count, default=120, help="of learning (default 120)")
-    parser.add_argument("--starts", metavar="N", type=count, default=4, help="random starts (default 4)")
+    parser.add_argument("--steps", metavar="N", type=count, default=STEPS, help=f"of learning (default {STEPS})")
+    parser.add_argument("--starts", metavar="N", type=count, default=STARTS, help=f"random starts (default {STARTS})")
     _pictures(parser.add_argument_group("pictures"))
     parser.add_argument("-o", "--output", metavar="FOLDER", type=file_name, help="folder of learned elements")
     parser.add_argument("--docs", metavar="DOCS", type=file_name, help="folder for wave_edof.md and wave/")
