@@ -270,3 +270,30 @@ def test_integrals_over_pixels_add_up():
     assert torch.allclose(
         total, integrate(pupil.intensity(coarse, sums), sums.pixel, coarse.grid.pitch).sum((-2, -1)), atol=1e-4
     )
+
+
+@pytest.mark.parametrize(("waves", "share"), [(0.5, [0.0, 4 / math.pi**2, 0.0, 4 / (9 * math.pi**2)]), (0.25, None)])
+def test_orders_of_a_grating_of_two_levels(waves, share):
+    """Ten periods of two levels, a lens behind: order m gets sinc²(m/2) sin²(π w) times what the lens alone has there.
+
+    The orders lie λz/p = 0.1375 mm apart, eight times the Airy radius; light of one in the box of another is below 1 %.
+    """
+    radius, z, wavelength, period = 0.5, 25.0, 0.55, 0.1
+    steps = torch.arange(20) % 2
+    heights = (1e-3 * wavelength * waves) * steps.double().expand(20, 20)
+    glass = constant(2.0)
+    lens = Element(EvenPowers(vector(-0.5 / z)), scalar(radius), glass)
+    grating = Element(Pixels(heights, scalar(0.5 * period)), scalar(radius), glass)
+    apart = 1e-3 * wavelength * z / period
+
+    def energy(elements, order):
+        pixels = grid(scalar(apart / 5), 5, vector(order * apart, 0.0))
+        own = WaveScene(elements, scalar(z), vector(math.inf), vector(wavelength), pixels)
+        return float(psf(own, engine="pupil", samples=400).energy)
+
+    alone = energy((lens,), 0)
+    for order in range(4):
+        law = np.sinc(order / 2) ** 2 * math.sin(math.pi * waves) ** 2 if order else math.cos(math.pi * waves) ** 2
+        if share is not None:
+            assert law == pytest.approx(share[order], abs=1e-12)
+        assert energy((lens, grating), order) / alone == pytest.approx(law, abs=0.01)
