@@ -240,7 +240,7 @@ def optimise(
     def loss(step: int, share: Share) -> tuple[Tensor, Record]:
         error = absolute_error(camera, batches(step, share)).sum() / pixels
         if share.rank == 0 and optics:  # once: gradients are summed over processes
-            error = error + camera.variables.violation()
+            error = error + camera.variables.violation().to(error.dtype)
         return error, camera.variables.numbers()
 
     yield from train(
