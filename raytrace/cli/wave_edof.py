@@ -4,13 +4,15 @@ import argparse
 import dataclasses
 import json
 import math
+import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
 import torch
 from tqdm import tqdm
 
-from raytrace.cli.door import CommandError, number, print_json, say
+from raytrace.cli.codesign_setup import plain
+from raytrace.cli.door import CommandError, print_json, say
 from raytrace.cli.wave_edof_table import STARTS, STEPS
 from raytrace.design.edof import Quality, World, kernels, periodic, quality, spectrum
 from raytrace.design.edof_page import CAPTIONS, markdown
@@ -45,7 +47,8 @@ def edof(arguments: argparse.Namespace) -> None:
         own = quality(
             elements, world, train=periodic(train, _WIDE), test=periodic(test, _WIDE), seed=settings.seed, found=found
         )
-    document = {"settings": dataclasses.asdict(settings), "world": dataclasses.asdict(world), **_plain(own)}
+    known = {"settings": settings, "world": world}
+    document = plain({name: dataclasses.asdict(one) for name, one in known.items()} | dataclasses.asdict(own))
     write_atomically(folder / "outcome.json", lambda file: file.write(json.dumps(document, indent=1).encode()))
     profile = as_made(elements[0]).profile if settings.kind == "rings" else as_pixels(elements[0], world.pixel).profile
     write_heights(profile, folder / "heights.npy")
@@ -70,14 +73,7 @@ def table(arguments: argparse.Namespace) -> None:
     if arguments.docs:
         _write_page(Path(arguments.docs), found, learned, world, arguments)
     if arguments.json:
-        print_json(
-            {
-                "rows": [
-                    {k: v if isinstance(v, str) else number(v) if v is not None else None for k, v in record.items()}
-                    for record in records(found)
-                ]
-            }
-        )
+        print_json({"rows": plain(records(found))})
     else:
         _print_table(found)
 
@@ -161,14 +157,15 @@ def _learned(arguments: argparse.Namespace, world: World, train: Pictures) -> di
         "learned-16": Settings(kind="rings", levels=16, **common),
     }
     asked = {name: own for name, own in wanted.items() if arguments.rows is None or name in arguments.rows}
-    if asked and not arguments.output:
-        say("learned rows are left out: give -o FOLDER, where they are kept")
-        return {}
-    found = {}
-    for name, settings in asked.items():
-        camera = _learn(settings, world, train, Path(arguments.output) / name, NAMES[name])
-        with torch.no_grad():
-            found[name] = camera.variables()
+    with tempfile.TemporaryDirectory() as unkept:
+        if asked and not arguments.output:
+            say("learned elements are not kept: -o FOLDER keeps them")
+        folder = Path(arguments.output or unkept)
+        found = {}
+        for name, settings in asked.items():
+            camera = _learn(settings, world, train, folder / name, NAMES[name])
+            with torch.no_grad():
+                found[name] = camera.variables()
     return found
 
 
@@ -232,10 +229,6 @@ def _print_table(found) -> None:
             ]
             print(f"{NAMES[record['row']]:>32} {cells[0]:>14} {cells[1]:>14} {record['spread_blind']:>7.2f} {talk:>14}")
         print()
-
-
-def _plain(own: Quality) -> dict:
-    return dataclasses.asdict(own)
 
 
 def _bar(given: Iterable, what: str):

@@ -26,7 +26,7 @@ _EDOF_EXAMPLES = """examples:
 _TABLE_DESCRIPTION = """\
 PSNR of restored pictures over 0.5 m to infinity for every baseline and for learned elements, behind two filters: the
 Wiener filter of the 1 m kernel with the best constant, and the best linear one that knows no depth. On dead leaves of
-two sizes, and on real pictures with --data. What is learned is kept in FOLDER and read again."""
+two sizes, and on real pictures with --data. What is learned is kept in FOLDER, if one is given, and read again."""
 
 _TABLE_EXAMPLES = """examples:
   raytrace wave table --json
