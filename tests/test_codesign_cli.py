@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 import raytrace
-from raytrace.cli import codesign_setup, codesign_table, main
+from raytrace.cli import codesign_setup, codesign_table
 from raytrace.design import study
 from raytrace.design.codesign import Settings, lens_at_start
 from raytrace.formats import read_lens
@@ -35,17 +35,9 @@ def pictures(tmp_path_factory):
 
 
 @pytest.fixture
-def run(capsys, tmp_path, monkeypatch):
-    """Run a command line in an empty folder: exit code, standard output, standard error."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("RAYTRACE_TRACEBACK", raising=False)
-
-    def call(*arguments):
-        capsys.readouterr()
-        code = main(["codesign", *map(str, arguments)])
-        return code, *capsys.readouterr()
-
-    return call
+def run(command):
+    """Run a subcommand of `raytrace codesign` in an empty folder: exit code, standard output, standard error."""
+    return functools.partial(command, "codesign")
 
 
 def read(path):

@@ -1,5 +1,6 @@
 """`raytrace wave psf` and `focus`: fixed forms, arrays and JSON against the library, files, and how they refuse."""
 
+import functools
 import json
 import math
 import subprocess
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from raytrace.cli import main, wave_table
+from raytrace.cli import wave_table
 from raytrace.grid import grid
 from raytrace.wave.aim import aim
 from raytrace.wave.baselines import BASELINES, baseline
@@ -26,17 +27,9 @@ SMALL = ["--depth", "1000", "--wavelength", "0.55", "--size", "16"]
 
 
 @pytest.fixture
-def run(capsys, tmp_path, monkeypatch):
-    """Run a subcommand in an empty folder: exit code, standard output, standard error."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("RAYTRACE_TRACEBACK", raising=False)
-
-    def call(*arguments):
-        capsys.readouterr()
-        code = main(["wave", *map(str, arguments)])
-        return code, *capsys.readouterr()
-
-    return call
+def run(command):
+    """Run a subcommand of `raytrace wave` in an empty folder: exit code, standard output, standard error."""
+    return functools.partial(command, "wave")
 
 
 def tensor(numbers):

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor, nn
 
 from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike
-from raytrace.zernike import noll, polynomials
 
 #: Of each kind of profile, the field that holds its numbers.
 NUMBERS = {Pixels: "heights", Rings: "heights", Zernike: "coefficients", EvenPowers: "coefficients"}
@@ -20,7 +19,7 @@ class PhaseVariables(nn.Module):
         numbers = start + unit · B c      c = `change`, from zero;   without a basis B = 1
 
     element: where it starts; unit: mm of a change of 1, a micrometre by default, so that rates of learning read in µm.
-    basis: (numbers..., K), what the K changes add to its heights or coefficients: `radial_basis`, say.
+    basis: (numbers..., K), what the K changes add to its heights or coefficients: `radial_powers`, say.
     others: elements in contact that stay as they are. tolerance: heights err by up to so many mm, evenly, by `draw`.
     """
 
@@ -61,7 +60,7 @@ class PhaseVariables(nn.Module):
 
 
 def radial_powers(radius: Tensor, terms: int) -> Tensor:
-    """The same polynomials as even powers of r in mm: (terms, terms), a column each, for `EvenPowers` profiles.
+    """Zernike polynomials without angle, n = 2, 4, …, as even powers of r in mm: (terms, terms), a column each.
 
     Z_n0 = √(n + 1) Σ_s (-1)^s (n - s)!/(s! ((n/2 - s)!)²) (r/R)^(n - 2s);   piston is left out
     """
@@ -72,20 +71,3 @@ def radial_powers(radius: Tensor, terms: int) -> Tensor:
             found[k - s - 1, k - 1] = (-1) ** s * math.sqrt(2 * k + 1) * share
     power = radius.detach() ** (-2.0 * torch.arange(1, terms + 1, dtype=torch.float64).to(radius))
     return power[:, None] * found.to(radius)
-
-
-def radial_basis(element: Element, terms: int) -> Tensor:
-    """Zernike polynomials without angle, n = 2, 4, …, 2·terms, at the middles of an element's rings: (R, terms)."""
-    profile = element.profile
-    middle = (torch.arange(len(profile.heights), dtype=profile.heights.dtype) + 0.5) * profile.pitch
-    # Beyond the aperture polynomials grow without bound, and no light comes.
-    r = (middle / element.radius).clamp(max=1.0)
-    return polynomials([(2 * k, 0) for k in range(1, terms + 1)], r, torch.zeros_like(r)).T
-
-
-def zernike_basis(element: Element, terms: Sequence[int]) -> Tensor:
-    """Noll's polynomials of these numbers at the middles of an element's pixels: (rows, columns, K)."""
-    heights, pitch = element.profile.heights, element.profile.pitch
-    y, x = ((torch.arange(n, dtype=heights.dtype) - 0.5 * (n - 1)) * pitch / element.radius for n in heights.shape)
-    far = torch.sqrt(x * x + y[:, None] ** 2).clamp_min(1.0)
-    return polynomials([noll(j) for j in terms], x / far, y[:, None] / far).movedim(0, -1)

@@ -65,7 +65,7 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0) -> Kernels:
     not exist behind a hard edge. residual: size of the terms that Debye's integral leaves out.
     Raises ValueError where the window or the blur would need too many rays.
     """
-    fields = [_field_kernels(_one_field(scene, f), _one_field_grid(grid, f), order) for f in range(scene.shape[1])]
+    fields = [_field_kernels(one_field(scene, f), one_field_grid(grid, f), order) for f in range(scene.shape[1])]
     kernel, centroid, covariance, residual = (
         torch.cat(parts, axis)
         for parts, axis in zip(zip(*(entries for _, *entries in fields), strict=True), (1, 2, 2, 1), strict=True)
@@ -113,7 +113,7 @@ def strehl(scene: Scene, *, order: int = 0) -> Tensor:
     The best point of the sensor plane, within 4 λ/NA of the centroid, is searched without gradient: to first order the
     value does not depend on it. 0 where no light arrives.
     """
-    ratios = [_strehl(_one_field(scene, f), order) for f in range(scene.shape[1])]
+    ratios = [_strehl(one_field(scene, f), order) for f in range(scene.shape[1])]
     return torch.cat(ratios, 1).to(scene.wavelengths.dtype)
 
 
@@ -123,7 +123,7 @@ def phase_along_radius(probe: Wavefront, reach: Tensor | float) -> float:
     dΦ/dp = (2πn/λ) |∂(L, M)/∂p · (x_ray - x)|: directions times the distance between ray and point.
     """
     with torch.no_grad():
-        spread = _half_spread(probe)[..., None]
+        spread = half_spread(probe)[..., None]
         blur = torch.where(probe.usable, torch.linalg.vector_norm(probe.landing, dim=0), 0.0).amax(-1, keepdim=True)
         phase = 2e3 * math.pi * (probe.index / probe.wavelength)[:, None] * spread * (blur + reach)
         return float(phase.max())
@@ -134,7 +134,7 @@ def _field_kernels(scene: Scene, grid: Grid, order: int) -> tuple:
     probe = _probe(scene)
     centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))) - probe.centre[:2]
     local = Grid(grid.pitch, grid.rows, grid.columns, centre)
-    cutoff = 2e3 * float((_half_spread(probe) * probe.index / probe.wavelength).max())
+    cutoff = 2e3 * float((half_spread(probe) * probe.index / probe.wavelength).max())
     if symmetry(scene) == "round" and is_centred(grid):
         # One radius tells all: as a row of points, without pixels.
         radii, matrix = radii_of_waves(grid, cutoff, order)
@@ -186,7 +186,7 @@ def _debye_residual(front: Wavefront, probe: Wavefront, corner: Tensor) -> Tenso
     up to 6 b s/|R|. Against sums of wavelets on the exit pupil it is 1 to 10 times the true error out of focus.
     """
     with torch.no_grad():
-        spread = _half_spread(probe)
+        spread = half_spread(probe)
         wavelength = 1e-3 * front.wavelength / front.index
         blur = torch.where(probe.usable, torch.linalg.vector_norm(probe.landing, dim=0), 0.0).amax(-1)
         b = torch.minimum(corner, blur + wavelength / spread.clamp_min(1e-30))
@@ -194,7 +194,7 @@ def _debye_residual(front: Wavefront, probe: Wavefront, corner: Tensor) -> Tenso
         return torch.minimum(0.2 * math.pi * b * spread / wavelength, torch.full_like(b, 6.0)) * stretch
 
 
-def _half_spread(front: Wavefront) -> Tensor:
+def half_spread(front: Wavefront) -> Tensor:
     """Largest distance (...) of the directions (L, M) of the rays from their mean."""
     L, M = torch.where(front.usable, front.direction[:2], 0.0).detach()
     count = front.usable.sum(-1, keepdim=True).clamp_min(1)
@@ -259,7 +259,7 @@ def _rays(scene: Scene, probe: Wavefront, fold: str, phase: float, order: int) -
 
 def _strehl(scene: Scene, order: int) -> Tensor:
     probe = _probe(scene)
-    spacing = 0.25e-3 * probe.wavelength / probe.index / _half_spread(probe).clamp_min(1e-30)
+    spacing = 0.25e-3 * probe.wavelength / probe.index / half_spread(probe).clamp_min(1e-30)
     light = _waves(scene, probe, 20 * spacing.max(), order + 1)
     front = light.wavefront
     with torch.no_grad():
@@ -277,12 +277,13 @@ def _strehl(scene: Scene, order: int) -> Tensor:
     return safe_divide(U.real**2 + U.imag**2, peak**2)
 
 
-def _one_field(scene: Scene, f: int) -> Scene:
+def one_field(scene: Scene, f: int) -> Scene:
     """One field of a scene in double precision: in single precision the OPD itself is known to 1/400 wave only."""
     return to(dataclasses.replace(scene, fields=scene.fields[:, f : f + 1]), dtype=torch.float64)
 
 
-def _one_field_grid(grid: Grid, f: int) -> Grid:
+def one_field_grid(grid: Grid, f: int) -> Grid:
+    """The windows of one field, in double precision."""
     centre = grid.centre
     if centre.dim() > 1 and centre.shape[2] > 1:
         centre = centre[:, :, f : f + 1]

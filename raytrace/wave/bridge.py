@@ -23,7 +23,15 @@ from raytrace.grid import Grid
 from raytrace.lens import Fields, Lens, SystemAperture
 from raytrace.numerics import safe_divide
 from raytrace.psf.dft import integrate, nodes_per_pixel, rings_and_arms, sub_pixels
-from raytrace.psf.diffraction import Waves, amplitude, phase_along_radius, waves
+from raytrace.psf.diffraction import (
+    Waves,
+    amplitude,
+    half_spread,
+    one_field,
+    one_field_grid,
+    phase_along_radius,
+    waves,
+)
 from raytrace.psf.radial import is_centred, radii_of_waves, unfold
 from raytrace.pupil import gauss_rings
 from raytrace.scene import Scene, cross_scene, symmetry
@@ -144,7 +152,9 @@ def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: i
     """
     elements = tuple(to(element, dtype=torch.float64) for element in elements)
     _check_media(scene)
-    found = [_field_kernels(_field_of(scene, f), elements, _grid_of(grid, f), order) for f in range(scene.shape[1])]
+    found = [
+        _field_kernels(one_field(scene, f), elements, one_field_grid(grid, f), order) for f in range(scene.shape[1])
+    ]
     kernel = torch.cat([kernel for _, kernel in found], 1).to(grid.pitch.dtype)
     return StopPsf(kernel, grid, max(rays for rays, _ in found))
 
@@ -155,7 +165,7 @@ def _field_kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, orde
     probe = wavefront(scene, *gauss_rings(*_PROBE, **like))
     centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))) - probe.centre[:2]
     local = Grid(grid.pitch, grid.rows, grid.columns, centre)
-    cutoff = 2e3 * float((_half_spread(probe) * probe.index / probe.wavelength).max())
+    cutoff = 2e3 * float((half_spread(probe) * probe.index / probe.wavelength).max())
     radial = all(is_radial(element) for element in elements)
     matrix = None
     if radial and symmetry(scene) == "round" and is_centred(grid):
@@ -236,7 +246,7 @@ def _reach_of_elements(scene: Scene, probe: Wavefront, elements: tuple[Element, 
         for element in elements:
             steps = steps + _phase_of_steps(element, beam, probe.wavelength)
             steps = steps + _phase_of_turns(element, beam, probe.wavelength)
-        steps = safe_divide(steps, 2 * math.pi * _half_spread(probe) * probe.index / wave)
+        steps = safe_divide(steps, 2 * math.pi * half_spread(probe) * probe.index / wave)
         return float((spread + steps - alone).max())
 
 
@@ -310,14 +320,6 @@ def _refuse_too_many(rule: tuple[int, int], elements: tuple[Element, ...]) -> No
         )
 
 
-def _half_spread(front: Wavefront) -> Tensor:
-    """Largest distance (...) of the directions (L, M) of the rays from their mean."""
-    L, M = torch.where(front.usable, front.direction[:2], 0.0).detach()
-    count = front.usable.sum(-1, keepdim=True).clamp_min(1)
-    dL, dM = L - L.sum(-1, keepdim=True) / count, M - M.sum(-1, keepdim=True) / count
-    return torch.where(front.usable, torch.hypot(dL, dM), 0.0).amax(-1)
-
-
 def _disc(radius: Tensor) -> Tensor:
     """Points (2, P) mm all over a disc, its centre and its rim among them."""
     points, _ = gauss_rings(*_FINE, dtype=radius.dtype, device=radius.device)
@@ -331,15 +333,3 @@ def _check_media(scene: Scene) -> None:
     indices = media(scene.lens, scene.wavelengths)[stop - 1 : stop + 1]
     if any(bool(((n - 1).abs() > 1e-3).any()) for n in indices):
         raise ValueError(f"elements count their path beside air; the stop, surface {stop}, borders on another medium")
-
-
-def _field_of(scene: Scene, f: int) -> Scene:
-    """One field of a scene in double precision, as `psf.diffraction` takes it."""
-    return to(dataclasses.replace(scene, fields=scene.fields[:, f : f + 1]), dtype=torch.float64)
-
-
-def _grid_of(grid: Grid, f: int) -> Grid:
-    centre = grid.centre
-    if centre.dim() > 1 and centre.shape[2] > 1:
-        centre = centre[:, :, f : f + 1]
-    return to(Grid(grid.pitch, grid.rows, grid.columns, centre), dtype=torch.float64)
