@@ -160,14 +160,26 @@ def _constant_front(bundle: Bundle, recorded: bool) -> _Front:
     kept_indices = indices if len(fixed) == len(indices) else None
     if _varies(rays):
         return _Front(0, None, [], kept_indices)
-    count, crossings, surfaces = 0, [], lens.surfaces[1:]
+    surfaces = lens.surfaces[1:]
+    count, crossings = _unvaried(lens, indices), []
     with torch.enable_grad():
-        for crossing in steps(surfaces, rays, indices=indices):
-            if _varies(crossing.rays):
-                break
-            count, rays = count + 1, crossing.rays
-            crossings += [crossing] if recorded else []
+        if recorded:
+            crossings = list(steps(surfaces[:count], rays, indices=indices[: count + 1]))
+            rays = crossings[-1].rays if crossings else rays
+        else:
+            rays = trace_surfaces(surfaces[:count], rays, indices=indices[: count + 1])
     return _Front(count, rays, crossings, kept_indices)
+
+
+def _unvaried(lens: Lens, indices: Sequence[Tensor]) -> int:
+    """How many surfaces after the object lie before the first that a variable moves, bends or stands behind."""
+    for count, surface in enumerate(lens.surfaces[1:]):
+        gap = lens.surfaces[count].thickness if count else None
+        shape = surface.curvature, surface.conic, surface.coefficients, surface.departure
+        numbers = pytree.tree_leaves((gap, shape, *indices[count : count + 2]))
+        if any(isinstance(number, Tensor) and number.requires_grad for number in numbers):
+            return count
+    return len(lens.surfaces) - 1
 
 
 def _varies(rays: Rays) -> bool:

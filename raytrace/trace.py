@@ -5,6 +5,7 @@ rays, hand them with the surfaces that are left.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -12,6 +13,9 @@ import torch
 from torch import Tensor
 
 from raytrace import glass
+from raytrace.fused.choice import is_fused
+from raytrace.fused.run import trace_compiled
+from raytrace.fused.structure import is_expressible
 from raytrace.lens import Lens
 from raytrace.numerics import dot, unit, with_batch_axes
 from raytrace.rays import Rays
@@ -182,7 +186,31 @@ def trace_surfaces(
     side: int = 1,
     gap: Tensor | None = None,
 ) -> Rays:
-    """The rays behind the last of the surfaces; arguments as for `steps`."""
+    """The rays behind the last of the surfaces; arguments as for `steps`.
+
+    The compiled trace takes the runs of surfaces that it knows, where it pays: see `fused.tracing`.
+    """
+    if torch.compiler.is_compiling():
+        return _eager(surfaces, rays, indices=indices, side=side, gap=gap)
+    first = 0
+    for expressible, run in itertools.groupby(surfaces, is_expressible):
+        last = first + len(list(run))
+        how = {"indices": indices[first : last + 1], "side": side, "gap": gap}
+        rays = (_fused if expressible else _eager)(surfaces[first:last], rays, **how)
+        side = -side if sum(surface.is_mirror for surface in surfaces[first:last]) % 2 else side
+        gap, first = surfaces[last - 1].thickness, last
+    return rays
+
+
+def _fused(surfaces: Sequence[Surface], rays: Rays, **how) -> Rays:
+    if is_fused(rays, how["indices"][0], len(surfaces)):
+        end = trace_compiled(surfaces, rays, **how, eager=_eager)
+        if end is not None:
+            return end
+    return _eager(surfaces, rays, **how)
+
+
+def _eager(surfaces: Sequence[Surface], rays: Rays, *, indices, side: int, gap: Tensor | None) -> Rays:
     after = None
     for _, crossed in _walk(surfaces, rays, indices, side, gap):
         after = crossed[0]

@@ -4,9 +4,24 @@ import pytest
 from hypothesis import settings
 
 from raytrace.cli import main
+from raytrace.fused import prepare, tracing
 
 settings.register_profile("reproducible", derandomize=True, deadline=None)
 settings.load_profile("reproducible")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _compiled_trace():
+    """Tests trace as a user does who has compiled the trace before, whichever of them comes first."""
+    prepare()
+
+
+@pytest.fixture
+def engine(request):
+    """Traces by torch alone, or as `problems.both_engines` says."""
+    name = getattr(request, "param", "eager")
+    with tracing(name):
+        yield name
 
 
 @pytest.fixture

@@ -9,7 +9,9 @@ import copy
 import pytest
 import torch
 from hardcases_scene import CASES, OUTPUTS, Scene
+from torch.testing import assert_close
 
+from raytrace.fused import engine
 from raytrace.rays import Rays
 from raytrace.trace import start, trace_surfaces
 
@@ -100,9 +102,14 @@ def turning_rays_by_90_degrees_turns_results(case):
         return torch.stack([-v[1], v[0], v[2]])
 
     found = traced(scene, turned(position), turned(direction))
-    assert torch.equal(found.position, turned(plain.position))
-    assert torch.equal(found.direction, turned(plain.direction))
-    assert torch.equal(found.opl, plain.opl)
+    expected = Rays(turned(plain.position), turned(plain.direction), plain.valid, plain.opl)
+    if engine() == "eager":
+        assert_equal_rays(found, expected)
+        return
+    # The compiled trace fuses y² into x² + y² and rounds once: not the same in x and y.
+    assert torch.equal(found.valid, expected.valid)
+    for name in ("position", "direction", "opl"):
+        assert_close(getattr(found, name), getattr(expected, name), rtol=1e-14, atol=1e-14)
 
 
 def light_goes_back_the_way_it_came(case):

@@ -7,11 +7,15 @@ import math
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
 
+import pytest
 import torch
 
 from raytrace.glass import AIR, MIRROR, Glass, constant
 from raytrace.lens import Fields, Lens, SystemAperture
 from raytrace.surface import Aperture, Surface
+
+#: Runs a test by torch alone and by the compiled trace (fixture `engine`).
+both_engines = pytest.mark.parametrize("engine", ["eager", "fused"], indirect=True)
 
 #: Lengths in mm, for tolerances that carry a unit.
 MICROMETRE = 1e-3

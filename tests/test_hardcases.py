@@ -16,6 +16,7 @@ import hardcases_wave
 import pytest
 import torch
 from hardcases_scene import CASES, OUTPUTS, Scene
+from problems import both_engines
 
 from raytrace.glass import InvalidIndex, OutOfRange, check_wavelengths, refractive_index, sellmeier
 from raytrace.wavefront import path_to_reference_sphere
@@ -36,8 +37,9 @@ def of_kind(kind: str) -> list:
     return [pytest.param(case, id=f"{kind}-{case['id']}") for case in CASES if case["kind"] == kind]
 
 
+@both_engines
 @pytest.mark.parametrize("case", [case for kind in dict.fromkeys(c["kind"] for c in CASES) for case in of_kind(kind)])
-def test_hard_case(case):
+def test_hard_case(case, engine):
     check(case)
 
 

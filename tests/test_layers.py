@@ -14,6 +14,7 @@ FLOORS = {
     # 0: mathematics, knows no optics
     "value": 0,
     "numerics": 0,
+    "shards": 0,
     "pupil": 0,
     "zernike": 0,
     "files": 0,
@@ -46,8 +47,10 @@ FLOORS = {
     "reuse": 7,
     # 8
     "scene": 8,
+    "streaming": 8,
     # 9
     "wavefront": 9,
+    "stream_gradient": 9,
     # lens files: a family of its own between the lens and the plots
     "formats.source": 4,
     "formats.zemax_keywords": 4,
@@ -74,7 +77,7 @@ FLOORS = {
 }
 
 #: Folders that stand on one floor as a whole; inside them imports only have to run one way (no cycle).
-FAMILIES = {"psf": 10, "analysis": 11, "wave": 12, "design": 13, "plot": 14, "bench": 15, "cli": 16}
+FAMILIES = {"fused": 3, "psf": 10, "analysis": 11, "wave": 12, "design": 13, "plot": 14, "bench": 15, "cli": 16}
 
 #: What only these files may import.
 RESERVED = {

@@ -9,6 +9,7 @@ from problems import (
     FEMTOMETRE,
     PICOMETRE,
     aspheric_singlet,
+    both_engines,
     double_gauss,
     lens,
     scalar,
@@ -29,6 +30,8 @@ from raytrace.trace import axial_path, media, reflect, refract, start, steps, tr
 from raytrace.value import to
 
 ROUNDING = 2.0**-53
+
+pytestmark = pytest.mark.usefixtures("engine")
 
 
 def refracted(d, n, norm_squared, n1, n2):
@@ -63,6 +66,7 @@ def rays_of_problem(problem) -> Rays:
     return rays_from_point(vector(*problem.source)[:, None].expand_as(aim), aim, index=index)
 
 
+@both_engines
 @pytest.mark.parametrize("problem", stigmatic_problems(), ids=lambda problem: problem.name)
 def test_stigmatic_system_images_a_point_into_a_point(problem):
     last = trace_surfaces(problem.surfaces, rays_of_problem(problem), indices=[scalar(n) for n in problem.media])
@@ -225,6 +229,7 @@ def test_the_lossy_system_loses_rays_in_every_way():
     assert 0 < crossings[-1].rays.valid.sum() < 7
 
 
+@both_engines
 @pytest.mark.parametrize("number", range(5))
 def test_first_and_second_derivatives_of_every_number_with_lost_rays(number):
     """Thickness, curvature, conic, terms and index of each surface, and the rays themselves."""
@@ -367,6 +372,7 @@ def test_fields_wavelengths_and_pupil_together_equal_one_at_a_time():
             assert torch.equal(alone.opl[0, 0], whole.opl[f, w])
 
 
+@both_engines
 @pytest.mark.parametrize("count", [2, 3, 4])
 def test_wavelengths_against_rays_of_fewer_axes(count):
     """(W, 1) wavelengths against (3, P) rays: three wavelengths must not be taken for three components."""
@@ -383,6 +389,7 @@ def test_wavelengths_against_rays_of_fewer_axes(count):
         assert torch.equal(found.valid[i], alone.valid)
 
 
+@both_engines
 @pytest.mark.parametrize("count", [2, 3, 4])
 @pytest.mark.parametrize("which", ["curvature", "thickness"])
 def test_population_against_rays_of_fewer_axes(count, which):

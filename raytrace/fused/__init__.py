@@ -1,0 +1,17 @@
+"""The same trace compiled: one loop in C++ over all surfaces, and its adjoint by hand.
+
+choice      which trace carries a batch of rays, and the switch to force one
+library     the C++ of this folder, compiled once for a machine
+structure   a run of surfaces as that code reads it
+run         the code called on tensors, forward and backward
+block.h     what it works on: blocks of rays that stay in the cache
+loops.h     the surfaces as loops over a block, where nothing can go wrong
+careful.h   one ray at one surface, with every case that surface.py and asphere.py know
+adjoint.h   the adjoint of a surface, with its derivation
+trace.cpp   rays through all surfaces and back, block by block
+"""
+
+from raytrace.fused.choice import engine as engine
+from raytrace.fused.choice import prepare as prepare
+from raytrace.fused.choice import tracing as tracing
+from raytrace.fused.library import NoCompiler as NoCompiler

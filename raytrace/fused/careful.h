@@ -1,0 +1,205 @@
+// One ray at one surface in the arithmetic of raytrace/surface.py and asphere.py, with every case they know.
+#pragma once
+#include "loops.h"
+
+namespace raytrace {
+
+// First crossing with an even asphere, asphere.py line by line: Newton's method from the base conic, accepted by a
+// residual relative to the size of the terms, and a bracketed search for the rays that fail.
+struct AsphereSearch {
+  const Surface<double>& s;
+  int terms;
+  double x, y, z, L, M, N;
+
+  struct Residual { double F, dF, scale, u; bool inside; };
+  struct Found { double t; bool small, forward; double radius; };
+
+  Residual residual(double t) const {
+    double hx = x + t * L, hy = y + t * M, hz = z + t * N, u = hx * hx + hy * hy, S, dS, d2S, size = 0;
+    bool inside = sag<double, false>(s, terms, u, S, dS, d2S);
+    for (int j = terms - 1; j >= 0; j--) size = size * u + std::fabs(s.a[j]);
+    double radial = hx * L + hy * M;
+    double scale = std::fabs(hz) + std::fabs(s.c * u) + u * size + std::fabs(z) + std::fabs(t * N);
+    scale += 2 * std::fabs(dS) * (u + std::fabs(radial) * std::fabs(t));
+    return {hz - S, N - 2 * dS * radial, scale, u, inside};
+  }
+
+  Found newton(double t) const {
+    const double rounding = std::numeric_limits<double>::epsilon();
+    for (int step = 0; step < 24; step++) {
+      Residual r = residual(t);
+      if (r.dF == 0 || !std::isfinite(r.F)) break;
+      t -= r.F / r.dF;
+      if (!(std::fabs(r.F) > rounding * r.scale)) break;
+    }
+    Residual r = residual(t);
+    bool small = std::fabs(r.F) <= 64 * rounding * r.scale && r.inside && std::isfinite(t);
+    return {t, small, r.dF * (N < 0 ? -1 : 1) > 0, std::sqrt(r.u)};
+  }
+
+  double start() const {
+    double plane = std::fabs(N) > 1e-6 ? -z / N : 0, shape = 1 + s.k;
+    double A = s.c * (L * L + M * M + shape * N * N);
+    double G = N - s.c * (x * L + y * M + shape * z * N);
+    double F = s.c * (x * x + y * y + shape * z * z) - 2 * z;
+    double discriminant = G * G - A * F;
+    if (!(discriminant > 0) || !(G * N > 0)) return plane;
+    double t = F / (G + signed_as(std::sqrt(discriminant), N));
+    return std::hypot(x + t * L, y + t * M) <= s.rim ? t : plane;
+  }
+
+  bool bracketed(double& found_at) const {
+    const int samples = 96, bisections = 64;
+    const double infinity = std::numeric_limits<double>::infinity();
+    const double big = std::pow(std::numeric_limits<double>::max(), 0.25);
+    double closed = (1 + s.k) * s.c * s.c, edge = closed > 0 ? 1 / std::sqrt(closed) : big;
+    double reach = 4 * (std::sqrt(x * x + y * y) + std::fabs(z));
+    double radius = edge < big ? std::fmin(edge, s.rim) : s.rim;
+    if (!(radius < big)) radius = reach;
+
+    double A = L * L + M * M, B = x * L + y * M, C = x * x + y * y - radius * radius;
+    double discriminant = B * B - A * C, width_root = std::sqrt(std::fmax(discriminant, 0.0));
+    double first = A > 0 ? (-B - width_root) / A : -big, last = A > 0 ? (-B + width_root) / A : big;
+    bool possible = A > 0 ? discriminant >= 0 : C <= 0;
+
+    double low = infinity, high = -infinity;
+    for (int i = 0; i <= 64; i++) {
+      double at = i / 64.0 * radius, S, dS, d2S;
+      sag<double, false>(s, terms, at * at * (1 - 1e-7), S, dS, d2S);
+      low = std::fmin(low, S), high = std::fmax(high, S);
+    }
+    double margin = (high - low) * 0.05 + std::numeric_limits<double>::min();
+    low -= margin, high += margin;
+    if (std::fabs(N) > 1e-9) {
+      double at_low = (low - z) / N, at_high = (high - z) / N;
+      first = std::fmax(first, std::fmin(at_low, at_high));
+      last = std::fmin(last, std::fmax(at_low, at_high));
+    }
+    if (!possible || !(last >= first)) return false;
+
+    double sign = N < 0 ? -1 : 1, width = (last - first) / samples, before = sign * residual(first).F;
+    bool found = false;
+    double left = first;
+    for (int i = 1; i <= samples && !found; i++) {
+      double t = first + i * width, after = sign * residual(t).F;
+      if (before <= 0 && after > 0) left = t - width, found = true;
+      before = after;
+    }
+    if (!found) return false;
+    double right = left + width;
+    for (int i = 0; i < bisections; i++) {
+      double middle = 0.5 * (left + right);
+      (sign * residual(middle).F <= 0 ? left : right) = middle;
+    }
+    double t = 0.5 * (left + right);
+    Found polished = newton(t);
+    bool stayed = polished.small && polished.forward && std::fabs(polished.t - t) <= std::fabs(width);
+    found_at = stayed ? polished.t : t;
+    return true;
+  }
+
+  bool operator()(double& t) const {
+    Found found = newton(start());
+    bool converged = found.small && found.forward;
+    t = found.t;
+    if (converged && found.radius <= s.rim) return true;
+    return bracketed(t) || converged;
+  }
+};
+
+template <typename T>
+Surface<double> in_double(const Surface<T>& s) {
+  Surface<double> d{};
+  d.at = s.at, d.gap = s.gap, d.c = s.c, d.k = s.k, d.n1 = s.n1, d.n2 = s.n2, d.rim = s.rim;
+  for (int j = 0; j < kTerms; j++) d.a[j] = s.a[j];
+  return d;
+}
+
+// Path from the foot of the perpendicular, taken in float64 for either type; whether there is a crossing.
+template <typename T>
+bool crossing(const Surface<T>& s, T px, T py, T pz, T dx, T dy, T dz, T& path) {
+  double x = px, y = py, z = pz, L = dx, M = dy, N = dz, t = 0;
+  bool met;
+  if (s.at->kind == kAsphere) {
+    const Surface<double> d = in_double(s);
+    met = AsphereSearch{d, s.at->terms, x, y, z, L, M, N}(t);
+  } else {
+    double c = s.c, shape = T(1) + s.k;
+    double A = c * (L * L + M * M + shape * N * N);
+    double G = s.at->kind == kSphere ? N : N - c * (x * L + y * M + shape * z * N);
+    double F = c * (x * x + y * y + shape * z * z) - 2 * z;
+    double discriminant = G * G - A * F, r = signed_as(std::sqrt(std::fmax(discriminant, 0.0)), N);
+    bool same_sign = (N < 0 ? -G : G) >= 0;
+    t = same_sign ? F / (G + r) : (G - r) / A;
+    double height = shape * c * (z + t * N);
+    met = discriminant > 0 && height < 1 && std::fabs(t) < std::numeric_limits<double>::infinity();
+    if (s.at->kind == kSphere) met = met && height > -1;
+  }
+  path = met ? T(t) : T(0);
+  return met;
+}
+
+// Carries ray i of a block over a gap and through a surface. A ray that is lost becomes the axial ray.
+template <typename T, bool path>
+void cross_carefully(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int i, const Surface<T>& s) {
+  T x = from.x[i], y = from.y[i], z = from.z[i], L = from.L[i], M = from.M[i], N = from.N[i];
+  T ahead = z - s.gap, hx, hy, hz, nx = 0, ny = 0, nz = 1, w = 1, cosine = N;
+  bool met;
+  if (s.at->kind == kPlane) {
+    T t = ahead / N;
+    met = t * t < std::numeric_limits<T>::infinity();
+    hx = x - t * L, hy = y - t * M, hz = 0;
+  } else {
+    T slide = -(x * L + y * M + ahead * N), t;
+    T px = x + slide * L, py = y + slide * M, pz = ahead + slide * N;
+    met = crossing(s, px, py, pz, L, M, N, t);
+    hx = px + t * L, hy = py + t * M, hz = pz + t * N;
+    T S, dS = 0, d2S, shape = T(1) + s.k;
+    bool asphere = s.at->kind == kAsphere;
+    if (sizeof(T) == 8 && met) {  // polished; a root in float64 is exact in float32
+      T F, dF;
+      if (asphere) {
+        sag<T, false>(s, s.at->terms, hx * hx + hy * hy, S, dS, d2S);
+        F = hz - S, dF = N - 2 * dS * (hx * L + hy * M);
+      } else {
+        F = T(0.5) * s.c * (hx * hx + hy * hy + shape * hz * hz) - hz;
+        dF = s.c * (hx * L + hy * M + shape * hz * N) - N;
+      }
+      T step = F / dF;
+      hx -= step * L, hy -= step * M, hz -= step * N;
+    }
+    if (asphere) {
+      sag<T, false>(s, s.at->terms, hx * hx + hy * hy, S, dS, d2S);
+      nx = -2 * dS * hx, ny = -2 * dS * hy, w = 1 + 4 * dS * dS * (hx * hx + hy * hy);
+    } else {
+      nx = -s.c * hx, ny = -s.c * hy, nz = 1 - shape * s.c * hz, w = 1 - s.k * s.c * s.c * (hx * hx + hy * hy);
+    }
+    cosine = nx * L + ny * M + nz * N;
+  }
+  T l = L, m = M, o = N;
+  bool survives = met;
+  if (met && s.at->bend == kRefract) {
+    Surface<T> usable = s;
+    usable.n2 = s.n2 > 0 ? s.n2 : T(1);  // an index of 0 is none: the discriminant, with n2 = 0, says so
+    T D = (s.n2 - s.n1) * (s.n2 + s.n1), a = s.n1 * cosine, b_squared = D * w + a * a;
+    survives = b_squared > 0;
+    T along = survives ? D / usable.n2 / (a + signed_as(root(b_squared), a)) : T(0), mu = s.n1 / usable.n2;
+    l = mu * L + along * nx, m = mu * M + along * ny, o = mu * N + along * nz;
+  } else if (met && s.at->bend == kReflect) {
+    T twice = 2 * cosine / w;
+    l = L - twice * nx, m = M - twice * ny, o = N - twice * nz;
+  }
+  if (survives && s.at->bend != kNone) {
+    T factor = T(1.5) - T(0.5) * (l * l + m * m + o * o);
+    l *= factor, m *= factor, o *= factor;
+  }
+  if (path) {
+    T longer = reduced_path(hx, hy, hz, x, y, z, L, M, N, s.gap, s.at->gap >= 0, T(s.at->side));
+    to.path[i] = survives ? from.path[i] + s.n1 * longer : T(0);
+  }
+  to.x[i] = survives ? hx : T(0), to.y[i] = survives ? hy : T(0), to.z[i] = survives ? hz : T(0);
+  to.L[i] = survives ? l : T(0), to.M[i] = survives ? m : T(0), to.N[i] = survives ? o : T(1);
+  if (!survives) notes.valid[i] = 0, notes.lost[i] = notes.surface, notes.any_lost = true;
+}
+
+}  // namespace raytrace

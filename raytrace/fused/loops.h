@@ -1,0 +1,217 @@
+// The surfaces as loops over a block: the algebra of raytrace/surface.py and trace.py where nothing can go wrong.
+#pragma once
+#include "block.h"
+
+namespace raytrace {
+
+// What a surface does to a ray that crosses it at h with cosine n·d: Snell or the law of reflection (trace.py).
+template <typename T, int bend>
+struct Law {
+  T mu, D, over_n2, n1;
+  explicit Law(const Surface<T>& s)
+      : mu(s.n1 / s.n2), D((s.n2 - s.n1) * (s.n2 + s.n1)), over_n2(T(1) / s.n2), n1(s.n1) {}
+
+  // Turns (L, M, N); false where no light passes.
+  inline bool operator()(T& L, T& M, T& N, T nx, T ny, T nz, T cosine, T norm_squared) const {
+    bool passes = true;
+    T along, keep;
+    if (bend == kRefract) {
+      T a = n1 * cosine;
+      T b_squared = a * a + D * norm_squared;
+      passes = b_squared > 0;
+      T b = signed_as(root(passes ? b_squared : T(1)), a);
+      along = D * over_n2 / (a + b);
+      keep = mu;
+    } else {
+      along = T(-2) * cosine / norm_squared;
+      keep = T(1);
+    }
+    T l = keep * L + along * nx, m = keep * M + along * ny, n = keep * N + along * nz;
+    T factor = T(1.5) - T(0.5) * (l * l + m * m + n * n);
+    L = l * factor, M = m * factor, N = n * factor;
+    return passes;
+  }
+};
+
+// n · path less the axial ray's, see `_reduced_path`; z is that before the gap, side the axial direction of light.
+template <typename T>
+inline T reduced_path(T hx, T hy, T hz, T x, T y, T z, T L, T M, T N, T gap, bool has_gap, T side) {
+  T path = (hx - x) * L + (hy - y) * M + (hz - z) * N;
+  if (!has_gap) return path;
+  T forward = T(1) + side * N;
+  bool usual = side * N > 0;
+  T lag = usual ? -side * (L * L + M * M) / (usual ? forward : T(1)) : N - side;
+  return path + gap * lag;
+}
+
+// S(u), its slope and, if asked for, its curvature at u = r²; `inside`: the radicand of the conic is above 0.
+template <typename T, bool second>
+inline bool sag(const Surface<T>& s, int terms, T u, T& S, T& dS, T& d2S) {
+  T shape = T(1) + s.k, radicand = T(1) - shape * s.c * s.c * u;
+  bool inside = radicand > 0;
+  T w = root(inside ? radicand : std::numeric_limits<T>::min()), over_w = T(1) / w;
+  T p = 0, dp = 0, d2p = 0;
+  for (int j = terms - 1; j >= 0; j--) {
+    if (second) d2p = d2p * u + dp;
+    dp = dp * u + p;
+    p = p * u + s.a[j];
+  }
+  // Σ a_j u^(j+1) = u p, so its derivatives are p + u p' and 2 p' + u p''; d2p carries p''/2.
+  S = s.c * u / (T(1) + w) + u * p;
+  dS = T(0.5) * s.c * over_w + p + u * dp;
+  if (second) d2S = T(0.25) * shape * s.c * s.c * s.c * over_w * over_w * over_w + 2 * dp + 2 * u * d2p;
+  return inside;
+}
+
+template <typename T, int bend, bool path>
+int cross_plane(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, const Surface<T>& s) {
+  const Law<T, bend> law(s);
+  const bool has_gap = s.at->gap >= 0;
+  const T gap = s.gap, side = T(s.at->side);
+  int flagged = 0;
+#pragma omp simd reduction(+ : flagged)
+  for (int i = 0; i < n; i++) {
+    T x = from.x[i], y = from.y[i], z = from.z[i], L = from.L[i], M = from.M[i], N = from.N[i];
+    T t = (z - gap) / N;
+    T hx = x - t * L, hy = y - t * M;
+    bool good = magnitude(t) < kFar<T>;
+    T l = L, m = M, o = N;
+    if (bend != kNone) good &= law(l, m, o, T(0), T(0), T(1), N, T(1));
+    if (path) {
+      to.path[i] = from.path[i] + s.n1 * reduced_path(hx, hy, T(0), x, y, z, L, M, N, gap, has_gap, side);
+    }
+    to.x[i] = hx, to.y[i] = hy, to.z[i] = T(0);
+    to.L[i] = l, to.M[i] = m, to.N[i] = o;
+    notes.flagged[i] = good ? T(0) : T(1);
+    flagged += good ? 0 : 1;
+  }
+  return flagged;
+}
+
+// A sphere: G = N and A = c at the foot of the perpendicular, and the root is n·d itself.
+template <typename T, int bend, bool path, bool conic>
+int cross_conic(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, const Surface<T>& s) {
+  const Law<T, bend> law(s);
+  const bool has_gap = s.at->gap >= 0;
+  const T gap = s.gap, side = T(s.at->side), c = s.c, shape = T(1) + s.k;
+  int flagged = 0;
+#pragma omp simd reduction(+ : flagged)
+  for (int i = 0; i < n; i++) {
+    T x = from.x[i], y = from.y[i], z = from.z[i], L = from.L[i], M = from.M[i], N = from.N[i];
+    T slide = x * L + y * M + (z - gap) * N;
+    T px = x - slide * L, py = y - slide * M, pz = (z - gap) - slide * N;
+    T A, G, F;
+    if (conic) {
+      A = c * (L * L + M * M + shape * N * N);
+      G = N - c * (px * L + py * M + shape * pz * N);
+      F = c * (px * px + py * py + shape * pz * pz) - T(2) * pz;
+    } else {
+      A = c, G = N, F = c * (px * px + py * py + pz * pz) - T(2) * pz;
+    }
+    T discriminant = G * G - A * F;
+    bool good = discriminant > kGrazing<T> * G * G;
+    T cosine = signed_as(root(good ? discriminant : T(1)), N);
+    T t = F / (G + cosine);
+    T hx = px + t * L, hy = py + t * M, hz = pz + t * N;
+    T nz = T(1) - shape * c * hz;
+    good &= nz > T(1) - kEdge<T>;
+    if (conic) good &= magnitude(t) < kFar<T>;
+    // On the nearer side of a sphere's equator n_z is at most 2; and G must not cancel against the root.
+    good &= conic ? G * N > T(0.01) * N * N : nz < T(1) + kEdge<T>;
+    T l = L, m = M, o = N;
+    if (bend != kNone) {
+      T w = conic ? T(1) - s.k * c * c * (hx * hx + hy * hy) : T(1);
+      good &= law(l, m, o, -c * hx, -c * hy, nz, cosine, w);
+    }
+    if (path) {
+      to.path[i] = from.path[i] + s.n1 * reduced_path(hx, hy, hz, x, y, z, L, M, N, gap, has_gap, side);
+    }
+    to.x[i] = hx, to.y[i] = hy, to.z[i] = hz;
+    to.L[i] = l, to.M[i] = m, to.N[i] = o;
+    notes.flagged[i] = good ? T(0) : T(1);
+    flagged += good ? 0 : 1;
+  }
+  return flagged;
+}
+
+// Newton's method from the base conic, every ray frozen once its step is small: quadratic convergence then puts the
+// error below rounding. Rays that take more than a few steps are left to `careful`.
+template <typename T>
+constexpr T kSmallStep = sizeof(T) == 4 ? T(2e-5) : T(1e-9);
+constexpr int kSteps = 8;
+
+template <typename T, int terms>
+void newton(const Rays<T>& from, Notes<T>& notes, int n, const Surface<T>& s) {
+  const T gap = s.gap, c = s.c, shape = T(1) + s.k;
+  const T rim_squared = T(s.rim) * T(s.rim);
+#pragma omp simd
+  for (int i = 0; i < n; i++) {
+    T x = from.x[i], y = from.y[i], z = from.z[i] - gap, L = from.L[i], M = from.M[i], N = from.N[i];
+    T slide = x * L + y * M + z * N;
+    T px = x - slide * L, py = y - slide * M, pz = z - slide * N;
+    T A = c * (L * L + M * M + shape * N * N);
+    T G = N - c * (px * L + py * M + shape * pz * N);
+    T F = c * (px * px + py * py + shape * pz * pz) - T(2) * pz;
+    T discriminant = G * G - A * F;
+    bool usable = (discriminant > 0) & (G * N > 0);
+    T t = F / (usable ? G + signed_as(root(usable ? discriminant : T(1)), N) : T(1));
+    T hx = px + t * L, hy = py + t * M;
+    bool within = hx * hx + hy * hy <= rim_squared;
+    bool flat = magnitude(N) > T(1e-6);
+    T plane = flat ? -pz / (flat ? N : T(1)) : T(0);
+    notes.px[i] = px, notes.py[i] = py, notes.pz[i] = pz;
+    notes.t[i] = usable & within ? t : plane;
+    notes.active[i] = T(1);
+  }
+  for (int step = 0; step < kSteps; step++) {
+    int going = 0;
+#pragma omp simd reduction(+ : going)
+    for (int i = 0; i < n; i++) {
+      T L = from.L[i], M = from.M[i], N = from.N[i], t = notes.t[i];
+      T x = notes.px[i] + t * L, y = notes.py[i] + t * M, z = notes.pz[i] + t * N;
+      T u = x * x + y * y, S, dS, d2S;
+      sag<T, false>(s, terms, u, S, dS, d2S);
+      T dF = N - T(2) * dS * (x * L + y * M);
+      T change = (z - S) / dF;
+      bool active = notes.active[i] > 0;
+      notes.t[i] = active ? t - change : t;
+      bool more = active & !(change * change <= kSmallStep<T> * kSmallStep<T> * (u + z * z));
+      notes.active[i] = more ? T(1) : T(0);
+      going += more ? 1 : 0;
+    }
+    if (!going) break;
+  }
+}
+
+template <typename T, int bend, bool path, int terms>
+int cross_asphere(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, const Surface<T>& s) {
+  newton<T, terms>(from, notes, n, s);
+  const Law<T, bend> law(s);
+  const bool has_gap = s.at->gap >= 0;
+  const T gap = s.gap, side = T(s.at->side), rim_squared = T(s.rim) * T(s.rim);
+  int flagged = 0;
+#pragma omp simd reduction(+ : flagged)
+  for (int i = 0; i < n; i++) {
+    T x = from.x[i], y = from.y[i], z = from.z[i], L = from.L[i], M = from.M[i], N = from.N[i], t = notes.t[i];
+    T hx = notes.px[i] + t * L, hy = notes.py[i] + t * M, hz = notes.pz[i] + t * N;
+    T u = hx * hx + hy * hy, S, dS, d2S;
+    bool good = sag<T, false>(s, terms, u, S, dS, d2S);
+    T slope = T(2) * dS, cosine = N - slope * (hx * L + hy * M);
+    T w = T(1) + slope * slope * u;
+    // `active` is 1 where Newton's method has not arrived, and NaN compares as false.
+    good &= (notes.active[i] < T(0.5)) & (u <= rim_squared) & (cosine * N > 0);
+    good &= cosine * cosine > kGrazing<T> * T(0.1) * w;
+    T l = L, m = M, o = N;
+    if (bend != kNone) good &= law(l, m, o, -slope * hx, -slope * hy, T(1), cosine, w);
+    if (path) {
+      to.path[i] = from.path[i] + s.n1 * reduced_path(hx, hy, hz, x, y, z, L, M, N, gap, has_gap, side);
+    }
+    to.x[i] = hx, to.y[i] = hy, to.z[i] = hz;
+    to.L[i] = l, to.M[i] = m, to.N[i] = o;
+    notes.flagged[i] = good ? T(0) : T(1);
+    flagged += good ? 0 : 1;
+  }
+  return flagged;
+}
+
+}  // namespace raytrace

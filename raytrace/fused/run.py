@@ -1,0 +1,224 @@
+"""Run: call the compiled trace on tensors, forward and backward.
+
+The gradient is that of the compiled adjoint (adjoint.h); a gradient of the gradient goes through the eager trace.
+"""
+
+import ctypes
+import itertools
+import threading
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.fused.library import library
+from raytrace.fused.structure import Structure, structure_of, with_numbers
+from raytrace.numerics import with_batch_axes
+from raytrace.rays import Rays
+from raytrace.surface import Surface
+
+_PIECE = 64  # blocks that a thread takes at a time
+_WORTH_A_THREAD = 2**16  # rays × surfaces
+
+#: surfaces, rays, indices, side, gap -> the rays behind the last surface, by torch alone.
+Eager = Callable[..., Rays]
+
+
+class _Call(ctypes.Structure):
+    """`Call` of trace.cpp."""
+
+    _fields_ = (
+        ("layout", ctypes.c_void_p),
+        *((name, ctypes.c_int64) for name in ("surfaces", "rows", "rays", "numbers")),
+        *((name, ctypes.c_void_p) for name in ("table", "constants")),
+        *((name, ctypes.c_void_p * 7) for name in ("rays_in", "rays_out", "cotangents", "by_rays")),
+        *((name, ctypes.c_void_p) for name in ("by_numbers", "valid_in", "valid_out")),
+    )
+
+
+def trace_compiled(
+    surfaces: Sequence[Surface],
+    rays: Rays,
+    *,
+    indices: Sequence[Tensor],
+    side: int,
+    gap: Tensor | None,
+    eager: Eager,
+) -> Rays | None:
+    """The rays behind the last of the surfaces; None for a batch that the compiled trace has no form for.
+
+    Arguments as for `trace.steps`; eager: the same trace by torch alone, for derivatives of derivatives.
+    """
+    structure, numbers = structure_of(surfaces, indices, side, gap)
+    shape = _batch(rays, numbers)
+    if shape is None:
+        return None
+    table = _table(numbers, shape)
+    given = [
+        *(with_batch_axes(x, len(shape)).expand(3, *shape).contiguous() for x in (rays.position, rays.direction)),
+        None if rays.opl is None else rays.opl.expand(shape).contiguous(),
+    ]
+    valid = rays.valid.expand(shape).contiguous()
+    if torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in (table, *given)):
+        again = _Again(structure, tuple(surfaces), side, eager)
+        position, direction, opl, valid = _Compiled.apply(again, valid, *given, table)
+    else:
+        position, direction, opl, valid = _forward(structure, valid, *given, table)
+    return Rays(position, direction, valid, opl)
+
+
+def _batch(rays: Rays, numbers: Sequence[Tensor]) -> torch.Size | None:
+    """Batch shape of the traced rays; None if a number of the lens has another dtype, or differs from
+    ray to ray of the last axis."""
+    parts = [rays.position.shape[1:], rays.direction.shape[1:], rays.valid.shape]
+    shape = torch.broadcast_shapes(
+        *parts, *(n.shape for n in numbers if n.dim()), *([(1,)] if rays.opl is None else [rays.opl.shape])
+    )
+    if any(n.dtype != rays.direction.dtype or (n.dim() and n.shape[-1] != 1) for n in numbers) or 0 in shape:
+        return None
+    return shape
+
+
+def _table(numbers: Sequence[Tensor], shape: torch.Size) -> Tensor:
+    """The numbers (rows, K): one row if none of them has batch axes, else a row for all rays of the last axis."""
+    if all(n.dim() == 0 for n in numbers):
+        return torch.stack(numbers)[None]
+    lead = shape[:-1]
+    return torch.stack([(n[..., 0] if n.dim() else n).expand(lead) for n in numbers], -1).reshape(-1, len(numbers))
+
+
+class _Again:
+    """What a second differentiation needs: the trace by torch alone as a function of tensors."""
+
+    def __init__(self, structure: Structure, surfaces: tuple[Surface, ...], side: int, eager: Eager):
+        self.structure, self.surfaces, self.side, self.eager = structure, surfaces, side, eager
+
+    def __call__(self, valid: Tensor, position: Tensor, direction: Tensor, opl: Tensor | None, table: Tensor) -> Rays:
+        numbers = table[0].unbind(0) if len(table) == 1 else _unrolled(table, valid.shape)
+        surfaces, indices, gap = with_numbers(self.structure, self.surfaces, numbers)
+        rays = Rays(position, direction, valid, opl)
+        return self.eager(surfaces, rays, indices=indices, side=self.side, gap=gap)
+
+
+def _unrolled(table: Tensor, shape: torch.Size) -> tuple[Tensor, ...]:
+    return table.reshape(*shape[:-1], 1, table.shape[-1]).unbind(-1)
+
+
+class _Compiled(torch.autograd.Function):
+    """Rays before the first surface and numbers of the lens -> rays behind the last."""
+
+    @staticmethod
+    def forward(ctx, again: _Again, valid, position, direction, opl, table):
+        ctx.set_materialize_grads(False)
+        ctx.again = again
+        ctx.save_for_backward(valid, position, direction, opl, table)
+        found = _forward(again.structure, valid, position, direction, opl, table)
+        ctx.mark_non_differentiable(found[3])
+        return found
+
+    @staticmethod
+    def backward(ctx, by_position, by_direction, by_opl, _):
+        given, cotangents = ctx.saved_tensors, (by_position, by_direction, by_opl)
+        if torch.is_grad_enabled():
+            return None, None, *_differentiable(ctx.again, given, cotangents, ctx.needs_input_grad[2:])
+        wanted = any(ctx.needs_input_grad[2:5])
+        by_rays, by_table = _backward(ctx.again.structure, given, cotangents, wanted)
+        return None, None, *by_rays, by_table
+
+
+def _differentiable(again: _Again, given, cotangents, needed) -> list[Tensor | None]:
+    """The gradient as a graph of its own, through the eager trace."""
+    valid, *inputs = given
+    end = again(valid, *inputs)
+    pairs = [(o, c) for o, c in zip((end.position, end.direction, end.opl), cotangents, strict=True) if c is not None]
+    wanted = [x for x, n in zip(inputs, needed, strict=True) if n and x is not None]
+    outputs, weights = [o for o, _ in pairs], [c for _, c in pairs]
+    found = iter(torch.autograd.grad(outputs, wanted, weights, create_graph=True, allow_unused=True))
+    return [next(found) if n and x is not None else None for x, n in zip(inputs, needed, strict=True)]
+
+
+def _forward(structure: Structure, valid, position, direction, opl, table):
+    """Position, direction, path and validity behind the last surface."""
+    out = torch.empty_like(position), torch.empty_like(direction), None if opl is None else torch.empty_like(opl)
+    valid_out = torch.empty_like(valid)
+    call = _call(structure, valid, position, direction, opl, table)
+    call.rays_out = _pointers(*out)
+    call.valid_out = valid_out.data_ptr()
+    function = getattr(library(), f"raytrace_forward_{_c_type(table)}")
+    _in_pieces(call, lambda first, last: function(ctypes.byref(call), first, last))
+    return *out, valid_out
+
+
+def _backward(structure: Structure, given, cotangents, wanted: bool):
+    """Derivatives by position, direction and path, if wanted, and by the numbers."""
+    valid, position, direction, opl, table = given
+    cotangents = [None if c is None else c.contiguous() for c in cotangents]
+    by_rays = [torch.empty_like(x) if wanted and x is not None else None for x in (position, direction, opl)]
+    call = _call(structure, valid, position, direction, opl, table)
+    call.cotangents, call.by_rays = _pointers(*cotangents), _pointers(*by_rays)
+    function = getattr(library(), f"raytrace_backward_{_c_type(table)}")
+    blocks_of_a_row = _blocks(call) // call.rows
+    sums: dict[int, tuple[int, np.ndarray]] = {}
+
+    def piece(first: int, last: int) -> None:
+        row = first // blocks_of_a_row
+        own = np.zeros(((last - 1) // blocks_of_a_row - row + 1, call.numbers))
+        sums[first] = row, own
+        function(ctypes.byref(call), first, last, ctypes.c_void_p(own.ctypes.data - 8 * row * call.numbers))
+
+    _in_pieces(call, piece)
+    total = np.zeros((call.rows, call.numbers))
+    for _, (row, own) in sorted(sums.items(), key=lambda item: item[0]):
+        total[row : row + len(own)] += own
+    return by_rays, torch.from_numpy(total).to(table.dtype)
+
+
+def _call(structure: Structure, valid, position, direction, opl, table) -> _Call:
+    rows, numbers = table.shape
+    return _Call(
+        layout=structure.layout.ctypes.data,
+        surfaces=len(structure.layout),
+        rows=rows,
+        rays=valid.numel() // rows,
+        numbers=numbers,
+        table=table.data_ptr(),
+        constants=structure.constants.ctypes.data,
+        rays_in=_pointers(position, direction, opl),
+        valid_in=valid.data_ptr(),
+    )
+
+
+def _pointers(position: Tensor | None, direction: Tensor | None, opl: Tensor | None):
+    parts = [None if t is None else t.data_ptr() + i * (t.nbytes // 3) for t in (position, direction) for i in range(3)]
+    return (ctypes.c_void_p * 7)(*parts, None if opl is None else opl.data_ptr())
+
+
+def _c_type(table: Tensor) -> str:
+    return "float" if table.dtype == torch.float32 else "double"
+
+
+def _blocks(call: _Call) -> int:
+    return library().raytrace_blocks(ctypes.byref(call))
+
+
+def _in_pieces(call: _Call, work: Callable[[int, int], None]) -> None:
+    """Call work(first block, last) on all blocks, in as many threads as torch has. What a piece is does not depend on
+    how many there are, so that sums of pieces do not either."""
+    blocks = _blocks(call)
+    ends = itertools.count()
+
+    def take() -> None:
+        for number in ends:
+            first = number * _PIECE
+            if first >= blocks:
+                return
+            work(first, min(first + _PIECE, blocks))
+
+    wanted = call.rows * call.rays * call.surfaces // _WORTH_A_THREAD
+    threads = [threading.Thread(target=take) for _ in range(min(torch.get_num_threads() - 1, wanted, blocks // _PIECE))]
+    for thread in threads:
+        thread.start()
+    take()
+    for thread in threads:
+        thread.join()

@@ -1,0 +1,235 @@
+// Rays through all surfaces of a lens, block by block, and the adjoint of the whole.
+//
+// The adjoint stores nothing of a trace but its start: it traces a block again, keeps what happened at each surface in
+// the cache, and goes back through it. Memory beside the results is O(surfaces × block) for each thread.
+#include <algorithm>
+#include <memory>
+#include <vector>
+
+#include "adjoint.h"
+#include "careful.h"
+
+namespace raytrace {
+
+// All that a call hands over; `_Call` in run.py has the same members in the same order.
+struct Call {
+  const Layout* layout;
+  int64_t surfaces, rows, rays, numbers;  // rays: of a row; numbers: of a row
+  const void* table;                      // (rows, numbers), of the rays' type
+  const double* constants;
+  const void* in[7];        // x, y, z, L, M, N and the path or null; each (rows, rays)
+  void* out[7];             // the same behind the last surface; null: not wanted
+  const void* cotangent[7];  // derivatives by the rays behind the last surface; null: 0
+  void* by_rays[7];          // derivatives by the rays before the first; null: not wanted
+  double* by_numbers;        // (rows, numbers), added to
+  const uint8_t* valid_in;
+  uint8_t* valid_out;
+};
+
+template <typename T>
+using Crosses = int (*)(const Rays<T>&, Rays<T>&, Notes<T>&, int, const Surface<T>&);
+template <typename T>
+using Pulls = Sums<T> (*)(const Rays<T>&, const Rays<T>&, Cotangents<T>&, Notes<T>&, int, const Surface<T>&);
+
+template <typename T, int bend, bool path>
+Crosses<T> crosses_for(const Layout& at) {
+  if (at.kind == kPlane) return cross_plane<T, bend, path>;
+  if (at.kind == kSphere) return cross_conic<T, bend, path, false>;
+  if (at.kind == kConic) return cross_conic<T, bend, path, true>;
+  if (at.terms <= 4) return cross_asphere<T, bend, path, 4>;
+  return at.terms <= 8 ? cross_asphere<T, bend, path, 8> : cross_asphere<T, bend, path, kTerms>;
+}
+
+template <typename T, int bend, bool path>
+Pulls<T> pulls_for(const Layout& at) {
+  if (at.kind == kPlane) return pull<T, kPlane, bend, path, 0>;
+  if (at.kind == kSphere) return pull<T, kSphere, bend, path, 0>;
+  if (at.kind == kConic) return pull<T, kConic, bend, path, 0>;
+  if (at.terms <= 4) return pull<T, kAsphere, bend, path, 4>;
+  return at.terms <= 8 ? pull<T, kAsphere, bend, path, 8> : pull<T, kAsphere, bend, path, kTerms>;
+}
+
+// `of` is crosses_for or pulls_for.
+#define CHOOSE(of, T, at, path)                                                                              \
+  ((at).bend == kNone      ? ((path) ? of<T, kNone, true>(at) : of<T, kNone, false>(at))                       \
+   : (at).bend == kRefract ? ((path) ? of<T, kRefract, true>(at) : of<T, kRefract, false>(at))                 \
+                           : ((path) ? of<T, kReflect, true>(at) : of<T, kReflect, false>(at)))
+
+// A ray passes all apertures of a surface (surface.py, `inside`); six constants each.
+template <typename T>
+void clip(const Rays<T>& rays, Notes<T>& notes, int n, const Layout& at, const double* constants) {
+  for (int number = 0; number < at.apertures; number++) {
+    const double* shape = constants + at.first_aperture + 6 * number;
+    const T a = T(shape[1]), b = T(shape[2]), cx = T(shape[4]), cy = T(shape[5]);
+    const bool obscures = shape[3] != 0;
+    for (int i = 0; i < n; i++) {
+      T x = rays.x[i] - cx, y = rays.y[i] - cy;
+      bool within, blocked;
+      if (shape[0] == 0) {
+        T r = x * x + y * y;
+        within = r >= a * a && r <= b * b;
+        blocked = (a > 0 ? r > a * a : r >= 0) && r < b * b;
+      } else if (shape[0] == 1) {
+        within = magnitude(x) <= a && magnitude(y) <= b;
+        blocked = magnitude(x) < a && magnitude(y) < b;
+      } else {
+        T level = (x / a) * (x / a) + (y / b) * (y / b);
+        within = level <= 1, blocked = level < 1;
+      }
+      notes.valid[i] &= obscures ? !blocked : within;
+    }
+  }
+}
+
+template <typename T>
+struct Step {
+  Surface<T> surface;
+  Crosses<T> crosses, silently;  // with the path as asked, and without
+  Pulls<T> pulls;
+};
+
+template <typename T>
+class Trace {
+ public:
+  explicit Trace(const Call& call) : call_(call), steps_(call.surfaces), path_(call.in[6] != nullptr) {}
+
+  void forward(int64_t first, int64_t last) {
+    auto rays = std::make_unique<Rays<T>[]>(2);
+    auto notes = std::make_unique<Notes<T>>();
+    each(first, last, [&](int64_t at, int count, int n) {
+      load(rays[0], *notes, at, count, n, path_);
+      int turn = 0;
+      for (size_t k = 0; k < steps_.size(); k++, turn = 1 - turn) cross(k, rays[turn], rays[1 - turn], *notes, n, path_);
+      store(call_.out, rays[turn], at, count);
+      if (call_.valid_out) std::memcpy(call_.valid_out + at, notes->valid, count);
+    });
+  }
+
+  void backward(int64_t first, int64_t last, double* by_numbers) {
+    auto rays = std::make_unique<Rays<T>[]>(steps_.size() + 1);
+    auto notes = std::make_unique<Notes<T>>();
+    auto g = std::make_unique<Cotangents<T>>();
+    each(first, last, [&](int64_t at, int count, int n) {
+      load(rays[0], *notes, at, count, n, false);
+      for (size_t k = 0; k < steps_.size(); k++) cross(k, rays[k], rays[k + 1], *notes, n, false);
+      pick(*g, at, count, n);
+      double* row = by_numbers + at / call_.rays * call_.numbers;
+      for (size_t k = steps_.size(); k-- > 0;) {
+        const Step<T>& step = steps_[k];
+        forget(k, *g, rays.get(), *notes, n);
+        add(row, *step.surface.at, step.pulls(rays[k], rays[k + 1], *g, *notes, n, step.surface));
+      }
+      store(call_.by_rays, *g, at, count);
+    });
+  }
+
+ private:
+  // Calls work(first ray, rays, rays filled up to whole vectors) for the blocks `first` to `last`.
+  template <typename Work>
+  void each(int64_t first, int64_t last, Work work) {
+    const int64_t blocks = (call_.rays + kBlock - 1) / kBlock;
+    int64_t prepared = -1;
+    for (int64_t block = first; block < last; block++) {
+      int64_t row = block / blocks, begin = block % blocks * kBlock;
+      if (row != prepared) prepare(row);
+      prepared = row;
+      int count = int(std::min<int64_t>(kBlock, call_.rays - begin));
+      work(row * call_.rays + begin, count, (count + kVector - 1) / kVector * kVector);
+    }
+  }
+
+  void prepare(int64_t row) {
+    const T* numbers = static_cast<const T*>(call_.table) + row * call_.numbers;
+    for (int64_t k = 0; k < call_.surfaces; k++) {
+      const Layout& at = call_.layout[k];
+      steps_[k] = {surface_of(at, numbers, call_.constants), CHOOSE(crosses_for, T, at, path_),
+                   CHOOSE(crosses_for, T, at, false), CHOOSE(pulls_for, T, at, path_)};
+    }
+  }
+
+  static void set_axial(Rays<T>& rays, int i) {
+    rays.x[i] = rays.y[i] = rays.z[i] = rays.L[i] = rays.M[i] = 0;
+    rays.N[i] = 1;
+  }
+
+  static T* part(Rays<T>& rays, int number) {
+    T* const parts[] = {rays.x, rays.y, rays.z, rays.L, rays.M, rays.N, rays.path};
+    return parts[number];
+  }
+
+  void load(Rays<T>& rays, Notes<T>& notes, int64_t at, int count, int n, bool path) {
+    for (int p = 0; p < 6 + path; p++)
+      std::memcpy(part(rays, p), static_cast<const T*>(call_.in[p]) + at, count * sizeof(T));
+    if (call_.valid_in) std::memcpy(notes.valid, call_.valid_in + at, count);
+    for (int i = 0; i < n; i++) notes.lost[i] = -1;
+    notes.any_lost = false;
+    for (int i = count; i < n; i++) set_axial(rays, i), rays.path[i] = 0, notes.valid[i] = 0;
+  }
+
+  void store(void* const* to, Rays<T>& rays, int64_t at, int count) {
+    for (int p = 0; p < 7; p++)
+      if (to[p]) std::memcpy(static_cast<T*>(to[p]) + at, part(rays, p), count * sizeof(T));
+  }
+
+  void cross(size_t k, const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, bool path) {
+    const Step<T>& step = steps_[k];
+    const Surface<T>& s = step.surface;
+    notes.surface = int32_t(k);
+    if ((path ? step.crosses : step.silently)(from, to, notes, n, s))
+      for (int i = 0; i < n; i++) {
+        if (notes.flagged[i] == 0) continue;
+        if (path) cross_carefully<T, true>(from, to, notes, i, s);
+        else cross_carefully<T, false>(from, to, notes, i, s);
+      }
+    if (s.at->apertures) clip(to, notes, n, *s.at, call_.constants);
+  }
+
+  void pick(Cotangents<T>& g, int64_t at, int count, int n) {
+    for (int p = 0; p < 7; p++) {
+      T* to = part(g, p);
+      const T* given = static_cast<const T*>(call_.cotangent[p]);
+      if (given) std::memcpy(to, given + at, count * sizeof(T));
+      int from = given ? count : 0;
+      std::memset(to + from, 0, (n - from) * sizeof(T));
+    }
+  }
+
+  // A ray lost at surface k starts anew behind it, whatever it was before: nothing passes back. Up to there it is put
+  // on an axial course, on which everything is finite.
+  static void forget(size_t k, Cotangents<T>& g, Rays<T>* rays, const Notes<T>& notes, int n) {
+    for (int i = 0; i < n && notes.any_lost; i++) {
+      if (notes.lost[i] != int32_t(k)) continue;
+      for (int p = 0; p < 7; p++) part(g, p)[i] = 0;
+      for (size_t before = 0; before <= k + 1; before++) set_axial(rays[before], i);
+    }
+  }
+
+  static void add(double* row, const Layout& at, const Sums<T>& sums) {
+    auto put = [row](int32_t offset, T value) { if (offset >= 0) row[offset] += value; };
+    put(at.gap, sums.gap), put(at.curvature, sums.c), put(at.conic, sums.k);
+    put(at.before, sums.n1), put(at.behind, sums.n2);
+    for (int j = 0; j < at.terms; j++) row[at.coefficients + j] += sums.a[j];
+  }
+
+  const Call& call_;
+  std::vector<Step<T>> steps_;
+  bool path_;
+};
+
+}  // namespace raytrace
+
+extern "C" {
+using raytrace::Call;
+using raytrace::Trace;
+
+// Blocks of rays that a call is cut into.
+int64_t raytrace_blocks(const Call* call) { return call->rows * ((call->rays + raytrace::kBlock - 1) / raytrace::kBlock); }
+void raytrace_forward_float(const Call* call, int64_t first, int64_t last) { Trace<float>(*call).forward(first, last); }
+void raytrace_forward_double(const Call* call, int64_t first, int64_t last) { Trace<double>(*call).forward(first, last); }
+void raytrace_backward_float(const Call* call, int64_t first, int64_t last, double* by_numbers) {
+  Trace<float>(*call).backward(first, last, by_numbers);
+}
+void raytrace_backward_double(const Call* call, int64_t first, int64_t last, double* by_numbers) {
+  Trace<double>(*call).backward(first, last, by_numbers);
+}
+}

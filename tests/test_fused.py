@@ -1,0 +1,315 @@
+"""The compiled trace: the eager one to rounding, its adjoint, how it is chosen, built and kept."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from problems import double_gauss, lens, scalar, surface, vector, vignetting_aperture
+from torch.autograd import gradcheck, gradgradcheck
+from torch.testing import assert_close
+
+from raytrace.departure import ZernikeSag
+from raytrace.files import shipped
+from raytrace.formats import read_lens
+from raytrace.fused import NoCompiler, engine, prepare, tracing
+from raytrace.fused.choice import is_fused
+from raytrace.fused.library import library
+from raytrace.fused.run import trace_compiled
+from raytrace.glass import MIRROR
+from raytrace.launch import launch
+from raytrace.pupil import sobol
+from raytrace.rays import Rays
+from raytrace.surface import Aperture
+from raytrace.trace import media, start, trace, trace_surfaces
+from raytrace.value import to
+
+LENSES = sorted(path for path in shipped("lenses").iterdir() if path.suffix == ".zmx")
+#: What both traces may differ by, in direction cosines and as a share of the size of a system.
+CLOSE = {torch.float64: 1e-14, torch.float32: 2e-6}
+
+
+@pytest.fixture(autouse=True)
+def _compiler():
+    try:
+        library()
+    except NoCompiler as error:
+        pytest.skip(str(error))
+
+
+#: Every kind of surface, a mirror, apertures of every shape, a dummy, and rays lost in every way.
+EVERYTHING = lens(
+    [
+        surface(0.05, 6.0, 1.6, conic=-0.3, apertures=vignetting_aperture(9.0)),
+        surface(-0.03, 2.0, coefficients=[1e-3, -1e-5], semi_diameter=12.0),
+        surface(None, 1.0, apertures=(Aperture("rectangular", (6.0, 7.0), centre=(0.5, -0.5)),)),
+        surface(-0.08, 3.0, 1.7, apertures=(Aperture("circular", (0.0, 0.3), obscures=True),)),
+        surface(None, 4.0, 1.5),
+        surface(0.01, 3.0, coefficients=[0.0, 1e-5, 1e-8, 1e-11, 1e-14], conic=-1.0, semi_diameter=14.0),
+        surface(-0.02, -10.0, MIRROR, conic=0.4, apertures=(Aperture("elliptic", (9.0, 8.0)),)),
+        surface(-0.01, -5.0),
+    ],
+    object_distance=50.0,
+)
+
+
+def some_rays(count: int = 700, dtype=torch.float64, seed: int = 4) -> Rays:
+    """Rays in a wide cone: most arrive, the others are lost in all ways."""
+    generator = torch.Generator().manual_seed(seed)
+    spread = torch.randn(4, count, generator=generator, dtype=torch.float64)
+    ones = torch.ones(count, dtype=torch.float64)
+    position = torch.stack([3 * spread[0], 3 * spread[1], -ones])
+    direction = torch.stack([0.08 * spread[2], 0.08 * spread[3], ones])
+    direction[:, ::50] = torch.stack([ones, ones, 0.1 * ones])[:, ::50]
+    return to(start(position, direction, torch.zeros(count, dtype=torch.float64)), dtype=dtype)
+
+
+def both(call):
+    found = []
+    for name in ("fused", "eager"):
+        with tracing(name):
+            found.append(call())
+    return found
+
+
+def assert_same_rays(fused: Rays, eager: Rays, close: float, size: float = 100.0) -> None:
+    """To a share `close` of the size (mm) of the system."""
+    assert torch.equal(fused.valid, eager.valid)
+    assert_close(fused.position, eager.position, rtol=0, atol=close * size)
+    assert_close(fused.direction, eager.direction, rtol=0, atol=close)
+    if eager.opl is not None:
+        assert_close(fused.opl, eager.opl, rtol=close, atol=close * size)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("path", LENSES, ids=lambda path: path.stem)
+def test_shipped_lenses_are_traced_as_by_torch(path, dtype):
+    system = to(read_lens(path), dtype=dtype)
+    with torch.no_grad(), tracing("eager"):
+        rays = launch(system, sobol(301)[0].to(dtype))
+    fused, eager = both(lambda: trace(system, rays, system.wavelengths[:, None]))
+    size = max(float(s.thickness.abs()) for s in system.surfaces[1:])
+    assert_same_rays(fused, eager, CLOSE[dtype], max(size, 10.0))
+    assert eager.valid.any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("with_path", [True, False])
+def test_every_kind_of_surface_and_of_loss(dtype, with_path):
+    system, rays = to(EVERYTHING, dtype=dtype), some_rays(dtype=dtype)
+    rays = rays if with_path else dataclasses.replace(rays, opl=None)
+    fused, eager = both(lambda: trace(system, rays, system.wavelengths[0]))
+    assert 20 < int((~eager.valid).sum()) < 600
+    assert_same_rays(fused, eager, 10 * CLOSE[dtype])
+
+
+@pytest.mark.parametrize(("dtype", "close"), [(torch.float64, 1e-11), (torch.float32, 2e-3)])
+@pytest.mark.parametrize("with_path", [True, False])
+def test_the_adjoint_is_what_autograd_finds(dtype, close, with_path):
+    """By every number of the lens and by the rays, of a merit in which all that comes out has a weight."""
+    system, rays = to(EVERYTHING, dtype=dtype), some_rays(dtype=dtype)
+    generator = torch.Generator().manual_seed(1)
+    weights = torch.randn(7, 700, generator=generator, dtype=torch.float64).to(dtype)
+
+    def gradients():
+        surfaces, leaves, indices = with_leaves(system)
+        given = [rays.position.clone().requires_grad_(), rays.direction.clone().requires_grad_()]
+        opl = rays.opl.clone().requires_grad_() if with_path else None
+        end = trace_surfaces(surfaces, Rays(*given, rays.valid, opl), indices=indices)
+        out = [end.position, end.direction, *([end.opl[None]] if with_path else [])]
+        merit = sum((w * x).sum() for w, x in zip(weights.split([3, 3, 1]), out, strict=False))
+        inputs = [*leaves, *given, *([opl] if with_path else [])]
+        return torch.autograd.grad(merit, inputs, allow_unused=True)
+
+    fused, eager = both(gradients)
+    for f, e in zip(fused, eager, strict=True):
+        if e is None:
+            assert f is None or not f.any()
+            continue
+        assert torch.isfinite(f).all()
+        # Sums over rays of both signs: what cancels is told by the largest of a kind.
+        assert float((f - e).abs().max()) <= close * (float(e.abs().max()) + 1.0)
+
+
+def with_leaves(system):
+    """Surfaces whose numbers are leaves, the leaves, and indices that are leaves too."""
+    leaves = []
+
+    def leaf(number):
+        leaves.append(number.detach().clone().requires_grad_())
+        return leaves[-1]
+
+    names = ("thickness", "curvature", "conic", "coefficients")
+    surfaces = [
+        dataclasses.replace(s, **{n: leaf(getattr(s, n)) for n in names if getattr(s, n) is not None})
+        for s in system.surfaces[1:]
+    ]
+    found = media(system, system.wavelengths[0])
+    distinct = {id(index): leaf(index) for index in found}
+    return surfaces, leaves, [distinct[id(index)] for index in found]
+
+
+def test_gradients_of_gradients_pass_through_the_eager_trace():
+    system = double_gauss()
+    rays = Rays(*(x[..., :5] for x in (some_rays().position, some_rays().direction, some_rays().valid)))
+
+    def spread(curvature, thickness):
+        surfaces = list(system.surfaces)
+        surfaces[1] = dataclasses.replace(surfaces[1], curvature=curvature)
+        surfaces[2] = dataclasses.replace(surfaces[2], thickness=thickness)
+        changed = dataclasses.replace(system, surfaces=tuple(surfaces))
+        return trace(changed, rays, system.wavelengths[0]).position[:2]
+
+    arguments = system.surfaces[1].curvature.clone().requires_grad_(), scalar(0.5).requires_grad_()
+    with tracing("fused"):
+        assert gradcheck(spread, arguments, atol=1e-5, rtol=1e-4)
+        assert gradgradcheck(spread, arguments, atol=1e-3, rtol=1e-3)
+
+
+def test_a_ray_does_not_depend_on_its_neighbours_nor_gradients_on_threads():
+    """Bit for bit: rays traced alone, in other places of a block, and sums over many blocks in one thread or two."""
+    rays, wavelength = some_rays(40_000), EVERYTHING.wavelengths[0]
+
+    def gradient(threads):
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        try:
+            surfaces, leaves, indices = with_leaves(EVERYTHING)
+            end = trace_surfaces(surfaces, rays, indices=indices)
+            return torch.autograd.grad((end.position**2).sum(), leaves, allow_unused=True)
+        finally:
+            torch.set_num_threads(before)
+
+    with tracing("fused"):
+        together = trace(EVERYTHING, rays, wavelength)
+        chosen = torch.tensor([0, 1, 15, 16, 17, 50, 255, 256, 300, 39_999])
+        alone = trace(EVERYTHING, Rays(*(x[..., chosen] for x in leaves_of_rays(rays))), wavelength)
+        for part, whole in zip(leaves_of_rays(alone), leaves_of_rays(together), strict=True):
+            assert torch.equal(part, whole[..., chosen])
+        for one, two in zip(gradient(1), gradient(2), strict=True):
+            assert one is two is None or torch.equal(one, two)
+
+
+def leaves_of_rays(rays: Rays):
+    return rays.position, rays.direction, rays.valid, rays.opl
+
+
+@pytest.mark.parametrize("axes", [(3, 1, 1), (3, 1), (1, 4, 1)])
+def test_populations_and_wavelengths_get_rows_of_their_own(axes):
+    """Numbers with batch axes, whose gradients come back in their own shape."""
+    rays = some_rays(50)
+    rays = Rays(rays.position[:, None], rays.direction[:, None], rays.valid[None], rays.opl[None])
+    scale = torch.linspace(0.9, 1.1, 12, dtype=torch.float64)[: axes[0] * axes[1] if len(axes) > 1 else axes[0]]
+
+    def outcome():
+        factor = scale.reshape(axes).clone().requires_grad_()
+        surfaces = [dataclasses.replace(EVERYTHING.surfaces[1], curvature=0.05 * factor), *EVERYTHING.surfaces[2:]]
+        end = trace_surfaces(surfaces, rays, indices=media(EVERYTHING, EVERYTHING.wavelengths[0]))
+        (gradient,) = torch.autograd.grad((end.position**2).sum(), factor)
+        return end, gradient
+
+    (fused, by_fused), (eager, by_eager) = both(outcome)
+    assert fused.shape == eager.shape
+    assert_same_rays(fused, eager, 1e-12)
+    assert_close(by_fused, by_eager, rtol=1e-10, atol=1e-8)
+
+
+def test_what_differs_along_the_last_axis_is_left_to_torch():
+    rays = some_rays(3)
+    surfaces = [surface(vector(0.01, 0.02, 0.03), 5.0, 1.5)]
+    how = {"indices": [scalar(1.0), scalar(1.5)], "side": 1, "gap": None}
+    assert trace_compiled(surfaces, rays, **how, eager=None) is None
+    fused, eager = both(lambda: trace_surfaces(surfaces, rays, indices=how["indices"]))
+    assert torch.equal(fused.position, eager.position)
+
+
+def test_surfaces_with_a_departure_are_traced_between_compiled_ones():
+    bump = ZernikeSag(vector(0.0, 0.0, 0.0, 1e-3, 2e-3), scalar(10.0))
+    surfaces = [*EVERYTHING.surfaces[1:4], surface(0.01, 2.0, 1.5, departure=bump), *EVERYTHING.surfaces[4:]]
+    system = dataclasses.replace(EVERYTHING, surfaces=(EVERYTHING.surfaces[0], *surfaces))
+    fused, eager = both(lambda: trace(system, some_rays(), system.wavelengths[0]))
+    assert_same_rays(fused, eager, 1e-12)
+
+
+def test_transforms_other_dtypes_and_the_switch_leave_it_to_torch():
+    rays, number = some_rays(4), scalar(1.0)
+    with tracing("fused"):
+        assert is_fused(rays, number, 1)
+        assert not is_fused(Rays(*(x.to("meta") for x in leaves_of_rays(rays))), number, 1)
+        assert not is_fused(dataclasses.replace(rays, position=rays.position.float()), number, 1)
+        seen = []
+        torch.func.vmap(lambda x: seen.append(is_fused(dataclasses.replace(rays, position=x), number, 1)) or x)(
+            rays.position[None]
+        )
+        assert seen == [False]
+    with tracing("eager"):
+        assert engine() == "eager"
+        assert not is_fused(rays, number, 10**9)
+        assert prepare() == "eager"
+    with pytest.raises(ValueError, match="'quick': expected one of auto, eager, fused"), tracing("quick"):
+        pass
+
+
+PROBE = """
+import raytrace, torch
+from raytrace.trace import trace
+from raytrace.fused.choice import is_fused
+from raytrace.rays import Rays
+lens = raytrace.read_lens({lens!r})
+count = {count}
+like = torch.zeros(3, count, dtype=torch.float64)
+like[2] = 1.0
+rays = Rays(0 * like, like, torch.ones(count, dtype=torch.bool))
+with torch.no_grad():
+    trace(lens, rays, lens.wavelengths[0])
+print(is_fused(Rays(like[:, :1], like[:, :1], rays.valid[:1]), lens.wavelengths, 1))
+"""
+
+
+def probe(folder: Path, count: int, **environment) -> subprocess.CompletedProcess:
+    """Trace so many rays in a process that keeps compiled code in a folder of its own, and ask what is chosen then."""
+    names = {"RAYTRACE_CACHE": str(folder), "PYTHONPATH": os.pathsep.join(sys.path), **environment}
+    own = {k: v for k, v in os.environ.items() if k not in ("RAYTRACE_TRACE", "CXX")} | names
+    script = PROBE.format(lens=str(shipped("lenses") / "double_gauss.zmx"), count=count)
+    done = subprocess.run([sys.executable, "-c", script], env=own, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def test_it_is_compiled_once_for_work_that_is_worth_it(tmp_path):
+    """A small batch compiles nothing; a large one does, says so, and the next process finds it on disk."""
+    assert probe(tmp_path, 100).stdout == "False\n"
+    assert not list(tmp_path.iterdir())
+    first = probe(tmp_path, 2**20)
+    (kept,) = tmp_path.iterdir()
+    stamp = kept.stat().st_mtime_ns
+    assert (first.stdout, kept.suffix) == ("True\n", ".so")
+    assert first.stderr in ("", "raytrace: compiling the trace, once for this machine …\n")
+    second = probe(tmp_path, 100)
+    assert (second.stdout, second.stderr) == ("True\n", "")
+    assert [path.stat().st_mtime_ns for path in tmp_path.iterdir()] == [stamp]
+
+
+@pytest.mark.parametrize(
+    ("environment", "reason"),
+    [
+        ({"CXX": "no-such-compiler"}, "no C++ compiler found (no-such-compiler)"),
+        ({"CXX": "false"}, "cannot compile the trace: exit status 1"),
+    ],
+)
+def test_without_a_compiler_torch_traces_and_one_line_says_why(tmp_path, environment, reason):
+    done = probe(tmp_path, 2**20, **environment)
+    assert done.stdout == "False\n"
+    assert reason in done.stderr
+    assert done.stderr.endswith("; tracing by torch alone\n")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_folder_that_cannot_be_written_is_told_of(tmp_path):
+    (tmp_path / "file").write_text("")
+    done = probe(tmp_path / "file", 2**20)
+    assert done.stdout == "False\n"
+    assert "set RAYTRACE_CACHE to a folder to write to" in done.stderr
