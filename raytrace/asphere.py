@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.numerics import polynomial, with_batch_axes
+from raytrace.numerics import broadcast_shape, polynomial, with_batch_axes
 
 _NEWTON_STEPS = 24
 _BISECTIONS = 64
@@ -89,9 +89,7 @@ def search(
     extra: Extra | None = None,
 ) -> tuple[Tensor, Tensor]:
     """What `asphere_root` does, outside of transforms; with `extra`, on a sag that is not symmetric about the axis."""
-    batch = torch.broadcast_shapes(
-        foot.shape[1:], direction.shape[1:], curvature.shape, conic.shape, coefficients.shape[1:]
-    )
+    batch = broadcast_shape(foot.shape[1:], direction.shape[1:], curvature.shape, conic.shape, coefficients.shape[1:])
     p, d = _expand(foot.double(), batch).reshape(3, -1), _expand(direction.double(), batch).reshape(3, -1)
     c, k = curvature.double().expand(batch).reshape(-1), conic.double().expand(batch).reshape(-1)
     coefficients = coefficients.double()
@@ -101,7 +99,11 @@ def search(
     t, residual_small, forward, radius = _newton(p, d, c, k, a, _start(p, d, c, k, rim), extra)
     converged = residual_small & forward
     good = converged & (radius <= rim)
-    if not bool(good.all()):
+    if not _reads_are_free(t):
+        t_few, found = _bracketed(p, d, c, k, a, rim, extra)
+        t = torch.where(good | ~found, t, t_few)
+        good = good | found | converged
+    elif not bool(good.all()):
         few = ~good
         subset = a if a.shape[1] == 1 else a[:, few]
         t_few, found = _bracketed(p[:, few], d[:, few], c[few], k[few], subset, rim, extra)
@@ -112,6 +114,15 @@ def search(
     return t.reshape(batch).to(foot.dtype), good.reshape(batch).clone()
 
 
+def _reads_are_free(tensor: Tensor) -> bool:
+    """Whether the host may ask what is in a tensor without waiting for a device.
+
+    Elsewhere every ray goes through every step and through the bracketed search: rays once arrived stay as they are, so
+    that the results are the same, bit for bit.
+    """
+    return tensor.device.type == "cpu"
+
+
 def _expand(x: Tensor, batch: torch.Size) -> Tensor:
     """(m, ...) to (m, *batch): batch axes align from the right, the leading axis stays in front."""
     return with_batch_axes(x, len(batch)).expand(x.shape[0], *batch)
@@ -119,9 +130,7 @@ def _expand(x: Tensor, batch: torch.Size) -> Tensor:
 
 @torch.library.register_fake("raytrace::asphere_root")
 def _(foot, direction, curvature, conic, coefficients, rim):
-    batch = torch.broadcast_shapes(
-        foot.shape[1:], direction.shape[1:], curvature.shape, conic.shape, coefficients.shape[1:]
-    )
+    batch = broadcast_shape(foot.shape[1:], direction.shape[1:], curvature.shape, conic.shape, coefficients.shape[1:])
     return foot.new_empty(batch), foot.new_empty(batch, dtype=torch.bool)
 
 
@@ -190,7 +199,7 @@ def _newton(p, d, c, k, a, t, extra=None):
         step = torch.where(usable, F / torch.where(usable, dF, 1.0), 0.0)
         t = torch.where(active, t - step, t)
         active = active & usable & (F.abs() > rounding * scale)
-        if not bool(active.any()):
+        if _reads_are_free(t) and not bool(active.any()):
             break
     F, dF, scale, u, inside_domain = _residual(p, d, c, k, a, t, extra)
     small = (F.abs() <= _ACCEPTED_RESIDUAL * rounding * scale) & inside_domain & torch.isfinite(t)

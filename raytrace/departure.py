@@ -1,6 +1,7 @@
 """Departure: what the sag of a surface has beside its conic and even terms, z = S(r²) + D(x, y).
 
     GridSag      D = Σ_ij c_ij B(x/p - i) B(y/p - j), the cubic spline through heights at points p apart
+    SplineSag    the same by its coefficients c, found once
     ZernikeSag   D = Σ_j c_j Z_j(x/R, y/R), Noll's polynomials
 
 Slopes and second derivatives are written out, and autograd may differentiate them further. Everything a search needs
@@ -30,10 +31,18 @@ class GridSag:
     Row 0 lies at the smallest y, column 0 at the smallest x. The spline is cubic with continuous second derivatives;
     at the ends the third derivative is continuous at the last point but one ("not a knot"), so that the error falls as
     pitch⁴ up to the rim. The surface ends half a pitch beyond the outermost points: a ray that crosses farther out
-    misses it.
+    misses it. Every meeting of rays and surface finds the coefficients of the spline anew: see `spline`.
     """
 
     heights: Tensor
+    pitch: Tensor
+
+
+@value
+class SplineSag:
+    """A cubic spline by its coefficients (rows + 2, columns + 2) mm, those beyond either end included; pitch: mm."""
+
+    coefficients: Tensor
     pitch: Tensor
 
 
@@ -45,7 +54,7 @@ class ZernikeSag:
     radius: Tensor
 
 
-Departure = GridSag | ZernikeSag
+Departure = GridSag | SplineSag | ZernikeSag
 
 
 class Sag(NamedTuple):
@@ -66,11 +75,21 @@ def numbers(departure: Departure) -> tuple[Tensor, Tensor]:
     """
     if isinstance(departure, ZernikeSag):
         return departure.coefficients.double(), departure.radius.double()
-    heights = departure.heights.double()
+    if isinstance(departure, GridSag):
+        departure = spline(departure)
+    return departure.coefficients.double(), departure.pitch.double()
+
+
+def spline(grid: GridSag) -> SplineSag:
+    """The spline of a grid, in float64: what is traced many times is filtered once, gradients to the heights included.
+
+    Raises ValueError for a grid of fewer than 4 × 4 heights.
+    """
+    heights = grid.heights.double()
     rows, columns = heights.shape
     if min(rows, columns) < _LEAST:
         raise ValueError(f"{rows} × {columns} heights: a cubic spline needs at least {_LEAST} × {_LEAST}")
-    return _spline_coefficients(_spline_coefficients(heights).T).T, departure.pitch.double()
+    return SplineSag(_spline_coefficients(_spline_coefficients(heights).T).T, grid.pitch.double())
 
 
 def sag_of(numbers: tuple[Tensor, Tensor], x: Tensor, y: Tensor, *, highest: int = 2) -> Sag:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from raytrace import glass
 from raytrace.lens import Lens
-from raytrace.numerics import dot, safe_divide, safe_sqrt, unit
+from raytrace.numerics import broadcast_shape, dot, safe_divide, safe_sqrt, unit
 from raytrace.paraxial import FirstOrder, first_order
 from raytrace.rays import Rays
 from raytrace.surface import sag
@@ -52,7 +52,7 @@ def vignette(lens: Lens, field: Tensor, pupil: Tensor) -> Tensor:
     """
     factors = lens.fields.vignetting
     if factors is None:
-        return torch.stack([p.expand(torch.broadcast_shapes(field.shape[1:], p.shape)) for p in pupil])
+        return torch.stack([p.expand(broadcast_shape(field.shape[1:], p.shape)) for p in pupil])
     own = torch.stack([lens.fields.x, lens.fields.y])
     same = (own.reshape(2, -1, *(1,) * (field.dim() - 1)) == field[:, None]).all(0)
     first = same & (same.to(torch.int64).cumsum(0) == 1)
@@ -155,7 +155,7 @@ def aim_at_stop(lens: Lens, through: Callable[..., Rays], pupil: Tensor, wavelen
             rays, arrives = crossing.rays, arrives & ~(crossing.missed | crossing.totally_reflected)
         return rays.position[:2] / radius, arrives
 
-    batch = torch.broadcast_shapes(at_stop(pupil)[0].shape[1:], pupil.shape[1:])
+    batch = broadcast_shape(at_stop(pupil)[0].shape[1:], pupil.shape[1:])
     target = torch.stack([p.expand(batch) for p in pupil])
     tolerance = _AIMING_TOLERANCE if pupil.dtype == torch.float64 else 1e-4
     aim, found = target.detach().clone(), torch.zeros(batch, dtype=torch.bool, device=pupil.device)

@@ -17,7 +17,7 @@ from torch import Tensor
 from raytrace.asphere import aligned, asphere_root, sag_and_derivatives, search
 from raytrace.departure import Departure, covers, numbers, sag_of, size_of
 from raytrace.glass import AIR, Glass
-from raytrace.numerics import differentiating, dot
+from raytrace.numerics import broadcast_shape, differentiating, dot
 from raytrace.value import value
 
 
@@ -341,9 +341,7 @@ def _(foot, direction, curvature, conic, coefficients, shape, scale, rim):
 
 @torch.library.register_fake("raytrace::departure_root")
 def _(foot, direction, curvature, conic, coefficients, shape, scale, rim):
-    batch = torch.broadcast_shapes(
-        foot.shape[1:], direction.shape[1:], curvature.shape, conic.shape, coefficients.shape[1:]
-    )
+    batch = broadcast_shape(foot.shape[1:], direction.shape[1:], curvature.shape, conic.shape, coefficients.shape[1:])
     return foot.new_empty(batch), foot.new_empty(batch, dtype=torch.bool)
 
 

@@ -9,7 +9,7 @@ from problems import lens, surface, vector
 from torch.autograd import gradcheck, gradgradcheck
 
 from raytrace import zernike
-from raytrace.departure import GridSag, ZernikeSag, covers, numbers, sag_of
+from raytrace.departure import GridSag, ZernikeSag, covers, numbers, sag_of, spline
 from raytrace.formats import write_lens
 from raytrace.formats.source import LensFileError
 from raytrace.grid import grid
@@ -132,6 +132,20 @@ def test_rows_are_y_and_columns_x():
     assert float(sag_of(shape, vector(1.0), vector(-1.25)).z) == pytest.approx(1.0)
     assert bool(covers(shape, vector(1.74), vector(1.49)))
     assert not bool(covers(shape, vector(1.0), vector(1.51)))
+
+
+def test_a_spline_found_once_is_the_grid_bit_for_bit_with_its_gradients():
+    """Through rays with lost ones: hits, directions, and derivatives by heights and pitch."""
+    gradients = []
+    for prepared in (lambda grid: grid, spline):
+        grid = sampled(wavy, 12)
+        inputs = [grid.heights.clone().requires_grad_(), grid.pitch.clone().requires_grad_()]
+        face = dataclasses.replace(ALL["grid"], departure=prepared(GridSag(*inputs)))
+        found = through(face, start(*oblique()))
+        gradients.append((found.detach(), *torch.autograd.grad((found * found.detach().cos()).sum(), inputs)))
+    for a, b in zip(*gradients, strict=True):
+        assert torch.allclose(a, b, rtol=1e-13, atol=1e-13 * float(a.abs().max()))
+    assert torch.equal(gradients[0][0], gradients[1][0])
 
 
 def test_a_grid_of_three_heights_is_refused():

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from raytrace.deconvolve import blind_filter, errors, psnr, wiener
+from raytrace.design import edof_table
 from raytrace.design.edof import (
     World,
     best_gamma,
@@ -21,10 +22,11 @@ from raytrace.design.edof import (
     spectrum,
     transfer,
 )
-from raytrace.design.edof_table import Content, records, table_of
+from raytrace.design.edof_table import STRENGTHS, Content, elements_of, records, table_of
 from raytrace.design.edof_training import Settings, begin, learn_element, scheduled
 from raytrace.design.phase import PhaseVariables, radial_powers
 from raytrace.design.training import OtherSettings
+from raytrace.glass import index
 from raytrace.pictures import dead_leaves
 from raytrace.wave.aim import aim
 from raytrace.wave.baselines import baseline
@@ -105,7 +107,15 @@ def test_learning_gains_two_decibels_over_the_lens_it_begins_with():
     assert float(psnr(after.detach()) - psnr(before.detach())) > 2
 
 
-@pytest.mark.parametrize("change", [{}, {"loss": "images", "restoration": "towards", "optimizer": "sgd", "rate": 0.5}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        {"loss": "images", "restoration": "towards", "optimizer": "sgd", "rate": 0.5},
+        {"kind": "rings", "pitch": 0.02, "tolerance": 3e-5},
+    ],
+    ids=["smooth", "pictures", "tolerance"],
+)
 def test_a_run_that_is_broken_off_ends_as_if_it_had_not_been(tmp_path, change):
     settings = dataclasses.replace(QUICK, **change)
     ends = []
@@ -204,6 +214,22 @@ def test_heights_err_within_their_tolerance():
         PhaseVariables(lens, basis=torch.zeros(3, 2, dtype=torch.float64))
 
 
+def test_errors_of_height_are_drawn_anew_at_every_step(tmp_path):
+    """By the seed and the number of the step: the heights do not move, and the loss is another each time."""
+    still = dataclasses.replace(QUICK, kind="rings", pitch=0.02, starts=0, steps=4, rate=1e-12, tolerance=1e-4)
+    losses = {}
+    for name, change in {"off": {"tolerance": 0.0}, "on": {}, "again": {}, "seed": {"seed": 1}}.items():
+        settings = dataclasses.replace(still, **change)
+        camera, run = begin(settings, SMALL, S, tmp_path / name)
+        losses[name] = [record["loss"] for _, record in learn_element(camera, LEAVES, settings, run)]
+    assert np.ptp(losses["off"]) < 1e-9 * losses["off"][0]
+    assert len(set(losses["on"])) == 4
+    assert losses["again"] == losses["on"]
+    assert not set(losses["seed"]) & set(losses["on"])
+    with pytest.raises(ValueError, match="belongs to rings"):
+        begin(dataclasses.replace(QUICK, tolerance=1e-4), SMALL, S, tmp_path / "smooth")
+
+
 def test_mirrored():
     found = mirrored(np.array([[1, 2], [3, 4]]))
     assert found.tolist() == [[1, 2, 2, 1], [3, 4, 4, 3], [3, 4, 4, 3], [1, 2, 2, 1]]
@@ -211,11 +237,24 @@ def test_mirrored():
 
 def test_the_table_says_what_it_knows():
     content = Content("leaves", PICTURES[:6], PICTURES[6:])
-    found = table_of([content], SMALL, {}, rows=["fresnel", "singlet"])
+    found = table_of([content], elements_of(["singlet", "fresnel"], SMALL, S, learned={}), SMALL)
+    assert list(found["leaves"]) == ["fresnel", "singlet"]
     rows = {record["row"]: record for record in records(found)}
     assert rows["fresnel"]["gain_blind"] == 0
     assert rows["fresnel"]["talk"] == 17.95
     assert rows["singlet"]["gain_blind"] == pytest.approx(rows["singlet"]["blind"] - rows["fresnel"]["blind"])
+
+
+def test_the_strength_of_cubic_plates_is_searched_once(monkeypatch):
+    """Both plates have the one that is best on the PMMA lens; rows that are not learned yet are left out."""
+    tried = []
+    real = edof_table.expected_error
+    monkeypatch.setattr(edof_table, "expected_error", lambda *given: tried.append(0) or real(*given))
+    found = elements_of(["cubic-refractive", "learned", "cubic"], SMALL, S, learned={})
+    assert list(found) == ["cubic", "cubic-refractive"]
+    assert len(tried) == len(STRENGTHS)
+    plates = [elements[1].profile.coefficients * (index(elements[1].glass, 0.55) - 1) for elements in found.values()]
+    torch.testing.assert_close(*plates)
 
 
 @pytest.mark.slow
@@ -232,7 +271,7 @@ def test_the_order_of_the_talk(tmp_path):
     with torch.no_grad():
         learned = {"learned": camera.variables()}
     names = ["fresnel", "multifocal", "cubic", "hybrid", "achromat", "learned"]
-    found = table_of([content], world, learned, rows=names)["leaves"]
+    found = table_of([content], elements_of(names, world, spectrum_, learned=learned), world)["leaves"]
     blind = {name: found[name].mean["blind"] for name in names}
     assert blind["fresnel"] < blind["multifocal"] < blind["cubic"] < min(blind["hybrid"], blind["achromat"])
     assert max(blind["hybrid"], blind["achromat"]) + 2 < blind["learned"]

@@ -1,12 +1,15 @@
 """What fabrication costs: the law of kinoforms, steps of height, and learning with steps in the loop."""
 
 import dataclasses
+import json
 import math
 
 import pytest
 import torch
 
 from raytrace.catalog import find_glass
+from raytrace.cli import main
+from raytrace.cli.wave_setup import height_map
 from raytrace.design.edof import World, expected_error, periodic, quality, scene, spectrum, transfer
 from raytrace.design.quantise import (
     WAYS,
@@ -24,6 +27,8 @@ from raytrace.pictures import dead_leaves
 from raytrace.wave.aim import aim
 from raytrace.wave.baselines import baseline
 from raytrace.wave.element import Element, EvenPowers, Rings, period
+from raytrace.wave.exchange import write_heights
+from raytrace.wave.fabrication import as_pixels, as_rings
 from raytrace.wave.psf import psf
 
 #: Small, and quick: 1 mm, f/20, one colour, three depths.
@@ -131,6 +136,39 @@ def test_errors_of_height_cost_little_and_repeat():
     assert rows[0].least == rows[0].greatest == pytest.approx(own.closed(element), abs=1e-9)
     assert abs(rows[1].mean - rows[0].mean) < 0.3
     assert abs(rows[2].mean - rows[0].mean) > 10 * abs(rows[1].mean - rows[0].mean)
+
+
+def test_a_file_of_rings_is_the_element_it_was_written_from(capsys, tmp_path):
+    """A kinoform of 1 mm in 20 µm rings by its whole heights; what is neither heights nor a run is refused."""
+    element = whole(fresnel(0.02))
+    write_heights(element.profile, tmp_path / "rings.npy")
+    words = ["--levels", "4", "--tolerance", "20", "--steps", "0", "--aperture", "1", "--limit", "2"]
+    given = ["wave", "quantise", "--element", str(tmp_path / "rings.npy"), *words]
+    assert main([*given, "--wrap", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["levels"]
+    assert [(row["element"], row["made"], row["levels"]) for row in rows] == [
+        ("rings.npy", "wrapped", n) for n in (0, 4)
+    ]
+    world = dataclasses.replace(World(), radius=0.5)
+    for row in rows:
+        assert row["efficiency"] == efficiency(made(element, row["levels"], wrap=True), world)
+        assert 5 < row["closed"] < 40
+    assert main([*given, "--aperture", "5"]) == 1
+    assert "less than the aperture of 5 mm" in capsys.readouterr().err
+    assert main(["wave", "quantise", "--element", "lens.txt"]) == 1
+    assert "or a height map (.npy" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".csv", ".png", ".tiff", ".dat"])
+def test_pixels_are_made_as_rings_are(tmp_path, suffix):
+    """A lens in pixels of 12.5 µm from every format: the law of its levels beside whole pixels, and the same PSNR."""
+    (lens,) = baseline("singlet", aim(radius=WORLD.radius, sensor=WORLD.sensor_distance, focus=WORLD.design))
+    write_heights(as_pixels(lens, 0.0125).profile, tmp_path / f"lens{suffix}")
+    element = height_map(str(tmp_path / f"lens{suffix}"), aperture=1.0, glass=lens.glass)
+    some, all_ = (efficiency(made(element, levels, wrap=True), WORLD) for levels in (8, 0))
+    assert some == pytest.approx(law(8) * all_, rel=0.02)
+    if suffix == ".dat":
+        assert judge().closed(element) == pytest.approx(judge().closed(as_rings(lens, 0.0125)), abs=0.3)
 
 
 def test_what_is_no_run_is_refused(tmp_path):

@@ -121,12 +121,12 @@ def test_two_processes_take_the_steps_of_one(tmp_path):
         import sys
         sys.path[:0] = {PATHS!r}
         import torch
-        torch.distributed.init_process_group("gloo")
-        from test_training import fit
-        weights = fit({str(tmp_path / "two")!r}, 10)
-        if torch.distributed.get_rank() == 0:
-            torch.save(weights, {str(tmp_path / "weights.pt")!r})
-        torch.distributed.destroy_process_group()
+        from raytrace.shards import processes
+        with processes() as share:
+            from test_training import fit
+            weights = fit({str(tmp_path / "two")!r}, 10)
+            if share.rank == 0:
+                torch.save(weights, {str(tmp_path / "weights.pt")!r})
     """)
     (tmp_path / "script.py").write_text(script)
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]

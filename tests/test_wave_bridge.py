@@ -8,6 +8,7 @@ import torch
 from problems import double_gauss, lens, scalar, surface, vector
 from torch.autograd import gradcheck
 
+from raytrace import departure
 from raytrace.glass import constant
 from raytrace.grid import centres, grid
 from raytrace.lens import Lens, with_sensor_distance
@@ -205,6 +206,34 @@ def test_a_height_map_of_pixels_is_traced_as_the_powers_it_samples():
     assert (landed[1].landing - landed[0].landing).abs().max() < 1e-5
     prism = (PMMA - 1) * 1e-3 * 35.5
     assert float(landed[2].centre[1]) == pytest.approx(prism, rel=2e-3)
+
+
+def test_a_height_map_is_filtered_once_however_often_it_is_traced(monkeypatch):
+    """Gradients to the heights are those of differences of 10 nm."""
+    filtered = []
+    real = departure._spline_coefficients
+    monkeypatch.setattr(departure, "_spline_coefficients", lambda heights: filtered.append(0) or real(heights))
+    line = 0.25 * (torch.arange(22, dtype=torch.float64) - 10.5)
+    heights = 0.5 + sag_of_powers(singlet(), line**2 + line[:, None] ** 2)
+    pupil, _ = gauss_rings(4)
+
+    def landed(map_):
+        lens_ = bridge.element_lens(
+            Element(Pixels(map_, scalar(0.25)), RADIUS, constant(PMMA)),
+            sensor_distance=SENSOR,
+            object_distance=FOCUS,
+            wavelengths=vector(0.55),
+        )
+        view = scene(lens_, AXIS, vector(700.0), vector(0.55))
+        return sum((wavefront(view, pupil).landing ** 2).sum() for _ in range(2))
+
+    free = heights.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(landed(free), free)
+    assert len(filtered) == 2  # along y and along x
+    bump = torch.zeros_like(heights)
+    bump[8, 13] = 1e-5
+    slope = float((landed(heights + bump) - landed(heights - bump)) / 2e-5)
+    assert float(gradient[8, 13]) == pytest.approx(slope, rel=1e-5)
 
 
 # -- elements at the stop ----------------------------------------------------------------------------------------------

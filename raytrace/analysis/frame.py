@@ -8,6 +8,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from raytrace.numerics import broadcast_shape
 
 class Tabular(abc.ABC):
     """A result that can be written as a table."""
@@ -25,7 +26,7 @@ class Tabular(abc.ABC):
 
 def flat(columns: dict[str, Tensor]) -> dict[str, np.ndarray]:
     """Columns as flat arrays of one length, in the order of their common shape."""
-    shape = torch.broadcast_shapes(*(column.shape for column in columns.values()))
+    shape = broadcast_shape(*(column.shape for column in columns.values()))
     return {name: column.detach().cpu().expand(shape).reshape(-1).numpy() for name, column in columns.items()}
 
 

@@ -1,14 +1,13 @@
 """The accuracy of the co-design experiment's PSFs in words: tables, page and CSV."""
 
-import csv
-import dataclasses
-import io
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from raytrace.bench.codesign_accuracy import DRAWS, FAR, NEAR, PITCH, PIXELS, WAVELENGTH, Accuracy, ModelError
+from raytrace.bench.page import KEPT as KEPT
+from raytrace.bench.page import measured, page
+from raytrace.bench.page import table as table
 
-KEPT = "<!-- kept when this page is made again -->"
 _NAMES = {"paraxial": "paraxial", "fourier": "Fourier", "gaussian": "Gaussian DRT", "drt": "DRT"}
 _SAID = {
     "random": "random, plain mean",
@@ -16,16 +15,6 @@ _SAID = {
     "splatted": "random, splatted over a pixel",
     "counted": "random, counted",
 }
-
-
-def table(rows: Iterable) -> str:
-    """Rows of one kind as CSV, a column for each of their fields; empty where a quantity does not exist."""
-    mappings = [dataclasses.asdict(row) for row in rows]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(mappings[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({key: _cell(value) for key, value in mapping.items()} for mapping in mappings)
-    return text.getvalue()
 
 
 def markdown(
@@ -65,11 +54,9 @@ def markdown(
         "least and the most); 2 is the most there is. Every object distance is in "
         "[model_error.csv](codesign/model_error.csv), every row above in [accuracy.csv](codesign/accuracy.csv).",
         "",
-        f"Median processor time of {repeats} batches, all entrants in turns in one run, one thread; "
-        + ", ".join(f"{name} {value}" for name, value in about.items())
-        + ".",
+        measured(f"{repeats} batches, all entrants in turns in one run", about) + ".",
     ]
-    return "\n".join([*lines, "", KEPT, kept]).rstrip() + "\n"
+    return page(lines, kept)
 
 
 def _rows(rows: Sequence[Accuracy]) -> list[str]:
@@ -108,7 +95,3 @@ def _place(field: float) -> str:
 
 def _error(error: float | None) -> str:
     return "–" if error is None else "< 1e-9" if error < 1e-9 else f"{error:.1e}" if error < 0.001 else f"{error:.3g}"
-
-
-def _cell(value):
-    return "" if value is None else f"{value:.6g}" if isinstance(value, float) else value

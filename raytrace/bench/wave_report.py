@@ -1,14 +1,13 @@
 """The benchmark of wave PSFs in words: page and CSV."""
 
-import csv
-import dataclasses
-import io
 import math
 from collections.abc import Mapping, Sequence
 
+from raytrace.bench.page import KEPT as KEPT
+from raytrace.bench.page import measured, page
+from raytrace.bench.page import table as table
 from raytrace.bench.wave import DEPTH, ERROR, PIXEL, SIZE, TALK, TARGET, WAVELENGTH, WaveRow, target
 
-KEPT = "<!-- kept when this page is made again -->"
 _NAMES = {
     "pupil": "pupil matrix DFT",
     "radial": "ring integrals",
@@ -16,15 +15,6 @@ _NAMES = {
     "angular_spectrum": "angular spectrum, band limit, true spheres",
     TALK: "Fresnel transfer function as in the talk",
 }
-
-
-def table(rows: Sequence[WaveRow]) -> str:
-    """Rows as CSV, a column for each of their fields; empty where a quantity does not exist."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [field.name for field in dataclasses.fields(WaveRow)], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({key: _cell(value) for key, value in dataclasses.asdict(row).items()} for row in rows)
-    return text.getvalue()
 
 
 def markdown(
@@ -55,11 +45,9 @@ def markdown(
         "Rows in italics are refused by `plan` (`AliasedSampling`) and forced here: copies of the image lie in the "
         "window, and the result is wrong altogether, not a little. *Predicted* is what `plan` says of the error.",
         "",
-        f"Median processor time of up to {repeats} calls, one thread; "
-        + ", ".join(f"{name} {value}" for name, value in about.items())
-        + ". All figures: [speed_vs_error.csv](wave/speed_vs_error.csv).",
+        measured(f"up to {repeats} calls", about) + ". All figures: [speed_vs_error.csv](wave/speed_vs_error.csv).",
     ]
-    return "\n".join([*lines, "", KEPT, kept]).rstrip() + "\n"
+    return page(lines, kept)
 
 
 def _goals(rows: Sequence[WaveRow]) -> list[str]:
@@ -98,7 +86,3 @@ def _ratio(value: float) -> str:
 
 def _digits(value: float | None) -> str:
     return "–" if value is None or math.isnan(value) else f"{value:.1e}" if value < 1 else f"{value:.1f}"
-
-
-def _cell(value):
-    return "" if value is None else f"{value:.6g}" if isinstance(value, float) else value

@@ -10,6 +10,7 @@ from raytrace import analysis
 from raytrace.analysis.frame import Tabular, flat
 from raytrace.cli.door import CommandError, field_points, number, open_lens, print_json, say
 from raytrace.lens import FIELD_UNITS, Lens
+from raytrace.numerics import broadcast_shape
 
 _UNITS = {
     "wavelength": "µm", "frequency": "1/mm", "sensor_distance": "mm", "radius": "mm", "height": "mm", "shift": "mm",
@@ -131,7 +132,7 @@ def _rows(columns: dict[str, Tensor]) -> list[dict]:
 
 
 def _print(columns: dict[str, Tensor], field_unit: str, every: int, unit: str) -> None:
-    length = torch.broadcast_shapes(*(c.shape for c in columns.values()))[-1]
+    length = broadcast_shape(*(c.shape for c in columns.values()))[-1]
     thin = every if length > 2 * every else 1
     table = flat({name: c[..., ::thin] if c.shape[-1] == length else c for name, c in columns.items()})
     if not table["field_x"].any():

@@ -14,7 +14,7 @@ from raytrace.bench import codesign_accuracy, codesign_report, psf, psf_report
 from raytrace.bench.measure import Row, calls, field_rays, measure, surfaces_of
 from raytrace.bench.psf_cases import USUAL, cases
 from raytrace.bench.report import machine, markdown
-from raytrace.cli import wave_bench
+from raytrace.cli import speed_bench, wave_bench
 from raytrace.cli.door import CommandError, open_lens, print_json, say
 from raytrace.files import write_atomically
 from raytrace.lens import Lens
@@ -23,10 +23,11 @@ from raytrace.lens import Lens
 def bench(arguments: argparse.Namespace) -> None:
     """Speed beside error, and beside a peer's if there is one: of the trace, or of the PSFs of lenses or waves."""
     other = {
-        "trace": ("lenses", "csv", "docs"),
-        "psf": ("lens", "rays", "docs"),
-        "codesign": ("lenses", "lens", "rays", "output", "csv", "plot", "threads"),
-        "wave": ("lenses", "lens", "rays", "output", "csv", "plot", "threads"),
+        "trace": ("lenses", "csv", "docs", "quick"),
+        "psf": ("lens", "rays", "docs", "quick"),
+        "codesign": ("lenses", "lens", "rays", "output", "csv", "plot", "threads", "quick"),
+        "wave": ("lenses", "lens", "rays", "output", "csv", "plot", "threads", "quick"),
+        "speed": ("lenses", "lens", "rays", "output", "csv", "plot"),
     }[arguments.what]
     for name in other:
         if getattr(arguments, name):
@@ -39,6 +40,9 @@ def bench(arguments: argparse.Namespace) -> None:
         wave_bench.bench_wave(arguments)
         return
     peer = None if arguments.no_peers else _peer()
+    if arguments.what == "speed":
+        speed_bench.bench_speed(arguments, with_peers=peer is not None)
+        return
     before = torch.get_num_threads()
     threads = arguments.threads or before
     try:

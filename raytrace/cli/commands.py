@@ -15,6 +15,8 @@ from raytrace.cli.options import (
     file_name,
     json,
     lens,
+    many,
+    memory,
     output,
     plot,
     positive,
@@ -76,6 +78,16 @@ def _spot(parser):
     conditions(parser)
     fields(parser)
     sampling(parser, rings=12)
+    parser.add_argument(
+        "--rays",
+        metavar="N",
+        type=many,
+        help="instead of --size, any number of sobol or random rays for each field and wavelength, as 1e9: "
+        "traced in chunks, none kept",
+    )
+    parser.add_argument(
+        "--max-bytes", metavar="BYTES", type=memory, help="memory that --rays may take, as 200MB (default 256MB)"
+    )
     ray_aiming(parser)
     plot(parser, "the spot diagram")
 
@@ -147,7 +159,7 @@ def _glass(parser):
 
 
 def _bench(parser):
-    parser.add_argument("what", choices=("trace", "psf", "codesign", "wave"), help="what to measure")
+    parser.add_argument("what", choices=("trace", "psf", "codesign", "wave", "speed"), help="what to measure")
     parser.add_argument(
         "lenses",
         metavar="LENS",
@@ -170,8 +182,10 @@ def _bench(parser):
         "--docs",
         metavar="DOCS",
         type=file_name,
-        help="codesign, wave: folder for codesign_accuracy.md and codesign/, or wave_bench.md and wave/",
+        help="codesign, wave, speed: folder for codesign_accuracy.md and codesign/, wave_bench.md and wave/, or "
+        "speed.md, .csv and .png",
     )
+    parser.add_argument("--quick", action="store_true", help="speed: few rays, to try it; its ratios mean little")
     plot(parser, "speed over number of rays, or time over error,")
 
 
@@ -249,9 +263,10 @@ COMMANDS = (
         "Trace each field and wavelength to the sensor: centroid, RMS and geometric radius about it.",
         """examples:
   raytrace spot double_gauss --plot spot.png
-  raytrace spot lens.zmx --object-distance 25000 --field 0 10 14 --json""",
+  raytrace spot lens.zmx --object-distance 25000 --field 0 10 14 --json
+  raytrace spot double_gauss --field 14 --rays 1e9 --max-bytes 200MB""",
         _spot,
-        "ray_commands.spot",
+        "spot_commands.spot",
     ),
     Command(
         "focus",
@@ -262,7 +277,7 @@ COMMANDS = (
   raytrace focus lenses/double_gauss.zmx --object-distance 25000 --plot focus.png
   raytrace focus lens.zmx --object-distance 10000 25000 50000 --field 0 10 14 -o focused.zmx""",
         _focus,
-        "ray_commands.focus",
+        "focus_commands.focus",
     ),
     Command(
         "trace",
@@ -274,17 +289,21 @@ COMMANDS = (
   raytrace trace double_gauss
   raytrace trace lens.zmx --rays rays.csv -o traced.csv""",
         _trace,
-        "ray_commands.trace",
+        "trace_commands.trace",
     ),
     Command(
         "psf",
         "point spread functions by five models",
         "Compute point spread functions over object distance and field, integrated over pixels, to a tolerance. "
-        "Models: paraxial, fourier, gaussian, drt (ray-traced), wave (diffraction of the traced wavefront).",
+        "Models: paraxial, fourier, gaussian, drt (ray-traced), wave (diffraction of the traced wavefront). Several "
+        "processes, or machines, share the kernels, or with --model drt --rays and for a single kernel of --model "
+        "gaussian the rays, and give the result of one to rounding, written once: torchrun --nproc-per-node 2 -m "
+        "raytrace psf …",
         """examples:
   raytrace psf double_gauss --model gaussian --object-distance 10000 30000 --plot psf.png
   raytrace psf double_gauss --model wave --field 14 --center chief --tol 1e-3 -o psf.npz
-  raytrace psf double_gauss --model drt --rays 256 --json""",
+  raytrace psf double_gauss --model drt --rays 256 --json
+""",
         _psf,
         "psf_commands.psf",
     ),
@@ -320,13 +339,16 @@ COMMANDS = (
         "Measure, forward and backward, in float32 and float64: the trace against a high-precision reference, or every "
         "PSF model at every sampling against converged ones (minutes), or what learns lenses in co-design: few rays "
         "beside many, and the models beside DRT (minutes), or every engine of wave PSFs beside the transfer function "
-        "it replaces (a minute). With the extra [bench] Optiland runs beside the first two.",
+        "it replaces (a minute), or the targets of speed: the trace beside limits of the machine (C++, built here if "
+        "there is a compiler), its memory and whole processes (minutes). With the extra [bench] Optiland runs beside "
+        "trace, psf and speed.",
         """examples:
   raytrace bench trace
   raytrace bench psf -o speed_vs_error.md --csv speed_vs_error.csv --plot speed_vs_error.png
   raytrace bench trace --rays 1000 100000 -o bench.md --plot bench.png
   raytrace bench codesign --docs docs
-  raytrace bench wave --docs docs""",
+  raytrace bench wave --docs docs
+  raytrace bench speed --quick --repeats 1""",
         _bench,
         "bench_commands.bench",
     ),

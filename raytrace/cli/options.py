@@ -35,6 +35,27 @@ def count(text: str) -> int:
     return number
 
 
+def many(text: str) -> int:
+    """A whole number above 0, also written as 1e9."""
+    number = finite(text)
+    if number < 1 or number != int(number):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
+    return int(text) if text.isdigit() else int(number)
+
+
+def memory(text: str) -> int:
+    """A number of bytes, with kB, MB or GB behind it (10³, 10⁶, 10⁹) or without."""
+    units = {"kb": 10**3, "mb": 10**6, "gb": 10**9, "b": 1}
+    unit = next((u for u in units if text.lower().endswith(u)), "")
+    try:
+        number = float(text[: len(text) - len(unit)])
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of bytes, as 200MB") from None
+    if not 1 <= number * units.get(unit, 1) < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of bytes above 0")
+    return int(number * units.get(unit, 1))
+
+
 def seed_number(text: str) -> int:
     """A whole number that seeds a generator: 0 to 2⁶³ - 1."""
     number = _whole(text)

@@ -14,13 +14,22 @@ from raytrace.grid import grid
 from raytrace.lens import FIELD_UNITS
 from raytrace.psf import NotConverged, Psf
 from raytrace.psf import psf as compute
+from raytrace.shards import Share, processes
 
 
 def psf(arguments: argparse.Namespace) -> None:
-    """Kernels over object distance × field: print, plot, save."""
+    """Kernels over object distance × field: print, plot, save; under torchrun computed by all processes."""
+    with processes() as share:
+        _psf(arguments, share)
+
+
+def _psf(arguments: argparse.Namespace, share: Share) -> None:
     lens = open_lens(arguments)
     fields = field_points(lens, arguments, on_axis=True)
     distances = arguments.object_distance or [float(lens.surfaces[0].thickness)]
+    rays_are_shared = arguments.model == "gaussian" or (arguments.model == "drt" and arguments.rays)
+    if share.processes > 1 and len(distances) * fields.shape[1] * len(lens.wavelengths) == 1 and not rays_are_shared:
+        say(f"a single kernel of {arguments.model} is not cut: each of the {share.processes} processes computes it")
     found = compute(
         lens,
         arguments.model,
@@ -32,7 +41,10 @@ def psf(arguments: argparse.Namespace) -> None:
         rays=arguments.rays,
         normalise=arguments.normalise,
         rho=arguments.rho,
+        share=share,
     )
+    if share.rank:
+        return
     labels = [f"{y:g}" if x == 0 else f"{x:g},{y:g}" for x, y in fields.T.tolist()]
     if arguments.output:
         write_atomically(arguments.output, lambda file: save(found, distances, fields, file))

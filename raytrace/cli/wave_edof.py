@@ -5,7 +5,7 @@ import dataclasses
 import json
 import math
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import torch
@@ -17,7 +17,7 @@ from raytrace.cli.wave_edof_table import STARTS, STEPS
 from raytrace.design.edof import Quality, World, kernels, periodic, quality, spectrum
 from raytrace.design.edof_page import CAPTIONS, markdown
 from raytrace.design.edof_scene import deep, flat
-from raytrace.design.edof_table import NAMES, TALK, Content, records, table_of, write_records
+from raytrace.design.edof_table import NAMES, ROWS, TALK, Content, elements_of, records, table_of, write_records
 from raytrace.design.edof_training import EdofCamera, Settings, begin, learn_element
 from raytrace.design.report import below_the_mark
 from raytrace.design.training import NotFinite, OtherSettings
@@ -63,15 +63,18 @@ def edof(arguments: argparse.Namespace) -> None:
 
 def table(arguments: argparse.Namespace) -> None:
     """Every row on every content; the page where --docs asks for it."""
-    unknown = set(arguments.rows or ()) - set(NAMES)
-    if unknown:
-        raise CommandError(f"--rows {' '.join(sorted(unknown))}: expected {', '.join(NAMES)}")
+    for option, given in (("rows", arguments.rows), ("also", arguments.also)):
+        unknown = sorted(set(given or ()) - set(NAMES))
+        if unknown:
+            raise CommandError(f"--{option} {' '.join(unknown)}: expected {', '.join(NAMES)}")
+    rows = [*(arguments.rows or (name for name, *_ in ROWS)), *(arguments.also or ())]
     world = World()
     contents, train = _contents(arguments)
-    learned = _learned(arguments, world, train)
-    found = table_of(contents, world, learned, rows=arguments.rows, progress=lambda given: _bar(given, "rows"))
+    learned = _learned(arguments, rows, world, train)
+    elements = elements_of(rows, world, spectrum(contents[0].train), learned=learned)
+    found = table_of(contents, elements, world, progress=lambda given: _bar(given, "rows"))
     if arguments.docs:
-        _write_page(Path(arguments.docs), found, learned, world, arguments)
+        _write_page(Path(arguments.docs), found, elements, world, arguments)
     if arguments.json:
         print_json({"rows": plain(records(found))})
     else:
@@ -80,6 +83,8 @@ def table(arguments: argparse.Namespace) -> None:
 
 def _settings(arguments: argparse.Namespace) -> Settings:
     kind = arguments.element
+    if arguments.tolerance and kind != "rings":
+        raise CommandError(f"--tolerance {arguments.tolerance:g}: a {kind} element has no rings; take --element rings")
     return Settings(
         kind=kind,
         glass=arguments.glass or ("F_SILICA" if kind == "rings" else "PMMA"),
@@ -92,7 +97,7 @@ def _settings(arguments: argparse.Namespace) -> Settings:
         rate=arguments.rate,
         steps=arguments.steps,
         starts=arguments.starts,
-        tolerance=arguments.tolerance or 0.0,
+        tolerance=1e-6 * (arguments.tolerance or 0.0),
         seed=arguments.seed,
     )
 
@@ -148,15 +153,24 @@ def _contents(arguments: argparse.Namespace) -> tuple[list[Content], Pictures]:
     return contents, learn_from
 
 
-def _learned(arguments: argparse.Namespace, world: World, train: Pictures) -> dict[str, tuple[Element, ...]]:
-    """The learned rows that are asked for."""
+def _learned(
+    arguments: argparse.Namespace, rows: Sequence[str], world: World, train: Pictures
+) -> dict[str, tuple[Element, ...]]:
+    """The learned ones of the rows."""
     common = {"steps": arguments.steps, "starts": arguments.starts, "seed": arguments.seed}
+    pictures = {"kind": "rings", "loss": "images", "restoration": "towards"}
     wanted = {
         "learned-smooth": Settings(kind="smooth", glass="PMMA", **common),
         "learned": Settings(kind="rings", **common),
         "learned-16": Settings(kind="rings", levels=16, **common),
-    }
-    asked = {name: own for name, own in wanted.items() if arguments.rows is None or name in arguments.rows}
+        "learned-images": Settings(**pictures, **common),
+        "learned-adadelta": Settings(**pictures, optimizer="adadelta", schedule="constant", rate=1.0, **common),
+        "learned-zernike": Settings(
+            kind="zernike", glass="PMMA", terms=22, spread=0.05, optimizer="adadelta", schedule="constant", rate=1.0,
+            **common
+        ),
+    }  # fmt: skip
+    asked = {name: own for name, own in wanted.items() if name in rows}
     with tempfile.TemporaryDirectory() as unkept:
         if asked and not arguments.output:
             say("learned elements are not kept: -o FOLDER keeps them")
@@ -169,11 +183,11 @@ def _learned(arguments: argparse.Namespace, world: World, train: Pictures) -> di
     return found
 
 
-def _write_page(docs: Path, found, learned, world: World, arguments: argparse.Namespace) -> None:
+def _write_page(docs: Path, found, elements, world: World, arguments: argparse.Namespace) -> None:
     folder = docs / "wave"
     folder.mkdir(parents=True, exist_ok=True)
     write_records(found, folder / "table.csv")
-    made = _figures(found, learned, world, arguments.seed)
+    made = _figures(found, elements, world, arguments.seed)
     for name, figure in made.items():
         save(figure, folder / name)
     page = docs / "wave_edof.md"
@@ -184,25 +198,27 @@ def _write_page(docs: Path, found, learned, world: World, arguments: argparse.Na
         for name, usual in (("starts", STARTS), ("steps", STEPS))
         if getattr(arguments, name) != usual
     )
-    command = f"raytrace wave table {data}{effort}-o FOLDER --docs docs"
-    text = markdown(found, learned, world, command=command, figures=[n for n in CAPTIONS if n in made], kept=kept)
+    also = f"--also {' '.join(arguments.also)} " if arguments.also else ""
+    command = f"raytrace wave table {data}{effort}{also}-o FOLDER --docs docs"
+    text = markdown(found, world, command=command, figures=[n for n in CAPTIONS if n in made], kept=kept)
     write_atomically(page, lambda file: file.write(text.encode()))
     say(f"written: {page}")
 
 
-def _figures(found, learned, world: World, seed: int) -> dict:
+def _figures(found, elements, world: World, seed: int) -> dict:
     """Figures of the page, by file name. Only dead leaves are shown."""
     made = {"depth.png": drawn.depth_figure(found, world)}
     first = next(iter(found.values()))
     if "fresnel" in first:
         made["gain.png"] = drawn.gain_figure(found)
     for name in ("learned", "learned-smooth"):
-        if name in learned:
-            found_kernels = kernels(learned[name], world)
-            made[f"{name}.png"] = drawn.element_figure(learned[name], found_kernels, first[name], world)
-    rows = [name for name in ("fresnel", "singlet", "ideal", "cubic-refractive", "learned") if name in first]
-    made["scene.png"] = drawn.scene_figure(*flat(rows, learned, world, seed=seed))
-    made["deep.png"] = drawn.deep_figure(deep(rows, learned, world, seed=seed))
+        if name in elements:
+            found_kernels = kernels(elements[name], world)
+            made[f"{name}.png"] = drawn.element_figure(elements[name], found_kernels, first[name], world)
+    shown = ("fresnel", "singlet", "ideal", "cubic-refractive", "learned")
+    shown = {name: elements[name] for name in shown if name in elements}
+    made["scene.png"] = drawn.scene_figure(*flat(shown, world, seed=seed))
+    made["deep.png"] = drawn.deep_figure(deep(shown, world, seed=seed))
     return made
 
 

@@ -19,7 +19,7 @@ best of several random starts of the smooth element. A run may be stopped at any
 _EDOF_EXAMPLES = """examples:
   raytrace wave edof -o rings --plot rings.png
   raytrace wave edof --element smooth --starts 8 -o smooth --json
-  raytrace wave edof --element rings --levels 16 -o etched
+  raytrace wave edof --element rings --levels 16 --tolerance 20 -o etched
   raytrace wave edof --element zernike --loss images --filter towards --optimizer adadelta --rate 1 -o original
   raytrace wave edof --data pictures --steps 300 -o run"""
 
@@ -31,6 +31,7 @@ two sizes, and on real pictures with --data. What is learned is kept in FOLDER, 
 _TABLE_EXAMPLES = """examples:
   raytrace wave table --json
   raytrace wave table --rows fresnel singlet achromat
+  raytrace wave table --rows fresnel learned --also learned-images learned-adadelta -o learned
   raytrace wave table --data pictures -o learned --docs docs"""
 
 
@@ -54,7 +55,10 @@ def _edof(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--levels", metavar="N", type=count, help="etched in so many steps of a wave while learned")
     parser.add_argument(
-        "--tolerance", metavar="MM", type=positive_finite, help="errors of height, drawn at every step (default none)"
+        "--tolerance",
+        metavar="NM",
+        type=positive_finite,
+        help="rings err in height by up to so many nm, drawn anew at every step (default 0)",
     )
     group = parser.add_argument_group("learning")
     group.add_argument("--loss", choices=("spectral", "images"), default="spectral", help="default spectral")
@@ -77,7 +81,14 @@ def _edof(parser: argparse.ArgumentParser) -> None:
 
 
 def _table(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--rows", metavar="ROW", nargs="+", help="only these (default: all)")
+    parser.add_argument("--rows", metavar="ROW", nargs="+", help="only these (default: all but those of --also)")
+    parser.add_argument(
+        "--also",
+        metavar="ROW",
+        nargs="+",
+        help="rows of other ways of learning beside the others: learned-images (loss of pictures, the original's "
+        "filter), learned-adadelta (the same by Adadelta), learned-zernike (22 polynomials, no symmetry, by Adadelta)",
+    )
     parser.add_argument("--steps", metavar="N", type=count, default=STEPS, help=f"of learning (default {STEPS})")
     parser.add_argument("--starts", metavar="N", type=count, default=STARTS, help=f"random starts (default {STARTS})")
     _pictures(parser.add_argument_group("pictures"))

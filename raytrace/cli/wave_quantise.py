@@ -8,7 +8,9 @@ from pathlib import Path
 
 from torch import Tensor
 
+from raytrace.catalog import find_glass
 from raytrace.cli.door import CommandError, print_json
+from raytrace.cli.wave_setup import height_map
 from raytrace.cli.wave_superres import bar, folders, page, pictures, write_csv
 from raytrace.design.edof import World, periodic, spectrum
 from raytrace.design.edof_training import Settings
@@ -30,6 +32,7 @@ from raytrace.pictures import Pictures
 from raytrace.wave.aim import aim
 from raytrace.wave.baselines import baseline, singlet
 from raytrace.wave.element import Element
+from raytrace.wave.exchange import FORMATS
 
 
 def quantise(arguments: argparse.Namespace) -> None:
@@ -79,8 +82,15 @@ def _element(arguments, given: str, train: Pictures, S: Tensor) -> tuple[str, El
     if given == "fresnel":
         (element,) = baseline("fresnel", aim(radius=world.radius, sensor=world.sensor_distance, focus=world.design))
         return given, element, world
+    if given != "learned" and Path(given).suffix.lower() in FORMATS and not Path(given).is_dir():
+        span = tuple(arguments.span) if arguments.span else None
+        glass = find_glass(arguments.glass)
+        made_of = height_map(given, aperture=arguments.aperture, glass=glass, pitch=arguments.pitch, span=span)
+        return Path(given).name, made_of, dataclasses.replace(world, radius=0.5 * arguments.aperture)
     if given != "learned" and not Path(given).is_dir():
-        raise CommandError(f"--element {given}: expected fresnel, learned, or the folder of a run")
+        raise CommandError(
+            f"--element {given}: expected fresnel, learned, the folder of a run, or a height map ({', '.join(FORMATS)})"
+        )
     try:
         return (Path(given).name, *read(given, S)) if given != "learned" else _learned(arguments, world, train, S)
     except ValueError as error:

@@ -73,23 +73,31 @@ def _named(arguments: argparse.Namespace) -> tuple[Element, ...]:
 
 def _from_file(arguments: argparse.Namespace) -> Element:
     """A height map in the aperture; wrapped where a design wavelength or steps are given."""
-    path = arguments.element
-    glass = _glass(arguments)
-    profile = read_heights(path, pitch=arguments.pitch, span=tuple(arguments.span) if arguments.span else None)
+    glass, span = _glass(arguments), tuple(arguments.span) if arguments.span else None
+    element = height_map(arguments.element, aperture=arguments.aperture, glass=glass, pitch=arguments.pitch, span=span)
+    if arguments.design_wavelength or arguments.levels:
+        element = wrapped(element, arguments.design_wavelength or _WAVELENGTH, levels=arguments.levels or 0)
+    return element
+
+
+def height_map(
+    path: str, *, aperture: float, glass: Glass, pitch: float | None = None, span: tuple[float, float] | None = None
+) -> Element:
+    """The element of a file of heights in an aperture of so many mm; pitch, span: of a file that does not say them.
+
+    Raises CommandError where the heights do not fill the aperture, and what `read_heights` raises.
+    """
+    profile = read_heights(path, pitch=pitch, span=span)
     profile = dataclasses.replace(profile, heights=profile.heights.double(), pitch=profile.pitch.double())
     counts = (2 * len(profile.heights),) if isinstance(profile, Rings) else profile.heights.shape
     across = min(counts) * float(profile.pitch)
     # What is cut to whole features may miss the rim by one of them.
-    if across + 2 * float(profile.pitch) < arguments.aperture:
+    if across + 2 * float(profile.pitch) < aperture:
         raise CommandError(
-            f"{path}: the heights are {across:.6g} mm across, less than the aperture of {arguments.aperture:g} mm; "
+            f"{path}: the heights are {across:.6g} mm across, less than the aperture of {aperture:g} mm; "
             f"give --aperture {across:.6g}"
         )
-    radius = torch.tensor(0.5 * arguments.aperture, dtype=torch.float64)
-    element = Element(profile, radius, glass)
-    if arguments.design_wavelength or arguments.levels:
-        element = wrapped(element, arguments.design_wavelength or _WAVELENGTH, levels=arguments.levels or 0)
-    return element
+    return Element(profile, torch.tensor(0.5 * aperture, dtype=torch.float64), glass)
 
 
 def _glass(arguments: argparse.Namespace) -> Glass:

@@ -25,13 +25,14 @@ kinoform against sinc²(1/L), and the expected PSNR over 0.5 m to infinity, in t
 knows no depth: of the Fresnel lens, and of a learned element of fused silica rings, wrapped and stepped afterwards or
 learned on with wraps and steps in the loop.
 
-An element is fresnel, learned (learned first, in FOLDER, or a temporary one), or the folder of a run of
-`raytrace wave edof --element rings`."""
+An element is fresnel, learned (learned first, in FOLDER, or a temporary one), the folder of a run of
+`raytrace wave edof --element rings`, or a file of heights, of rings or pixels, as `raytrace wave psf` reads it."""
 
 _QUANTISE_EXAMPLES = """examples:
   raytrace wave quantise --element fresnel --json
   raytrace wave quantise --levels 2 4 16 --tolerance 20 --no-wrap
   raytrace wave quantise --element rings --steps 0
+  raytrace wave quantise --element rings/heights.npy --glass F_SILICA --levels 16 --steps 0
   raytrace wave quantise --docs docs -o learned"""
 
 
@@ -94,11 +95,21 @@ def _superres(parser: argparse.ArgumentParser) -> None:
 def _quantise(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--element",
-        metavar="NAME|FOLDER",
+        metavar="NAME|FOLDER|FILE",
         type=file_name,
         nargs="+",
         default=["fresnel", "learned"],
-        help="default fresnel learned",
+        help="fresnel, learned (default both), folders of `raytrace wave edof`, or height maps: .npy, .csv, .png, "
+        ".tif, .dat, .grd; fine maps of pixels take minutes, rings seconds",
+    )
+    files = parser.add_argument_group("height maps")
+    files.add_argument("--glass", metavar="NAME", default="F_SILICA", help="material (default F_SILICA)")
+    files.add_argument(
+        "--aperture", metavar="MM", type=positive_finite, default=5.0, help="diameter, sensor at 35.5 mm (default 5)"
+    )
+    files.add_argument("--pitch", metavar="MM", type=positive_finite, help="of a file that does not say it")
+    files.add_argument(
+        "--span", metavar="MM", type=float, nargs=2, help="heights of black and white of a picture that does not say"
     )
     levels = [2, 4, 8, 16, 32, 64]
     parser.add_argument(

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from raytrace.deconvolve import blind_error, blind_filter, errors, power_spectrum, psnr, wiener
+from raytrace.design.descent import minimise
 from raytrace.grid import grid
 from raytrace.image import transfer_functions
 from raytrace.pictures import Pictures, draws
@@ -221,25 +222,3 @@ def best_of_starts(
         if found < least:
             best, least = own, found
     return best
-
-
-def minimise(parameters: Sequence[Tensor], error: Callable[[], Tensor], *, steps: int) -> list[float]:
-    """Bring parameters to the least `error` by L-BFGS with exact gradients; returns it at every evaluation."""
-    shapes, course = [p.shape for p in parameters], []
-
-    def put(values: np.ndarray) -> None:
-        with torch.no_grad():
-            for p, part in zip(parameters, np.split(values, np.cumsum([s.numel() for s in shapes])[:-1]), strict=True):
-                p.copy_(torch.as_tensor(part).reshape(p.shape))
-
-    def error_and_gradient(values: np.ndarray) -> tuple[float, np.ndarray]:
-        put(values)
-        value = error()
-        course.append(float(value.detach()))
-        gradient = torch.autograd.grad(value, list(parameters))
-        return course[-1], torch.cat([g.flatten() for g in gradient]).double().numpy()
-
-    start = torch.cat([p.detach().flatten() for p in parameters]).double().numpy()
-    options = {"maxiter": steps, "ftol": 1e-10, "gtol": 1e-10}
-    put(scipy.optimize.minimize(error_and_gradient, start, jac=True, method="L-BFGS-B", options=options).x)
-    return course

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from raytrace.design.edof import Quality, World
 from raytrace.design.edof_table import NAMES, TALK
 from raytrace.design.report import KEPT
-from raytrace.wave.element import Element
 
 CAPTIONS = {
     "gain.png": "Gains over the Fresnel lens, by content and filter, beside the talk's.",
@@ -20,7 +19,6 @@ CAPTIONS = {
 
 def markdown(
     found: Mapping[str, Mapping[str, Quality]],
-    learned: Mapping[str, Sequence[Element]],
     world: World,
     *,
     command: str,

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from raytrace.deconvolve import blind_filter, psnr, restore
 from raytrace.design.edof import World, kernels, mirrored, spectrum, transfer
-from raytrace.design.edof_table import elements_of
 from raytrace.image import blur_layers, depth_masks
 from raytrace.pictures import dead_leaves, draws
 from raytrace.wave.element import Element
@@ -44,7 +43,7 @@ def coloured_leaves(size: int, *, colours: int = 3, seed: int = 0) -> np.ndarray
 
 @torch.no_grad()
 def flat(
-    rows: Sequence[str], learned: Mapping[str, Sequence[Element]], world: World, *, seed: int = 0
+    elements: Mapping[str, Sequence[Element]], world: World, *, seed: int = 0
 ) -> tuple[dict[str, dict[str, tuple[np.ndarray, float]]], np.ndarray]:
     """A scene at the nearest, the middle and the farthest depth: by row and depth what is restored, with its PSNR; and
     the scene.
@@ -54,9 +53,8 @@ def flat(
     picture = torch.as_tensor(np.stack([mirrored(colour) for colour in leaves]))
     S, noise = spectrum(picture), _noise(picture, world, seed)
     found: dict[str, dict[str, tuple[np.ndarray, float]]] = {}
-    for name in rows:
-        elements = learned[name] if name in learned else elements_of(name, world, S)
-        H = transfer(kernels(elements, world), size)
+    for name, own in elements.items():
+        H = transfer(kernels(own, world), size)
         G = blind_filter(H, S, world.noise)
         found[name] = {}
         for d in (0, len(H) // 2, len(H) - 1):
@@ -69,7 +67,7 @@ def flat(
 
 
 @torch.no_grad()
-def deep(rows: Sequence[str], learned: Mapping[str, Sequence[Element]], world: World, *, seed: int = 0) -> Deep:
+def deep(elements: Mapping[str, Sequence[Element]], world: World, *, seed: int = 0) -> Deep:
     """Leaves on a floor from the nearest depth, below, to the farthest, above; near layers hide far ones."""
     size, half = 320, world.size // 2
     picture = torch.as_tensor(coloured_leaves(size + 2 * half, colours=len(world.wavelengths), seed=seed))
@@ -81,10 +79,9 @@ def deep(rows: Sequence[str], learned: Mapping[str, Sequence[Element]], world: W
     masks = depth_masks(depth, planes, softness=0.1 * float(planes[1] - planes[0]))
     truth, S = picture[:, half:-half, half:-half], spectrum(picture)
     seen, back = {}, {}
-    for name in rows:
-        elements = learned[name] if name in learned else elements_of(name, world, S)
-        depths = [math.inf if plane == 0 else 1e3 / plane for plane in planes.tolist()]
-        found = kernels(elements, world, depths=depths)
+    depths = [math.inf if plane == 0 else 1e3 / plane for plane in planes.tolist()]
+    for name, own in elements.items():
+        found = kernels(own, world, depths=depths)
         # What misses the window comes back as haze, even over the scene.
         haze = (1 - found.energy.mean(0))[:, None, None] * picture.mean((-2, -1), keepdim=True)
         image = blur_layers(picture, masks, found.kernel) + haze

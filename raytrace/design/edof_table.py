@@ -12,7 +12,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from raytrace.design.edof import Quality, World, expected_error, kernels, quality, spectrum, transfer
+from raytrace.design.edof import Quality, World, expected_error, kernels, quality, transfer
 from raytrace.files import write_atomically
 from raytrace.wave.aim import Aim, aim
 from raytrace.wave.baselines import baseline
@@ -28,22 +28,28 @@ TALK = {
     "learned": 24.30,
 }
 
-#: Rows: (name, what it is called, of BASELINES or None where it is learned, its options).
-ROWS: tuple[tuple[str, str, str | None, dict], ...] = (
-    ("fresnel", "Fresnel lens", "fresnel", {}),
-    ("multifocal", "multifocal Fresnel lens", "multifocal", {}),
-    ("cubic", "cubic plate on a Fresnel lens", "cubic", {}),
-    ("hybrid", "hybrid achromat", "hybrid", {}),
-    ("achromat", "diffractive achromat", "achromat", {}),
-    ("singlet", "PMMA singlet", "singlet", {}),
-    ("ideal", "ideal lens without dispersion", "ideal", {}),
-    ("multifocal-refractive", "multifocal PMMA lens", "multifocal-refractive", {}),
-    ("cubic-refractive", "cubic plate on a PMMA lens", "cubic-refractive", {}),
-    ("learned-smooth", "learned, smooth PMMA", None, {}),
-    ("learned", "learned, fused silica rings", None, {}),
-    ("learned-16", "learned, wrapped, 16 levels", None, {}),
+#: Rows: (name, what it is called, of BASELINES or None where it is learned).
+ROWS: tuple[tuple[str, str, str | None], ...] = (
+    ("fresnel", "Fresnel lens", "fresnel"),
+    ("multifocal", "multifocal Fresnel lens", "multifocal"),
+    ("cubic", "cubic plate on a Fresnel lens", "cubic"),
+    ("hybrid", "hybrid achromat", "hybrid"),
+    ("achromat", "diffractive achromat", "achromat"),
+    ("singlet", "PMMA singlet", "singlet"),
+    ("ideal", "ideal lens without dispersion", "ideal"),
+    ("multifocal-refractive", "multifocal PMMA lens", "multifocal-refractive"),
+    ("cubic-refractive", "cubic plate on a PMMA lens", "cubic-refractive"),
+    ("learned-smooth", "learned, smooth PMMA", None),
+    ("learned", "learned, fused silica rings", None),
+    ("learned-16", "learned, wrapped, 16 levels", None),
 )
-NAMES = {name: title for name, title, *_ in ROWS}
+#: Other ways of learning, (name, what it is called): rows that are there only where they are asked for.
+ALSO = (
+    ("learned-images", "rings, learned from pictures"),
+    ("learned-adadelta", "rings, from pictures by Adadelta"),
+    ("learned-zernike", "learned, Zernike PMMA, by Adadelta"),
+)
+NAMES = {name: title for name, title, *_ in (*ROWS, *ALSO)}
 
 #: Strengths of cubic plates in waves that are tried; the best in closed form is taken.
 STRENGTHS = (5.0, 10.0, 15.0, 20.0, 30.0)
@@ -64,40 +70,44 @@ def aim_of(world: World) -> Aim:
     return aim(radius=world.radius, sensor=world.sensor_distance, focus=world.design, exact=world.exact)
 
 
-def elements_of(name: str, world: World, S: Tensor) -> tuple[Element, ...]:
-    """A baseline; of cubic plates the strength that is best for pictures of spectrum S (n, n), on the PMMA lens."""
-    made_for = aim_of(world)
-    (kind,) = [kind for row, _, kind, _ in ROWS if row == name]
-    if not name.startswith("cubic"):
-        return baseline(kind, made_for)
-    strength = min(
-        STRENGTHS, key=lambda own: _closed_form(baseline("cubic-refractive", made_for, strength=own), world, S)
-    )
-    return baseline(kind, made_for, strength=strength)
+def elements_of(
+    rows: Iterable[str], world: World, S: Tensor, *, learned: Mapping[str, Sequence[Element]]
+) -> dict[str, Sequence[Element]]:
+    """The elements of rows, in the order of the table: learned ones as given, those that are not there left out.
+
+    Cubic plates have the strength that is best for pictures of spectrum S (n, n) on the PMMA lens, searched once.
+    """
+    made_for, wanted = aim_of(world), set(rows)
+    kinds = {name: kind for name, _, kind in ROWS if name in wanted and kind}
+    options = {}
+    if any(kind.startswith("cubic") for kind in kinds.values()):
+        options = {"strength": min(STRENGTHS, key=lambda own: _error_of_cubic(own, made_for, world, S))}
+    found = {
+        name: baseline(kind, made_for, **(options if kind.startswith("cubic") else {})) for name, kind in kinds.items()
+    }
+    found |= {name: elements for name, elements in learned.items() if name in wanted}
+    return {name: found[name] for name in NAMES if name in found}
 
 
-def _closed_form(elements: Sequence[Element], world: World, S: Tensor) -> float:
+def _error_of_cubic(strength: float, made_for: Aim, world: World, S: Tensor) -> float:
+    elements = baseline("cubic-refractive", made_for, strength=strength)
     return float(expected_error(transfer(kernels(elements, world), S.shape[-1]), S, world.noise))
 
 
 def table_of(
     contents: Sequence[Content],
+    elements: Mapping[str, Sequence[Element]],
     world: World,
-    learned: Mapping[str, Sequence[Element]],
     *,
-    rows: Sequence[str] | None = None,
     progress: Callable[[Iterable], Iterable] = iter,
 ) -> dict[str, dict[str, Quality]]:
-    """Quality by content and row. learned: the elements of the rows that are not baselines."""
-    wanted = [name for name, _, kind, _ in ROWS if (rows is None or name in rows) and (kind or name in learned)]
+    """Quality by content and row, of the elements of each row."""
     found: dict[str, dict[str, Quality]] = {content.name: {} for content in contents}
-    S = spectrum(contents[0].train)
-    for name in progress(wanted):
-        elements = learned[name] if name in learned else elements_of(name, world, S)
-        found_kernels = kernels(elements, world)
+    for name in progress(list(elements)):
+        own = kernels(elements[name], world)
         for content in contents:
             found[content.name][name] = quality(
-                elements, world, train=content.train, test=content.test, found=found_kernels
+                elements[name], world, train=content.train, test=content.test, found=own
             )
     return found
 

@@ -51,7 +51,8 @@ class Settings:
     steps of a period they are etched in while learned, 0 for any height; wrap: modulo one wave at 0.55 µm.
     loss: of LOSSES; restoration: of RESTORATIONS, for loss "images"; optimizer, schedule, rate (µm or a share of it).
     steps; starts: random starts of the smooth optimum, the best is kept; spread: of them, µm; size: of the periodic
-    pictures; batch; noise: least and largest deviation drawn for "images"; tolerance: of heights, mm, drawn each step.
+    pictures; batch; noise: least and largest deviation drawn for "images"; tolerance: rings err by up to so many mm,
+    evenly, drawn anew at every step by the seed and its number.
     """
 
     kind: str = "rings"
@@ -131,6 +132,8 @@ def start(
     settings: Settings, world: World, spectrum: Tensor, *, progress: Callable[[Iterable], Iterable] = iter
 ) -> PhaseVariables:
     """Where learning begins: a lens for the design depth, or the best smooth element of several random starts."""
+    if settings.tolerance and settings.kind != "rings":
+        raise ValueError(f"a tolerance of {settings.tolerance:g} mm belongs to rings; {settings.kind!r} has none")
     glass = find_glass(settings.glass)
     made_for = aim(radius=world.radius, sensor=world.sensor_distance, focus=world.design, exact=world.exact)
     path = converging(made_for) / (index(glass, made_for.wavelength) - 1)
@@ -165,7 +168,7 @@ def _zernike(settings: Settings, lens: Element) -> PhaseVariables:
     """Noll's polynomials from piston to the last of `terms`, in contact with a lens that stays."""
     none = Zernike(lens.radius.new_zeros(settings.terms))
     random = torch.as_tensor(draws(settings.seed, _START).standard_normal(settings.terms)).to(lens.radius)
-    variables = PhaseVariables(dataclasses.replace(lens, profile=none), others=(lens,), tolerance=settings.tolerance)
+    variables = PhaseVariables(dataclasses.replace(lens, profile=none), others=(lens,))
     with torch.no_grad():
         variables.change.copy_(settings.spread * random)
         variables.change[:3] = 0  # piston and tilts change no picture

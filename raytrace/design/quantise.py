@@ -19,11 +19,12 @@ from torch import Tensor
 
 from raytrace.deconvolve import blind_filter, errors, psnr
 from raytrace.design.edof import World, expected_error, scene, spectrum, transfer
+from raytrace.design.edof import kernels as kernels_of
 from raytrace.design.edof_training import EdofCamera, Settings, begin, learn_element, scheduled
 from raytrace.design.phase import PhaseVariables
 from raytrace.design.training import Record
 from raytrace.pictures import Pictures, draws
-from raytrace.wave.element import Element, Rings, period
+from raytrace.wave.element import Element, Pixels, Rings, period
 from raytrace.wave.fabrication import with_tolerance, wrapped
 from raytrace.wave.plan import plan
 from raytrace.wave.psf import psf
@@ -52,7 +53,11 @@ def efficiency(element: Element, world: World, *, points: int = _POINTS) -> floa
     found = scene((element,), there, depths=[world.design])
     place = (torch.arange(points, dtype=element.radius.dtype) + 0.5) / points
     r = element.radius * torch.sqrt(place)
-    phase = 2 * math.pi / (1e-3 * WAVELENGTH) * residual(found, r, torch.zeros_like(r))[0, 0]
+    x, y = r, torch.zeros_like(r)
+    if isinstance(element.profile, Pixels):  # all round, by the golden angle
+        turn = math.pi * (3 - math.sqrt(5)) * (place * points - 0.5)
+        x, y = r * torch.cos(turn), r * torch.sin(turn)
+    phase = 2 * math.pi / (1e-3 * WAVELENGTH) * residual(found, x, y)[0, 0]
     return float(torch.cos(phase).mean() ** 2 + torch.sin(phase).mean() ** 2)
 
 
@@ -65,7 +70,7 @@ def whole(element: Element) -> Element:
 
 
 def made(element: Element, levels: int, *, wrap: bool) -> Element:
-    """Rings as they are made: in `levels` steps of a period (0: any height), modulo the period or not."""
+    """Rings or pixels as they are made: in `levels` steps of a period (0: any height), modulo the period or not."""
     element = whole(element)
     if wrap:
         return wrapped(element, WAVELENGTH, levels=levels)
@@ -78,7 +83,9 @@ def made(element: Element, levels: int, *, wrap: bool) -> Element:
 
 
 class Judge:
-    """Errors of round elements in one world, for pictures of spectrum S (n, n): what heights do not change is kept."""
+    """Errors of elements in one world, for pictures of spectrum S (n, n): what the heights of rings do not change is
+    kept; maps of pixels are computed depth by depth, for memory.
+    """
 
     def __init__(self, world: World, S: Tensor):
         self.world, self.S, self._memo, self._plan = world, S, Memo(), None
@@ -89,6 +96,8 @@ class Judge:
 
     def transfer(self, element: Element) -> Tensor:
         """H (D, W, n, n)."""
+        if isinstance(element.profile, Pixels):
+            return transfer(kernels_of((element,), self.world), self.S.shape[-1])
         found = scene((element,), self.world)
         # The sums of rings depend on their heights no more than the plan should: one for all.
         self._plan = self._plan or plan(scene((whole(element),), self.world))

@@ -1,16 +1,14 @@
 """A camera's error in closed form, by the best linear filter of `deconvolve`: deterministic, no network, no noise."""
 
 import math
-from collections.abc import Sequence
 
-import numpy as np
-import scipy.optimize
 import torch
 from torch import Tensor
 
 from raytrace.deconvolve import kernel_error
 from raytrace.deconvolve import power_spectrum as periodogram
 from raytrace.design.camera import Camera
+from raytrace.design.descent import minimise
 from raytrace.pictures import Pictures, crop
 
 #: Length of the first step, mm of thickness or of sag. L-BFGS-B takes 1 of its own units, and a sensor moved by 1 mm
@@ -54,32 +52,20 @@ def optimise_closed_form(camera: Camera, spectrum: Tensor, *, distances: Tensor 
     """
     distances = even_distances(camera) if distances is None else distances
     variables = camera.variables
-    parameters = list(variables.parameters())
-    course: list[float] = []
 
-    def put(values: Sequence[float]) -> None:
-        with torch.no_grad():
-            for parameter, value in zip(parameters, values, strict=True):
-                parameter.fill_(_FIRST_STEP * float(value))
+    def error() -> Tensor:
+        return camera_error(camera, spectrum, distances) + variables.violation()
 
-    def error_and_gradient(values: np.ndarray) -> tuple[float, np.ndarray]:
-        put(values)
-        error = camera_error(camera, spectrum, distances) + variables.violation()
-        gradient = torch.autograd.grad(error, parameters)
-        course.append(float(error.detach()))
-        return course[-1], np.array([_FIRST_STEP * float(g) for g in gradient])
-
-    start = np.array([float(parameter.detach()) / _FIRST_STEP for parameter in parameters])
-    bounds = [_parameter_bounds(variables, variable) for variable in variables.variables]
     # Errors are of 1e-3 and variables of millimetres: the default tolerance (2e-9 of 1) would stop too soon.
-    best = scipy.optimize.minimize(
-        error_and_gradient, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-11, "gtol": 1e-10}
+    return minimise(
+        list(variables.parameters()),
+        error,
+        unit=_FIRST_STEP,
+        bounds=[_parameter_bounds(variables, variable) for variable in variables.variables],
+        tolerance=1e-11,
     )
-    put(best.x)
-    return course
 
 
 def _parameter_bounds(variables, variable) -> tuple[float, float]:
     low, high = variables.bounds.get(variable.name, (-math.inf, math.inf))
-    ends = sorted(((low - variable.start) / variable.unit, (high - variable.start) / variable.unit))
-    return ends[0] / _FIRST_STEP, ends[1] / _FIRST_STEP
+    return tuple(sorted(((low - variable.start) / variable.unit, (high - variable.start) / variable.unit)))

@@ -21,7 +21,8 @@ from torch import Tensor
 
 from raytrace.catalog import find_glass
 from raytrace.deconvolve import mean_square_error, psnr
-from raytrace.design.edof import World, minimise, scene, spectrum
+from raytrace.design.descent import minimise
+from raytrace.design.edof import World, scene, spectrum
 from raytrace.design.phase import PhaseVariables
 from raytrace.glass import index
 from raytrace.pictures import Pictures, draws

@@ -4,12 +4,11 @@ A run lives in a folder: `settings.json` (what it was asked for), `log.csv` (one
 last state, replaced as a whole). Nothing that a step draws depends on what was drawn before, so a resumed run repeats
 the steps since its checkpoint bit by bit.
 
-Several processes (torchrun) share every batch: each takes its samples, and gradients are summed over all of them. Only
-the first process writes.
+Several processes (`raytrace.shards`) share every batch: each takes its samples, and gradients are summed over all of
+them. Only the first process writes.
 """
 
 import csv
-import dataclasses
 import io
 import json
 import math
@@ -18,9 +17,10 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import torch
-from torch import Tensor, distributed, nn
+from torch import Tensor, nn
 
 from raytrace.files import write_atomically
+from raytrace.shards import Share, share, total
 
 #: What a step reports: numbers by name, a column of the log each.
 Record = dict[str, float]
@@ -32,24 +32,6 @@ class NotFinite(ArithmeticError):
 
 class OtherSettings(ValueError):
     """A run that is resumed with other settings than it was begun with."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Share:
-    """What one process takes of every batch: samples `rank`, `rank + processes`, … ."""
-
-    rank: int = 0
-    processes: int = 1
-
-    def of(self, samples: range) -> list[int]:
-        return list(samples[self.rank :: self.processes])
-
-
-def share() -> Share:
-    """The share of this process: all, unless torch.distributed is running."""
-    if distributed.is_available() and distributed.is_initialized():
-        return Share(distributed.get_rank(), distributed.get_world_size())
-    return Share()
 
 
 class Run:
@@ -152,15 +134,15 @@ def train(
         value, record = loss(step, mine)
         if value.requires_grad:
             value.backward()
-        total = _sum_over_processes(parameters, value.detach())
-        if not math.isfinite(total):
+        summed = _sum_over_processes(parameters, value.detach())
+        if not math.isfinite(summed):
             kept = (
                 f"the last checkpoint is {run.checkpoint}" if run.checkpoint.exists() else "no checkpoint was made yet"
             )
-            raise NotFinite(f"step {step}: the loss is {total}, or its gradient is none; {kept}")
+            raise NotFinite(f"step {step}: the loss is {summed}, or its gradient is none; {kept}")
         optimizer.step()
         after_step()
-        record = {"loss": total, **record}
+        record = {"loss": summed, **record}
         rows.append((step, record))
         step += 1
         due = step % every == 0 or step == steps or time.monotonic() - kept_at >= seconds
@@ -189,12 +171,10 @@ def _sum_over_processes(parameters: list[nn.Parameter], value: Tensor) -> float:
     gradients = [p.grad for p in parameters if p.grad is not None]
     if share().processes > 1:
         for parameter in parameters:
-            # The order of these sums is the same in all processes, so all take the same step.
-            if parameter.grad is None:
-                parameter.grad = torch.zeros_like(parameter)
-            distributed.all_reduce(parameter.grad)
-        value = value.clone()
-        distributed.all_reduce(value)
+            # The sums are the same in all processes to the last bit, so all take the same step.
+            mine = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+            parameter.grad = total(mine)
+        value = total(value)
         gradients = [p.grad for p in parameters]
     finite = all(bool(torch.isfinite(g).all()) for g in gradients)
     return float(value) if finite else math.nan

@@ -16,7 +16,7 @@ import tempfile
 import threading
 from pathlib import Path
 
-SOURCES = ("block.h", "loops.h", "careful.h", "adjoint.h", "trace.cpp")
+SOURCES = ("block.h", "loops.h", "careful.h", "adjoint.h", "tangent.h", "trace.cpp")
 FLAGS = ("-O3", "-std=c++17", "-fPIC", "-shared", "-fopenmp-simd", "-fno-math-errno", "-fno-trapping-math")
 #: Flags that some compilers or processors do not know: tried in this order, the last none.
 _OWN_PROCESSOR = (("-march=native", "-mprefer-vector-width=512"), ("-march=native",), ())

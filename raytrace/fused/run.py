@@ -14,7 +14,7 @@ from torch import Tensor
 
 from raytrace.fused.library import library
 from raytrace.fused.structure import Structure, structure_of, with_numbers
-from raytrace.numerics import with_batch_axes
+from raytrace.numerics import broadcast_shape, with_batch_axes
 from raytrace.rays import Rays
 from raytrace.surface import Surface
 
@@ -34,6 +34,9 @@ class _Call(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("table", "constants")),
         *((name, ctypes.c_void_p * 7) for name in ("rays_in", "rays_out", "cotangents", "by_rays")),
         *((name, ctypes.c_void_p) for name in ("by_numbers", "valid_in", "valid_out")),
+        ("changes", ctypes.c_int64),
+        ("change", ctypes.c_void_p),
+        ("changed", ctypes.c_void_p * 7),
     )
 
 
@@ -72,7 +75,7 @@ def _batch(rays: Rays, numbers: Sequence[Tensor]) -> torch.Size | None:
     """Batch shape of the traced rays; None if a number of the lens has another dtype, or differs from
     ray to ray of the last axis."""
     parts = [rays.position.shape[1:], rays.direction.shape[1:], rays.valid.shape]
-    shape = torch.broadcast_shapes(
+    shape = broadcast_shape(
         *parts, *(n.shape for n in numbers if n.dim()), *([(1,)] if rays.opl is None else [rays.opl.shape])
     )
     if any(n.dtype != rays.direction.dtype or (n.dim() and n.shape[-1] != 1) for n in numbers) or 0 in shape:
@@ -172,6 +175,23 @@ def _backward(structure: Structure, given, cotangents, wanted: bool):
     for _, (row, own) in sorted(sums.items(), key=lambda item: item[0]):
         total[row : row + len(own)] += own
     return by_rays, torch.from_numpy(total).to(table.dtype)
+
+
+def push(structure: Structure, valid, position, direction, opl, table: Tensor, change: Tensor):
+    """How position (V, 3, ...), direction (V, 3, ...) and path (V, ...) behind the last surface change with the table.
+
+    change: (V, rows, K), the change of the table for each of V variables; the rays before the first surface stay.
+    """
+    call = _call(structure, valid, position, direction, opl, table)
+    out = [
+        torch.empty(len(change), *t.shape, dtype=t.dtype) for t in (position[0],) * 6 + (() if opl is None else (opl,))
+    ]
+    change = change.contiguous()
+    call.changes, call.change = len(change), change.data_ptr()
+    call.changed = (ctypes.c_void_p * 7)(*(t.data_ptr() for t in out))
+    function = getattr(library(), f"raytrace_tangents_{_c_type(table)}")
+    _in_pieces(call, lambda first, last: function(ctypes.byref(call), first, last))
+    return torch.stack(out[:3], 1), torch.stack(out[3:6], 1), None if opl is None else out[6]
 
 
 def _call(structure: Structure, valid, position, direction, opl, table) -> _Call:

@@ -8,6 +8,7 @@
 
 #include "adjoint.h"
 #include "careful.h"
+#include "tangent.h"
 
 namespace raytrace {
 
@@ -24,10 +25,15 @@ struct Call {
   double* by_numbers;        // (rows, numbers), added to
   const uint8_t* valid_in;
   uint8_t* valid_out;
+  int64_t changes;    // forward derivatives that are asked for at once
+  const void* change;  // (changes, rows, numbers), of the rays' type
+  void* changed[7];    // (changes, rows, rays) each: how the rays behind the last surface change; null: not wanted
 };
 
 template <typename T>
 using Crosses = int (*)(const Rays<T>&, Rays<T>&, Notes<T>&, int, const Surface<T>&);
+template <typename T>
+using Pushes = void (*)(const Rays<T>&, const Rays<T>&, Rays<T>&, int, const Surface<T>&, const Change<T>&);
 template <typename T>
 using Pulls = Sums<T> (*)(const Rays<T>&, const Rays<T>&, Cotangents<T>&, Notes<T>&, int, const Surface<T>&);
 
@@ -49,7 +55,16 @@ Pulls<T> pulls_for(const Layout& at) {
   return at.terms <= 8 ? pull<T, kAsphere, bend, path, 8> : pull<T, kAsphere, bend, path, kTerms>;
 }
 
-// `of` is crosses_for or pulls_for.
+template <typename T, int bend, bool path>
+Pushes<T> pushes_for(const Layout& at) {
+  if (at.kind == kPlane) return push<T, kPlane, bend, path, 0>;
+  if (at.kind == kSphere) return push<T, kSphere, bend, path, 0>;
+  if (at.kind == kConic) return push<T, kConic, bend, path, 0>;
+  if (at.terms <= 4) return push<T, kAsphere, bend, path, 4>;
+  return at.terms <= 8 ? push<T, kAsphere, bend, path, 8> : push<T, kAsphere, bend, path, kTerms>;
+}
+
+// `of` is crosses_for, pulls_for or pushes_for.
 #define CHOOSE(of, T, at, path)                                                                              \
   ((at).bend == kNone      ? ((path) ? of<T, kNone, true>(at) : of<T, kNone, false>(at))                       \
    : (at).bend == kRefract ? ((path) ? of<T, kRefract, true>(at) : of<T, kRefract, false>(at))                 \
@@ -86,6 +101,7 @@ struct Step {
   Surface<T> surface;
   Crosses<T> crosses, silently;  // with the path as asked, and without
   Pulls<T> pulls;
+  Pushes<T> pushes;
 };
 
 template <typename T>
@@ -123,7 +139,41 @@ class Trace {
     });
   }
 
+  void tangents(int64_t first, int64_t last) {
+    auto rays = std::make_unique<Rays<T>[]>(steps_.size() + 1);
+    auto notes = std::make_unique<Notes<T>>();
+    auto d = std::make_unique<Rays<T>>();
+    const int64_t all = call_.rows * call_.rays;
+    each(first, last, [&](int64_t at, int count, int n) {
+      load(rays[0], *notes, at, count, n, false);
+      for (size_t k = 0; k < steps_.size(); k++) cross(k, rays[k], rays[k + 1], *notes, n, false);
+      for (int64_t number = 0; number < call_.changes; number++) {
+        push_all(number, at / call_.rays, rays.get(), *d, *notes, n);
+        void* to[7];
+        for (int p = 0; p < 7; p++)
+          to[p] = call_.changed[p] ? static_cast<T*>(call_.changed[p]) + number * all : nullptr;
+        store(to, *d, at, count);
+      }
+    });
+  }
+
  private:
+  // One change, from the first surface that it touches on. A ray lost at a surface starts anew behind it.
+  void push_all(int64_t number, int64_t row, const Rays<T>* rays, Rays<T>& d, const Notes<T>& notes, int n) {
+    const T* changes = static_cast<const T*>(call_.change) + (number * call_.rows + row) * call_.numbers;
+    for (int p = 0; p < 7; p++) std::memset(part(d, p), 0, n * sizeof(T));
+    bool begun = false;
+    for (size_t k = 0; k < steps_.size(); k++) {
+      const Surface<T>& s = steps_[k].surface;
+      const Change<T> change = change_of(*s.at, changes);
+      begun |= change.any;
+      if (begun) steps_[k].pushes(rays[k], rays[k + 1], d, n, s, change);
+      for (int i = 0; i < n && notes.any_lost; i++)
+        if (notes.lost[i] == int32_t(k))
+          for (int p = 0; p < 7; p++) part(d, p)[i] = 0;
+    }
+  }
+
   // Calls work(first ray, rays, rays filled up to whole vectors) for the blocks `first` to `last`.
   template <typename Work>
   void each(int64_t first, int64_t last, Work work) {
@@ -143,7 +193,8 @@ class Trace {
     for (int64_t k = 0; k < call_.surfaces; k++) {
       const Layout& at = call_.layout[k];
       steps_[k] = {surface_of(at, numbers, call_.constants), CHOOSE(crosses_for, T, at, path_),
-                   CHOOSE(crosses_for, T, at, false), CHOOSE(pulls_for, T, at, path_)};
+                   CHOOSE(crosses_for, T, at, false), CHOOSE(pulls_for, T, at, path_),
+                   CHOOSE(pushes_for, T, at, path_)};
     }
   }
 
@@ -226,6 +277,8 @@ using raytrace::Trace;
 int64_t raytrace_blocks(const Call* call) { return call->rows * ((call->rays + raytrace::kBlock - 1) / raytrace::kBlock); }
 void raytrace_forward_float(const Call* call, int64_t first, int64_t last) { Trace<float>(*call).forward(first, last); }
 void raytrace_forward_double(const Call* call, int64_t first, int64_t last) { Trace<double>(*call).forward(first, last); }
+void raytrace_tangents_float(const Call* call, int64_t first, int64_t last) { Trace<float>(*call).tangents(first, last); }
+void raytrace_tangents_double(const Call* call, int64_t first, int64_t last) { Trace<double>(*call).tangents(first, last); }
 void raytrace_backward_float(const Call* call, int64_t first, int64_t last, double* by_numbers) {
   Trace<float>(*call).backward(first, last, by_numbers);
 }

@@ -5,15 +5,27 @@ import functools
 
 import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from raytrace.grid import Grid
 from raytrace.grid import grid as make_grid
 from raytrace.lens import Lens
 from raytrace.numerics import safe_divide
 from raytrace.psf import gaussian
-from raytrace.psf.ladder import MODELS, Psf, by_order, by_rays, by_tolerance, climb, polychromatic, with_options
+from raytrace.psf.ladder import (
+    MODELS,
+    Psf,
+    by_order,
+    by_rays,
+    by_tolerance,
+    climb,
+    polychromatic,
+    with_options,
+    with_shares,
+)
 from raytrace.reuse import Memo
 from raytrace.scene import EmptyPsf, Scene, scene, trace_scene
+from raytrace.shards import Share
 
 
 def psf(
@@ -33,6 +45,7 @@ def psf(
     rho: Tensor | float = 0.5,
     zernike: Tensor | None = None,
     memo: Memo | None = None,
+    share: Share | None = None,
 ) -> Psf:
     """PSFs of a lens, differentiable in every number of the lens, its sensor distance and the grid.
 
@@ -48,6 +61,8 @@ def psf(
     normalise: "energy" (1 = all light through the entrance pupil) or "window".
     rho: of `paraxial`, σ over the blur radius. zernike: of `fourier`, Noll coefficients from 1 on, mm RMS of path.
     memo: rays of earlier calls, which are not traced again where nothing before them has changed.
+    share: of this process (`shards.share()`), if all processes call psf alike to compute the kernels together; each
+    gets all of them, equal to those of one process to rounding, without gradient.
     Raises ValueError for arguments that make no sense, EmptyPsf if no ray of the whole batch reaches the sensor;
     a single empty kernel of a batch is 0 with gradient 0. Warns NotConverged.
     """
@@ -61,6 +76,9 @@ def psf(
     _check_batch(fields, distances, wavelengths, weights)
     base = make_grid(wavelengths.new_tensor(0.005), 21) if grid is None else grid
     models = with_options({"paraxial": {"rho": rho}, "fourier": {"zernike": zernike}})
+    if share is not None and share.processes > 1:
+        _check_shares(lens, rho, zernike)
+        models = with_shares(models, share, kernels=len(distances) * fields.shape[1] * len(wavelengths))
     drive = {
         "auto": lambda *scene: climb(*scene, models, tol or 0.01),
         "order": lambda *scene: by_order(*scene, models, model, order),
@@ -122,6 +140,15 @@ def _check_batch(fields: Tensor, distances: Tensor, wavelengths: Tensor, weights
         raise ValueError(f"{weights.numel()} wavelength_weights for {len(wavelengths)} wavelengths")
     if bool((weights < 0).any()) or not bool(weights.sum() > 0):
         raise ValueError(f"wavelength_weights {weights.tolist()} are below 0 or sum to 0")
+
+
+def _check_shares(*numbers) -> None:
+    """What processes cannot share: derivatives, and options that differ between kernels."""
+    leaves = [leaf for leaf in pytree.tree_leaves(numbers) if isinstance(leaf, Tensor)]
+    if torch.is_grad_enabled() and any(leaf.requires_grad for leaf in leaves):
+        raise ValueError("kernels that processes share have no gradient: leave share out, or use torch.no_grad()")
+    if any(isinstance(option, Tensor) and option.dim() > 1 for option in numbers):
+        raise ValueError("processes share kernels of one rho and one zernike only: leave share out")
 
 
 def _group(lens, fields, wavelengths, weights, base, center, memo, drive, distances) -> Psf:

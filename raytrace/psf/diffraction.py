@@ -32,8 +32,10 @@ from raytrace.psf.dft import (
     to_grid_mirrored,
 )
 from raytrace.psf.radial import is_centred, radii_of_waves, unfold
+from raytrace.psf.sharing import symmetry
 from raytrace.pupil import gauss_rings
-from raytrace.scene import Kernels, Scene, symmetry, trace_scene
+from raytrace.scene import Kernels, Scene, trace_scene
+from raytrace.shards import everywhere, largest
 from raytrace.value import to, value
 from raytrace.wavefront import Wavefront, wavefront
 
@@ -126,7 +128,7 @@ def phase_along_radius(probe: Wavefront, reach: Tensor | float) -> float:
         spread = half_spread(probe)[..., None]
         blur = torch.where(probe.usable, torch.linalg.vector_norm(probe.landing, dim=0), 0.0).amax(-1, keepdim=True)
         phase = 2e3 * math.pi * (probe.index / probe.wavelength)[:, None] * spread * (blur + reach)
-        return float(phase.max())
+        return float(largest(phase.max()))
 
 
 def _field_kernels(scene: Scene, grid: Grid, order: int) -> tuple:
@@ -134,7 +136,7 @@ def _field_kernels(scene: Scene, grid: Grid, order: int) -> tuple:
     probe = _probe(scene)
     centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))) - probe.centre[:2]
     local = Grid(grid.pitch, grid.rows, grid.columns, centre)
-    cutoff = 2e3 * float((half_spread(probe) * probe.index / probe.wavelength).max())
+    cutoff = 2e3 * float(largest((half_spread(probe) * probe.index / probe.wavelength).max()))
     if symmetry(scene) == "round" and is_centred(grid):
         # One radius tells all: as a row of points, without pixels.
         radii, matrix = radii_of_waves(grid, cutoff, order)
@@ -142,7 +144,7 @@ def _field_kernels(scene: Scene, grid: Grid, order: int) -> tuple:
         corner = radii.detach().max()
     else:
         x, y, weight = sub_pixels(local, nodes_per_pixel(float(grid.pitch.detach()), cutoff, order))
-        matrix, corner = None, torch.hypot(x.detach().abs().amax(-1), y.detach().abs().amax(-1)).max()
+        matrix, corner = None, largest(torch.hypot(x.detach().abs().amax(-1), y.detach().abs().amax(-1)).max())
     light = _waves(scene, probe, corner, order)
     U = amplitude(light, x, y)
     intensity = U.real**2 + U.imag**2
@@ -252,7 +254,7 @@ def _rays(scene: Scene, probe: Wavefront, fold: str, phase: float, order: int) -
         right = points[0] > 0
         points, weights, unit = points[:, right], 2 * weights[right], unit[:, unit[0] > 0]
     with torch.no_grad():
-        if bool(probe.valid.all()) and bool(trace_scene(scene, _RIM * unit).valid.all()):
+        if everywhere(probe.valid.all()) and everywhere(trace_scene(scene, _RIM * unit).valid.all()):
             return points, weights
     return between(*clear_arms(scene, unit), unit, rings=rings)
 

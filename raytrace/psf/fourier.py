@@ -33,8 +33,10 @@ from raytrace.psf.dft import (
 )
 from raytrace.psf.paraxial import chief_ray_height
 from raytrace.psf.radial import is_centred, radii_of_waves, reach, unfold
+from raytrace.psf.sharing import symmetry
 from raytrace.pupil import gauss_rings, with_rim
-from raytrace.scene import Kernels, Scene, symmetry
+from raytrace.scene import Kernels, Scene
+from raytrace.shards import largest
 from raytrace.trace import media
 from raytrace.value import to, value
 
@@ -80,7 +82,8 @@ def _kernels(lens: Paraxial, window: Grid, waves: Tensor | None, order: int) -> 
     """Kernels (D, F, W, rows, columns), one after the other: each has its own phases."""
     shape = lens.defocus.shape
     centre = window.centre.reshape(2, *(window.centre.shape[1:] or (1, 1, 1))) - lens.chief
-    nodes = nodes_per_pixel(float(window.pitch.detach()), 2 * float(lens.frequency.detach().abs().max()), order)
+    steepest = float(largest(lens.frequency.detach().abs().max()))
+    nodes = nodes_per_pixel(float(window.pitch.detach()), 2 * steepest, order)
     x, y, weight = sub_pixels(Grid(window.pitch, window.rows, window.columns, centre), nodes)
     pixels = []
     for place in itertools.product(*map(range, shape)):
@@ -97,10 +100,10 @@ def _round_kernels(lens: Paraxial, window: Grid, order: int) -> Tensor:
     """
     shared = bool((lens.frequency == lens.frequency[:1]).all())
     frequency = (lens.frequency[:1] if shared else lens.frequency)[..., None]
-    steepest = float(lens.frequency.detach().abs().max())
+    steepest = float(largest(lens.frequency.detach().abs().max()))
     radii, matrix = radii_of_waves(window, 2 * steepest, order)
     corner = float(window.pitch.detach()) * reach(window)
-    phase = 2 * math.pi * steepest * corner + 2 * float(lens.defocus.detach().abs().max())
+    phase = 2 * math.pi * steepest * corner + 2 * float(largest(lens.defocus.detach().abs().max()))
     radius, weights = _rings(rings_and_arms(phase, order)[0], like=radii)
     spectrum = weights * phasor(lens.defocus[..., None] * radius * radius / (2 * math.pi))
     J0 = bessel_j0(2 * math.pi * (frequency * radii)[..., None] * radius)

@@ -13,9 +13,11 @@ from raytrace.grid import Grid
 from raytrace.numerics import safe_divide
 from raytrace.psf.clear import between, clear_arms, rays_of_search
 from raytrace.psf.pixels import gaussian_pixels
+from raytrace.psf.sharing import symmetry, trace_shared
 from raytrace.psf.splat import histogram
 from raytrace.pupil import gauss_rings, sobol
-from raytrace.scene import Kernels, Scene, beam_share, symmetry, trace_scene
+from raytrace.scene import Kernels, Scene, beam_share
+from raytrace.shards import Share, everywhere
 from raytrace.surface import Aperture
 from raytrace.value import value
 
@@ -41,7 +43,7 @@ class Light:
     outer: Tensor | None = None
 
 
-def kernels(scene: Scene, grid: Grid, *, order: int) -> Kernels:
+def kernels(scene: Scene, grid: Grid, *, order: int, share: Share | None = None) -> Kernels:
     """Gaussians with the centroid and covariance of `order` Gauss rings of 4·(order - 1) arms, 8 at least.
 
     Only what the scene's symmetry does not give is traced: `order` rays of one meridian if every field is on the axis
@@ -50,18 +52,18 @@ def kernels(scene: Scene, grid: Grid, *, order: int) -> Kernels:
     Where rays are lost, rings follow the clear part of every arm, see `trace_light`.
     The energy is the transmitted fraction of the light through the whole entrance pupil, of which vignetting factors
     leave the share (1 - VCX)(1 - VCY). Where no ray arrives it is 0, and so is every derivative.
-    residual: see `residual`.
+    residual: see `residual`. share: of the rays that this process traces, if others trace the rest.
     """
     fold = symmetry(scene)
-    light = trace_light(scene, order, fold)
+    light = trace_light(scene, order, fold, share=share)
     shape, found = _kernels_of_light(scene, grid, light, fold)
     return dataclasses.replace(found, residual=residual(light, grid, shape, order, fold))
 
 
-def kernels_alone(scene: Scene, grid: Grid, *, order: int) -> Kernels:
+def kernels_alone(scene: Scene, grid: Grid, *, order: int, share: Share | None = None) -> Kernels:
     """The same without their residual, which takes half of the time."""
     fold = symmetry(scene)
-    return _kernels_of_light(scene, grid, trace_light(scene, order, fold), fold)[1]
+    return _kernels_of_light(scene, grid, trace_light(scene, order, fold, share=share), fold)[1]
 
 
 def _kernels_of_light(scene: Scene, grid: Grid, light: Light, fold: str) -> tuple[Tensor, Kernels]:
@@ -72,7 +74,7 @@ def _kernels_of_light(scene: Scene, grid: Grid, light: Light, fold: str) -> tupl
     return shape, Kernels(energy[..., None, None] * shape, grid, centroid, covariance, light.rays)
 
 
-def trace_light(scene: Scene, order: int, fold: str) -> Light:
+def trace_light(scene: Scene, order: int, fold: str, *, share: Share | None = None) -> Light:
     """The rays of an order, of the part of the pupil that stands for all of it.
 
     If all rays arrive, those at the rim too that are added for a lens with apertures, that is all. If some are lost, or
@@ -84,16 +86,16 @@ def trace_light(scene: Scene, order: int, fold: str) -> Light:
     if not any(stands_inside(aperture) for aperture in apertures):
         points, weights = fold_pupil(order, fold, scene.wavelengths)
         rim = rim_points(order, fold, scene.wavelengths) if apertures else points[:, :0]
-        rays = trace_scene(scene, torch.cat([points, rim], 1))
+        hits, valid = trace_shared(scene, torch.cat([points, rim], 1), share)
         inside, count = points.shape[1], points.shape[1] + rim.shape[1]
-        if bool(rays.valid.all()):
-            return Light(rays.position[:2, ..., :inside], rays.valid[..., :inside], weights, count)
+        if everywhere(valid.all()):
+            return Light(hits[..., :inside], valid[..., :inside], weights, count)
     unit = directions(32 * max(order - 1, 1), fold, scene.wavelengths)
     inner, outer = clear_arms(scene, unit)
     points, weights = between(inner, outer, unit, rings=2 * order)
-    rays = trace_scene(scene, points)
+    hits, valid = trace_shared(scene, points, share)
     count += rays_of_search(unit.shape[1], inner.shape[-1]) + points.shape[-1]
-    return Light(rays.position[:2], rays.valid, weights, count, inner, outer)
+    return Light(hits, valid, weights, count, inner, outer)
 
 
 def stands_inside(aperture: Aperture) -> bool:

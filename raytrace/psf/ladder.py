@@ -13,7 +13,9 @@ from raytrace.grid import Grid
 from raytrace.numerics import safe_divide, safe_sqrt
 from raytrace.paraxial import first_order
 from raytrace.psf import diffraction, fourier, gaussian, paraxial, raymap, rays
+from raytrace.psf.sharing import shared
 from raytrace.scene import Kernels, Scene
+from raytrace.shards import Share
 from raytrace.value import value
 
 
@@ -57,18 +59,21 @@ class Model:
 
     kernels: (scene, grid, order=…) -> Kernels; orders: from the coarsest to the finest.
     lean: the same without the residual, where that costs time; None if it does not.
+    plain: (scene, grid, rays=…) -> Kernels of that many plain rays; None if the model has an order of rays only.
     by_width: True if the error is that of σ, False if it is that of the kernel.
     proof: the error of an order is so many times its difference from the next, which is computed to prove it; None: the
         error of the finer of two orders is extrapolated from their difference, by the numbers that follow.
     first: ratio of successive changes that is taken for granted while only one change is known; None: two are needed.
     least, most: bounds on the ratios measured after that; margin: a factor on the estimate, see `_estimate`.
     unseen: share of `Kernels.residual` that counts as error: what two orders may have in common.
+    shares_rays, by_field: how processes share its kernels, see `with_shares`.
     floor: what rounding leaves at least. The constants cover 95 % of the cases that docs/psf_error.md calls fitted.
     """
 
     kernels: Callable[..., Kernels]
     orders: Sequence[int]
     lean: Callable[..., Kernels] | None = None
+    plain: Callable[..., Kernels] | None = None
     by_width: bool = False
     proof: float | None = None
     first: float | None = None
@@ -77,6 +82,8 @@ class Model:
     margin: float = 1.0
     unseen: float = 0.0
     floor: float = 0.0
+    shares_rays: bool = False
+    by_field: bool = False
 
 
 MODELS: dict[str, Model] = {
@@ -88,6 +95,7 @@ MODELS: dict[str, Model] = {
         (2, 3, 4, 5, 6, 8, 10, 12, 16, 24),
         lean=gaussian.kernels_alone,
         by_width=True,
+        shares_rays=True,
         # Rings converge as fast as the lens is smooth, in leaps: what is left after one says nothing of the next.
         proof=2.0,
         least=1e-4,
@@ -97,8 +105,10 @@ MODELS: dict[str, Model] = {
     ),
     # Cells halve their error with each order: no faster, whatever a lucky change says. The table of rings that round
     # light is read from (radial.py) is good to 1e-5.
-    "drt": Model(raymap.kernels, range(11), first=0.6, least=0.6, most=0.6, unseen=0.15, floor=1e-5),
-    "wave": Model(diffraction.kernels, range(-2, 6), first=0.23, least=1e-3, most=0.5, floor=1e-7),
+    "drt": Model(
+        raymap.kernels, range(11), plain=rays.kernels, first=0.6, least=0.6, most=0.6, unseen=0.15, floor=1e-5
+    ),
+    "wave": Model(diffraction.kernels, range(-2, 6), first=0.23, least=1e-3, most=0.5, floor=1e-7, by_field=True),
 }
 
 #: Models from the one that knows least to the one that knows most: the rungs of `model="auto"`.
@@ -111,6 +121,28 @@ def with_options(options: Mapping[str, Mapping]) -> dict[str, Model]:
     for name, arguments in options.items():
         models[name] = dataclasses.replace(models[name], kernels=functools.partial(models[name].kernels, **arguments))
     return models
+
+
+def with_shares(models: Mapping[str, Model], share: Share, *, kernels: int) -> dict[str, Model]:
+    """The models, computed together by processes that all call them alike and all get the kernels, without gradient.
+
+    Each process computes some of the kernels, and whole fields of a model that decides `by_field`. Rays are dealt out
+    where they are plain, and where there is only one kernel, of a model that `shares_rays`. A single kernel of another
+    one is not cut: every process computes it.
+    """
+
+    def of(model: Model) -> Model:
+        deal = functools.partial(shared, share=share, by_field=model.by_field)
+        if kernels == 1:
+            deal = functools.partial(functools.partial, share=share) if model.shares_rays else lambda same: same
+        return dataclasses.replace(
+            model,
+            kernels=deal(model.kernels),
+            lean=model.lean and deal(model.lean),
+            plain=model.plain and functools.partial(model.plain, share=share),
+        )
+
+    return {name: of(model) for name, model in models.items()}
 
 
 def by_order(batch: Scene, pixels: Grid, weights: Tensor, models: Mapping[str, Model], model: str, order: int) -> Psf:
@@ -194,12 +226,12 @@ def _rounding(batch: Scene, pixels: Grid, found: Psf, ladder: Model) -> Tensor:
 
 def by_rays(batch: Scene, pixels: Grid, weights: Tensor, models: Mapping[str, Model], model: str, count: int) -> Psf:
     """About `count` rays a kernel; the error is the change from half as many."""
-    if model == "drt":
+    ladder, before = models[model], None
+    if ladder.plain is not None:
         found, half = (
-            polychromatic(rays.kernels(batch, pixels, rays=max(n, 1)), weights, model) for n in (count, count // 2)
+            polychromatic(ladder.plain(batch, pixels, rays=max(n, 1)), weights, model) for n in (count, count // 2)
         )
         return dataclasses.replace(found, error=_kernel_change(half, found).detach())
-    ladder, before = models[model], None
     for order in ladder.orders:
         found = polychromatic(ladder.kernels(batch, pixels, order=order), weights, model)
         if found.rays > count:

@@ -17,13 +17,14 @@ from torch import Tensor
 from raytrace.grid import Grid
 from raytrace.numerics import safe_divide
 from raytrace.scene import varies
+from raytrace.shards import everywhere
 
 _STEPS = 64  # of the table of g in a pixel
 
 
 def is_centred(grid: Grid) -> bool:
     """Whether every window is centred on the axis, to a billionth of a pixel, and stays there under differentiation."""
-    return not varies(grid.centre) and bool((grid.centre.abs() <= 1e-9 * grid.pitch.abs()).all())
+    return not varies(grid.centre) and everywhere((grid.centre.abs() <= 1e-9 * grid.pitch.abs()).all())
 
 
 def reach(grid: Grid) -> float:

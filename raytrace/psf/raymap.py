@@ -30,8 +30,10 @@ from raytrace.psf.rays import (
     trace_fans,
     turned,
 )
+from raytrace.psf.sharing import symmetry
 from raytrace.psf.splat import cell_widths
-from raytrace.scene import Kernels, Scene, beam_share, symmetry
+from raytrace.scene import Kernels, Scene, beam_share
+from raytrace.shards import largest
 from raytrace.surface import Aperture
 from raytrace.value import value
 
@@ -80,8 +82,8 @@ def kernels_and_reason(scene: Scene, grid: Grid, *, order: int = 3) -> tuple[Ker
     why = ""
     for degree in _degrees(order):
         found = fit(scene, degree)
-        error = float((found.residual / pitch).amax())
-        edge_error = float(found.edge_residual.amax())
+        error = float(largest((found.residual / pitch).amax()))
+        edge_error = float(largest(found.edge_residual.amax()))
         if error <= limit and edge_error <= limit:
             return _kernels_of_map(scene, grid, found, order), (
                 f"map of degree {degree} through {found.rays} rays, within {error:.1e} pixels"

@@ -17,8 +17,10 @@ from torch import Tensor
 from raytrace import pupil
 from raytrace.grid import Grid
 from raytrace.numerics import safe_divide
+from raytrace.psf.sharing import pooled, symmetry
 from raytrace.psf.splat import cell_energy, cell_widths, cells, clear_share, histogram, splat_cells, splat_smooth
-from raytrace.scene import Kernels, Scene, beam_share, cross_scene, symmetry, trace_scene
+from raytrace.scene import Kernels, Scene, beam_share, cross_scene, trace_scene
+from raytrace.shards import Share, total
 from raytrace.spot import spot
 from raytrace.surface import Aperture
 from raytrace.value import value
@@ -51,18 +53,20 @@ def kernels(
     rays: int | None = None,
     sampling: Callable[..., tuple[Tensor, Tensor]] = pupil.sobol,
     width: float = 0.25,
+    share: Share | None = None,
 ) -> Kernels:
     """Ray-traced PSFs, differentiable in every number of the lens, the sensor distance and the grid.
 
     order: 0 … 10; each has twice the rays of the one before, and half its error.
     rays: instead, that many plain rays of `sampling` (`pupil.sobol`, `pupil.random`), each blurred by the kernel of
     `splat_smooth` of half width `width` pixels; a width of 0 is the histogram, which has no derivative.
+    share: of the plain rays that this process traces, if others trace the rest; then without gradient.
     A kernel that no ray reaches has energy 0 and gradient 0. Vignetting factors of a field shrink the beam, and its
     energy with it.
     """
     if rays is None:
         return kernels_of_fans(scene, grid, trace_fans(scene, order), width=cell_width(order))
-    return _kernels_of_points(scene, grid, rays, sampling, width)
+    return _kernels_of_points(scene, grid, rays, sampling, width, share or Share())
 
 
 def trace_fans(scene: Scene, order: int) -> Fans:
@@ -217,16 +221,21 @@ def moments_of_fans(fans: Fans) -> tuple[Tensor, Tensor]:
     return torch.where(lit, centroid, 0.0), covariance
 
 
-def _kernels_of_points(scene: Scene, grid: Grid, count: int, sampling: Callable, width: float) -> Kernels:
+def _kernels_of_points(scene: Scene, grid: Grid, count: int, sampling: Callable, width: float, share: Share) -> Kernels:
     thickness = scene.lens.surfaces[-2].thickness
     disc, weights = sampling(count, dtype=thickness.dtype, device=thickness.device)
+    mine = share.part(count)
+    disc, weights = disc[:, mine], weights[mine]
     traced = trace_scene(scene, disc)
     energy = torch.where(traced.valid, weights, 0.0).expand(*scene.shape, -1)
     points = torch.where(traced.valid, traced.position[:2], 0.0).expand(2, *scene.shape, -1)
     kernel = splat_smooth(grid, points, energy, width=width) if width else histogram(grid, points, energy)
     light = spot(traced, weights)
-    share = safe_divide(energy, energy.sum(-1, keepdim=True))
+    part = safe_divide(energy, energy.sum(-1, keepdim=True))
     x, y = torch.where(energy > 0, points - light.centroid[..., None], 0.0)
-    covariance = torch.stack([(share * a * b).sum(-1) for a, b in ((x, x), (x, y), (y, y))])
+    covariance = torch.stack([(part * a * b).sum(-1) for a, b in ((x, x), (x, y), (y, y))])
+    centroid = light.centroid.expand(2, *scene.shape)
+    if share.processes > 1:
+        kernel, (centroid, covariance) = total(kernel), pooled(energy.sum(-1), centroid, covariance)
     kernel = kernel * beam_share(scene)[..., None, None]
-    return Kernels(kernel, grid, light.centroid.expand(2, *scene.shape), covariance, count)
+    return Kernels(kernel, grid, centroid, covariance, count)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from raytrace.grid import Grid
 from raytrace.numerics import safe_divide
+from raytrace.shards import largest
 
 
 def splat(grid: Grid, points: Tensor, weights: Tensor) -> Tensor:
@@ -88,9 +89,9 @@ def cell_widths(grid: Grid, points: Tensor) -> tuple[float, float, float]:
     w = points.detach() / grid.pitch.detach()
     across, along = (torch.roll(w, -1, -2) - w).abs(), w.diff().abs()
     sides = torch.maximum(across[..., 1:], across[..., :-1]), torch.maximum(along, torch.roll(along, -1, -2))
-    widest = [side.amax() for side in sides]
+    widest = largest(torch.stack([side.amax() for side in sides])).unbind()
     both = sum(safe_divide(side, most.expand_as(side)) for side, most in zip(sides, widest, strict=True))
-    return *(float(most) for most in widest), max(1.0, float(both.amax()))
+    return *(float(most) for most in widest), max(1.0, float(largest(both.amax())))
 
 
 def half_widths(w: Tensor, *, closed: bool = True) -> tuple[Tensor, Tensor]:

@@ -17,10 +17,11 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace.departure import GridSag, ZernikeSag, numbers, sag_of
+from raytrace.departure import GridSag, ZernikeSag, numbers, sag_of, spline
 from raytrace.glass import index
 from raytrace.grid import Grid
-from raytrace.lens import Fields, Lens, SystemAperture
+from raytrace.launch import rays_of_field, vignette
+from raytrace.lens import Fields, Lens, SystemAperture, with_object_distance
 from raytrace.numerics import safe_divide
 from raytrace.psf.dft import integrate, nodes_per_pixel, rings_and_arms, sub_pixels
 from raytrace.psf.diffraction import (
@@ -34,9 +35,9 @@ from raytrace.psf.diffraction import (
 )
 from raytrace.psf.radial import is_centred, radii_of_waves, unfold
 from raytrace.pupil import gauss_rings
-from raytrace.scene import Scene, cross_scene, symmetry
+from raytrace.scene import Scene, symmetry
 from raytrace.surface import Surface, sag_at
-from raytrace.trace import media
+from raytrace.trace import media, trace_surfaces
 from raytrace.value import to, value
 from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike, is_radial, path, profile_height
 from raytrace.wavefront import Wavefront, wavefront
@@ -127,8 +128,11 @@ def surfaces_of(element: Element, *, substrate: Tensor | float = 0.0) -> tuple[S
         departure = ZernikeSag(profile.coefficients - piston, element.radius)
         back = dataclasses.replace(back, departure=departure)
     else:
-        centre = sag_of(numbers(GridSag(profile.heights, profile.pitch)), zero, zero, highest=0).z
-        back = dataclasses.replace(back, departure=GridSag(profile.heights - centre, profile.pitch))
+        departure = spline(GridSag(profile.heights, profile.pitch))
+        centre = sag_of(numbers(departure), zero, zero, highest=0).z
+        # The weights of a spline sum to 1: less everywhere as at the axis. Found once, however often it is traced.
+        departure = dataclasses.replace(departure, coefficients=departure.coefficients - centre)
+        back = dataclasses.replace(back, departure=departure)
     thickness = centre + torch.as_tensor(substrate, dtype=zero.dtype)
     with torch.no_grad():
         lowest = float((thickness + sag_at(back, *_disc(element.radius))).min())
@@ -199,8 +203,11 @@ def _through(light: Waves, stop: Tensor, elements: tuple[Element, ...]) -> Waves
 
 def _at_stop(scene: Scene, pupil: Tensor) -> Tensor:
     """Where the rays of pupil points meet the stop, (2, D, F, W, P) mm."""
-    hit = cross_scene(scene, pupil)[scene.lens.stop - 1].rays.position[:2]
-    return hit.expand(2, *scene.shape, pupil.shape[-1])
+    lens = with_object_distance(scene.lens, scene.lens.surfaces[0].thickness[..., None])
+    field, wavelength = scene.fields[:, :, None, None], scene.wavelengths[:, None]
+    rays = rays_of_field(lens, field, vignette(lens, field, pupil), wavelength=wavelength)
+    hit = trace_surfaces(lens.surfaces[1 : lens.stop + 1], rays, indices=media(lens, wavelength)[: lens.stop + 1])
+    return hit.position[:2].expand(2, *scene.shape, pupil.shape[-1])
 
 
 def _unfolded(light: Waves, stop: Tensor, arms: int) -> tuple[Waves, Tensor]:

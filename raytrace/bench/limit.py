@@ -1,0 +1,172 @@
+"""The limits of this machine: `limit.cpp` built by the compiler found, and traced with as any other tracer.
+
+Nothing is allocated, dispatched or differentiated there: what a trace of this arithmetic could reach on these cores.
+"""
+
+import ctypes
+import dataclasses
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from raytrace.lens import Lens
+from raytrace.rays import Rays
+from raytrace.surface import Surface
+from raytrace.trace import media
+from raytrace.value import to
+
+#: Beside -O3 -march=native: roots and comparisons as vector instructions, which errno and traps would forbid; no
+#: arithmetic changes by that. The last is tried first, and left out where a compiler does not know it.
+FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math")
+_WIDEST = "-mprefer-vector-width=512"
+_COMPILERS = ("g++", "c++", "clang++")
+_TERMS = 8
+_MOST_STEPS = 24
+_PLANE, _SPHERE, _ASPHERE = range(3)
+
+
+class NoCompiler(RuntimeError):
+    """No compiler of C++ was found, or none that builds the limits."""
+
+
+class _Surface(ctypes.Structure):
+    _fields_ = (
+        ("kind", ctypes.c_int32),
+        ("bends", ctypes.c_int32),
+        ("terms", ctypes.c_int32),
+        ("reserved", ctypes.c_int32),
+        ("gap", ctypes.c_double),
+        ("curvature", ctypes.c_double),
+        ("shape", ctypes.c_double),
+        ("before", ctypes.c_double),
+        ("behind", ctypes.c_double),
+        ("coefficients", ctypes.c_double * _TERMS),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Built:
+    """The compiled limits and how they were made, for people."""
+
+    library: ctypes.CDLL
+    compiler: str
+    flags: tuple[str, ...]
+
+    @property
+    def words(self) -> str:
+        return f"{self.compiler} {' '.join(self.flags)}"
+
+
+def build(compiler: str | None = None) -> Built:
+    """Compile the limits: a second or two. compiler: default `$CXX`, else the first found. Raises NoCompiler."""
+    asked = compiler or os.environ.get("CXX")
+    found = next((name for name in ([asked] if asked else _COMPILERS) if shutil.which(name)), None)
+    if found is None:
+        raise NoCompiler(f"no C++ compiler found (looked for {asked or ', '.join(_COMPILERS)})")
+    said = ""
+    for flags in ((*FLAGS, _WIDEST), FLAGS):
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "limit.so"
+            source = Path(__file__).with_name("limit.cpp")
+            words = [found, "-std=c++17", *flags, "-shared", "-fPIC", "-pthread", str(source), "-o", str(file)]
+            done = subprocess.run(words, capture_output=True, text=True, timeout=300)
+            if done.returncode == 0:
+                return Built(ctypes.CDLL(str(file)), _version(found), flags)
+            said = done.stderr.strip().splitlines()[0] if done.stderr.strip() else f"exit {done.returncode}"
+    raise NoCompiler(f"{found} does not build the limits: {said}")
+
+
+class Limit:
+    """One lens in the limits. safe: with the arithmetic of the trace, else the plain one (see `limit.cpp`).
+
+    steps: of Newton's method on aspheres. Raises ValueError for what the limits do not know: mirrors, apertures,
+    departures, conics without aspheric terms, aspheres in the plain one.
+    """
+
+    with_path = False
+    has_gradient = False
+
+    def __init__(self, built: Built, lens: Lens, dtype: torch.dtype, *, safe: bool, steps: int = 0, threads: int = 1):
+        if not 0 <= steps <= _MOST_STEPS:
+            raise ValueError(f"{steps} steps of Newton's method: expected 0 to {_MOST_STEPS}")
+        self.name = "safe limit" if safe else "plain limit"
+        self.dtype, self.safe, self.steps, self.threads = dtype, safe, steps, threads
+        lens = to(lens, dtype=dtype)
+        self._surfaces = _surfaces(lens, safe)
+        self._call = getattr(built.library, f"trace_{str(dtype).removeprefix('torch.')}")
+        self._call.restype = None
+        self._out: Rays | None = None
+
+    def prepare(self) -> None:
+        pass
+
+    def forward(self, rays: Rays) -> tuple[Tensor, None]:
+        return self.trace(rays).position[:2], None
+
+    def trace(self, rays: Rays) -> Rays:
+        """The rays (3, P) behind the last surface. The memory of the result is that of the call before."""
+        position, direction, valid = (a.contiguous() for a in (rays.position, rays.direction, rays.valid))
+        if position.dtype != self.dtype or direction.dtype != self.dtype or position.dim() != 2:
+            raise ValueError(f"rays {tuple(position.shape)} of {position.dtype}: expected (3, P) of {self.dtype}")
+        if self._out is None or self._out.position.shape != position.shape:
+            self._out = Rays(torch.zeros_like(position), torch.zeros_like(direction), torch.zeros_like(valid))
+        tensors = (position, direction, valid, self._out.position, self._out.direction, self._out.valid)
+        self._call(
+            self._surfaces,
+            len(self._surfaces),
+            *(ctypes.c_void_p(tensor.data_ptr()) for tensor in tensors),
+            ctypes.c_int64(position.shape[1]),
+            self.steps,
+            int(not self.safe),
+            self.threads,
+        )
+        return self._out
+
+
+def _surfaces(lens: Lens, safe: bool) -> ctypes.Array:
+    indices = media(lens, lens.wavelengths[lens.primary_wavelength])
+    found = [
+        _surface(surface, number, gap, n1, n2)
+        for number, (surface, gap, n1, n2) in enumerate(
+            zip(lens.surfaces[1:], _gaps(lens), indices[:-1], indices[1:], strict=True), 1
+        )
+    ]
+    if not safe and any(one.kind == _ASPHERE for one in found):
+        raise ValueError("the plain limit knows planes and spheres only")
+    return (_Surface * len(found))(*found)
+
+
+def _gaps(lens: Lens) -> Sequence[float]:
+    """mm before every surface after the object; rays stand in the frame of the first."""
+    return [0.0, *(float(surface.thickness) for surface in lens.surfaces[1:-1])]
+
+
+def _surface(surface: Surface, number: int, gap: float, n1: Tensor, n2: Tensor) -> _Surface:
+    conic_alone = surface.conic is not None and surface.coefficients is None
+    if surface.is_mirror or surface.apertures or surface.departure is not None or conic_alone:
+        raise ValueError(f"surface {number}: the limits know planes, spheres and even aspheres that refract")
+    a = [] if surface.coefficients is None else surface.coefficients.tolist()
+    if len(a) > _TERMS:
+        raise ValueError(f"surface {number}: {len(a)} aspheric terms; the limits know up to {_TERMS}")
+    return _Surface(
+        kind=_PLANE if surface.is_plane else _ASPHERE if a else _SPHERE,
+        bends=int(n2 is not n1),
+        terms=len(a),
+        gap=gap,
+        curvature=0.0 if surface.curvature is None else float(surface.curvature),
+        shape=1.0 if surface.conic is None else 1 + float(surface.conic),
+        before=float(n1),
+        behind=float(n2),
+        coefficients=(ctypes.c_double * _TERMS)(*a),
+    )
+
+
+def _version(compiler: str) -> str:
+    done = subprocess.run([compiler, "--version"], capture_output=True, text=True, timeout=60)
+    return done.stdout.splitlines()[0] if done.stdout else compiler

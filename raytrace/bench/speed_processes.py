@@ -1,0 +1,157 @@
+"""What only whole processes show: peak memory, the time of a command, two processes at once.
+
+Each measurement starts Python anew and talks to it by lines; the functions `serve_…` are what runs there.
+"""
+
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from raytrace.bench.measure import field_rays
+from raytrace.bench.speed_own import Engine
+from raytrace.files import shipped
+from raytrace.formats import read_lens
+from raytrace.rays import Rays
+from raytrace.value import to
+
+_PATTERN = 2**12  # rays that are repeated to fill a large batch: launching many would set the peak
+_WARM_UP = 2**14
+_MOST_BYTES = 4 * 2**30
+_SPOT = ("-m", "raytrace", "spot", "lenses/double_gauss.zmx")
+_BARE = ("-c", "import torch, matplotlib.pyplot")
+
+
+def bytes_per_ray(dtype: torch.dtype, rays: int, *, threads: int) -> tuple[float, int]:
+    """Peak memory of forward + backward above the inputs, bytes a ray, and of how many rays.
+
+    A 32nd of the rays goes first; where all of them would take more than 4 GiB, it stays at that.
+    """
+    few = max(4 * _WARM_UP, rays // 32)
+    found = _peak(dtype, few, threads)
+    return (found, few) if rays <= few or found * rays > _MOST_BYTES else (_peak(dtype, rays, threads), rays)
+
+
+def spot_process_ratio(repeats: int) -> tuple[float, float, float]:
+    """Time of `raytrace spot` over that of the bare imports, processes in turns; then both medians, s."""
+    taken: dict[tuple[str, ...], list[float]] = {_SPOT: [], _BARE: []}
+    for turn in range(repeats + 1):
+        for words, seconds in taken.items():
+            began = time.perf_counter()
+            subprocess.run([sys.executable, *words], env=_environment(), stdout=subprocess.DEVNULL, check=True)
+            if turn:  # the first brings the files into memory
+                seconds.append(time.perf_counter() - began)
+    spot, bare = (statistics.median(seconds) for seconds in taken.values())
+    return spot / bare, spot, bare
+
+
+def two_process_gain(dtype: torch.dtype, rays: int, *, seconds: float, repeats: int) -> tuple[float, float, float]:
+    """Rays a second of two processes of one thread over those of one; then both, rays/s. Medians, in turns."""
+    workers = [_start("serve_rate", dtype, rays, 1) for _ in range(2)]
+    try:
+        for worker in workers:
+            _read(worker)
+        alone, together = [], []
+        for _ in range(repeats):
+            alone.append(sum(_rates(workers[:1], seconds)))
+            together.append(sum(_rates(workers, seconds)))
+    finally:
+        for worker in workers:
+            worker.stdin.close()
+            worker.wait(timeout=60)
+    one, two = statistics.median(alone), statistics.median(together)
+    return two / one, one, two
+
+
+def serve_memory(dtype: str, rays: int, threads: int) -> None:
+    """Print the growth of the peak in bytes a ray, then leave."""
+    torch.set_num_threads(threads)
+    tracer, batch = _tracer_and_rays(dtype, rays)
+    centroid = torch.zeros(2, dtype=tracer.dtype)
+    few = Rays(*(x[..., :_WARM_UP].clone() for x in (batch.position, batch.direction, batch.valid)))
+    for _ in range(2):
+        tracer.gradient_by_all(few, centroid)
+    before = _resident()
+    tracer.gradient_by_all(batch, centroid)
+    print((_highest() - before) / rays, flush=True)
+
+
+def serve_rate(dtype: str, rays: int, threads: int) -> None:
+    """Trace for as long as each line of the input says, s, and print rays a second; until the input ends."""
+    torch.set_num_threads(threads)
+    tracer, batch = _tracer_and_rays(dtype, rays)
+    for _ in range(2):
+        tracer.forward(batch)
+    print("ready", flush=True)
+    for line in sys.stdin:
+        began, done = time.perf_counter(), 0
+        while time.perf_counter() - began < float(line):
+            tracer.forward(batch)
+            done += rays
+        print(done / (time.perf_counter() - began), flush=True)
+
+
+def _tracer_and_rays(dtype: str, count: int) -> tuple[Engine, Rays]:
+    tracer = Engine(read_lens(shipped("lenses") / "double_gauss.zmx"), getattr(torch, dtype))
+    few = to(field_rays(tracer.lens_as_read, _PATTERN), dtype=tracer.dtype)
+    position, direction = (torch.empty(3, count, dtype=tracer.dtype) for _ in range(2))
+    for first in range(0, count, _PATTERN):
+        width = min(_PATTERN, count - first)
+        position[:, first : first + width] = few.position[:, :width]
+        direction[:, first : first + width] = few.direction[:, :width]
+    return tracer, Rays(position, direction, torch.ones(count, dtype=torch.bool))
+
+
+def _peak(dtype: torch.dtype, rays: int, threads: int) -> float:
+    worker = _start("serve_memory", dtype, rays, threads)
+    found = float(_read(worker))
+    worker.stdin.close()
+    worker.wait(timeout=60)
+    return found
+
+
+def _rates(workers: Sequence[subprocess.Popen], seconds: float) -> list[float]:
+    for worker in workers:
+        worker.stdin.write(f"{seconds}\n")
+        worker.stdin.flush()
+    return [float(_read(worker)) for worker in workers]
+
+
+def _start(function: str, dtype: torch.dtype, rays: int, threads: int) -> subprocess.Popen:
+    words = f"{str(dtype).removeprefix('torch.')!r}, {rays}, {threads}"
+    code = f"from raytrace.bench.speed_processes import {function}; {function}({words})"
+    environment = _environment() | {"OMP_NUM_THREADS": str(threads)}
+    pipe = subprocess.PIPE
+    return subprocess.Popen([sys.executable, "-c", code], env=environment, stdin=pipe, stdout=pipe, text=True)
+
+
+def _read(worker: subprocess.Popen) -> str:
+    line = worker.stdout.readline()
+    if not line:
+        raise RuntimeError(f"a process of the benchmark ended with code {worker.wait()} before it answered")
+    return line
+
+
+def _environment() -> dict[str, str]:
+    """The environment in which Python finds this very package."""
+    here = str(Path(__file__).parents[2])
+    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (here, os.environ.get("PYTHONPATH"))))}
+
+
+def _resident() -> int:
+    """Bytes in memory now; where the system does not say, the highest so far."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+    except OSError:
+        return _highest()
+
+
+def _highest() -> int:
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit

@@ -1,0 +1,128 @@
+"""`raytrace spot`."""
+
+import argparse
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from raytrace import pupil
+from raytrace.cli.door import (
+    field_points,
+    number,
+    numbers,
+    open_lens,
+    print_json,
+    ray_aiming,
+    say,
+)
+from raytrace.launch import launch
+from raytrace.lens import FIELD_UNITS, Lens
+from raytrace.rays import Rays
+from raytrace.spot import Spot, spot_of_points
+from raytrace.spot import spot as spot_of
+from raytrace.trace import media, steps
+
+_RINGS = 12
+_DEFAULT_SIZE = {"gauss": _RINGS, "hexapolar": _RINGS, "square": 32, "sobol": 1024, "random": 1024}
+
+
+def pupil_points(arguments: argparse.Namespace) -> tuple[Tensor, Tensor]:
+    """Points and weights of the sampling asked for."""
+    size = arguments.size or _DEFAULT_SIZE[arguments.sampling]
+    if arguments.sampling in ("sobol", "random"):
+        return pupil.SAMPLINGS[arguments.sampling](size, seed=arguments.seed)
+    return pupil.SAMPLINGS[arguments.sampling](size)
+
+
+def spot(arguments: argparse.Namespace) -> None:
+    """Spot of every field and wavelength on the sensor."""
+    if arguments.rays is not None or arguments.max_bytes is not None:
+        from raytrace.cli import spot_stream
+
+        return spot_stream.spot(arguments)
+    lens = open_lens(arguments)
+    fields = field_points(lens, arguments)
+    # The rim carries no weight: it shows in the geometric radius, which Gaussian nodes inside the pupil miss.
+    points, weights = pupil.with_rim(*pupil_points(arguments))
+    rays, unaimed, vignetted = _to_sensor(lens, points, fields, ray_aiming(arguments))
+    if unaimed:
+        say(f"warning: {unaimed} of {rays.valid.numel()} rays found no way to their point of the stop")
+    spots = spot_of(rays, weights)
+    if arguments.plot:
+        from raytrace import plot
+
+        plot.save(plot.spot_diagram(lens, fields=fields, pupil=(points, weights)), arguments.plot)
+        say(f"spot diagram written to {arguments.plot}")
+    if arguments.json:
+        print_json(_spot_document(lens, fields, spots, vignetted))
+        return
+    unit = FIELD_UNITS[lens.fields.kind]
+    print(f"{'field':>10} {'wavelength':>11} {'centroid x':>13} {'centroid y':>13} {'RMS':>10} {'GEO':>10} {'rays':>7}")
+    print(f"{unit:>10} {'µm':>11} {'mm':>13} {'mm':>13} {'µm':>10} {'µm':>10} {'lost':>7}")
+    for f in range(fields.shape[1]):
+        for w, wavelength in enumerate(lens.wavelengths.tolist()):
+            x, y = spots.centroid[:, f, w].tolist()
+            rms, geometric = 1000 * float(spots.rms_radius[f, w]), 1000 * float(spots.geometric_radius[f, w])
+            lost = rays.valid.shape[-1] - int(spots.rays[f, w])
+            print(
+                f"{field_label(fields[:, f]):>10} {wavelength:>11g} {x:>13.7f} {y:>13.7f} {rms:>10.4f} "
+                f"{geometric:>10.4f} {lost:>7}"
+            )
+        if len(lens.wavelengths) > 1:
+            whole = polychromatic(lens, spots, weights, f)
+            rms, geometric = 1000 * float(whole.rms_radius), 1000 * float(whole.geometric_radius)
+            x, y = whole.centroid.tolist()
+            print(f"{'':>10} {'all':>11} {x:>13.7f} {y:>13.7f} {rms:>10.4f} {geometric:>10.4f}")
+
+
+def _to_sensor(lens: Lens, points: Tensor, fields: Tensor, aiming: bool | None) -> tuple[Rays, int, Tensor]:
+    """Rays (3, F, W, P) on the sensor, traced field by field; how many were not aimed; which were vignetted."""
+    indices = media(lens, lens.wavelengths[:, None])
+    arrived, vignetted, unaimed = [], [], 0
+    long = points.shape[1] * len(lens.wavelengths) * fields.shape[1] * len(lens.surfaces) > 1_000_000
+    for field in tqdm(fields.unbind(1), unit="field", disable=not long):
+        rays = launch(lens, points, fields=field[:, None], ray_aiming=aiming)
+        unaimed += int((~rays.valid).sum())
+        clipped = torch.zeros_like(rays.valid)
+        for crossing in steps(lens.surfaces[1:], rays, indices=indices):
+            rays, clipped = crossing.rays, clipped | crossing.clipped
+        arrived.append(rays)
+        vignetted.append(clipped)
+    joined = Rays(
+        torch.cat([rays.position for rays in arrived], 1),
+        torch.cat([rays.direction for rays in arrived], 1),
+        torch.cat([rays.valid for rays in arrived]),
+    )
+    return joined, unaimed, torch.cat(vignetted)
+
+
+def polychromatic(lens: Lens, spots: Spot, weights: Tensor, field: int) -> Spot:
+    """The spot of one field over all wavelengths, by their weights."""
+    wavelength_weights = lens.wavelength_weights / lens.wavelength_weights.sum()
+    joint = (wavelength_weights[:, None] * weights).flatten()
+    return spot_of_points(spots.points[:, field].flatten(1), spots.valid[field].flatten(), joint)
+
+
+def _spot_document(lens: Lens, fields: Tensor, spots: Spot, vignetted: Tensor) -> dict:
+    results = [
+        {
+            "field": numbers(fields[:, f]),
+            "wavelength": wavelength,
+            "centroid": numbers(spots.centroid[:, f, w]) if int(spots.rays[f, w]) else [None, None],
+            "rms_radius": number(spots.rms_radius[f, w]) if int(spots.rays[f, w]) else None,
+            "geometric_radius": number(spots.geometric_radius[f, w]) if int(spots.rays[f, w]) else None,
+            "rays": int(spots.rays[f, w]),
+            "vignetted": int(vignetted[f, w].sum()),
+            "launched": spots.valid.shape[-1],
+        }
+        for f in range(fields.shape[1])
+        for w, wavelength in enumerate(lens.wavelengths.tolist())
+    ]
+    return {"field_type": lens.fields.kind, "field_unit": FIELD_UNITS[lens.fields.kind], "results": results}
+
+
+def field_label(field: Tensor) -> str:
+    """A field point in words: its y alone on the axis of x."""
+    x, y = field.tolist()
+    return f"{y:g}" if x == 0 else f"{x:g},{y:g}"

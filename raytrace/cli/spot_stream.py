@@ -1,0 +1,87 @@
+"""`raytrace spot --rays`: spots of any number of rays, of which none is kept."""
+
+import argparse
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from raytrace.cli.door import CommandError, field_points, number, numbers, open_lens, print_json, ray_aiming
+from raytrace.lens import FIELD_UNITS, Lens
+from raytrace.streaming import MAX_BYTES, StreamedSpot, stream_spots
+
+_RIM = 72  # rays on the rim of the pupil, for the largest radius, as the spot of few rays has them
+
+
+def spot(arguments: argparse.Namespace) -> None:
+    """Spot of every field and wavelength; results are printed when all rays are through, or not at all."""
+    _check(arguments)
+    lens = open_lens(arguments)
+    fields = field_points(lens, arguments)
+    total = arguments.rays * fields.shape[1] * len(lens.wavelengths)
+    with tqdm(total=total, unit="ray", unit_scale=True, leave=False) as bar:
+        each, whole = stream_spots(
+            lens,
+            arguments.rays,
+            fields=fields,
+            sampling="random" if arguments.sampling == "random" else "sobol",
+            seed=arguments.seed,
+            rim=_RIM,
+            ray_aiming=ray_aiming(arguments),
+            max_bytes=MAX_BYTES if arguments.max_bytes is None else arguments.max_bytes,
+            progress=bar.update,
+        )
+    if arguments.json:
+        print_json(_document(lens, fields, each))
+    else:
+        _print(lens, fields, each, whole)
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    if arguments.rays is None:
+        raise CommandError("--max-bytes belongs to --rays: without it all rays are kept")
+    if arguments.size is not None:
+        raise CommandError("--rays and --size exclude each other: both are a number of rays")
+    if arguments.sampling in ("hexapolar", "square"):
+        raise CommandError(f"--rays takes --sampling sobol (its default) or random, not {arguments.sampling}")
+    if arguments.plot:
+        raise CommandError("--plot needs the rays, and --rays keeps none: leave one out")
+
+
+def _document(lens: Lens, fields: Tensor, spots: StreamedSpot) -> dict:
+    results = [
+        {
+            "field": numbers(fields[:, f]),
+            "wavelength": wavelength,
+            "centroid": numbers(spots.centroid[:, f, w]) if int(spots.rays[f, w]) else [None, None],
+            "rms_radius": number(spots.rms_radius[f, w]) if int(spots.rays[f, w]) else None,
+            "geometric_radius": number(spots.geometric_radius[f, w]) if int(spots.rays[f, w]) else None,
+            "geometric_bound": number(spots.geometric_bound[f, w]) if int(spots.rays[f, w]) else None,
+            "rays": int(spots.rays[f, w]),
+            "launched": spots.launched,
+        }
+        for f in range(fields.shape[1])
+        for w, wavelength in enumerate(lens.wavelengths.tolist())
+    ]
+    return {"field_type": lens.fields.kind, "field_unit": FIELD_UNITS[lens.fields.kind], "results": results}
+
+
+def _print(lens: Lens, fields: Tensor, each: StreamedSpot, whole: StreamedSpot) -> None:
+    unit = FIELD_UNITS[lens.fields.kind]
+    print(
+        f"{'field':>10} {'wavelength':>11} {'centroid x':>13} {'centroid y':>13} {'RMS':>10} {'GEO':>10} {'rays':>12}"
+    )
+    print(f"{unit:>10} {'µm':>11} {'mm':>13} {'mm':>13} {'µm':>10} {'µm':>10} {'lost':>11}")
+    for f in range(fields.shape[1]):
+        x, y = fields[:, f].tolist()
+        label = f"{y:g}" if x == 0 else f"{x:g},{y:g}"
+        for w, wavelength in enumerate(lens.wavelengths.tolist()):
+            print(f"{label:>10} {wavelength:>11g} {_numbers(each, (f, w))} {each.launched - int(each.rays[f, w]):>11}")
+        if len(lens.wavelengths) > 1:
+            print(f"{'':>10} {'all':>11} {_numbers(whole, (f,))}")
+
+
+def _numbers(spots: StreamedSpot, at: tuple[int, ...]) -> str:
+    x, y = spots.centroid[(slice(None), *at)].tolist()
+    radii = 1000 * torch.stack([spots.rms_radius[at], spots.geometric_radius[at]])
+    return f"{x:>13.7f} {y:>13.7f} {radii[0]:>10.4f} {radii[1]:>10.4f}"

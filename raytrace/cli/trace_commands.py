@@ -1,0 +1,41 @@
+"""`raytrace trace`."""
+
+import argparse
+import sys
+
+from raytrace.cli import ray_table
+from raytrace.cli.door import (
+    open_lens,
+    print_json,
+    ray_aiming,
+    say,
+)
+from raytrace.files import write_atomically
+
+
+def trace(arguments: argparse.Namespace) -> None:
+    """Rays of a table, or the chief and marginal rays of the fields, surface by surface."""
+    lens = open_lens(arguments)
+    if arguments.rays is not None:
+        batches, total = ray_table.read(arguments.rays, lens)
+    else:
+        batches, total, unaimed = ray_table.chief_and_marginal(lens, ray_aiming(arguments))
+        if unaimed:
+            say(f"warning: {unaimed} rays found no way to their point of the stop and are left out")
+    fates = ray_table.Fates()
+    if arguments.output:
+
+        def write(file):
+            ray_table.write_csv(lambda text: file.write(text.encode()), lens, batches, total, fates, progress=True)
+
+        write_atomically(arguments.output, write)
+        if arguments.json:
+            print_json({"rays": total, "output": arguments.output, "lost": fates.counts()})
+        else:
+            say(f"{total} rays written to {arguments.output}")
+    elif arguments.json:
+        ray_table.write_json(sys.stdout.write, lens, batches, total, fates)
+    else:
+        ray_table.write_csv(sys.stdout.write, lens, batches, total, fates, progress=False)
+    for line in fates.lines():
+        say(line)

@@ -1,0 +1,250 @@
+"""Shards: processes begun by torchrun that compute one thing together, and end together.
+
+    torchrun --nproc-per-node 2 -m raytrace psf LENS …
+
+Every process takes its `Share`, and `total` sums what they found, so that all of them have it; within `agreeing` they
+also take the same decisions and fail together. What runs in one process needs none of this, and pays for none of it.
+"""
+
+import contextlib
+import contextvars
+import dataclasses
+import importlib
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import torch
+from torch import Tensor, distributed
+
+_NUMBERS = 8  # agreed on at once, at most
+_PATIENCE = 600.0  # s that processes wait for each other to begin
+_COURTESY = 10.0  # s that one with an error waits for the first process to say it
+_is_agreeing = contextvars.ContextVar("raytrace.shards.is_agreeing", default=False)
+
+
+class ProcessLost(ConnectionError):
+    """Another process of the job has ended; this one ends as well."""
+
+
+class FailedElsewhere(ValueError):
+    """Another process of the job refused its share; the message is its own."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Share:
+    """What one process takes: of samples `rank`, `rank + processes`, …; of a row the part number `rank`."""
+
+    rank: int = 0
+    processes: int = 1
+
+    def of(self, samples: range) -> list[int]:
+        return list(samples[self.rank :: self.processes])
+
+    def part(self, count: int) -> slice:
+        """Neighbours among `count` things: all parts together are all of them, of equal size but for one."""
+        return slice(count * self.rank // self.processes, count * (self.rank + 1) // self.processes)
+
+
+def share() -> Share:
+    """The share of this process: all, unless torch.distributed is running."""
+    if distributed.is_available() and distributed.is_initialized():
+        return Share(distributed.get_rank(), distributed.get_world_size())
+    return Share()
+
+
+# -- what processes tell each other ------------------------------------------------------------------------------------
+
+
+def total(part: Tensor) -> Tensor:
+    """The sum of a tensor over all processes, in all of them the same to the last bit; without gradient.
+
+    Raises ProcessLost where one of them has ended.
+    """
+    if share().processes == 1:
+        return part
+    part = part.detach().clone(memory_format=torch.contiguous_format)
+    _reduce(part, "SUM")
+    return part
+
+
+def gathered(part: Tensor) -> Tensor:
+    """(processes, ...) from the tensor (...) of each of them, of one shape in all; without gradient."""
+    mine = share()
+    rows = part.new_zeros(mine.processes, *part.shape)
+    rows[mine.rank] = part.detach()
+    return total(rows)
+
+
+@contextlib.contextmanager
+def agreeing() -> Iterator[None]:
+    """Each process computes a part of one thing; `largest` holds for all parts, and an error in one is raised by all.
+
+    Every process has to call `largest` equally often in the block. Errors of others arrive there, or when it ends.
+    """
+    if share().processes == 1:
+        yield
+        return
+    token = _is_agreeing.set(True)
+    try:
+        yield
+        _agree(torch.zeros(0))
+    except (ProcessLost, FailedElsewhere):
+        raise
+    except Exception as error:
+        _agree(torch.zeros(0), error)
+        raise
+    finally:
+        _is_agreeing.reset(token)
+
+
+@contextlib.contextmanager
+def alone() -> Iterator[None]:
+    """Within a block of `agreeing`: what follows is decided by this process for itself."""
+    token = _is_agreeing.set(False)
+    try:
+        yield
+    finally:
+        _is_agreeing.reset(token)
+
+
+def largest(numbers: Tensor) -> Tensor:
+    """The numbers, () or (K,), K < 8; within `agreeing`, each the largest that a process has; then without gradient."""
+    return _agree(numbers) if _is_agreeing.get() else numbers
+
+
+def everywhere(condition: Tensor) -> bool:
+    """Whether a condition () holds; within `agreeing`, whether it does in every process."""
+    return not bool(largest(~condition))
+
+
+def _agree(numbers: Tensor, error: Exception | None = None) -> Tensor:
+    """The largest of each number; where a process comes with an error instead, raises it as FailedElsewhere."""
+    mine = share()
+    message = torch.zeros(_NUMBERS, dtype=torch.float64)  # on the CPU, where all processes can meet
+    message[0] = 0 if error is None else mine.rank + 1
+    message[1 : 1 + numbers.numel()] = numbers.detach().reshape(-1)
+    _reduce(message, "MAX")
+    failed = int(message[0])
+    if failed:
+        text = [_said(error)]
+        distributed.broadcast_object_list(text, src=failed - 1, device=torch.device("cpu"))
+        if error is None:
+            raise FailedElsewhere(text[0])
+    return message[1 : 1 + numbers.numel()].reshape(numbers.shape).to(numbers)
+
+
+def _said(error: Exception | None) -> str:
+    expected = isinstance(error, ValueError | LookupError | OSError)
+    return f"{error}" if expected else f"{type(error).__name__}: {error}"
+
+
+def _reduce(numbers: Tensor, operation: str) -> None:
+    """Combine a tensor in place over processes: "SUM" or "MAX"."""
+    try:
+        distributed.all_reduce(numbers, getattr(distributed.ReduceOp, operation))
+        return
+    except RuntimeError:
+        pass  # its traceback would keep the process group alive: it is let go before the next line
+    raise ProcessLost("another process of this job has ended before its share was done")
+
+
+# -- beginning and ending ----------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def processes() -> Iterator[Share]:
+    """The processes of torchrun for a while; only the first one speaks. Without torchrun, this one.
+
+    Tensors on the CPU travel by gloo, those on a GPU by NCCL; each process has a GPU of its own where there are enough.
+    An error ends all processes. It is raised by one, the first wherever it lives to do so; others leave by SystemExit.
+    """
+    if not (distributed.is_available() and distributed.is_torchelastic_launched()):
+        yield Share()
+        return
+    with _ended_by_signals():
+        store = _begin()
+        try:
+            with _silent_unless_first():
+                yield share()
+        except BaseException as error:
+            if not _is_to_speak(error, store):
+                raise SystemExit(1) from None
+            raise
+        finally:
+            distributed.destroy_process_group()
+
+
+def _begin() -> "distributed.Store":
+    """Meet the others and begin the process group; the store outlives any of the processes, for torchrun keeps it."""
+    # Its functions take the group of the moment for a default argument, and an optimiser imports it at the first step:
+    # then the group would outlive its end, and its threads, killed by the interpreter's, would abort the process.
+    importlib.import_module("torch.distributed.nn.functional")
+    store, rank, count = next(iter(distributed.rendezvous("env://")))
+    store = distributed.PrefixStore("raytrace", store)
+    store.set(f"here {rank}", "")
+    # Not left to the process group: it waits where no signal arrives.
+    if not _wait(lambda: store.check([f"here {other}" for other in range(count)]), _PATIENCE):
+        raise ProcessLost(f"not all of {count} processes have begun after {_PATIENCE:.0f} s")
+    gpus = torch.cuda.device_count()
+    has_own_gpu = gpus >= int(os.environ.get("LOCAL_WORLD_SIZE", count)) > 0
+    if has_own_gpu:
+        torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", rank)))
+    backend = "cpu:gloo,cuda:nccl" if has_own_gpu else "gloo"
+    distributed.init_process_group(backend, store=store, rank=rank, world_size=count)
+    return store
+
+
+@contextlib.contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """torchrun ends the other processes by SIGTERM if one fails: make that an error, so that files are cleaned up."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(number, frame):
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        raise ProcessLost("ended by torchrun, because another process of this job has failed")
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
+def _silent_unless_first() -> Iterator[None]:
+    with contextlib.ExitStack() as stack:
+        if share().rank:
+            nowhere = stack.enter_context(open(os.devnull, "w"))
+            stack.enter_context(contextlib.redirect_stdout(nowhere))
+            stack.enter_context(contextlib.redirect_stderr(nowhere))
+        yield
+
+
+def _is_to_speak(error: BaseException, store: "distributed.Store") -> bool:
+    """Whether this process is the one that says what went wrong: the first if it fails as well, else any one."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # on the way out already
+    with contextlib.suppress(RuntimeError):  # torchrun itself is gone, and the store with it
+        if share().rank == 0:
+            store.set("first failed", "")
+        else:
+            lost = isinstance(error, ProcessLost)
+            if _wait(lambda: store.check(["first failed"]), 1.0 if lost else _COURTESY):
+                return False
+        return store.add("speakers", 1) == 1
+    return True
+
+
+def _wait(condition: Callable[[], bool], seconds: float) -> bool:
+    """Whether a condition comes true in so many seconds; signals arrive meanwhile."""
+    until = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > until:
+            return False
+        time.sleep(0.02)
+    return True

@@ -1,0 +1,396 @@
+"""The speed benchmark: its limits trace what the package traces, its definitions hold, its page is written. No timings.
+
+Whole processes are stood in for, but for one slow test: each would start torch anew.
+"""
+
+import dataclasses
+import json
+import math
+import re
+
+import pytest
+import torch
+
+from raytrace.bench import speed, speed_processes
+from raytrace.bench.limit import Limit, NoCompiler, build
+from raytrace.bench.measure import errors_of, field_rays, surfaces_of
+from raytrace.bench.speed import Bench, Row, Sizes, interleaved, measure, stages
+from raytrace.bench.speed_own import Engine, leaves_of, three_aspheres, with_sensor_leaf
+from raytrace.bench.speed_report import KEPT, document, markdown, table, targets
+from raytrace.bench.tracers import squared_radius
+from raytrace.cli import main
+from raytrace.cli import speed_bench as command
+from raytrace.files import shipped
+from raytrace.formats import read_lens
+from raytrace.fused import tracing
+from raytrace.plot.speed import speed_figure
+from raytrace.rays import Rays
+from raytrace.reuse import Memo, trace_bundle
+from raytrace.trace import trace, trace_surfaces
+from raytrace.value import to
+
+#: What `raytrace bench speed --json` is read for.
+KEYS = {
+    "forward_over_limit", "forward_over_optiland", "backward_over_forward", "backward_over_optiland", "bytes_per_ray",
+    "small_batch_ms", "asphere_over_limit", "sensor_step_gain", "spot_process_ratio", "two_process_gain",
+    "forward_over_plain_limit", "small_batch_over_optiland", "asphere_over_optiland",
+}  # fmt: skip
+TINY = Sizes(600, (64,), small=16, memory=64, sensor=64, distances=2, window=0.01)
+#: mm on the image: rounding of 12 surfaces, a hundred millimetres of path.
+AGREES = {torch.float32: 1e-4, torch.float64: 1e-10}
+
+
+@pytest.fixture(autouse=True)
+def threads():
+    before = torch.get_num_threads()
+    yield
+    assert torch.get_num_threads() == before, "the benchmark left another number of threads behind"
+
+
+@pytest.fixture(autouse=True)
+def processes(monkeypatch):
+    """Stand-ins of what starts processes: other numbers for other dtypes."""
+    monkeypatch.setattr(speed, "bytes_per_ray", lambda dtype, rays, threads: (100.0 * dtype.itemsize, rays))
+    monkeypatch.setattr(speed, "spot_process_ratio", lambda repeats: (1.25, 2.5, 2.0))
+    monkeypatch.setattr(speed, "two_process_gain", lambda dtype, rays, seconds, repeats: (1.8, 10.0, 18.0))
+    monkeypatch.setattr(speed, "_SHORTEST", 0.0)  # one call a turn
+
+
+@pytest.fixture(scope="module")
+def built():
+    try:
+        return build()
+    except NoCompiler as error:
+        pytest.skip(str(error))
+
+
+def lens_named(name):
+    return read_lens(shipped("lenses") / f"{name}.zmx")
+
+
+def compared(limit, lens, rays):
+    """Largest distance of position and direction, where both come through; and that the same rays do."""
+    lens, rays = to(lens, dtype=limit.dtype), to(rays, dtype=limit.dtype)
+    with torch.no_grad(), tracing("eager"):
+        expected = trace(lens, rays, lens.wavelengths[lens.primary_wavelength])
+    found = limit.trace(rays)
+    assert torch.equal(found.valid, expected.valid)
+    alive = expected.valid
+    return max(
+        float((found.position - expected.position)[:, alive].abs().max()),
+        float((found.direction - expected.direction)[:, alive].abs().max()),
+    )
+
+
+# -- the limits --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", AGREES, ids=str)
+@pytest.mark.parametrize("name", ["double_gauss", "tessar", "cooke_triplet"])
+def test_safe_limit_traces_what_the_package_traces(built, name, dtype):
+    """1000 rays: whole blocks and a part of one, shared by two threads."""
+    lens = lens_named(name)
+    limit = Limit(built, lens, dtype, safe=True, threads=2)
+    assert compared(limit, lens, field_rays(lens, 1000)) < AGREES[dtype]
+
+
+def test_work_of_several_threads_is_that_of_one(built):
+    """So many rays that three threads get unequal shares."""
+    lens = lens_named("double_gauss")
+    rays = field_rays(lens, 20_001)
+    one, three = (Limit(built, lens, torch.float64, safe=True, threads=n).trace(rays) for n in (1, 3))
+    assert torch.equal(one.position, three.position)
+    assert torch.equal(one.direction, three.direction)
+    assert bool(three.valid.all())
+
+
+@pytest.mark.parametrize("dtype", AGREES, ids=str)
+def test_lost_rays_are_lost_in_the_safe_limit_too(built, dtype):
+    """Missed and totally reflected rays go on as axial ones; rays lost before the lens stay lost.
+
+    In float32 rays that graze a surface differ by more: the package takes roots in float64.
+    """
+    lens = to(lens_named("double_gauss"), dtype=dtype)
+    spread = torch.linspace(-1.0, 1.0, 900, dtype=dtype)
+    position = torch.stack([70 * spread, 40 * torch.cos(9 * spread), -5 + 0 * spread])
+    direction = torch.stack([0.6 * torch.sin(31 * spread), 0.5 * torch.cos(17 * spread), 1 + 0 * spread])
+    rays = Rays(position, direction / torch.linalg.vector_norm(direction, dim=0), spread.abs() < 0.9)
+    limit = Limit(built, lens, dtype, safe=True)
+    found = limit.trace(rays)
+    assert bool(torch.isfinite(found.position).all())
+    assert 0.05 < float(found.valid.double().mean()) < 0.6
+    with torch.no_grad(), tracing("eager"):
+        expected = trace(lens, rays, lens.wavelengths[0])
+    differ = int((found.valid ^ expected.valid).sum())
+    assert differ == 0 if dtype == torch.float64 else differ < 5
+    both, bound = found.valid & expected.valid, AGREES[dtype] if dtype == torch.float64 else 0.05
+    assert float((found.position - expected.position)[:, both].abs().max()) < bound
+
+
+def test_plain_limit_is_the_textbook(built):
+    lens = lens_named("double_gauss")
+    limit = Limit(built, lens, torch.float64, safe=False)
+    assert compared(limit, lens, field_rays(lens, 1000)) < AGREES[torch.float64]
+
+
+@pytest.mark.parametrize("dtype", AGREES, ids=str)
+def test_limit_of_the_aspheres_converges_in_the_steps_it_is_given(built, dtype):
+    lens = three_aspheres()
+    bench = Bench(dtype, TINY, 1, 1, built)
+    steps = speed.newton_steps(bench, lens)
+    assert 3 <= steps <= 6  # strong, but not wild
+    rays = field_rays(lens, 1000)
+    assert compared(Limit(built, lens, dtype, safe=True, steps=steps), lens, rays) < AGREES[dtype]
+    # Too few steps are noticed by the residual, not passed off as a crossing.
+    assert not bool(Limit(built, lens, dtype, safe=True, steps=0).trace(to(rays, dtype=dtype)).valid.all())
+
+
+def test_limits_refuse_what_they_do_not_know(built):
+    for lens, safe in ((lens_named("hubble"), True), (three_aspheres(), False)):
+        with pytest.raises(ValueError, match="know"):
+            Limit(built, lens, torch.float64, safe=safe)
+    limit = Limit(built, lens_named("double_gauss"), torch.float64, safe=True)
+    with pytest.raises(ValueError, match="expected"):
+        limit.trace(to(field_rays(lens_named("double_gauss"), 8), dtype=torch.float32))
+    assert "-march=native" in built.words
+
+
+def test_no_compiler_is_said():
+    with pytest.raises(NoCompiler, match="no-such-compiler"):
+        build("no-such-compiler")
+
+
+# -- what is measured --------------------------------------------------------------------------------------------------
+
+
+def test_the_aspheres_are_strong_and_right():
+    lens = three_aspheres()
+    errors = errors_of(Engine(lens, torch.float64, "eager"), lens, field_rays(lens, 24))
+    assert errors.position < 1e-7  # nm
+    for surface in lens.surfaces[1:4]:
+        powers = torch.tensor([3.0 ** (2 * j) for j in range(1, 6)], dtype=torch.float64)
+        assert float((surface.coefficients * powers).sum().abs()) > 0.1  # mm at a height of 3 mm
+
+
+def test_gradient_is_by_curvatures_thicknesses_and_every_index():
+    """The last of the leaves are indices; theirs against central differences of the merit."""
+    lens = lens_named("double_gauss")
+    rays, centroid = field_rays(lens, 50), torch.zeros(2, dtype=torch.float64)
+    own = Engine(lens, torch.float64, "eager")
+    found = own.gradient_by_all(rays, centroid)
+    surfaces, indices, leaves = leaves_of(lens)
+    assert torch.equal(torch.stack(found[:19]), own.gradient(rays, centroid))  # 8 curvatures and 11 thicknesses
+    assert len(found) == len(leaves) == 19 + 11  # runs of one medium: air in front to air behind
+    assert indices[5] is indices[6]  # the stop bends nothing
+
+    def merit(number: int, step: float):
+        moved = [index.detach() for index in leaves[19:]]
+        moved[number] = moved[number] + step
+        at = {id(leaf): index for leaf, index in zip(leaves[19:], moved, strict=True)}
+        end = trace_surfaces(surfaces, rays, indices=[at[id(index)] for index in indices])
+        return float(squared_radius(*end.position[:2], centroid).detach())
+
+    for number in range(11):
+        slope = (merit(number, 1e-6) - merit(number, -1e-6)) / 2e-6
+        assert float(found[19 + number]) == pytest.approx(slope, rel=1e-6)
+
+
+def test_slope_of_the_sensor_step_is_a_derivative_with_and_without_memory():
+    """The mean squared radius is a parabola in the sensor distance: central differences are exact but for rounding."""
+    lens, leaf = with_sensor_leaf(lens_named("double_gauss"))
+    pupil = torch.tensor([[0.3, -0.7, 0.1], [0.2, 0.4, -0.9]], dtype=torch.float64)
+    bundle = (lens, torch.zeros(2, 1, dtype=torch.float64), lens.wavelengths[0], pupil)
+    memo = Memo()
+    for _ in range(2):
+        assert float(speed._slope(trace_bundle(bundle, memo), leaf)) == pytest.approx(
+            float(speed._slope(trace_bundle(bundle), leaf)), rel=1e-13
+        )
+
+    def merit(step: float) -> float:
+        with torch.no_grad():
+            x, y, _ = trace_bundle((with_sensor_leaf_at(lens, leaf + step), *bundle[1:])).position
+            return float(((x - x.mean()) ** 2 + (y - y.mean()) ** 2).mean())
+
+    slope = (merit(0.01) - merit(-0.01)) / 0.02
+    assert float(speed._slope(trace_bundle(bundle), leaf)) == pytest.approx(slope, rel=1e-9)
+
+
+def with_sensor_leaf_at(lens, thickness):
+    surfaces = list(lens.surfaces)
+    surfaces[-2] = dataclasses.replace(surfaces[-2], thickness=thickness)
+    return dataclasses.replace(lens, surfaces=tuple(surfaces))
+
+
+def test_entrants_take_turns_each_prepared(monkeypatch):
+    said = []
+
+    def job(name):
+        return lambda: said.append(name), lambda: said.append(f"({name})")
+
+    bench = Bench(torch.float64, TINY, 3, 1, None)
+    seconds = interleaved({"a": job("a"), "b": job("b")}, bench)
+    assert set(seconds) == {"a", "b"}
+    turn = ["(a)", "a", "(b)", "b"]
+    assert said[8:] == 3 * turn  # behind two calls of each to warm up
+    assert said[:8] == ["(a)", "a"] * 2 + ["(b)", "b"] * 2
+
+
+class Peer(Engine):
+    """A peer that is this package under another name."""
+
+    backend = "torch"
+
+    def __init__(self, lens, dtype):
+        super().__init__(lens, dtype, "eager")
+        self.name = "Optiland, torch"
+
+
+@pytest.fixture(scope="module")
+def measured(request):
+    """Rows and ratios of both dtypes on tiny batches, with limits where there is a compiler, and a stand-in peer."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(speed, "bytes_per_ray", lambda dtype, rays, threads: (100.0 * dtype.itemsize, rays))
+        patch.setattr(speed, "spot_process_ratio", lambda repeats: (1.25, 2.5, 2.0))
+        patch.setattr(speed, "two_process_gain", lambda dtype, rays, seconds, repeats: (1.8, 10.0, 18.0))
+        patch.setattr(speed, "_SHORTEST", 0.0)
+        lenses = speed.double_gauss(), three_aspheres()
+        benches = [
+            Bench(dtype, TINY, 1, 1, request.getfixturevalue("built"), *([Peer(lens, dtype)] for lens in lenses))
+            for dtype in speed.DTYPES
+        ]
+        words = []
+        before = torch.get_num_threads()
+        rows, ratios = measure(benches, progress=words.append)
+        torch.set_num_threads(before)
+        assert len(words) == stages(benches)
+        return rows, ratios
+
+
+def test_every_ratio_is_there_for_both_dtypes(measured):
+    _, ratios = measured
+    assert list(ratios) == ["float32", "float64"]
+    for dtype, numbers in ratios.items():
+        assert set(numbers) >= KEYS
+        assert all(numbers[key] > 0 for key in KEYS)
+        assert numbers["bytes_per_ray"] == 100 * getattr(torch, dtype).itemsize
+        assert numbers["spot_process_ratio"] == 1.25
+        assert numbers["one_process_speed"] == 10.0 * surfaces_of(speed.double_gauss())
+
+
+def test_ratios_are_those_of_the_speeds(measured):
+    rows, ratios = measured
+    for dtype, numbers in ratios.items():
+        speeds = {(row.what, row.tracer, row.rays): row.speed for row in rows if row.dtype == dtype}
+
+        def ratio(what, tracer, rays=TINY.rays, speeds=speeds):
+            return speeds[what, "raytrace", rays] / speeds[what, tracer, rays]
+
+        assert numbers["forward_over_limit"] == pytest.approx(ratio("forward", "safe limit"))
+        assert numbers["forward_over_plain_limit"] == pytest.approx(ratio("forward", "plain limit"))
+        assert numbers["forward_over_optiland"] == pytest.approx(ratio("forward", "Optiland, torch"))
+        assert numbers["backward_over_optiland"] == pytest.approx(ratio("backward", "Optiland, torch"))
+        assert numbers["small_batch_over_optiland"] == pytest.approx(ratio("backward", "Optiland, torch", TINY.small))
+        assert numbers["asphere_over_limit"] == pytest.approx(ratio("asphere", "safe limit"))
+        small_s = 12 * TINY.small / speeds["backward", "raytrace", TINY.small]
+        assert numbers["small_batch_ms"] == pytest.approx(1e3 * small_s)
+
+
+def test_accuracy_stands_beside_every_speed_of_the_tables(measured):
+    """nm on the image: rounding of float32 at 20 mm, and of float64."""
+    rows, _ = measured
+    bound = {"float32": 1e3, "float64": 1e-4}
+    for row in rows:
+        assert row.seconds > 0
+        if row.rays != TINY.small:
+            assert 0 < row.position < bound[row.dtype], row
+            assert row.what != "backward" or 0 < row.gradient < 1e-3, row
+
+
+def test_page_table_and_figure_hold_the_figures(measured):
+    rows, ratios = measured
+    about = {"processor": "one", "torch threads": 2}
+    page = markdown(rows, ratios, sizes=TINY, about=about, compiler="cc -O3", repeats=1, kept="words")
+    assert page.endswith(f"{KEPT}\nwords\n")
+    assert "built by cc -O3" in page
+    assert "of the time of day; processor one" in page
+    for target in targets(TINY):
+        line = next(line for line in page.splitlines() if line.startswith(f"| {target.words} |"))
+        assert re.search(r"\| (yes|no) \|", line), line
+    assert "| × retracing" not in page
+    assert len(table(rows).splitlines()) == 1 + len(rows)
+    figure = speed_figure([dataclasses.asdict(row) for row in rows])
+    assert [panel.get_title() for panel in figure.axes] == ["float32", "float64"]
+    assert all(panel.get_xscale() == panel.get_yscale() == "log" for panel in figure.axes)
+    labels = {line.get_label() for line in figure.axes[0].get_lines()}
+    assert labels == {"raytrace", "raytrace, eager", "safe limit", "plain limit", "Optiland, torch"}
+
+
+def test_targets_are_judged_on_the_right_side():
+    by_key = {target.key: target for target in targets(Sizes())}
+    assert "2²⁰ rays" in by_key["forward_over_limit"].words
+    assert by_key["forward_over_limit"].met(0.7) is True
+    assert by_key["forward_over_limit"].met(0.69) is False
+    assert by_key["small_batch_ms"].met(0.5) is True
+    assert by_key["small_batch_ms"].met(0.51) is False
+    assert by_key["bytes_per_ray"].met(None) is None
+    assert by_key["bytes_per_ray"].met(math.nan) is None
+    assert set(by_key) | {"forward_over_plain_limit"} == KEYS
+
+
+def test_document_has_speeds_by_entrant_in_millions():
+    row = Row("raytrace", "float32", "forward", 64, 1e-3, 5e6, 1.0, None)
+    found = document([row], {"float32": {"two_process_gain": math.inf, "bytes_per_ray": 64.0}})
+    assert found["float32"]["millions_per_second"] == {"forward": {"raytrace": {"64": 5.0}}}
+    assert found["float32"]["two_process_gain"] is None
+    assert found["float32"]["bytes_per_ray"] == 64.0
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
+
+COMMAND = ["bench", "speed", "--quick", "--repeats", "1", "--no-peers", "--threads", "1"]
+
+
+def test_command_without_compiler_and_peers_says_so_and_leaves_their_ratios_out(monkeypatch, tmp_path, capsys):
+    def refuse():
+        raise NoCompiler("no C++ compiler found")
+
+    monkeypatch.setattr(command, "build", refuse)
+    monkeypatch.setattr(speed, "QUICK", TINY)
+    kept = tmp_path / "speed.md"
+    kept.write_text(f"stale\n{KEPT}\nwhat bounds it\n", encoding="utf-8")
+    assert main([*COMMAND, "--json", "--docs", str(tmp_path)]) == 0
+    said = capsys.readouterr()
+    assert "no C++ compiler found: without limits" in said.err
+    found = json.loads(said.out)
+    for dtype in ("float32", "float64"):
+        assert set(found[dtype]) >= KEYS
+        for key in KEYS:
+            absent = key.endswith(("over_limit", "over_plain_limit", "over_optiland"))
+            assert (found[dtype][key] is None) == absent, key
+    assert found["machine"]["torch threads"] == 1
+    page = kept.read_text(encoding="utf-8")
+    assert page.endswith(f"{KEPT}\nwhat bounds it\n")
+    assert "of processor time" in page
+    assert "stale" not in page
+    assert "Newton" not in page
+    assert (tmp_path / "speed.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "speed.csv").exists()
+
+
+def test_options_of_other_benchmarks_are_refused(capsys):
+    assert main(["bench", "speed", "--rays", "5"]) != 0
+    assert "bench speed takes no --rays" in capsys.readouterr().err
+    assert main(["bench", "trace", "--quick"]) != 0
+    assert "bench trace takes no --quick" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_processes_answer():
+    """Each in its units; the memory of a ray is at least what comes back: 6 numbers and a flag."""
+    found, rays = speed_processes.bytes_per_ray(torch.float32, 2**16, threads=1)
+    assert rays == 2**16
+    assert 25 < found < 1e5
+    gain, one, two = speed_processes.two_process_gain(torch.float64, 2**12, seconds=0.2, repeats=1)
+    assert gain == two / one > 0
+    ratio, spot, bare = speed_processes.spot_process_ratio(1)
+    assert ratio == spot / bare > 0.3
