@@ -39,6 +39,7 @@ FLOORS = {
     "trace": 4,
     # 5
     "paraxial": 5,
+    "jacobian": 5,
     # 6
     "launch": 6,
     "spot": 6,

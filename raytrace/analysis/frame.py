@@ -10,6 +10,7 @@ from torch import Tensor
 
 from raytrace.numerics import broadcast_shape
 
+
 class Tabular(abc.ABC):
     """A result that can be written as a table."""
 

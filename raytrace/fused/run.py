@@ -7,6 +7,7 @@ import ctypes
 import itertools
 import threading
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -53,27 +54,45 @@ def trace_compiled(
 
     Arguments as for `trace.steps`; eager: the same trace by torch alone, for derivatives of derivatives.
     """
+    task = task_of(surfaces, rays, indices=indices, side=side, gap=gap)
+    if task is None:
+        return None
+    if torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in task.given):
+        again = _Again(task.structure, tuple(surfaces), side, eager)
+        position, direction, opl, valid = _Compiled.apply(again, task.valid, *task.given)
+    else:
+        position, direction, opl, valid = _forward(task.structure, task.valid, *task.given)
+    return Rays(position, direction, valid, opl)
+
+
+class Task(NamedTuple):
+    """What the compiled trace is given: contiguous rays, and the numbers (rows, K) in a table.
+
+    given: position (3, ...), direction (3, ...), path (...) or None, and the table.
+    """
+
+    structure: Structure
+    valid: Tensor
+    given: tuple[Tensor, Tensor, Tensor | None, Tensor]
+
+
+def task_of(
+    surfaces: Sequence[Surface], rays: Rays, *, indices: Sequence[Tensor], side: int = 1, gap: Tensor | None = None
+) -> Task | None:
+    """A batch as the compiled trace takes it; None if it has no form for it."""
     structure, numbers = structure_of(surfaces, indices, side, gap)
     shape = _batch(rays, numbers)
     if shape is None:
         return None
-    table = _table(numbers, shape)
-    given = [
-        *(with_batch_axes(x, len(shape)).expand(3, *shape).contiguous() for x in (rays.position, rays.direction)),
-        None if rays.opl is None else rays.opl.expand(shape).contiguous(),
-    ]
-    valid = rays.valid.expand(shape).contiguous()
-    if torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in (table, *given)):
-        again = _Again(structure, tuple(surfaces), side, eager)
-        position, direction, opl, valid = _Compiled.apply(again, valid, *given, table)
-    else:
-        position, direction, opl, valid = _forward(structure, valid, *given, table)
-    return Rays(position, direction, valid, opl)
+    position, direction = (
+        with_batch_axes(x, len(shape)).expand(3, *shape).contiguous() for x in (rays.position, rays.direction)
+    )
+    opl = None if rays.opl is None else rays.opl.expand(shape).contiguous()
+    return Task(structure, rays.valid.expand(shape).contiguous(), (position, direction, opl, _table(numbers, shape)))
 
 
 def _batch(rays: Rays, numbers: Sequence[Tensor]) -> torch.Size | None:
-    """Batch shape of the traced rays; None if a number of the lens has another dtype, or differs from
-    ray to ray of the last axis."""
+    """Batch shape; None if a number has another dtype than the rays, or differs from ray to ray of the last axis."""
     parts = [rays.position.shape[1:], rays.direction.shape[1:], rays.valid.shape]
     shape = broadcast_shape(
         *parts, *(n.shape for n in numbers if n.dim()), *([(1,)] if rays.opl is None else [rays.opl.shape])
@@ -177,21 +196,20 @@ def _backward(structure: Structure, given, cotangents, wanted: bool):
     return by_rays, torch.from_numpy(total).to(table.dtype)
 
 
-def push(structure: Structure, valid, position, direction, opl, table: Tensor, change: Tensor):
+def push(task: Task, changes: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
     """How position (V, 3, ...), direction (V, 3, ...) and path (V, ...) behind the last surface change with the table.
 
-    change: (V, rows, K), the change of the table for each of V variables; the rays before the first surface stay.
+    changes: (V, rows, K), that of the table for each of V variables; the rays before the first surface stay.
     """
-    call = _call(structure, valid, position, direction, opl, table)
-    out = [
-        torch.empty(len(change), *t.shape, dtype=t.dtype) for t in (position[0],) * 6 + (() if opl is None else (opl,))
-    ]
-    change = change.contiguous()
-    call.changes, call.change = len(change), change.data_ptr()
-    call.changed = (ctypes.c_void_p * 7)(*(t.data_ptr() for t in out))
-    function = getattr(library(), f"raytrace_tangents_{_c_type(table)}")
+    call = _call(task.structure, task.valid, *task.given)
+    changes = changes.contiguous()
+    call.changes, call.change = len(changes), changes.data_ptr()
+    position, direction = (changes.new_empty(3, len(changes), *task.valid.shape) for _ in range(2))
+    opl = None if task.given[2] is None else changes.new_empty(len(changes), *task.valid.shape)
+    call.changed = _pointers(position, direction, opl)
+    function = getattr(library(), f"raytrace_tangents_{_c_type(changes)}")
     _in_pieces(call, lambda first, last: function(ctypes.byref(call), first, last))
-    return torch.stack(out[:3], 1), torch.stack(out[3:6], 1), None if opl is None else out[6]
+    return position.transpose(0, 1), direction.transpose(0, 1), opl
 
 
 def _call(structure: Structure, valid, position, direction, opl, table) -> _Call:
