@@ -45,6 +45,15 @@ def focus_moments(rays: Rays, weights: Tensor | None = None) -> tuple[Tensor, Te
     return (share * (centred * tilted).sum(0)).sum(-1), (share * (tilted * tilted).sum(0)).sum(-1)
 
 
+def spot_parabola(rays: Rays, weights: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    """Q0 mm², Q1 mm, Q2 of the mean square radius Q0 + 2 s Q1 + s² Q2 on a sensor moved by s mm; each (...).
+
+    rays: (3, ..., P) as `image_rays` gives them. Once they are traced, a step of an optimisation of the sensor distance
+    is this polynomial, whatever the number of rays.
+    """
+    return spot_of_points(rays.position[:2], rays.valid, weights).mean_square_radius, *focus_moments(rays, weights)
+
+
 def through_focus(rays: Rays, shifts: Tensor, weights: Tensor | None = None) -> Spot:
     """Spots (S, ...) on the sensor moved by each of the shifts (S,) mm; rays: (3, ..., P) on the sensor."""
     points, slopes = _points_and_slopes(rays)

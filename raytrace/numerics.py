@@ -52,13 +52,13 @@ def broadcast_shape(*shapes: Sequence[int]) -> torch.Size:
 
     `torch.broadcast_shapes` is the same, but its first call loads a library of computer algebra: 0.3 s.
     """
-    sizes = [1] * max(map(len, shapes), default=0)
+    sizes = [1] * max([0, *(len(shape) for shape in shapes)])
     for shape in shapes:
-        for place, size in enumerate(reversed(shape), 1):
-            if size != 1:
-                if sizes[-place] not in (1, size):
+        for place in range(1, len(shape) + 1):
+            if shape[-place] != 1:
+                if sizes[-place] not in (1, shape[-place]):
                     raise ValueError(f"shapes {', '.join(str(tuple(shape)) for shape in shapes)} do not broadcast")
-                sizes[-place] = size
+                sizes[-place] = shape[-place]
     return torch.Size(sizes)
 
 

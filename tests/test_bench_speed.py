@@ -21,6 +21,7 @@ from raytrace.bench.tracers import squared_radius
 from raytrace.cli import main
 from raytrace.cli import speed_bench as command
 from raytrace.files import shipped
+from raytrace.focus import spot_parabola
 from raytrace.formats import read_lens
 from raytrace.fused import tracing
 from raytrace.plot.speed import speed_figure
@@ -213,6 +214,8 @@ def test_slope_of_the_sensor_step_is_a_derivative_with_and_without_memory():
 
     slope = (merit(0.01) - merit(-0.01)) / 0.02
     assert float(speed._slope(trace_bundle(bundle), leaf)) == pytest.approx(slope, rel=1e-9)
+    parabola = torch.stack(spot_parabola(speed.detached(trace_bundle(bundle))))
+    assert float(speed.slope_of_parabolas(parabola, leaf, float(leaf.detach()))) == pytest.approx(slope, rel=1e-9)
 
 
 def with_sensor_leaf_at(lens, thickness):

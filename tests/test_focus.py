@@ -8,7 +8,7 @@ import torch
 from problems import double_gauss, lens, scalar, surface, vector
 
 from raytrace import pupil
-from raytrace.focus import focus, focus_moments, image_rays, through_focus
+from raytrace.focus import focus, focus_moments, image_rays, spot_parabola, through_focus
 from raytrace.glass import MIRROR
 from raytrace.lens import with_object_distance, with_sensor_distance
 from raytrace.paraxial import first_order
@@ -140,3 +140,12 @@ def test_all_rays_lost_leaves_the_sensor_where_it_is():
     found = focus(dataclasses.replace(blind, surfaces=surfaces), points, torch.ones(2, dtype=torch.float64))
     assert found.item() == 40.0
     assert torch.autograd.grad(found, c)[0].item() == 0.0
+
+
+def test_the_parabola_of_a_spot_is_its_mean_square_radius_through_focus():
+    """On sensors moved by s, traced anew: Q0 + 2 s Q1 + s² Q2."""
+    system = double_gauss()
+    constant, linear, square = spot_parabola(image_rays(system, POINTS), WEIGHTS)
+    for shift in (-0.3, 0.0, 0.5):
+        traced = rms(with_sensor_distance(system, system.surfaces[-2].thickness + shift))
+        torch.testing.assert_close(constant + 2 * shift * linear + shift**2 * square, traced, rtol=1e-11, atol=0)

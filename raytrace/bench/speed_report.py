@@ -112,6 +112,7 @@ def _goals(ratios: Mapping, sizes: Sizes) -> list[str]:
 
 
 def _definitions(ratios: Mapping, compiler: str) -> list[str]:
+    carried = ", ".join(f"{_number(n.get('sensor_step_gain_of_memo'))} in {dtype}" for dtype, n in ratios.items())
     memory = ", ".join(f"{numbers['bytes_per_ray_rays']:,} rays in {dtype}" for dtype, numbers in ratios.items())
     return [
         "A speed is rays × surfaces / s; the stop and the image are surfaces, the object is not. *Forward* is `trace` "
@@ -124,8 +125,11 @@ def _definitions(ratios: Mapping, compiler: str) -> list[str]:
         _limits(ratios, compiler),
         "",
         f"Peak memory: growth of the resident peak of a fresh process, {memory}. Sensor step: forward and gradient of "
-        "the mean squared radius by the sensor distance, with a `Memo` filled before, over tracing anew the same rays, "
-        "launched beforehand, one object distance at a time. The bare imports are `import torch, matplotlib.pyplot`, "
+        "the mean squared radius by the sensor distance, from the parabolas of the spots (`focus.spot_parabola`), beside "
+        "tracing anew the same rays, launched beforehand, one object distance at a time; with a `Memo`, which carries "
+        "every ray to the sensor and serves any merit, the gain is "
+        f"{carried}. "
+        "The bare imports are `import torch, matplotlib.pyplot`, "
         "processes in turns. Two processes trace at the same time, a thread each.",
         "",
         f"Errors beside the speeds: on the image, the largest of {SAMPLE} rays against a tracer of 50 digits that gets "
