@@ -40,9 +40,11 @@ def launch(
     fields = torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields
     wavelengths = lens.wavelengths if wavelengths is None else wavelengths
     vignetted = vignette(lens, fields[:, :, None, None], pupil)
-    return rays_of_field(
-        lens, fields[:, :, None, None], vignetted, wavelength=wavelengths[:, None], ray_aiming=ray_aiming
-    )
+    field, wavelength = fields[:, :, None, None], wavelengths[:, None]
+    rays = rays_of_field(lens, field, vignetted, wavelength=wavelength, ray_aiming=ray_aiming)
+    batch = broadcast_shape(rays.shape, rays.opl.shape)
+    position, direction = rays.position.expand(3, *batch), rays.direction.expand(3, *batch)
+    return Rays(position, direction, rays.valid.expand(batch), rays.opl.expand(batch))
 
 
 def vignette(lens: Lens, field: Tensor, pupil: Tensor) -> Tensor:
@@ -72,6 +74,7 @@ def rays_of_field(
 
     field: (2, ...) degrees or mm, as `lens.fields.kind` says; pupil: (2, ...) fractions of the entrance pupil, or of
     the stop with ray aiming; wavelength: (...) µm. An aimed ray that finds no way to its stop point is lost.
+    Position, direction and validity have axes of 1 where the wavelength makes no difference to them.
     """
     ray_aiming = lens.ray_aiming if ray_aiming is None else ray_aiming
     paraxial = first_order(lens)
@@ -233,9 +236,8 @@ def _through_entrance_pupil(lens: Lens, field: Tensor, pupil: Tensor, paraxial: 
         aim_x, aim_y = field[0] + radius * pupil[0], field[1] + radius * pupil[1]
     else:
         aim_x, aim_y = radius * pupil[0], radius * pupil[1]
-    x, y, aim_x, aim_y, depth, index, distance = torch.broadcast_tensors(
-        field[0], field[1], aim_x, aim_y, depth, index, distance
-    )
+    # Not the index: all wavelengths start alike, and only their paths differ.
+    x, y, aim_x, aim_y, depth, distance = torch.broadcast_tensors(field[0], field[1], aim_x, aim_y, depth, distance)
     aim = torch.stack([aim_x, aim_y, depth])
     if at_infinity:
         return rays_from_infinity(torch.stack([x, y, torch.ones_like(x)]), aim, index=index)

@@ -18,6 +18,7 @@ from torch.utils import _pytree as pytree
 
 from raytrace.launch import rays_of_field, vignette
 from raytrace.lens import Lens, with_object_distance
+from raytrace.numerics import broadcast_shape
 from raytrace.rays import Rays
 from raytrace.trace import Crossing, media, steps, trace_surfaces
 
@@ -253,7 +254,7 @@ def _at_distances(front: _Front, weights: Tensor) -> _Front:
 
 def _part(rays: Rays, rows: slice) -> Rays:
     """The rays of some of the object distances."""
-    opl = None if rays.opl is None else rays.opl.expand(rays.shape)[rows]
+    opl = None if rays.opl is None else rays.opl.expand(broadcast_shape(rays.shape, rays.opl.shape))[rows]
     return Rays(rays.position[:, rows], rays.direction[:, rows], rays.valid.expand(rays.shape)[rows], opl)
 
 

@@ -42,7 +42,7 @@ _CONVERGED = {torch.float32: 1e-5, torch.float64: 1e-12}
 @dataclasses.dataclass(frozen=True)
 class Sizes:
     """How much is measured. rays: of the ratios; counts: of the figure; small: of the small batch; memory: rays of the
-    peak; sensor: rays for each of `distances`; window: s of each turn of the processes.
+    peak; sensor: rays for each of `distances`; window: s of each turn of the processes; less: rays of `less_work`.
     """
 
     rays: int = 2**20
@@ -52,9 +52,10 @@ class Sizes:
     sensor: int = 2**20
     distances: int = 41
     window: float = 1.0
+    less: int = 2**18
 
 
-QUICK = Sizes(2**16, (2**8, 2**12, 2**16), memory=2**18, sensor=2**14, distances=5, window=0.2)
+QUICK = Sizes(2**16, (2**8, 2**12, 2**16), memory=2**18, sensor=2**14, distances=5, window=0.2, less=2**14)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,6 +18,7 @@ from raytrace.bench.measure import field_rays
 from raytrace.bench.speed_own import Engine
 from raytrace.files import shipped
 from raytrace.formats import read_lens
+from raytrace.fused import prepare
 from raytrace.rays import Rays
 from raytrace.value import to
 
@@ -98,6 +99,7 @@ def serve_rate(dtype: str, rays: int, threads: int) -> None:
 
 
 def _tracer_and_rays(dtype: str, count: int) -> tuple[Engine, Rays]:
+    prepare()
     tracer = Engine(read_lens(shipped("lenses") / "double_gauss.zmx"), getattr(torch, dtype))
     few = to(field_rays(tracer.lens_as_read, _PATTERN), dtype=tracer.dtype)
     position, direction = (torch.empty(3, count, dtype=tracer.dtype) for _ in range(2))

@@ -23,6 +23,9 @@ start here:
 
 LENS is a lens file (.zmx, or a prescription table .csv, .tsv, .txt) or the name of a shipped lens, as double_gauss.
 Lengths are mm, wavelengths µm, angles degrees. `raytrace COMMAND --help` teaches each command by example.
+
+Large batches are traced by C++ that is compiled once for the machine, where there is a compiler; RAYTRACE_TRACE=eager
+traces by torch alone, =fused always by C++, and RAYTRACE_CACHE is the folder that the compiled code is kept in.
 """
 
 

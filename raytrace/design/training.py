@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from raytrace.files import write_atomically
+from raytrace.fused import prepare
 from raytrace.shards import Share, share, total
 
 #: What a step reports: numbers by name, a column of the log each.
@@ -126,6 +127,7 @@ def train(
     after_step: a projection, say.
     Raises NotFinite at a loss or a gradient that is no number, before it is stepped into.
     """
+    prepare()  # numbers must not depend on when somebody else compiles the trace
     step, mine, kept_at = _resume(module, optimizer, run), share(), time.monotonic()
     rows: list[tuple[int, Record]] = []
     parameters = [p for p in module.parameters() if p.requires_grad]

@@ -166,7 +166,7 @@ def _centre(batch: Scene, lens: Lens, center: str, weights: Tensor) -> Tensor | 
     with torch.no_grad():
         if center == "centroid":
             pixel = make_grid(batch.wavelengths.new_tensor(1.0), 1)
-            return polychromatic(gaussian.kernels(batch, pixel, order=6), weights, "gaussian").centroid
+            return polychromatic(gaussian.kernels_alone(batch, pixel, order=6), weights, "gaussian").centroid
         primary = lens.wavelengths[lens.primary_wavelength][None]
         rays = trace_scene(dataclasses.replace(batch, wavelengths=primary), batch.fields.new_zeros(2, 1))
         return rays.position[:2, :, :, 0, 0]

@@ -8,13 +8,14 @@ from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from raytrace.grid import Grid
 from raytrace.numerics import safe_divide, safe_sqrt
 from raytrace.paraxial import first_order
 from raytrace.psf import diffraction, fourier, gaussian, paraxial, raymap, rays
 from raytrace.psf.sharing import shared
-from raytrace.scene import Kernels, Scene
+from raytrace.scene import Kernels, Scene, varies
 from raytrace.shards import Share
 from raytrace.value import value
 
@@ -181,9 +182,15 @@ def by_tolerance(
         reason = f"{model}: the estimated error {float(error.max()):.1e} stays above the tolerance {tol:g}"
         warnings.warn(reason, NotConverged, stacklevel=4)
     residual, order = found.residual, found.order
-    if torch.is_grad_enabled():
+    if torch.is_grad_enabled() and _vary(batch, pixels, weights, ladder.kernels):
         found = by_order(batch, pixels, weights, models, model, order)
     return dataclasses.replace(found, error=error, residual=residual, reason=reason)
+
+
+def _vary(batch: Scene, pixels: Grid, weights: Tensor, kernels: Callable[..., Kernels]) -> bool:
+    """Whether a derivative may be asked for by any number of the scene, the pixels or the model's own options."""
+    options = getattr(kernels, "keywords", {})
+    return any(varies(number) for number in pytree.tree_leaves((batch, pixels, weights, options)))
 
 
 def _estimate(ladder: Model, changes: list[Tensor], found: Psf, rounding: Tensor) -> Tensor:

@@ -123,6 +123,9 @@ def trace_apertures(scene: Scene, disc: Tensor) -> tuple[Tensor, list[tuple[Aper
 
     disc: pupil points (2, P), or (2, D, F, W, P) with axes of 1 where kernels have the same ones.
     """
+    if not any(surface.apertures for surface in scene.lens.surfaces):
+        rays = trace_scene(scene, disc)  # nothing to record on the way
+        return rays.position[:2], [], rays.valid
     shape = (*scene.shape, disc.shape[-1])
     crossings = cross_scene(scene, disc)
     # Rays that do not start are lost before the first surface.
