@@ -36,7 +36,9 @@ KEYS = {
     "small_batch_ms", "asphere_over_limit", "sensor_step_gain", "spot_process_ratio", "two_process_gain",
     "forward_over_plain_limit", "small_batch_over_optiland", "asphere_over_optiland",
 }  # fmt: skip
-TINY = Sizes(600, (64,), small=16, memory=64, sensor=64, distances=2, window=0.01)
+#: Ways of doing less work.
+LESS = {"prefix", "planes", "symmetry", "wavelengths", "object distances"}
+TINY = Sizes(600, (64,), small=16, memory=64, sensor=64, distances=2, window=0.01, less=64)
 #: mm on the image: rounding of 12 surfaces, a hundred millimetres of path.
 AGREES = {torch.float32: 1e-4, torch.float64: 1e-10}
 
@@ -371,11 +373,14 @@ def test_command_without_compiler_and_peers_says_so_and_leaves_their_ratios_out(
             absent = key.endswith(("over_limit", "over_plain_limit", "over_optiland"))
             assert (found[dtype][key] is None) == absent, key
     assert found["machine"]["torch threads"] == 1
+    assert {kind.partition(":")[0] for kind in (row["what"] for row in found["less_work"])} == LESS
     page = kept.read_text(encoding="utf-8")
     assert page.endswith(f"{KEPT}\nwhat bounds it\n")
     assert "of processor time" in page
     assert "stale" not in page
     assert "Newton" not in page
+    section = page.partition("## Less work")[2]
+    assert all(f"| {row['what']} | {row['engine']} |" in section for row in found["less_work"])
     assert (tmp_path / "speed.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "speed.csv").exists()
 

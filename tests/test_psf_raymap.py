@@ -9,7 +9,7 @@ import torch
 from raytrace.formats import read_lens
 from raytrace.grid import Grid, grid
 from raytrace.lens import Lens, with_sensor_distance
-from raytrace.psf import rays
+from raytrace.psf import raymap, rays
 from raytrace.psf.raymap import fit, kernels, kernels_and_reason, reference
 from raytrace.scene import scene
 from raytrace.surface import Aperture
@@ -145,3 +145,27 @@ def test_derivatives_are_those_of_the_kernel_with_vignetted_rays(field, name):
     with torch.no_grad():
         difference = (merit(number(step)) - merit(number(-step))) / (2 * step)
     assert float(slope) == pytest.approx(float(difference), rel=2e-3, abs=1e-6)
+
+
+def test_half_of_a_symmetric_fan_stands_for_all_of_it(monkeypatch):
+    """Kernels, moments and gradients of a field along y from the lines of x > 0, and from all lines."""
+    system = double_gauss()
+    bend = system.surfaces[2].curvature.clone().requires_grad_()
+    surfaces = [*system.surfaces[:2], dataclasses.replace(system.surfaces[2], curvature=bend), *system.surfaces[3:]]
+    of = scene_of(dataclasses.replace(system, surfaces=tuple(surfaces)), 9.0)
+    pixels = window(of, 0.02, 9)
+    pixels = dataclasses.replace(pixels, centre=torch.stack([torch.zeros_like(pixels.centre[0]), pixels.centre[1]]))
+    weights = torch.linspace(0.5, 2.0, 81, dtype=torch.float64).reshape(9, 9)
+
+    def outcome():
+        found = kernels(of, pixels, order=2)
+        (gradient,) = torch.autograd.grad((found.kernel * weights).sum() + found.covariance.sum(), bend)
+        return found.kernel.detach(), found.centroid.detach(), found.covariance.detach(), gradient
+
+    half = outcome()
+    monkeypatch.setattr(raymap, "_is_symmetric", lambda grid: False)
+    whole = outcome()
+    assert float(half[0].sum()) > 0.5
+    assert not torch.equal(half[0], whole[0])
+    for one, all_of_it in zip(half, whole, strict=True):
+        torch.testing.assert_close(one, all_of_it, rtol=1e-8, atol=1e-9)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from raytrace.bench.limit import Built, Limit
 from raytrace.bench.measure import SAMPLE, Errors, clock, errors_of, field_rays, surfaces_of
-from raytrace.bench.speed_own import Engine, three_aspheres, with_sensor_leaf
+from raytrace.bench.speed_own import Engine, Repeated, three_aspheres, with_sensor_leaf
 from raytrace.bench.speed_processes import bytes_per_ray, spot_process_ratio, two_process_gain
 from raytrace.bench.tracers import Tracer, in_pieces, squared_radius
 from raytrace.files import shipped
@@ -348,32 +348,10 @@ def _limits(lens: Lens, bench: Bench) -> list[Limit]:
     return [Limit(bench.built, lens, bench.dtype, safe=safe, threads=bench.threads) for safe in (True, False)]
 
 
-class _Repeated:
-    """A tracer whose sample of rays stands many times in a batch, so that it takes the way of large batches."""
-
-    def __init__(self, tracer: Tracer, copies: int, *, has_gradient: bool):
-        self.tracer, self.copies, self.has_gradient = tracer, copies, has_gradient
-        self.dtype, self.with_path = tracer.dtype, tracer.with_path
-
-    def prepare(self) -> None:
-        self.tracer.prepare()
-
-    def forward(self, rays: Rays) -> tuple[Tensor, Tensor | None]:
-        points, path = self.tracer.forward(self._many(rays))
-        return points[:, : rays.direction.shape[1]], None if path is None else path[: rays.direction.shape[1]]
-
-    def gradient(self, rays: Rays, centroid: Tensor) -> Tensor:
-        return self.tracer.gradient(self._many(rays), centroid)
-
-    def _many(self, rays: Rays) -> Rays:
-        many = (x.repeat(*(1,) * (x.dim() - 1), self.copies) for x in (rays.position, rays.direction, rays.valid))
-        return Rays(*many)
-
-
 def _errors(tracer: Tracer, lens: Lens, count: int, *, gradient: bool = False) -> Errors:
     """Of `SAMPLE` rays against 50 digits; own rays in a batch as large as is timed (of a graph, at most 2¹⁶)."""
     copies = max(1, min(count, _PIECE) // SAMPLE) if isinstance(tracer, Engine) else 1
-    return errors_of(_Repeated(tracer, copies, has_gradient=gradient), lens, field_rays(lens, SAMPLE))
+    return errors_of(Repeated(tracer, copies, has_gradient=gradient), lens, field_rays(lens, SAMPLE))
 
 
 def _rows(

@@ -5,7 +5,7 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from raytrace.bench.tracers import Own, squared_radius, with_leaves
+from raytrace.bench.tracers import Own, Tracer, squared_radius, with_leaves
 from raytrace.fused import prepare, tracing
 from raytrace.glass import constant
 from raytrace.lens import Fields, Lens, SystemAperture
@@ -38,6 +38,28 @@ class Engine(Own):
         with tracing(self.engine):
             end = trace_surfaces(self._surfaces, rays, indices=self._indices)
             return torch.autograd.grad(squared_radius(end.position[0], end.position[1], centroid), self.leaves)
+
+
+class Repeated:
+    """A tracer whose sample of rays stands many times in a batch, so that it takes the way of large batches."""
+
+    def __init__(self, tracer: Tracer, copies: int, *, has_gradient: bool):
+        self.tracer, self.copies, self.has_gradient = tracer, copies, has_gradient
+        self.dtype, self.with_path = tracer.dtype, tracer.with_path
+
+    def prepare(self) -> None:
+        self.tracer.prepare()
+
+    def forward(self, rays: Rays) -> tuple[Tensor, Tensor | None]:
+        points, path = self.tracer.forward(self._many(rays))
+        return points[:, : rays.direction.shape[1]], None if path is None else path[: rays.direction.shape[1]]
+
+    def gradient(self, rays: Rays, centroid: Tensor) -> Tensor:
+        return self.tracer.gradient(self._many(rays), centroid)
+
+    def _many(self, rays: Rays) -> Rays:
+        many = (x.repeat(*(1,) * (x.dim() - 1), self.copies) for x in (rays.position, rays.direction, rays.valid))
+        return Rays(*many)
 
 
 def leaves_of(lens: Lens) -> tuple[tuple[Surface, ...], list[Tensor], list[Tensor]]:

@@ -11,7 +11,7 @@ import torch
 from tqdm import tqdm
 
 from raytrace import plot
-from raytrace.bench import speed, speed_report
+from raytrace.bench import less_work, speed, speed_report
 from raytrace.bench.limit import Built, NoCompiler, build
 from raytrace.bench.report import machine
 from raytrace.bench.speed_own import three_aspheres
@@ -29,17 +29,19 @@ def bench_speed(arguments: argparse.Namespace, *, with_peers: bool) -> None:
         torch.set_num_threads(threads)
         peers = importlib.import_module("raytrace.bench.speed_peer") if with_peers else None
         benches = _benches(arguments, threads, built, peers)
-        with tqdm(total=speed.stages(benches), desc="measuring", disable=None) as bar:
+        sizes = benches[0].sizes
+        total = speed.stages(benches) + len(less_work.cases(sizes))
+        with tqdm(total=total, desc="measuring", disable=None) as bar:
             rows, ratios = speed.measure(benches, progress=lambda words: _show(bar, words))
+            gains = less_work.measure(sizes, repeats=arguments.repeats, progress=lambda words: _show(bar, words))
         torch.set_num_threads(threads)
         about = machine() | (peers.versions() if peers else {})
     finally:
         torch.set_num_threads(before)
-    sizes = benches[0].sizes
     page = Path(arguments.docs) / "speed.md" if arguments.docs else None
     kept = page.read_text(encoding="utf-8").partition(speed_report.KEPT)[2].strip() if page and page.exists() else ""
     report = speed_report.markdown(
-        rows, ratios, sizes=sizes, about=about, compiler=compiler, repeats=arguments.repeats, kept=kept
+        rows, ratios, sizes=sizes, about=about, compiler=compiler, repeats=arguments.repeats, gains=gains, kept=kept
     )
     if page:
         _write(page, report, rows)
@@ -47,7 +49,7 @@ def bench_speed(arguments: argparse.Namespace, *, with_peers: bool) -> None:
         found = speed_report.document(rows, ratios)
         errors = [dataclasses.asdict(row) | {"position": number(row.position)} for row in rows]
         about = {"machine": about, "compiler": compiler, "repeats": arguments.repeats, "sizes": sizes.__dict__}
-        print_json(found | about | {"rows": errors})
+        print_json(found | about | {"rows": errors, "less_work": [dataclasses.asdict(gain) for gain in gains]})
     else:
         print(report, end="")
 

@@ -32,7 +32,7 @@ from raytrace.psf.rays import (
 )
 from raytrace.psf.sharing import symmetry
 from raytrace.psf.splat import cell_widths
-from raytrace.scene import Kernels, Scene, beam_share
+from raytrace.scene import Kernels, Scene, beam_share, varies
 from raytrace.shards import largest
 from raytrace.surface import Aperture
 from raytrace.value import value
@@ -54,6 +54,7 @@ class RayMap:
     hits: (2, D, F, W, T) mm; crossings: (2, D, F, W, T) mm for each of `apertures`; of an axial scene only y counts.
     residual: (D, F, W) mm, the largest error of the rays that were not fitted; NaN-free, inf if a ray is lost.
     edge_residual: (D, F, W) the same for the clearance in the apertures, of their radius.
+    is_mirrored: whether the light is symmetric in x.
     """
 
     degree: int
@@ -64,6 +65,7 @@ class RayMap:
     residual: Tensor
     edge_residual: Tensor
     rays: int
+    is_mirrored: bool = False
 
 
 def kernels(scene: Scene, grid: Grid, *, order: int = 3) -> Kernels:
@@ -134,13 +136,15 @@ def fit(scene: Scene, degree: int) -> RayMap:
         edge = torch.maximum(edge, largest(error))
     residual = largest((mapped @ check.T - hits[..., count:]).abs().amax(0))
     apertures = tuple(aperture for aperture, _ in crossed)
-    return RayMap(degree, axial, mapped, crossings, apertures, residual, edge, disc.shape[1])
+    return RayMap(degree, axial, mapped, crossings, apertures, residual, edge, disc.shape[1], mirrored)
 
 
-def fans_of_map(ray_map: RayMap, across: int, along: int) -> Fans:
-    """The map on so many lines of so many cells."""
+def fans_of_map(ray_map: RayMap, across: int, along: int, *, is_half: bool = False) -> Fans:
+    """The map on so many lines of so many cells; is_half: as for `Fans`, of a map that is mirrored."""
     like = ray_map.hits
     at_angle, at_radius = places(across, along)
+    if is_half:
+        at_angle = at_angle[np.arange(-1, across // 2 + 1)]
     angle, radius = (torch.as_tensor(t, dtype=like.dtype, device=like.device) for t in (at_angle, at_radius))
     if ray_map.axial:
         radial = torch.as_tensor(_axial_basis(ray_map.degree, at_radius), dtype=like.dtype).to(like.device)
@@ -160,7 +164,7 @@ def fans_of_map(ray_map: RayMap, across: int, along: int) -> Fans:
         clearance(aperture, on_fans(terms))
         for aperture, terms in zip(ray_map.apertures, ray_map.crossings, strict=True)
     )
-    return Fans(on_fans(ray_map.hits), radius, clearances, ray_map.rays)
+    return Fans(on_fans(ray_map.hits), radius, clearances, ray_map.rays, is_half)
 
 
 def reference(scene: Scene, grid: Grid, *, lines: int = 2048) -> Tensor:
@@ -190,10 +194,16 @@ def _kernels_of_map(scene: Scene, grid: Grid, ray_map: RayMap, order: int) -> Ke
         2 * math.ceil(min(_MOST_LINES, max(least, width * count) * both * 2 ** (order / 2)) / 2)
         for width, count, least in zip(widths, (2 * _LINES, _LINES), (_LINES, _LINES // 2), strict=True)
     )
-    fans = fans_of_map(ray_map, across, along)
+    is_half = ray_map.is_mirrored and _is_symmetric(grid)
+    fans = fans_of_map(ray_map, across, along, is_half=is_half)
     kernel = energy_of_fans(grid, fans) * beam_share(scene)[..., None, None]
     centroid, covariance = moments_of_fans(fans)
     return _with_residual(Kernels(kernel, grid, centroid, covariance, ray_map.rays), ray_map.residual)
+
+
+def _is_symmetric(grid: Grid) -> bool:
+    """Whether every window is symmetric in x, and stays so under differentiation."""
+    return not varies(grid.centre) and not bool((grid.centre[0] != 0).any())
 
 
 def _kernels_of_meridian(scene: Scene, grid: Grid, ray_map: RayMap, order: int) -> Kernels:

@@ -37,12 +37,15 @@ class Fans:
     points: (2, D, F, W, A, N) mm; radius: (N,) of the nodes, of the pupil.
     clearances: one (D, F, W, A, N) for each aperture, above 0 where light passes it; no unit.
     rays: how many were traced for each kernel.
+    is_half: whether the lines are those of x > 0 and one more beyond either end, of light symmetric in x: cells between
+        the outer two on either side are their own images, all others have one.
     """
 
     points: Tensor
     radius: Tensor
     clearances: tuple[Tensor, ...]
     rays: int
+    is_half: bool = False
 
 
 def kernels(
@@ -172,17 +175,31 @@ def kernels_of_fans(scene: Scene, grid: Grid, fans: Fans, *, width: float = 1.0)
 
 
 def energy_of_fans(grid: Grid, fans: Fans) -> Tensor:
-    """Energy (D, F, W, rows, columns) of fans whose cells are no wider than a pixel, some lines at a time."""
+    """Energy (D, F, W, rows, columns) of fans whose cells are no wider than a pixel, some lines at a time.
+
+    The window of half a fan is symmetric in x as well.
+    """
+    count = fans.points.shape[-2]
+    if not fans.is_half:
+        return _energy_of_lines(grid, fans, range(count + 1), count)
+    whole = 2 * (count - 2)
+    half = _energy_of_lines(grid, fans, range(1, count - 1), whole)
+    own = [_energy_of_lines(grid, fans, range(first, first + 2), whole) for first in (0, count - 2)]
+    return half + half.flip(-1) + sum(own)
+
+
+def _energy_of_lines(grid: Grid, fans: Fans, lines: range, cells_round: int) -> Tensor:
+    """Energy of the cells between these lines, of so many round the pupil."""
     count = fans.points.shape[-2]
     height = max(1, _CHUNK // fans.points[0, ..., 0, :].numel())
-    if height >= count:
+    if len(lines) > count and height >= count:
         return splat_cells(grid, fans.points, fans.radius, fans.clearances)
     kernel = 0.0
-    for first in range(0, count, height):
-        rows = torch.arange(first, min(first + height, count) + 1, device=fans.points.device) % count
+    for first in range(lines.start, lines.stop - 1, height):
+        rows = torch.arange(first, min(first + height + 1, lines.stop), device=fans.points.device) % count
         points, *clearances = (t.index_select(-2, rows) for t in (fans.points, *fans.clearances))
         part = splat_cells(grid, points, fans.radius, clearances, closed=False)
-        kernel = kernel + part * ((len(rows) - 1) / count)
+        kernel = kernel + part * ((len(rows) - 1) / cells_round)
     return kernel
 
 
@@ -211,14 +228,23 @@ def cut_line(t: Tensor, parts: int) -> Tensor:
 def moments_of_fans(fans: Fans) -> tuple[Tensor, Tensor]:
     """Centroid (2, D, F, W) mm and covariance (3, D, F, W) mm² of the light of fans, no pixels and no window."""
     reference = fans.points[..., :1, :1].detach()
-    (x, ax, bx), (y, ay, by) = (cells(t, fans.radius) for t in fans.points - reference)
-    weights = cell_energy(fans.radius, x.shape[-2]) * clear_share(fans.clearances, fans.radius)
+    if fans.is_half:
+        reference = torch.stack([torch.zeros_like(reference[0]), reference[1]])
+    closed = not fans.is_half
+    (x, ax, bx), (y, ay, by) = (cells(t, fans.radius, closed=closed) for t in fans.points - reference)
+    weights = cell_energy(fans.radius, x.shape[-2]) * clear_share(fans.clearances, fans.radius, closed=closed)
     weights = torch.as_tensor(weights).expand(x.shape)
+    if fans.is_half:
+        # All but the outer cells stand for two.
+        weights = torch.cat([0.5 * weights[..., :1, :], weights[..., 1:-1, :], 0.5 * weights[..., -1:, :]], -2)
     share = safe_divide(weights, weights.sum((-2, -1), keepdim=True))
     mean_x, mean_y = ((share * t).sum((-2, -1), keepdim=True) for t in (x, y))
+    mean_x = torch.zeros_like(mean_x) if fans.is_half else mean_x
     x, y = x - mean_x, y - mean_y
     pairs = (x * x + (ax * ax + bx * bx) / 3, x * y + (ax * ay + bx * by) / 3, y * y + (ay * ay + by * by) / 3)
     covariance = torch.stack([(share * pair).sum((-2, -1)) for pair in pairs])
+    if fans.is_half:
+        covariance = torch.stack([covariance[0], torch.zeros_like(covariance[1]), covariance[2]])
     lit = weights.sum((-2, -1)) > 0
     centroid = torch.stack([mean_x, mean_y])[..., 0, 0] + reference[..., 0, 0]
     return torch.where(lit, centroid, 0.0), covariance
