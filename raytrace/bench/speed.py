@@ -4,11 +4,12 @@ Every ratio is of medians of calls that were interleaved, so that a busy machine
 processor time, else of the time of day. A speed is rays × surfaces / s; surfaces are those a ray is carried to.
 """
 
+import contextlib
 import dataclasses
 import itertools
 import math
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -30,7 +31,9 @@ from raytrace.trace import media, trace_surfaces
 from raytrace.value import to
 
 DTYPES = (torch.float32, torch.float64)
-_PIECE = 2**16  # rays at a time that a peer is tried with, beside all at once
+_PIECE = 2**16
+_PIECES = (_PIECE, 2**18)  # rays at a time that tracers are tried with, beside all at once
+_MOST_OF_PEER = 3 * _PIECE  # rays whose graph a peer holds at once
 _LARGEST_GRAPH = 4e9  # bytes
 _MANY = 100  # steps timed together that take microseconds
 _SHORTEST = 0.02  # s: shorter calls are timed many at a time
@@ -148,18 +151,16 @@ def _backward(bench: Bench, found: Mapping) -> tuple[list[Row], dict]:
     lens, count = double_gauss(), bench.sizes.rays
     rays, centroid = to(field_rays(lens, count), dtype=bench.dtype), torch.zeros(2, dtype=bench.dtype)
     own = Engine(lens, bench.dtype)
-    piece = min(count, max(_PIECE, int(_LARGEST_GRAPH / max(found["bytes_per_ray"], 1.0))))
-    jobs = {own.name: (lambda: in_pieces(rays, piece, lambda part: own.gradient_by_all(part, centroid)), own.prepare)}
-    jobs["forward"] = _forward_job(own, rays, bench)
+    most = max(_PIECE, int(_LARGEST_GRAPH / max(found["bytes_per_ray"], 1.0)))
+    jobs = {own.name: _gradient_job(own, rays, centroid, bench, most), "forward": _forward_job(own, rays, bench)}
     tracers = [own, *(peer for peer in bench.peers if peer.has_gradient)]
     # Before the leaves of `gradient_by_all` take their places in a peer.
     errors = {one.name: _errors(one, lens, count, gradient=True) for one in tracers}
-    jobs |= {one.name: _gradient_job(one, rays, centroid, bench) for one in tracers[1:]}
+    jobs |= {one.name: _gradient_job(one, rays, centroid, bench, _MOST_OF_PEER) for one in tracers[1:]}
     seconds = interleaved(jobs, bench)
     return _rows("backward", lens, count, tracers, seconds, errors, bench), {
         "backward_over_forward": seconds[own.name] / seconds["forward"],
         "backward_over_optiland": _over(seconds, *_optiland(seconds)),
-        "backward_piece": piece,
     }
 
 
@@ -224,15 +225,15 @@ def _sensor(bench: Bench, _: Mapping) -> tuple[list[Row], dict]:
         _slope(end, leaf)
         parabolas.append(torch.stack(spot_parabola(detached(end))))
     parabolas = torch.stack(parabolas, -1)
-    torch.set_num_threads(bench.threads)
-    for _ in range(max(1, min(bench.repeats, 3))):
-        turn = [0.0, 0.0]
-        for bundle in bundles:
-            turn = [a + b for a, b in zip(turn, _sensor_turn(bundle, leaf, memo, now), strict=True)]
-        began = now()
-        for _ in range(_MANY):
-            slope_of_parabolas(parabolas, leaf, float(leaf.detach()))
-        taken.append([*turn, (now() - began) / _MANY])
+    with torch_threads(bench.threads):
+        for _ in range(max(1, min(bench.repeats, 3))):
+            turn = [0.0, 0.0]
+            for bundle in bundles:
+                turn = [a + b for a, b in zip(turn, _sensor_turn(bundle, leaf, memo, now), strict=True)]
+            began = now()
+            for _ in range(_MANY):
+                slope_of_parabolas(parabolas, leaf, float(leaf.detach()))
+            taken.append([*turn, (now() - began) / _MANY])
     retraced, kept, summed = (statistics.median(column) for column in zip(*taken, strict=True))
     gains = {"sensor_step_gain": retraced / summed, "sensor_step_gain_of_memo": retraced / kept}
     return [], gains | {"sensor_step_s": summed, "sensor_rays": bench.sizes.sensor, "sensor_distances": len(distances)}
@@ -296,25 +297,37 @@ def interleaved(jobs: Mapping[str, Job], bench: Bench) -> dict[str, float]:
 
 def _seconds(job: Job, calls: int, threads: int) -> float:
     call, prepare = job
-    torch.set_num_threads(threads)
-    prepare()
-    now = clock(threads)
-    began = now()
-    for _ in range(calls):
-        call()
-    return (now() - began) / calls
+    with torch_threads(threads):
+        prepare()
+        now = clock(threads)
+        began = now()
+        for _ in range(calls):
+            call()
+        return (now() - began) / calls
+
+
+@contextlib.contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """So many threads of torch for a while."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _forward_job(tracer: Tracer, rays: Rays, bench: Bench) -> Job:
-    """Whole; a peer in pieces where a trial finds that faster."""
+    """Whole, or in pieces where a trial finds that faster."""
     rays, count = to(rays, dtype=tracer.dtype), rays.direction.shape[1]
-    jobs = {size: _in_pieces(tracer, rays, size, tracer.forward) for size in {count, min(count, _PIECE)}}
-    return _faster(jobs, bench) if hasattr(tracer, "backend") else jobs[count]
+    sizes = {min(count, size) for size in (*_PIECES, count)}
+    return _faster({size: _in_pieces(tracer, rays, size, tracer.forward) for size in sizes}, bench)
 
 
-def _gradient_job(tracer: Tracer, rays: Rays, centroid: Tensor, bench: Bench) -> Job:
+def _gradient_job(tracer: Tracer, rays: Rays, centroid: Tensor, bench: Bench, most: int) -> Job:
+    """The same of a gradient, of at most `most` rays at a time."""
     count = rays.direction.shape[1]
-    sizes = {min(count, _PIECE), min(count, 3 * _PIECE)}
+    sizes = {min(count, size, most) for size in (*_PIECES, most)}
 
     def gradient(part: Rays):
         return tracer.gradient_by_all(part, centroid)
@@ -332,7 +345,7 @@ def _faster(jobs: Mapping[int, Job], bench: Bench) -> Job:
         return next(iter(jobs.values()))
     for job in jobs.values():
         _seconds(job, 1, bench.threads)
-    return min(jobs.values(), key=lambda job: _seconds(job, 1, bench.threads))
+    return min(jobs.values(), key=lambda job: min(_seconds(job, 1, bench.threads) for _ in range(2)))
 
 
 # -- who takes part ----------------------------------------------------------------------------------------------------

@@ -121,8 +121,8 @@ def _definitions(ratios: Mapping, compiler: str) -> list[str]:
         "A speed is rays × surfaces / s; the stop and the image are surfaces, the object is not. *Forward* is `trace` "
         "without gradient and without optical path, which Optiland alone computes all the same; *forward + backward* "
         "is the gradient of the mean squared spot radius by every curvature, thickness and index. *raytrace* chooses "
-        "its engine by itself, *eager* is asked for. Peers trace all rays at once or 2¹⁶ at a time, whichever a trial "
-        "finds faster. Of Optiland the loop over surfaces alone is timed; its numpy back end is float64 in both "
+        "its engine by itself, *eager* is asked for. All trace 2¹⁶ or 2¹⁸ rays at a time, or all at once, whichever a "
+        "trial finds faster. Of Optiland the loop over surfaces alone is timed; its numpy back end is float64 in both "
         "columns.",
         "",
         _limits(ratios, compiler),

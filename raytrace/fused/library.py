@@ -16,10 +16,15 @@ import tempfile
 import threading
 from pathlib import Path
 
+import torch
+
 SOURCES = ("block.h", "loops.h", "careful.h", "adjoint.h", "tangent.h", "trace.cpp")
-FLAGS = ("-O3", "-std=c++17", "-fPIC", "-shared", "-fopenmp-simd", "-fno-math-errno", "-fno-trapping-math")
-#: Flags that some compilers or processors do not know: tried in this order, the last none.
-_OWN_PROCESSOR = (("-march=native", "-mprefer-vector-width=512"), ("-march=native",), ())
+FLAGS = ("-O3", "-std=c++17", "-fPIC", "-fopenmp-simd", "-fno-math-errno", "-fno-trapping-math")
+#: Flags that not every compiler, processor or torch knows: tried in this order, the last none. With -fopenmp, which
+#: stands only where it compiles, threads are those of the OpenMP that torch has loaded: two of them would wait for each
+#: other's turn at full power.
+_THREADS, _PROCESSOR, _VECTORS = ("-fopenmp",), ("-march=native",), ("-mprefer-vector-width=512",)
+_TRIED = (_THREADS + _PROCESSOR + _VECTORS, _THREADS + _PROCESSOR, _PROCESSOR + _VECTORS, _PROCESSOR, ())
 _COMPILERS = ("c++", "g++", "clang++")
 
 
@@ -34,11 +39,9 @@ def library() -> ctypes.CDLL:
     if not path.exists():
         _build(path)
     try:
-        found = ctypes.CDLL(str(path))
+        return ctypes.CDLL(str(path))
     except OSError as error:
         raise NoCompiler(f"{path} cannot be loaded ({error}); remove it and try again") from None
-    found.raytrace_blocks.restype = ctypes.c_int64
-    return found
 
 
 @functools.cache
@@ -74,7 +77,9 @@ def _kept_at() -> Path:
         digest.update(Path(__file__).with_name(name).read_bytes())
     program = compiler()
     stamp = os.stat(program)
-    digest.update(repr((FLAGS, _OWN_PROCESSOR, program, stamp.st_size, stamp.st_mtime_ns, _processor())).encode())
+    digest.update(
+        repr((FLAGS, _TRIED, torch.__version__, program, stamp.st_size, stamp.st_mtime_ns, _processor())).encode()
+    )
     return cache_folder() / f"trace-{digest.hexdigest()[:20]}.so"
 
 
@@ -97,12 +102,12 @@ def _build(path: Path) -> None:
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-            made = Path(folder) / path.name
-            for own in _OWN_PROCESSOR:
-                done = subprocess.run(
-                    [program, *FLAGS, *own, str(source), "-o", str(made)], capture_output=True, text=True
-                )
+            made, compiled = Path(folder) / path.name, Path(folder) / "trace.o"
+            for own in _TRIED:
+                done = _run(program, *FLAGS, *own, "-c", str(source), "-o", str(compiled))
                 if done.returncode == 0:
+                    done = _run(program, "-shared", str(compiled), "-o", str(made))
+                if done.returncode == 0 and _can_be_loaded(made):
                     os.replace(made, path)
                     return
     except OSError as error:
@@ -113,3 +118,16 @@ def _build(path: Path) -> None:
         note.cancel()
     said = (done.stderr.strip() or f"exit status {done.returncode}").splitlines()[0]
     raise NoCompiler(f"{program} cannot compile the trace: {said}")
+
+
+def _run(*words: str) -> subprocess.CompletedProcess:
+    return subprocess.run(words, capture_output=True, text=True)
+
+
+def _can_be_loaded(path: Path) -> bool:
+    """Whether what the code needs is there: its threads are torch's."""
+    try:
+        ctypes.CDLL(str(path))
+    except OSError:
+        return False
+    return True

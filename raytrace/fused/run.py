@@ -4,8 +4,6 @@ The gradient is that of the compiled adjoint (adjoint.h); a gradient of the grad
 """
 
 import ctypes
-import itertools
-import threading
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -19,7 +17,6 @@ from raytrace.numerics import broadcast_shape, with_batch_axes
 from raytrace.rays import Rays
 from raytrace.surface import Surface
 
-_PIECE = 64  # blocks that a thread takes at a time
 _WORTH_A_THREAD = 2**16  # rays × surfaces
 
 #: surfaces, rays, indices, side, gap -> the rays behind the last surface, by torch alone.
@@ -167,8 +164,7 @@ def _forward(structure: Structure, valid, position, direction, opl, table):
     call = _call(structure, valid, position, direction, opl, table)
     call.rays_out = _pointers(*out)
     call.valid_out = valid_out.data_ptr()
-    function = getattr(library(), f"raytrace_forward_{_c_type(table)}")
-    _in_pieces(call, lambda first, last: function(ctypes.byref(call), first, last))
+    _run("forward", call, table)
     return *out, valid_out
 
 
@@ -179,20 +175,9 @@ def _backward(structure: Structure, given, cotangents, wanted: bool):
     by_rays = [torch.empty_like(x) if wanted and x is not None else None for x in (position, direction, opl)]
     call = _call(structure, valid, position, direction, opl, table)
     call.cotangents, call.by_rays = _pointers(*cotangents), _pointers(*by_rays)
-    function = getattr(library(), f"raytrace_backward_{_c_type(table)}")
-    blocks_of_a_row = _blocks(call) // call.rows
-    sums: dict[int, tuple[int, np.ndarray]] = {}
-
-    def piece(first: int, last: int) -> None:
-        row = first // blocks_of_a_row
-        own = np.zeros(((last - 1) // blocks_of_a_row - row + 1, call.numbers))
-        sums[first] = row, own
-        function(ctypes.byref(call), first, last, ctypes.c_void_p(own.ctypes.data - 8 * row * call.numbers))
-
-    _in_pieces(call, piece)
     total = np.zeros((call.rows, call.numbers))
-    for _, (row, own) in sorted(sums.items(), key=lambda item: item[0]):
-        total[row : row + len(own)] += own
+    call.by_numbers = total.ctypes.data
+    _run("backward", call, table)
     return by_rays, torch.from_numpy(total).to(table.dtype)
 
 
@@ -207,8 +192,7 @@ def push(task: Task, changes: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
     position, direction = (changes.new_empty(3, len(changes), *task.valid.shape) for _ in range(2))
     opl = None if task.given[2] is None else changes.new_empty(len(changes), *task.valid.shape)
     call.changed = _pointers(position, direction, opl)
-    function = getattr(library(), f"raytrace_tangents_{_c_type(changes)}")
-    _in_pieces(call, lambda first, last: function(ctypes.byref(call), first, last))
+    _run("tangents", call, changes)
     return position.transpose(0, 1), direction.transpose(0, 1), opl
 
 
@@ -232,31 +216,8 @@ def _pointers(position: Tensor | None, direction: Tensor | None, opl: Tensor | N
     return (ctypes.c_void_p * 7)(*parts, None if opl is None else opl.data_ptr())
 
 
-def _c_type(table: Tensor) -> str:
-    return "float" if table.dtype == torch.float32 else "double"
-
-
-def _blocks(call: _Call) -> int:
-    return library().raytrace_blocks(ctypes.byref(call))
-
-
-def _in_pieces(call: _Call, work: Callable[[int, int], None]) -> None:
-    """Call work(first block, last) on all blocks, in as many threads as torch has. What a piece is does not depend on
-    how many there are, so that sums of pieces do not either."""
-    blocks = _blocks(call)
-    ends = itertools.count()
-
-    def take() -> None:
-        for number in ends:
-            first = number * _PIECE
-            if first >= blocks:
-                return
-            work(first, min(first + _PIECE, blocks))
-
-    wanted = call.rows * call.rays * call.surfaces // _WORTH_A_THREAD
-    threads = [threading.Thread(target=take) for _ in range(min(torch.get_num_threads() - 1, wanted, blocks // _PIECE))]
-    for thread in threads:
-        thread.start()
-    take()
-    for thread in threads:
-        thread.join()
+def _run(what: str, call: _Call, table: Tensor) -> None:
+    """Call the compiled code, in torch's threads where the work is worth them."""
+    function = getattr(library(), f"raytrace_{what}_{'float' if table.dtype == torch.float32 else 'double'}")
+    work = call.rows * call.rays * call.surfaces
+    function(ctypes.byref(call), min(torch.get_num_threads(), 1 + work // _WORTH_A_THREAD))

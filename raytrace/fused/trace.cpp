@@ -267,22 +267,55 @@ class Trace {
   bool path_;
 };
 
+// A trace is cut into pieces of so many blocks, which threads take as they come. What a piece is does not depend on the
+// number of threads, and sums of pieces are added in their order: so results do not depend on it either.
+constexpr int64_t kPiece = 64;
+
+inline int64_t blocks_of(const Call& call) { return call.rows * ((call.rays + kBlock - 1) / kBlock); }
+
+template <typename T, typename Work>
+void in_pieces(const Call& call, int threads, Work work) {
+  const int64_t blocks = blocks_of(call), pieces = (blocks + kPiece - 1) / kPiece;
+  (void)threads;
+#pragma omp parallel for schedule(dynamic, 1) num_threads(threads) if (threads > 1)
+  for (int64_t piece = 0; piece < pieces; piece++) {
+    Trace<T> trace(call);
+    work(trace, piece, piece * kPiece, std::min((piece + 1) * kPiece, blocks));
+  }
+}
+
+template <typename T>
+void forward(const Call& call, int threads) {
+  in_pieces<T>(call, threads, [](Trace<T>& t, int64_t, int64_t first, int64_t last) { t.forward(first, last); });
+}
+
+template <typename T>
+void tangents(const Call& call, int threads) {
+  in_pieces<T>(call, threads, [](Trace<T>& t, int64_t, int64_t first, int64_t last) { t.tangents(first, last); });
+}
+
+template <typename T>
+void backward(const Call& call, int threads) {
+  const int64_t of_a_row = blocks_of(call) / call.rows, pieces = (blocks_of(call) + kPiece - 1) / kPiece;
+  std::vector<std::vector<double>> sums(pieces);  // of each piece, over the rows that it touches
+  in_pieces<T>(call, threads, [&](Trace<T>& t, int64_t piece, int64_t first, int64_t last) {
+    int64_t row = first / of_a_row, rows = (last - 1) / of_a_row - row + 1;
+    sums[piece].assign(rows * call.numbers, 0.0);
+    t.backward(first, last, sums[piece].data() - row * call.numbers);
+  });
+  for (int64_t piece = 0; piece < pieces; piece++) {
+    double* row = call.by_numbers + piece * kPiece / of_a_row * call.numbers;
+    for (size_t i = 0; i < sums[piece].size(); i++) row[i] += sums[piece][i];
+  }
+}
+
 }  // namespace raytrace
 
 extern "C" {
-using raytrace::Call;
-using raytrace::Trace;
-
-// Blocks of rays that a call is cut into.
-int64_t raytrace_blocks(const Call* call) { return call->rows * ((call->rays + raytrace::kBlock - 1) / raytrace::kBlock); }
-void raytrace_forward_float(const Call* call, int64_t first, int64_t last) { Trace<float>(*call).forward(first, last); }
-void raytrace_forward_double(const Call* call, int64_t first, int64_t last) { Trace<double>(*call).forward(first, last); }
-void raytrace_tangents_float(const Call* call, int64_t first, int64_t last) { Trace<float>(*call).tangents(first, last); }
-void raytrace_tangents_double(const Call* call, int64_t first, int64_t last) { Trace<double>(*call).tangents(first, last); }
-void raytrace_backward_float(const Call* call, int64_t first, int64_t last, double* by_numbers) {
-  Trace<float>(*call).backward(first, last, by_numbers);
-}
-void raytrace_backward_double(const Call* call, int64_t first, int64_t last, double* by_numbers) {
-  Trace<double>(*call).backward(first, last, by_numbers);
-}
+void raytrace_forward_float(const raytrace::Call* call, int threads) { raytrace::forward<float>(*call, threads); }
+void raytrace_forward_double(const raytrace::Call* call, int threads) { raytrace::forward<double>(*call, threads); }
+void raytrace_tangents_float(const raytrace::Call* call, int threads) { raytrace::tangents<float>(*call, threads); }
+void raytrace_tangents_double(const raytrace::Call* call, int threads) { raytrace::tangents<double>(*call, threads); }
+void raytrace_backward_float(const raytrace::Call* call, int threads) { raytrace::backward<float>(*call, threads); }
+void raytrace_backward_double(const raytrace::Call* call, int threads) { raytrace::backward<double>(*call, threads); }
 }
