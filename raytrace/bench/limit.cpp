@@ -11,7 +11,6 @@
 
 #include <cmath>
 #include <cstdint>
-#include <thread>
 #include <vector>
 
 namespace {
@@ -298,17 +297,14 @@ template <class T>
 void trace(const Surface* surfaces, int number, const Arrays<T>& rays, int steps, bool plain, int threads) {
     const std::vector<Surface> copied(surfaces, surfaces + number);
     const std::int64_t blocks = (rays.count + Block<T>::size - 1) / Block<T>::size;
-    const std::int64_t most = blocks / 8 + 1;  // starting a thread costs as much as some blocks
+    const std::int64_t most = blocks / 8 + 1;  // waking a thread costs as much as some blocks
     const std::int64_t workers = threads < most ? threads : most;
     const std::int64_t share = (blocks + workers - 1) / workers * Block<T>::size;
-    std::vector<std::thread> others;
-    for (std::int64_t k = 1; k < workers; k++)
-        others.emplace_back([&, k] {
-            const std::int64_t last = (k + 1) * share < rays.count ? (k + 1) * share : rays.count;
-            trace_blocks(copied, rays, k * share, last, steps, plain);
-        });
-    trace_blocks(copied, rays, 0, share < rays.count ? share : rays.count, steps, plain);
-    for (std::thread& other : others) other.join();
+#pragma omp parallel for schedule(static, 1) num_threads(int(workers)) if (workers > 1)
+    for (std::int64_t k = 0; k < workers; k++) {
+        const std::int64_t last = (k + 1) * share < rays.count ? (k + 1) * share : rays.count;
+        trace_blocks(copied, rays, k * share, last, steps, plain);
+    }
 }
 
 }  // namespace

@@ -22,9 +22,9 @@ from raytrace.trace import media
 from raytrace.value import to
 
 #: Beside -O3 -march=native: roots and comparisons as vector instructions, which errno and traps would forbid; no
-#: arithmetic changes by that. The last is tried first, and left out where a compiler does not know it.
+#: arithmetic changes by that. The others are tried first, and left out where a compiler does not know them.
 FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math")
-_WIDEST = "-mprefer-vector-width=512"
+_WIDEST, _THREADS = "-mprefer-vector-width=512", "-fopenmp"
 _COMPILERS = ("g++", "c++", "clang++")
 _TERMS = 8
 _MOST_STEPS = 24
@@ -69,17 +69,26 @@ def build(compiler: str | None = None) -> Built:
     found = next((name for name in ([asked] if asked else _COMPILERS) if shutil.which(name)), None)
     if found is None:
         raise NoCompiler(f"no C++ compiler found (looked for {asked or ', '.join(_COMPILERS)})")
-    said = ""
-    for flags in ((*FLAGS, _WIDEST), FLAGS):
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "limit.so"
-            source = Path(__file__).with_name("limit.cpp")
-            words = [found, "-std=c++17", *flags, "-shared", "-fPIC", "-pthread", str(source), "-o", str(file)]
-            done = subprocess.run(words, capture_output=True, text=True, timeout=300)
-            if done.returncode == 0:
-                return Built(ctypes.CDLL(str(file)), _version(found), flags)
-            said = done.stderr.strip().splitlines()[0] if done.stderr.strip() else f"exit {done.returncode}"
-    raise NoCompiler(f"{found} does not build the limits: {said}")
+    for flags in ((*FLAGS, _WIDEST, _THREADS), (*FLAGS, _THREADS), FLAGS):
+        made = _compiled(found, flags)
+        if isinstance(made, ctypes.CDLL):
+            return Built(made, _version(found), flags)
+    raise NoCompiler(f"{found} does not build the limits: {made}")
+
+
+def _compiled(compiler: str, flags: Sequence[str]) -> ctypes.CDLL | str:
+    """The limits, or why they cannot be had. Linked without -fopenmp: threads are torch's, as the compiled trace's."""
+    with tempfile.TemporaryDirectory() as folder:
+        source = Path(__file__).with_name("limit.cpp")
+        compiled, file = Path(folder) / "limit.o", Path(folder) / "limit.so"
+        for words in (["-std=c++17", *flags, "-fPIC", "-c", source, "-o", compiled], ["-shared", compiled, "-o", file]):
+            done = subprocess.run([compiler, *map(str, words)], capture_output=True, text=True, timeout=300)
+            if done.returncode:
+                return done.stderr.strip().splitlines()[0] if done.stderr.strip() else f"exit {done.returncode}"
+        try:
+            return ctypes.CDLL(str(file))
+        except OSError as error:
+            return str(error)
 
 
 class Limit:
