@@ -179,6 +179,22 @@ def test_the_jacobian_sums_up_to_the_gradient(engine):
     assert_close(found, expected, rtol=1e-11, atol=0)
 
 
+def test_a_gap_that_rays_along_the_axis_cross_has_no_derivative():
+    """Exactly none: what moves a kernel is counted by derivatives other than 0."""
+    heights = torch.linspace(-8.0, 8.0, 33, dtype=torch.float64)
+    zero = torch.zeros_like(heights)
+    rays = start(torch.stack([zero, heights, zero]), torch.stack([zero, zero, zero + 1]), None)
+    gap = scalar(7.0).requires_grad_()
+    mirror = surface(-0.01, -30.0, MIRROR, conic=-1.1)
+    surfaces = [dataclasses.replace(surface(None), thickness=gap), mirror, surface(None)]
+    for (gradient,) in both(
+        lambda: torch.autograd.grad(
+            (trace_surfaces(surfaces, rays, indices=[scalar(1.0)] * 4).position ** 2).sum(), gap
+        )
+    ):
+        assert float(gradient) == 0.0
+
+
 def test_gradients_of_gradients_pass_through_the_eager_trace():
     system = double_gauss()
     rays = Rays(*(x[..., :5] for x in (some_rays().position, some_rays().direction, some_rays().valid)))

@@ -66,7 +66,7 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
       sag<T, true>(s, terms, u, S, dS, d2S);
       nx = T(-2) * dS * hx, ny = T(-2) * dS * hy, w = T(1) + T(4) * dS * dS * u;
     }
-    T cosine = nx * L + ny * M + nz * N, over_cosine;
+    T tilt = nx * L + ny * M, cosine = tilt + nz * N, over_cosine;
 
     // Behind the surface: Snell's law or that of reflection.
     T gL = gl, gM = gm, gN = gn, gnx = 0, gny = 0, gnz = 0, gw = 0;
@@ -136,8 +136,10 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
     }
 
     // The hit: implicit function theorem.
-    T s_bar = (gX * L + gY * M + gZ * N) * over_cosine;
-    gX -= s_bar * nx, gY -= s_bar * ny, gZ -= s_bar * nz;
+    // Z̄ - s n_z is written out, so that a gap gets exactly 0 from rays along the axis: they do not see it.
+    T across = gX * L + gY * M, s_bar = (across + gZ * N) * over_cosine;
+    gZ = (gZ * tilt - across * nz) * over_cosine;
+    gX -= s_bar * nx, gY -= s_bar * ny;
     if (kind == kSphere || kind == kConic) {
       sum_c += T(0.5) * s_bar * (u + shape * hz * hz);
       if (kind == kConic) sum_k += T(0.5) * s_bar * c * hz * hz;
