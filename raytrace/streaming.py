@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from raytrace import pupil
-from raytrace.fused import prepare
+from raytrace.fused.choice import WORTH_COMPILING, prepare
 from raytrace.launch import is_at_infinity, launch
 from raytrace.lens import Lens
 from raytrace.numerics import safe_divide, safe_sqrt
@@ -26,7 +26,6 @@ _CHUNK = {"cpu": 2**15}  # rays whose temporaries stay in the caches of a core
 _CHUNK_ELSEWHERE = 2**22  # rays that fill an accelerator
 _FEWEST = 256  # rays of a chunk: fewer would be overhead alone
 _PILOT = 2**16  # first rays, whose centroid is what the largest distance is measured from
-_WORTH_COMPILING = 2**23  # rays × surfaces: a chunk alone would not make the trace compile itself
 _SOBOL_BITS = torch.quasirandom.SobolEngine.MAXBIT
 _SOBOL_POINTS = 2**_SOBOL_BITS
 #: Bytes of temporaries a ray takes at most, in float64 by the eager trace; measured, see docs/streaming.md.
@@ -360,8 +359,8 @@ def shots_of(
     ray_aiming: bool | None,
 ) -> tuple[list[Shot], tuple[int, int], Tensor]:
     """Shots of fields × wavelengths, those numbers, and the weights (W,) of the wavelengths, which sum to 1."""
-    if rays * len(lens.surfaces) >= _WORTH_COMPILING:
-        prepare()
+    if rays * len(lens.surfaces) >= WORTH_COMPILING:
+        prepare()  # a chunk alone would not be worth it
     fields = torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields
     weights = lens.wavelength_weights if wavelengths is None and wavelength_weights is None else wavelength_weights
     wavelengths = lens.wavelengths if wavelengths is None else wavelengths

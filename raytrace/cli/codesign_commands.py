@@ -11,7 +11,6 @@ from raytrace.cli.codesign_setup import (
     Experiment,
     experiment,
     plain,
-    processes,
     refuse_too_few,
     settings_of,
     settings_without_network,
@@ -22,6 +21,7 @@ from raytrace.design.codesign import STEPS, Outcome
 from raytrace.design.optima import Optimum, closed_form
 from raytrace.design.spectral import power_spectrum
 from raytrace.files import write_atomically
+from raytrace.shards import processes
 
 #: The forms of the command by their word, and the options that only some of them know.
 _FORMS = {

@@ -1,11 +1,9 @@
 """What the forms of `raytrace codesign` share: settings, pictures, and one run with its progress."""
 
 import argparse
-import contextlib
 import dataclasses
 import hashlib
 import json
-import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -19,10 +17,11 @@ from tqdm import tqdm
 from raytrace.cli.door import CommandError, field_points, find_lens, number, open_lens, refuse_untraceable, say
 from raytrace.design.codesign import STEPS, Outcome, Settings, camera, lens_at_start, outcome, run_model
 from raytrace.design.network import PRESETS, RedNetShape, faster_precision
-from raytrace.design.training import NotFinite, Record, share
+from raytrace.design.training import NotFinite, Record
 from raytrace.lens import Lens
 from raytrace.paraxial import paraxial_image_distance
 from raytrace.pictures import Pictures, dead_leaves, files, read, split
+from raytrace.shards import share
 
 _LEAVES = 100  # pictures, where none are given
 _DISTANCES = 9  # at which a finished run is tested
@@ -48,24 +47,6 @@ class Experiment:
     def distances(self) -> tuple[float, ...]:
         """Object distances in mm at which runs are tested."""
         return tuple(np.linspace(self.settings.near, self.settings.far, _DISTANCES).tolist())
-
-
-@contextlib.contextmanager
-def processes() -> Iterator[None]:
-    """Under torchrun, the processes that share every batch; only the first one speaks."""
-    if not distributed.is_torchelastic_launched():
-        yield
-        return
-    distributed.init_process_group("gloo")
-    try:
-        with contextlib.ExitStack() as stack:
-            if share().rank:
-                nowhere = stack.enter_context(open(os.devnull, "w"))
-                stack.enter_context(contextlib.redirect_stdout(nowhere))
-                stack.enter_context(contextlib.redirect_stderr(nowhere))
-            yield
-    finally:
-        distributed.destroy_process_group()
 
 
 def experiment(arguments: argparse.Namespace, settings: Settings) -> Experiment:

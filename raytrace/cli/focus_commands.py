@@ -18,7 +18,7 @@ from raytrace.cli.door import (
     print_json,
     say,
 )
-from raytrace.cli.spot_commands import field_label, pupil_points
+from raytrace.cli.spots import field_label, pupil_points
 from raytrace.focus import focus as best_focus
 from raytrace.focus import focus_moments, focus_of_merit, image_rays
 from raytrace.formats import read_lens, write_lens

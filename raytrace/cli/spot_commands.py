@@ -7,32 +7,14 @@ from torch import Tensor
 from tqdm import tqdm
 
 from raytrace import pupil
-from raytrace.cli.door import (
-    field_points,
-    number,
-    numbers,
-    open_lens,
-    print_json,
-    ray_aiming,
-    say,
-)
+from raytrace.cli.door import field_points, open_lens, print_json, ray_aiming, say
+from raytrace.cli.spots import field_label, pupil_points, spot_entry
 from raytrace.launch import launch
 from raytrace.lens import FIELD_UNITS, Lens
 from raytrace.rays import Rays
 from raytrace.spot import Spot, spot_of_points
 from raytrace.spot import spot as spot_of
 from raytrace.trace import media, steps
-
-_RINGS = 12
-_DEFAULT_SIZE = {"gauss": _RINGS, "hexapolar": _RINGS, "square": 32, "sobol": 1024, "random": 1024}
-
-
-def pupil_points(arguments: argparse.Namespace) -> tuple[Tensor, Tensor]:
-    """Points and weights of the sampling asked for."""
-    size = arguments.size or _DEFAULT_SIZE[arguments.sampling]
-    if arguments.sampling in ("sobol", "random"):
-        return pupil.SAMPLINGS[arguments.sampling](size, seed=arguments.seed)
-    return pupil.SAMPLINGS[arguments.sampling](size)
 
 
 def spot(arguments: argparse.Namespace) -> None:
@@ -107,12 +89,7 @@ def polychromatic(lens: Lens, spots: Spot, weights: Tensor, field: int) -> Spot:
 def _spot_document(lens: Lens, fields: Tensor, spots: Spot, vignetted: Tensor) -> dict:
     results = [
         {
-            "field": numbers(fields[:, f]),
-            "wavelength": wavelength,
-            "centroid": numbers(spots.centroid[:, f, w]) if int(spots.rays[f, w]) else [None, None],
-            "rms_radius": number(spots.rms_radius[f, w]) if int(spots.rays[f, w]) else None,
-            "geometric_radius": number(spots.geometric_radius[f, w]) if int(spots.rays[f, w]) else None,
-            "rays": int(spots.rays[f, w]),
+            **spot_entry(fields, wavelength, spots, f, w),
             "vignetted": int(vignetted[f, w].sum()),
             "launched": spots.valid.shape[-1],
         }
@@ -120,9 +97,3 @@ def _spot_document(lens: Lens, fields: Tensor, spots: Spot, vignetted: Tensor) -
         for w, wavelength in enumerate(lens.wavelengths.tolist())
     ]
     return {"field_type": lens.fields.kind, "field_unit": FIELD_UNITS[lens.fields.kind], "results": results}
-
-
-def field_label(field: Tensor) -> str:
-    """A field point in words: its y alone on the axis of x."""
-    x, y = field.tolist()
-    return f"{y:g}" if x == 0 else f"{x:g},{y:g}"

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from raytrace.cli.door import CommandError, field_points, number, numbers, open_lens, print_json, ray_aiming
+from raytrace.cli.door import CommandError, field_points, number, open_lens, print_json, ray_aiming
+from raytrace.cli.spots import field_label, spot_entry
 from raytrace.lens import FIELD_UNITS, Lens
 from raytrace.streaming import MAX_BYTES, StreamedSpot, stream_spots
 
@@ -51,13 +52,8 @@ def _check(arguments: argparse.Namespace) -> None:
 def _document(lens: Lens, fields: Tensor, spots: StreamedSpot) -> dict:
     results = [
         {
-            "field": numbers(fields[:, f]),
-            "wavelength": wavelength,
-            "centroid": numbers(spots.centroid[:, f, w]) if int(spots.rays[f, w]) else [None, None],
-            "rms_radius": number(spots.rms_radius[f, w]) if int(spots.rays[f, w]) else None,
-            "geometric_radius": number(spots.geometric_radius[f, w]) if int(spots.rays[f, w]) else None,
+            **spot_entry(fields, wavelength, spots, f, w),
             "geometric_bound": number(spots.geometric_bound[f, w]) if int(spots.rays[f, w]) else None,
-            "rays": int(spots.rays[f, w]),
             "launched": spots.launched,
         }
         for f in range(fields.shape[1])
@@ -73,8 +69,7 @@ def _print(lens: Lens, fields: Tensor, each: StreamedSpot, whole: StreamedSpot) 
     )
     print(f"{unit:>10} {'µm':>11} {'mm':>13} {'mm':>13} {'µm':>10} {'µm':>10} {'lost':>11}")
     for f in range(fields.shape[1]):
-        x, y = fields[:, f].tolist()
-        label = f"{y:g}" if x == 0 else f"{x:g},{y:g}"
+        label = field_label(fields[:, f])
         for w, wavelength in enumerate(lens.wavelengths.tolist()):
             print(f"{label:>10} {wavelength:>11g} {_numbers(each, (f, w))} {each.launched - int(each.rays[f, w]):>11}")
         if len(lens.wavelengths) > 1:

@@ -4,12 +4,7 @@ import argparse
 import sys
 
 from raytrace.cli import ray_table
-from raytrace.cli.door import (
-    open_lens,
-    print_json,
-    ray_aiming,
-    say,
-)
+from raytrace.cli.door import open_lens, print_json, ray_aiming, say
 from raytrace.files import write_atomically
 
 

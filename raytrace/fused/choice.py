@@ -18,7 +18,7 @@ from raytrace.rays import Rays
 
 ENGINES = ("auto", "eager", "fused")
 
-_WORTH_BUILDING = 2**23  # rays × surfaces of one call: it takes torch 0.3 s, and compiling, once for a machine, 10 s
+WORTH_COMPILING = 2**23  # rays × surfaces of one call: it takes torch 0.3 s, and compiling, once for a machine, 10 s
 
 _engine: contextvars.ContextVar[str | None] = contextvars.ContextVar("engine", default=None)
 _refused: list[str] = []
@@ -63,7 +63,7 @@ def is_fused(rays: Rays, numbers: Tensor, surfaces: int) -> bool:
     if asked == "fused":
         library()
         return True
-    return _available(build=rays.direction[0].numel() * surfaces >= _WORTH_BUILDING)
+    return _available(build=rays.direction[0].numel() * surfaces >= WORTH_COMPILING)
 
 
 def _has_form(rays: Rays, numbers: Tensor) -> bool:

@@ -63,6 +63,15 @@ inline bool sag(const Surface<T>& s, int terms, T u, T& S, T& dS, T& d2S) {
   return inside;
 }
 
+// Ray i behind a surface; 1 if it is flagged.
+template <typename T>
+inline int leave(Rays<T>& to, Notes<T>& notes, int i, T x, T y, T z, T L, T M, T N, bool good) {
+  to.x[i] = x, to.y[i] = y, to.z[i] = z;
+  to.L[i] = L, to.M[i] = M, to.N[i] = N;
+  notes.flagged[i] = good ? T(0) : T(1);
+  return good ? 0 : 1;
+}
+
 template <typename T, int bend, bool path>
 int cross_plane(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, const Surface<T>& s) {
   const Law<T, bend> law(s);
@@ -77,13 +86,8 @@ int cross_plane(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, const 
     bool good = magnitude(t) < kFar<T>;
     T l = L, m = M, o = N;
     if (bend != kNone) good &= law(l, m, o, T(0), T(0), T(1), N, T(1));
-    if (path) {
-      to.path[i] = from.path[i] + s.n1 * reduced_path(hx, hy, T(0), x, y, z, L, M, N, gap, has_gap, side);
-    }
-    to.x[i] = hx, to.y[i] = hy, to.z[i] = T(0);
-    to.L[i] = l, to.M[i] = m, to.N[i] = o;
-    notes.flagged[i] = good ? T(0) : T(1);
-    flagged += good ? 0 : 1;
+    if (path) to.path[i] = from.path[i] + s.n1 * reduced_path(hx, hy, T(0), x, y, z, L, M, N, gap, has_gap, side);
+    flagged += leave(to, notes, i, hx, hy, T(0), l, m, o, good);
   }
   return flagged;
 }
@@ -123,13 +127,8 @@ int cross_conic(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, const 
       T w = conic ? T(1) - s.k * c * c * (hx * hx + hy * hy) : T(1);
       good &= law(l, m, o, -c * hx, -c * hy, nz, cosine, w);
     }
-    if (path) {
-      to.path[i] = from.path[i] + s.n1 * reduced_path(hx, hy, hz, x, y, z, L, M, N, gap, has_gap, side);
-    }
-    to.x[i] = hx, to.y[i] = hy, to.z[i] = hz;
-    to.L[i] = l, to.M[i] = m, to.N[i] = o;
-    notes.flagged[i] = good ? T(0) : T(1);
-    flagged += good ? 0 : 1;
+    if (path) to.path[i] = from.path[i] + s.n1 * reduced_path(hx, hy, hz, x, y, z, L, M, N, gap, has_gap, side);
+    flagged += leave(to, notes, i, hx, hy, hz, l, m, o, good);
   }
   return flagged;
 }
@@ -203,13 +202,8 @@ int cross_asphere(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, cons
     good &= cosine * cosine > kGrazing<T> * T(0.1) * w;
     T l = L, m = M, o = N;
     if (bend != kNone) good &= law(l, m, o, -slope * hx, -slope * hy, T(1), cosine, w);
-    if (path) {
-      to.path[i] = from.path[i] + s.n1 * reduced_path(hx, hy, hz, x, y, z, L, M, N, gap, has_gap, side);
-    }
-    to.x[i] = hx, to.y[i] = hy, to.z[i] = hz;
-    to.L[i] = l, to.M[i] = m, to.N[i] = o;
-    notes.flagged[i] = good ? T(0) : T(1);
-    flagged += good ? 0 : 1;
+    if (path) to.path[i] = from.path[i] + s.n1 * reduced_path(hx, hy, hz, x, y, z, L, M, N, gap, has_gap, side);
+    flagged += leave(to, notes, i, hx, hy, hz, l, m, o, good);
   }
   return flagged;
 }

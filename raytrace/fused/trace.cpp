@@ -37,38 +37,35 @@ using Pushes = void (*)(const Rays<T>&, const Rays<T>&, Rays<T>&, int, const Sur
 template <typename T>
 using Pulls = Sums<T> (*)(const Rays<T>&, const Rays<T>&, Cotangents<T>&, Notes<T>&, int, const Surface<T>&);
 
-template <typename T, int bend, bool path>
-Crosses<T> crosses_for(const Layout& at) {
-  if (at.kind == kPlane) return cross_plane<T, bend, path>;
-  if (at.kind == kSphere) return cross_conic<T, bend, path, false>;
-  if (at.kind == kConic) return cross_conic<T, bend, path, true>;
-  if (at.terms <= 4) return cross_asphere<T, bend, path, 4>;
-  return at.terms <= 8 ? cross_asphere<T, bend, path, 8> : cross_asphere<T, bend, path, kTerms>;
+// The functions for one kind of surface.
+template <typename T, int kind, int bend, bool path, int terms>
+struct Of {
+  static Crosses<T> crosses() {
+    if constexpr (kind == kPlane) return cross_plane<T, bend, path>;
+    else if constexpr (kind == kAsphere) return cross_asphere<T, bend, path, terms>;
+    else return cross_conic<T, bend, path, kind == kConic>;
+  }
+  static Pulls<T> pulls() { return pull<T, kind, bend, path, terms>; }
+  static Pushes<T> pushes() { return push<T, kind, bend, path, terms>; }
+};
+
+// Calls work(Of<…>{}) for the kind of a surface, what it does to light, and whether the path is asked for.
+template <typename T, int bend, bool path, typename Work>
+void by_kind(const Layout& at, Work work) {
+  if (at.kind == kPlane) work(Of<T, kPlane, bend, path, 0>{});
+  else if (at.kind == kSphere) work(Of<T, kSphere, bend, path, 0>{});
+  else if (at.kind == kConic) work(Of<T, kConic, bend, path, 0>{});
+  else if (at.terms <= 4) work(Of<T, kAsphere, bend, path, 4>{});
+  else if (at.terms <= 8) work(Of<T, kAsphere, bend, path, 8>{});
+  else work(Of<T, kAsphere, bend, path, kTerms>{});
 }
 
-template <typename T, int bend, bool path>
-Pulls<T> pulls_for(const Layout& at) {
-  if (at.kind == kPlane) return pull<T, kPlane, bend, path, 0>;
-  if (at.kind == kSphere) return pull<T, kSphere, bend, path, 0>;
-  if (at.kind == kConic) return pull<T, kConic, bend, path, 0>;
-  if (at.terms <= 4) return pull<T, kAsphere, bend, path, 4>;
-  return at.terms <= 8 ? pull<T, kAsphere, bend, path, 8> : pull<T, kAsphere, bend, path, kTerms>;
+template <typename T, bool path, typename Work>
+void by_bend(const Layout& at, Work work) {
+  if (at.bend == kNone) by_kind<T, kNone, path>(at, work);
+  else if (at.bend == kRefract) by_kind<T, kRefract, path>(at, work);
+  else by_kind<T, kReflect, path>(at, work);
 }
-
-template <typename T, int bend, bool path>
-Pushes<T> pushes_for(const Layout& at) {
-  if (at.kind == kPlane) return push<T, kPlane, bend, path, 0>;
-  if (at.kind == kSphere) return push<T, kSphere, bend, path, 0>;
-  if (at.kind == kConic) return push<T, kConic, bend, path, 0>;
-  if (at.terms <= 4) return push<T, kAsphere, bend, path, 4>;
-  return at.terms <= 8 ? push<T, kAsphere, bend, path, 8> : push<T, kAsphere, bend, path, kTerms>;
-}
-
-// `of` is crosses_for, pulls_for or pushes_for.
-#define CHOOSE(of, T, at, path)                                                                              \
-  ((at).bend == kNone      ? ((path) ? of<T, kNone, true>(at) : of<T, kNone, false>(at))                       \
-   : (at).bend == kRefract ? ((path) ? of<T, kRefract, true>(at) : of<T, kRefract, false>(at))                 \
-                           : ((path) ? of<T, kReflect, true>(at) : of<T, kReflect, false>(at)))
 
 // A ray passes all apertures of a surface (surface.py, `inside`); six constants each.
 template <typename T>
@@ -192,9 +189,11 @@ class Trace {
     const T* numbers = static_cast<const T*>(call_.table) + row * call_.numbers;
     for (int64_t k = 0; k < call_.surfaces; k++) {
       const Layout& at = call_.layout[k];
-      steps_[k] = {surface_of(at, numbers, call_.constants), CHOOSE(crosses_for, T, at, path_),
-                   CHOOSE(crosses_for, T, at, false), CHOOSE(pulls_for, T, at, path_),
-                   CHOOSE(pushes_for, T, at, path_)};
+      Step<T>& step = steps_[k];
+      step.surface = surface_of(at, numbers, call_.constants);
+      auto all = [&step](auto of) { step.crosses = of.crosses(), step.pulls = of.pulls(), step.pushes = of.pushes(); };
+      by_bend<T, false>(at, [&step](auto of) { step.silently = of.crosses(); });
+      path_ ? by_bend<T, true>(at, all) : by_bend<T, false>(at, all);
     }
   }
 
