@@ -71,7 +71,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         warnings.simplefilter("always")
         warnings.showwarning = _show_warning
         try:
-            getattr(importlib.import_module(f"raytrace.cli.{module}"), function)(arguments)
+            with importlib.import_module("raytrace.cli.progress").heartbeat(arguments.command):
+                getattr(importlib.import_module(f"raytrace.cli.{module}"), function)(arguments)
         except KeyboardInterrupt:
             return _fail("interrupted", 130)
         except BrokenPipeError:

@@ -8,7 +8,6 @@ from pathlib import Path
 from types import ModuleType
 
 import torch
-from tqdm import tqdm
 
 from raytrace.bench import codesign_accuracy, codesign_report, psf, psf_report
 from raytrace.bench.measure import Row, calls, field_rays, measure, surfaces_of
@@ -16,6 +15,7 @@ from raytrace.bench.psf_cases import USUAL, cases
 from raytrace.bench.report import machine, markdown
 from raytrace.cli import speed_bench, wave_bench
 from raytrace.cli.door import CommandError, open_lens, print_json, say
+from raytrace.cli.progress import progress
 from raytrace.files import write_atomically
 from raytrace.lens import Lens
 
@@ -61,7 +61,7 @@ def _bench_trace(arguments: argparse.Namespace, peer: ModuleType | None, threads
         raise CommandError(f"{name}: not every ray of the middle field starts; choose another lens")
     peers = peer.peers(lens) if peer else []
     total = calls(counts, repeats=arguments.repeats, peers=peers)
-    with tqdm(total=total, desc="measuring", unit="call", disable=None) as bar:
+    with progress(total, "call", what="measuring") as bar:
         rows = measure(lens, counts, repeats=arguments.repeats, peers=peers, threads=threads, progress=bar.update)
     _write_trace(arguments, name, rows, surfaces_of(lens), _about(peer))
 
@@ -70,7 +70,7 @@ def _bench_psf(arguments: argparse.Namespace, peer: ModuleType | None, threads: 
     lenses = {Path(name).stem: name for name in arguments.lenses or USUAL}
     found = cases([(stem, _open(name)) for stem, name in lenses.items()])
     others = {"peer_methods": importlib.import_module("raytrace.bench.psf_peer").peer_methods} if peer else {}
-    with tqdm(total=psf.steps(found), desc="measuring", disable=None) as bar:
+    with progress(psf.steps(found), what="measuring") as bar:
         rows = psf.measure(
             found, repeats=arguments.repeats, threads=threads, progress=bar.update, say=bar.write, **others
         )
@@ -95,7 +95,7 @@ def _bench_codesign(arguments: argparse.Namespace) -> None:
     chosen, fields, sensors = codesign_accuracy.entrants(), codesign_accuracy.FIELDS, codesign_accuracy.SENSORS
     scenes = {"fields": fields, "sensors": sensors, "samples": codesign_accuracy.SAMPLES}
     total = codesign_accuracy.steps(chosen, fields=len(fields), sensors=len(sensors), repeats=arguments.repeats)
-    with tqdm(total=total, desc="measuring", disable=None) as bar:
+    with progress(total, what="measuring") as bar:
         rows, gaps = codesign_accuracy.measure(
             _open("double_gauss"), chosen=chosen, repeats=arguments.repeats, progress=bar.update, **scenes
         )

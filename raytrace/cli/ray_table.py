@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import pandas
 import torch
-from tqdm import tqdm
 
 from raytrace.cli.door import CommandError, check_glasses, primary
 from raytrace.launch import launch
@@ -181,12 +180,13 @@ def _without_nan(row: dict) -> dict:
 
 
 def write_csv(
-    put: Callable[[str], object], lens: Lens, batches: Iterable[Batch], total: int, fates: Fates, *, progress: bool
+    put: Callable[[str], object], lens: Lens, batches: Iterable[Batch], fates: Fates, progress: Callable[[int], object]
 ) -> None:
-    """Write the traced batches as CSV; every float as the shortest text that reads back the same."""
+    """Write the traced batches as CSV; every float as the shortest text that reads back the same.
+
+    progress: called with the number of rays of each batch.
+    """
     put(",".join(OUTPUT) + "\n")
-    hide = not (progress and total > _BATCH)
-    with tqdm(total=total, unit="ray", unit_scale=True, disable=hide) as bar:
-        for batch in batches:
-            put(traced(lens, batch, fates).to_csv(header=False, index=False))
-            bar.update(len(batch.wavelength))
+    for batch in batches:
+        put(traced(lens, batch, fates).to_csv(header=False, index=False))
+        progress(len(batch.wavelength))

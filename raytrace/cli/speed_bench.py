@@ -8,7 +8,6 @@ from pathlib import Path
 from types import ModuleType
 
 import torch
-from tqdm import tqdm
 
 from raytrace import plot
 from raytrace.bench import less_work, speed, speed_report
@@ -16,6 +15,7 @@ from raytrace.bench.limit import Built, NoCompiler, build
 from raytrace.bench.report import machine
 from raytrace.bench.speed_own import three_aspheres
 from raytrace.cli.door import number, print_json, say
+from raytrace.cli.progress import Bar, Lines, progress
 from raytrace.files import write_atomically
 from raytrace.plot.speed import speed_figure
 
@@ -31,7 +31,7 @@ def bench_speed(arguments: argparse.Namespace, *, with_peers: bool) -> None:
         benches = _benches(arguments, threads, built, peers)
         sizes = benches[0].sizes
         total = speed.stages(benches) + len(less_work.cases(sizes))
-        with tqdm(total=total, desc="measuring", disable=None) as bar:
+        with progress(total, what="measuring") as bar:
             rows, ratios = speed.measure(benches, progress=lambda words: _show(bar, words))
             gains = less_work.measure(sizes, repeats=arguments.repeats, progress=lambda words: _show(bar, words))
         torch.set_num_threads(threads)
@@ -54,7 +54,7 @@ def bench_speed(arguments: argparse.Namespace, *, with_peers: bool) -> None:
         print(report, end="")
 
 
-def _show(bar: tqdm, words: str) -> None:
+def _show(bar: Bar | Lines, words: str) -> None:
     bar.set_postfix_str(words)
     bar.update()
 

@@ -4,10 +4,10 @@ import argparse
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from raytrace import pupil
 from raytrace.cli.door import field_points, open_lens, print_json, ray_aiming, say
+from raytrace.cli.progress import progress
 from raytrace.cli.spots import field_label, pupil_points, spot_entry
 from raytrace.launch import launch
 from raytrace.lens import FIELD_UNITS, Lens
@@ -62,8 +62,7 @@ def _to_sensor(lens: Lens, points: Tensor, fields: Tensor, aiming: bool | None) 
     """Rays (3, F, W, P) on the sensor, traced field by field; how many were not aimed; which were vignetted."""
     indices = media(lens, lens.wavelengths[:, None])
     arrived, vignetted, unaimed = [], [], 0
-    long = points.shape[1] * len(lens.wavelengths) * fields.shape[1] * len(lens.surfaces) > 1_000_000
-    for field in tqdm(fields.unbind(1), unit="field", disable=not long):
+    for field in progress(fields.unbind(1), "field", what="spot"):
         rays = launch(lens, points, fields=field[:, None], ray_aiming=aiming)
         unaimed += int((~rays.valid).sum())
         clipped = torch.zeros_like(rays.valid)

@@ -4,9 +4,9 @@ import argparse
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from raytrace.cli.door import CommandError, field_points, number, open_lens, print_json, ray_aiming
+from raytrace.cli.progress import progress
 from raytrace.cli.spots import field_label, spot_entry
 from raytrace.lens import FIELD_UNITS, Lens
 from raytrace.streaming import MAX_BYTES, StreamedSpot, stream_spots
@@ -20,7 +20,7 @@ def spot(arguments: argparse.Namespace) -> None:
     lens = open_lens(arguments)
     fields = field_points(lens, arguments)
     total = arguments.rays * fields.shape[1] * len(lens.wavelengths)
-    with tqdm(total=total, unit="ray", unit_scale=True, leave=False) as bar:
+    with progress(total, "ray", what="spot") as bar:
         each, whole = stream_spots(
             lens,
             arguments.rays,

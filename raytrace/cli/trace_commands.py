@@ -5,6 +5,7 @@ import sys
 
 from raytrace.cli import ray_table
 from raytrace.cli.door import open_lens, print_json, ray_aiming, say
+from raytrace.cli.progress import Lines, progress
 from raytrace.files import write_atomically
 
 
@@ -21,9 +22,10 @@ def trace(arguments: argparse.Namespace) -> None:
     if arguments.output:
 
         def write(file):
-            ray_table.write_csv(lambda text: file.write(text.encode()), lens, batches, total, fates, progress=True)
+            ray_table.write_csv(lambda text: file.write(text.encode()), lens, batches, fates, bar.update)
 
-        write_atomically(arguments.output, write)
+        with progress(total, "ray", what="trace") as bar:
+            write_atomically(arguments.output, write)
         if arguments.json:
             print_json({"rays": total, "output": arguments.output, "lost": fates.counts()})
         else:
@@ -31,6 +33,7 @@ def trace(arguments: argparse.Namespace) -> None:
     elif arguments.json:
         ray_table.write_json(sys.stdout.write, lens, batches, total, fates)
     else:
-        ray_table.write_csv(sys.stdout.write, lens, batches, total, fates, progress=False)
+        with Lines(total, "ray", what="trace") as lines:  # no bar: the terminal may be where the rays are written
+            ray_table.write_csv(sys.stdout.write, lens, batches, fates, lines.update)
     for line in fates.lines():
         say(line)

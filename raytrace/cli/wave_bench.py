@@ -4,13 +4,12 @@ import argparse
 import dataclasses
 from pathlib import Path
 
-from tqdm import tqdm
-
 from raytrace import plot
 from raytrace.bench import wave_report
 from raytrace.bench.report import machine
 from raytrace.bench.wave import agreement, bench_scene, entrants, measure, target
 from raytrace.cli.door import number, print_json
+from raytrace.cli.progress import progress
 from raytrace.files import write_atomically
 from raytrace.plot.wave import bench_figure
 
@@ -18,7 +17,7 @@ from raytrace.plot.wave import bench_figure
 def bench_wave(arguments: argparse.Namespace) -> None:
     """Every engine at several samplings beside the talk's method, in one run and one thread."""
     found = entrants()
-    with tqdm(total=len(found) * (1 + arguments.repeats), desc="measuring", disable=None) as bar:
+    with progress(len(found) * (1 + arguments.repeats), what="measuring") as bar:
         rows = measure(found, repeats=arguments.repeats, progress=bar.update)
     apart = agreement(bench_scene())
     about = machine() | {"torch threads": 1}

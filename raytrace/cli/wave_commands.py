@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from raytrace import plot
 from raytrace.cli.door import CommandError, number, print_json, say
+from raytrace.cli.progress import progress
 from raytrace.cli.wave_setup import elements, kernels, scene
 from raytrace.design.focusing import Learned, Setting, learn_to_focus
 from raytrace.files import write_atomically
@@ -61,7 +61,7 @@ def _caustic(arguments: argparse.Namespace, seen: WaveScene, found: WavePsf):
     """Planes from four fifths of the sensor distance to six fifths; light up to a tenth of the aperture."""
     z = seen.sensor_distance
     distances, half = z * torch.linspace(0.8, 1.2, _PLANES, dtype=z.dtype), 0.05 * arguments.aperture
-    planes = tqdm(distances, desc="planes", disable=None)
+    planes = progress(distances, "plane", what="caustic")
     light = torch.cat([caustic(seen, plane[None], half=half) for plane in planes], -2)
     return figures.caustic_figure(
         light,
@@ -186,13 +186,13 @@ def focus(arguments: argparse.Namespace) -> None:
     torch.set_num_threads(1)  # arrays are small: a second thread would only wait
     torch.optim.SGD([torch.zeros(1)], 1.0)  # torch loads its compiler with the first optimiser: no part of learning
     began, busy = time.perf_counter(), time.process_time()
-    with tqdm(total=arguments.steps, desc="learning", unit="step", disable=None) as bar:
+    with progress(arguments.steps, what="learning") as bar:
 
-        def progress(step: int, ratio: float) -> None:
+        def show(step: int, ratio: float) -> None:
             bar.set_postfix_str(f"peak {ratio:.3f} of the ideal lens's")
             bar.update(min(1, step))
 
-        found = learn_to_focus(setting, steps=arguments.steps, frames=_SHOWN, progress=progress)
+        found = learn_to_focus(setting, steps=arguments.steps, frames=_SHOWN, progress=show)
     seconds, busy = time.perf_counter() - began, time.process_time() - busy
     torch.set_num_threads(threads)
     if arguments.output:

@@ -5,14 +5,14 @@ import dataclasses
 import json
 import math
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from tqdm import tqdm
 
 from raytrace.cli.codesign_setup import plain
 from raytrace.cli.door import CommandError, print_json, say
+from raytrace.cli.progress import progress
 from raytrace.cli.wave_edof_table import STARTS, STEPS
 from raytrace.design.edof import Quality, World, kernels, periodic, quality, spectrum
 from raytrace.design.edof_page import CAPTIONS, markdown
@@ -72,7 +72,7 @@ def table(arguments: argparse.Namespace) -> None:
     contents, train = _contents(arguments)
     learned = _learned(arguments, rows, world, train)
     elements = elements_of(rows, world, spectrum(contents[0].train), learned=learned)
-    found = table_of(contents, elements, world, progress=lambda given: _bar(given, "rows"))
+    found = table_of(contents, elements, world, progress=lambda given: progress(given, "row"))
     if arguments.docs:
         _write_page(Path(arguments.docs), found, elements, world, arguments)
     if arguments.json:
@@ -106,10 +106,10 @@ def _learn(settings: Settings, world: World, train: Pictures, folder: Path, labe
     """A learned camera, trained as far as is left, with a bar."""
     S = spectrum(periodic(train, settings.size))
     try:
-        camera, run = begin(settings, world, S, folder, progress=lambda given: _bar(given, f"{label}: starts"))
+        camera, run = begin(settings, world, S, folder, progress=lambda given: progress(given, "start", what=label))
         bar, last = None, None
         for step, record in learn_element(camera, train, settings, run):
-            bar = bar or tqdm(total=settings.steps, initial=step, desc=label, unit="step", disable=None)
+            bar = bar or progress(settings.steps, what=label, initial=step)
             bar.set_postfix_str(f"loss {record['loss']:.6f}", refresh=False)
             bar.update()
             last = record
@@ -134,7 +134,7 @@ def _from_folder(arguments: argparse.Namespace) -> Pictures:
     try:
         paths = files(arguments.data)
         paths = [paths[i * len(paths) // arguments.limit] for i in range(min(arguments.limit, len(paths)))]
-        return read(list(dict.fromkeys(paths)), least=_WIDE // 2, progress=lambda given: _bar(given, "pictures"))
+        return read(list(dict.fromkeys(paths)), least=_WIDE // 2, progress=lambda given: progress(given, "picture"))
     except NoPictures as error:
         raise CommandError(str(error)) from error
 
@@ -143,7 +143,7 @@ def _contents(arguments: argparse.Namespace) -> tuple[list[Content], Pictures]:
     """All contents of the table, and the pictures that elements are learned from: sharp leaves."""
     made = {
         name: dead_leaves(_LEAVES, size=_WIDE // 2, seed=arguments.seed, smallest=smallest)
-        for name, smallest in _bar(LEAVES.items(), "dead leaves")
+        for name, smallest in progress(LEAVES.items(), "dead leaf")
     }
     learn_from = split(made["sharp leaves"])[0]
     if arguments.data:
@@ -245,7 +245,3 @@ def _print_table(found) -> None:
             ]
             print(f"{NAMES[record['row']]:>32} {cells[0]:>14} {cells[1]:>14} {record['spread_blind']:>7.2f} {talk:>14}")
         print()
-
-
-def _bar(given: Iterable, what: str):
-    return tqdm(list(given), desc=what, leave=False, disable=None)

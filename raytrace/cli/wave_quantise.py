@@ -10,8 +10,9 @@ from torch import Tensor
 
 from raytrace.catalog import find_glass
 from raytrace.cli.door import CommandError, print_json
+from raytrace.cli.progress import progress
 from raytrace.cli.wave_setup import height_map
-from raytrace.cli.wave_superres import bar, folders, page, pictures, write_csv
+from raytrace.cli.wave_superres import folders, page, pictures, write_csv
 from raytrace.design.edof import World, periodic, spectrum
 from raytrace.design.edof_training import Settings
 from raytrace.design.quantise import (
@@ -53,7 +54,7 @@ def quantise(arguments: argparse.Namespace) -> None:
             levels=arguments.levels,
             ways=ways,
             steps=arguments.steps,
-            progress=lambda cases: bar(cases, "elements"),
+            progress=lambda cases: progress(cases, "element"),
         )
         steps += rows
         for way in ways:
@@ -101,7 +102,7 @@ def _learned(arguments, world: World, train: Pictures, S: Tensor) -> tuple[str, 
     settings = Settings(steps=arguments.learn, starts=arguments.starts, seed=arguments.seed)
     with tempfile.TemporaryDirectory() as temporary:
         folder = arguments.output or temporary
-        for _ in bar(learned(settings, world, S, train, folder), "learning"):
+        for _ in progress(learned(settings, world, S, train, folder), what="learning"):
             pass
         return "learned", *read(folder, S)
 

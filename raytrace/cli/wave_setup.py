@@ -10,10 +10,10 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from raytrace.catalog import find_glass
 from raytrace.cli.door import CommandError, catalogs
+from raytrace.cli.progress import progress
 from raytrace.glass import Glass, check_wavelengths
 from raytrace.glass_table import from_table
 from raytrace.grid import grid
@@ -158,7 +158,7 @@ def kernels(found: WaveScene, *, engine: str, samples: int | None, tol: float) -
 
 def _one_by_one(found: WaveScene, chosen: Plan) -> WavePsf:
     rows = []
-    with tqdm(total=len(found.depths) * len(found.wavelengths), desc="kernels", disable=None) as bar:
+    with progress(len(found.depths) * len(found.wavelengths), "kernel", what="wave psf") as bar:
         for depth in found.depths.split(1):
             row = []
             for wavelength in found.wavelengths.split(1):

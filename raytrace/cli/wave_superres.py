@@ -4,12 +4,11 @@ import argparse
 import csv
 import dataclasses
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-from tqdm import tqdm
-
 from raytrace.cli.door import print_json, say
+from raytrace.cli.progress import progress
 from raytrace.deconvolve import psnr
 from raytrace.design.edof import World, periodic, spectrum
 from raytrace.design.report import KEPT, below_the_mark, table
@@ -38,10 +37,6 @@ from raytrace.superresolution import least_error
 _NOISES = (0.0003, 0.001, 0.003, 0.01, 0.03)
 
 
-def bar(given: Iterable, what: str) -> Iterable:
-    return tqdm(given, desc=what, leave=False, disable=None)
-
-
 def pictures(arguments: argparse.Namespace, least: int) -> tuple[Pictures, Pictures, str]:
     """To make filters for, to restore, and what they are."""
     if not arguments.data:
@@ -49,7 +44,7 @@ def pictures(arguments: argparse.Namespace, least: int) -> tuple[Pictures, Pictu
     paths = files(arguments.data)
     if arguments.limit < len(paths):
         paths = [paths[i * len(paths) // arguments.limit] for i in range(arguments.limit)]
-    return *split(read_pictures(paths, least=least, progress=lambda given: bar(given, "pictures"))), "pictures"
+    return *split(read_pictures(paths, least=least, progress=lambda given: progress(given, "picture"))), "pictures"
 
 
 # --- super-resolution
@@ -72,7 +67,7 @@ def superres(arguments: argparse.Namespace) -> None:
     """Learn, restore and compare; draw, write the page."""
     train, test, kind = pictures(arguments, 96)
     cameras = [(factor, tuple(colours)) for factor in arguments.factor for colours in arguments.wavelength or [[0.55]]]
-    blocks = [_block(arguments, factor, colours, train, test) for factor, colours in bar(cameras, "cameras")]
+    blocks = [_block(arguments, factor, colours, train, test) for factor, colours in progress(cameras, "camera")]
     noises = _over_noise(arguments, train, test) if arguments.docs else []
     if arguments.json:
         print_json({"noise": arguments.noise, "pictures": kind, "cameras": [_document(block) for block in blocks]})
@@ -122,7 +117,7 @@ def _over_noise(arguments, train: Pictures, test: Pictures) -> list[dict]:
     """The small scene of the first camera at several noises, everything made for each."""
     colours = (arguments.wavelength or [[0.55]])[0]
     found = []
-    for noise in bar(_NOISES, "noises"):
+    for noise in progress(_NOISES, "noise"):
         world = world_of(colours, noise=noise)
         rows, _, _ = _small(arguments, world, arguments.factor[0], train, test, arguments.places[:1])
         found.append({"noise": noise, **{row.name: row.psnr for row in rows}})

@@ -1,0 +1,138 @@
+"""How far a long command has come, on standard error: a bar on a terminal, else one line every ten seconds.
+
+    with progress(total, "ray", what="tracing") as bar:
+        bar.update(many)
+    for plane in progress(planes, "plane"):
+        ...
+
+Around every command stands `heartbeat`: it writes the lines, from a thread of its own, so that they come also while a
+single step takes minutes, and in a command that counts nothing.
+"""
+
+import contextlib
+import os
+import sys
+import threading
+import time
+from collections.abc import Iterable, Iterator, Sized
+
+from tqdm import tqdm
+
+EVERY = 10.0  # s between two lines
+_THOUSANDS = ("ray",)  # units that are counted by the million
+
+_open: list["Bar | Lines"] = []  # what is under way, the innermost last
+
+
+def progress(work: int | Iterable | None, unit: str = "step", *, what: str = "", initial: int = 0) -> "Bar | Lines":
+    """The progress of some work: `update(n)`, `set_postfix_str(words)`, `close()`, as tqdm's; a context manager.
+
+    work: the number of steps, None where it is not known, or what is to be gone through, which is then iterated over.
+    what: what is done, for people; unit: of the steps; initial: of them, those done before.
+    """
+    items, total = _parts(work)
+    if total is None or not _is_terminal():
+        return Lines(work, unit, what=what, initial=initial)
+    many = unit in _THOUSANDS
+    return Bar(items, total=total, desc=what or None, unit=unit, initial=initial, unit_scale=many, leave=False)
+
+
+@contextlib.contextmanager
+def heartbeat(what: str) -> Iterator[None]:
+    """Within the block, a line every ten seconds about what is under way; none while a bar stands on a terminal."""
+    done, before = threading.Event(), [*_open]
+
+    def beat() -> None:
+        while not done.wait(EVERY):
+            shown = _open[-1:]
+            if shown and isinstance(shown[0], Lines) and os.environ.get("RANK", "0") == "0":  # of processes, one speaks
+                print(f"raytrace: {shown[0]}", file=sys.stderr, flush=True)
+
+    Lines(None, what=what)
+    threading.Thread(target=beat, daemon=True).start()
+    try:
+        yield
+    finally:
+        done.set()
+        _open[:] = before  # what a failure left open, too
+
+
+class Bar(tqdm):
+    """A bar, while which no lines are written."""
+
+    def __init__(self, *arguments, **keywords):
+        super().__init__(*arguments, **keywords)
+        _open.append(self)
+
+    def write(self, words: str) -> None:
+        super().write(words, file=sys.stderr)
+
+    def close(self) -> None:
+        _leave(self)
+        super().close()
+
+
+class Lines:
+    """Progress in words: `tracing: 3/10 planes, 0:20 gone, about 0:47 left`."""
+
+    def __init__(self, work: int | Iterable | None, unit: str = "step", *, what: str = "", initial: int = 0):
+        self.items, self.total = _parts(work)
+        self.what, self.unit = what, unit
+        self.n = self.initial = initial
+        self.begun, self.words = time.monotonic(), ""
+        _open.append(self)
+
+    def update(self, n: int = 1) -> None:
+        self.n += n
+
+    def set_postfix_str(self, words: str = "", refresh: bool = True) -> None:
+        self.words = words
+
+    def write(self, words: str) -> None:
+        print(words, file=sys.stderr)
+
+    def close(self) -> None:
+        _leave(self)
+
+    def __enter__(self) -> "Lines":
+        return self
+
+    def __exit__(self, *error) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator:
+        with self:
+            for item in self.items:
+                yield item
+                self.update()
+
+    def __str__(self) -> str:
+        passed, gone = time.monotonic() - self.begun, self.n - self.initial
+        said = [f"{self.n:,}{f'/{self.total:,}' if self.total else ''} {self.unit}s"] if self.n else []
+        said.append(f"{clock(passed)} gone")
+        if self.total and gone > 0 and self.n <= self.total:
+            said.append(f"about {clock(passed * (self.total - self.n) / gone)} left")
+        return ": ".join(filter(None, [self.what, ", ".join(filter(None, [*said, self.words]))]))
+
+
+def clock(seconds: float) -> str:
+    """Minutes and seconds for people, as 1:07; with hours where there are any."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def _parts(work: int | Iterable | None) -> tuple[Iterable | None, int | None]:
+    """What is gone through, and in how many steps, as far as is known."""
+    if not isinstance(work, Iterable):
+        return None, work
+    return work, len(work) if isinstance(work, Sized) else None
+
+
+def _leave(entry: "Bar | Lines") -> None:
+    if _open:  # None where a bar outlives this module
+        _open[:] = [other for other in _open if other is not entry]
+
+
+def _is_terminal() -> bool:
+    return sys.stderr is not None and sys.stderr.isatty()
