@@ -1,26 +1,29 @@
 """Launch: from field points and pupil points to rays in front of surface 1.
 
 Rays start on the plane of the paraxial entrance pupil (at the primary wavelength), wherever it lies; an object 10¹² mm
-away costs no digits. With ray aiming they are steered until they fill the real stop.
+away costs no digits. With ray aiming they are steered until they fill the stop, whose radius is that of the paraxial or
+of the real marginal ray.
 """
 
 import dataclasses
+import warnings
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from raytrace import glass
-from raytrace.lens import Lens
+from raytrace.aiming import aim_at_stop, at_stop
+from raytrace.lens import RAY_AIMING, Lens
 from raytrace.numerics import broadcast_shape, dot, safe_divide, safe_sqrt, unit
 from raytrace.paraxial import FirstOrder, first_order
 from raytrace.rays import Rays
 from raytrace.surface import sag
-from raytrace.trace import media, start, steps, trace, trace_surfaces
+from raytrace.trace import start, trace
 
-_AIMING_STAGES = 1, 20  # the field in one go, and for rays that fail in 20 parts, each started from those before it
-_AIMING_STEPS = 8  # Newton steps at each stage
-_AIMING_TOLERANCE = 1e-7  # of the stop radius, in float64
+
+class MarginalRayLost(UserWarning):
+    """The real marginal ray does not reach the stop, whose size it was to tell."""
 
 
 def launch(
@@ -29,13 +32,13 @@ def launch(
     *,
     fields: Tensor | None = None,
     wavelengths: Tensor | None = None,
-    ray_aiming: bool | None = None,
+    ray_aiming: str | None = None,
 ) -> Rays:
     """Rays of every field, wavelength and pupil point: batch shape (F, W, P).
 
     pupil: (2, P) on the unit disc; fields: (2, F) in the lens's own kind of field, by default those of the lens with
     their vignetting factors (a field given that equals one of the lens's gets its factors too);
-    wavelengths: (W,) µm, by default those of the lens; ray_aiming: by default as the lens asks.
+    wavelengths: (W,) µm, by default those of the lens; ray_aiming: a key of RAY_AIMING, by default the lens's.
     """
     fields = torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields
     wavelengths = lens.wavelengths if wavelengths is None else wavelengths
@@ -68,7 +71,7 @@ def vignette(lens: Lens, field: Tensor, pupil: Tensor) -> Tensor:
 
 
 def rays_of_field(
-    lens: Lens, field: Tensor, pupil: Tensor, *, wavelength: Tensor, ray_aiming: bool | None = None
+    lens: Lens, field: Tensor, pupil: Tensor, *, wavelength: Tensor, ray_aiming: str | None = None
 ) -> Rays:
     """Rays of field points through pupil points; everything broadcasts.
 
@@ -76,17 +79,17 @@ def rays_of_field(
     the stop with ray aiming; wavelength: (...) µm. An aimed ray that finds no way to its stop point is lost.
     Position, direction and validity have axes of 1 where the wavelength makes no difference to them.
     """
-    ray_aiming = lens.ray_aiming if ray_aiming is None else ray_aiming
+    lens = with_ray_aiming(lens, ray_aiming)
     paraxial = first_order(lens)
     index = glass.refractive_index(lens.surfaces[0].glass, wavelength).to(pupil.dtype)
-    field = object_field(lens, field, paraxial, ray_aiming=ray_aiming)
+    field = object_field(lens, field, paraxial)
 
     def through(pupil: Tensor, fraction: float = 1.0) -> Rays:
         return _through_entrance_pupil(lens, _part_of_field(lens, field, fraction), pupil, paraxial, index)
 
-    if not ray_aiming or lens.fields.telecentric:
+    if lens.ray_aiming == "off" or lens.fields.telecentric:
         return through(pupil)
-    aimed, found = aim_at_stop(lens, through, pupil, wavelength)
+    aimed, found = aim_at_stop(lens, through, pupil, wavelength, _aimed_radius(lens, paraxial))
     rays = through(aimed)
     return dataclasses.replace(rays, valid=rays.valid & found)
 
@@ -121,7 +124,7 @@ def is_at_infinity(lens: Lens) -> bool:
     return False
 
 
-def object_field(lens: Lens, field: Tensor, paraxial: FirstOrder, *, ray_aiming: bool = False) -> Tensor:
+def object_field(lens: Lens, field: Tensor, paraxial: FirstOrder) -> Tensor:
     """Field points (2, ...) as slopes (tan θx, tan θy) for an object at infinity, else as object heights in mm."""
     distance, kind = lens.surfaces[0].thickness, lens.fields.kind
     at_infinity = is_at_infinity(lens)
@@ -137,68 +140,7 @@ def object_field(lens: Lens, field: Tensor, paraxial: FirstOrder, *, ray_aiming:
     estimate = _scaled(field, scale)
     if kind == "paraxial_image_height":
         return estimate
-    return _field_of_real_height(lens, field, estimate, paraxial, ray_aiming)
-
-
-def aim_at_stop(lens: Lens, through: Callable[..., Rays], pupil: Tensor, wavelength: Tensor) -> tuple[Tensor, Tensor]:
-    """Entrance pupil points (2, ...) whose rays pass the stop at `pupil` times its radius; and whether found (...).
-
-    through(pupil, fraction): rays of a fraction of the field. Newton's method, where it fails followed from the axis
-    to the full field; the last step is attached, so first derivatives are exact. The signs of the pupil are those of
-    the entrance pupil: where it is an inverted image of the stop, so are aimed and paraxial rays.
-    """
-    surfaces = lens.surfaces[1 : lens.stop + 1]
-    indices = media(lens, wavelength)[: lens.stop + 1]
-    radius = stop_radius(lens) * torch.where(_marginal_height(lens).detach() < 0, -1.0, 1.0)
-
-    def at_stop(pupil: Tensor, fraction: float = 1.0) -> tuple[Tensor, Tensor]:
-        rays = through(pupil, fraction)
-        arrives = rays.valid
-        for crossing in steps(surfaces, rays, indices=indices):
-            rays, arrives = crossing.rays, arrives & ~(crossing.missed | crossing.totally_reflected)
-        return rays.position[:2] / radius, arrives
-
-    batch = broadcast_shape(at_stop(pupil)[0].shape[1:], pupil.shape[1:])
-    target = torch.stack([p.expand(batch) for p in pupil])
-    tolerance = _AIMING_TOLERANCE if pupil.dtype == torch.float64 else 1e-4
-    aim, found = target.detach().clone(), torch.zeros(batch, dtype=torch.bool, device=pupil.device)
-    for stages in _AIMING_STAGES:
-        followed = _follow(at_stop, target.detach(), stages)
-        error, _, arrives = _error_and_jacobian(at_stop, followed, target.detach())
-        close = (error.abs() <= tolerance).all(0) & arrives
-        aim, found = torch.where(close & ~found, followed, aim), found | close
-        if bool(found.all()):
-            break
-    _, jacobian, _ = _error_and_jacobian(at_stop, aim, target.detach())
-    attached = aim - _solve(jacobian, at_stop(aim)[0] - target)
-    return torch.where(found, attached, target), found
-
-
-def _follow(at_stop: Callable, target: Tensor, stages: int) -> Tensor:
-    """Pupil points whose rays reach the target, followed from the axis to the full field in so many stages.
-
-    Each stage starts where the two before it point to, or where the last one ended if that is nearer. A Newton step
-    that loses the ray or leads away from the target is shortened, and not taken.
-    """
-    before = aim = target.clone()
-    for stage in range(1, stages + 1):
-
-        def at_stage(q: Tensor, fraction: float = stage / stages):
-            return at_stop(q, fraction)
-
-        here, ahead = (_error_and_jacobian(at_stage, start, target) for start in (aim, 2 * aim - before))
-        nearer = ahead[2] & (~here[2] | (_length(ahead[0]) < _length(here[0])))
-        before, aim = aim, torch.where(nearer, 2 * aim - before, aim)
-        size = torch.where(nearer, _length(ahead[0]), torch.where(here[2], _length(here[0]), torch.inf))
-        step = torch.where(nearer, _solve(ahead[1], ahead[0]), _solve(here[1], here[0]))
-        share = torch.ones_like(size)
-        for _ in range(_AIMING_STEPS):
-            error, jacobian, arrives = _error_and_jacobian(at_stage, aim - share * step, target)
-            better = arrives & (_length(error) < size)
-            aim = torch.where(better, aim - share * step, aim)
-            size, step = torch.where(better, _length(error), size), torch.where(better, _solve(jacobian, error), step)
-            share = torch.where(better, 1.0, share / 4)
-    return aim
+    return _field_of_real_height(lens, field, estimate, paraxial)
 
 
 def _part_of_field(lens: Lens, field: Tensor, fraction: float) -> Tensor:
@@ -209,20 +151,48 @@ def _part_of_field(lens: Lens, field: Tensor, fraction: float) -> Tensor:
     return _scaled(field, safe_divide(torch.tan(fraction * torch.atan(slope)), slope))
 
 
+def with_ray_aiming(lens: Lens, ray_aiming: str | None) -> Lens:
+    """The lens with another kind of ray aiming, a key of RAY_AIMING; its own where that is None. Raises ValueError."""
+    if ray_aiming is None or ray_aiming == lens.ray_aiming:
+        return lens
+    if ray_aiming not in RAY_AIMING:
+        raise ValueError(f"ray aiming {ray_aiming!r}: expected one of {', '.join(RAY_AIMING)}")
+    return dataclasses.replace(lens, ray_aiming=ray_aiming)
+
+
 def stop_radius(lens: Lens) -> Tensor:
-    """Height in mm at the stop of the real axial ray through the edge of the entrance pupil, primary wavelength."""
-    return lens.aperture.value if lens.aperture.kind == "float_by_stop" else _marginal_height(lens).abs()
+    """Radius in mm of the stop: where the axial ray through the edge of the entrance pupil meets it.
 
-
-def _marginal_height(lens: Lens) -> Tensor:
-    """The same height with its sign: negative where the entrance pupil is an inverted image of the stop."""
-    wavelength = lens.wavelengths[lens.primary_wavelength]
+    The paraxial ray where rays are aimed by it, or where the real one does not reach the stop; else the real one. At
+    the primary wavelength.
+    """
+    if lens.aperture.kind == "float_by_stop":
+        return lens.aperture.value
     paraxial = first_order(lens)
+    if lens.ray_aiming == "paraxial":
+        return paraxial.stop_height.abs()
+    height, arrives = _marginal_height(lens, paraxial)
+    return torch.where(arrives, height.abs(), paraxial.stop_height.abs())
+
+
+def _aimed_radius(lens: Lens, paraxial: FirstOrder) -> Tensor:
+    """The radius of the stop with the sign of `FirstOrder.stop_height`; warns MarginalRayLost."""
+    by_real_ray = lens.ray_aiming == "real" and lens.aperture.kind != "float_by_stop"
+    if by_real_ray and not bool(_marginal_height(lens, paraxial)[1].all()):
+        message = "the real marginal ray does not reach the stop; rays are aimed over the radius of the paraxial one"
+        warnings.warn(message, MarginalRayLost, stacklevel=4)
+    return stop_radius(lens) * torch.where(paraxial.stop_height.detach() < 0, -1.0, 1.0)
+
+
+def _marginal_height(lens: Lens, paraxial: FirstOrder) -> tuple[Tensor, Tensor]:
+    """Height in mm at the stop of the real axial ray through the edge of the entrance pupil, and whether it arrives."""
+    wavelength = lens.wavelengths[lens.primary_wavelength]
     edge = lens.wavelengths.new_tensor([0.0, 1.0]).to(paraxial.entrance_pupil_diameter.dtype)
     index = glass.refractive_index(lens.surfaces[0].glass, wavelength).to(edge.dtype)
-    rays = _through_entrance_pupil(lens, torch.zeros_like(edge), edge, paraxial, index)
-    indices = media(lens, wavelength)[: lens.stop + 1]
-    return trace_surfaces(lens.surfaces[1 : lens.stop + 1], rays, indices=indices).position[1]
+    position, arrives = at_stop(
+        lens, _through_entrance_pupil(lens, torch.zeros_like(edge), edge, paraxial, index), wavelength
+    )
+    return position[1], arrives
 
 
 def _through_entrance_pupil(lens: Lens, field: Tensor, pupil: Tensor, paraxial: FirstOrder, index: Tensor) -> Rays:
@@ -277,11 +247,12 @@ def _telecentric_radius(lens: Lens, paraxial: FirstOrder, index: Tensor) -> Tens
     )
 
 
-def _field_of_real_height(lens, height: Tensor, estimate: Tensor, paraxial: FirstOrder, ray_aiming: bool) -> Tensor:
+def _field_of_real_height(lens, height: Tensor, estimate: Tensor, paraxial: FirstOrder) -> Tensor:
     """Scale the paraxial field (2, ...) until the real chief ray meets the image at `height` (2, ...) mm."""
     wavelength = lens.wavelengths[lens.primary_wavelength]
     index = glass.refractive_index(lens.surfaces[0].glass, wavelength).to(height.dtype)
     wanted = dot_2(height, height)
+    radius = None if lens.ray_aiming == "off" else _aimed_radius(lens, paraxial)
 
     def image_height(scale: Tensor) -> Tensor:
         def through(pupil: Tensor, fraction: float = 1.0) -> Rays:
@@ -289,7 +260,7 @@ def _field_of_real_height(lens, height: Tensor, estimate: Tensor, paraxial: Firs
             return _through_entrance_pupil(lens, part, pupil, paraxial, index)
 
         centre = torch.zeros_like(height)
-        rays = through(aim_at_stop(lens, through, centre, wavelength)[0] if ray_aiming else centre)
+        rays = through(aim_at_stop(lens, through, centre, wavelength, radius)[0] if radius is not None else centre)
         return safe_divide(dot_2(trace(lens, rays, wavelength).position[:2], height), wanted)
 
     scale = torch.ones_like(wanted.detach())
@@ -315,30 +286,3 @@ def _value_and_slope(function: Callable[[Tensor], Tensor], point: Tensor) -> tup
     """f(p) and f'(p) of a function that acts on each entry alone, outside the graph."""
     value, pull = torch.func.vjp(function, point)
     return value.detach(), pull(torch.ones_like(value))[0].detach()
-
-
-def _error_and_jacobian(function: Callable[[Tensor], Tensor], point: Tensor, target: Tensor):
-    """f(p) - target (2, ...), the rows ∂f_x/∂p, ∂f_y/∂p (2, ...) of each ray's own Jacobian, and whether it arrives.
-
-    All outside the graph; function: p -> f(p), arrives.
-    """
-    value, pull, arrives = torch.func.vjp(function, point, has_aux=True)
-    x, y = torch.zeros_like(value), torch.zeros_like(value)
-    x[0], y[1] = 1.0, 1.0
-    return (value - target).detach(), (pull(x)[0].detach(), pull(y)[0].detach()), arrives
-
-
-def _length(vector: Tensor) -> Tensor:
-    return torch.linalg.vector_norm(vector, dim=0)
-
-
-def _solve(jacobian: tuple[Tensor, Tensor], error: Tensor) -> Tensor:
-    """Solve the 2 × 2 systems by Cramer's rule; 0 where singular."""
-    of_x, of_y = jacobian
-    determinant = of_x[0] * of_y[1] - of_x[1] * of_y[0]
-    return torch.stack(
-        [
-            safe_divide(error[0] * of_y[1] - of_x[1] * error[1], determinant),
-            safe_divide(of_x[0] * error[1] - error[0] * of_y[0], determinant),
-        ]
-    )

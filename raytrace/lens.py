@@ -16,6 +16,13 @@ FIELD_UNITS = {
     "real_image_height": "mm",
 }
 
+#: How rays find the stop, in the order of OpticStudio's numbers 0, 1, 2.
+RAY_AIMING = {
+    "off": "through points of the paraxial entrance pupil",
+    "paraxial": "to points of the stop, whose radius is that of the paraxial marginal ray",
+    "real": "to points of the stop, whose radius is that of the real marginal ray",
+}
+
 #: What the number of a system aperture means.
 APERTURE_KINDS = {
     "entrance_pupil_diameter": "mm",
@@ -63,7 +70,7 @@ class Lens:
     wavelengths: (W,) µm; wavelength_weights: (W,); primary_wavelength: 0-based position in `wavelengths`.
     name, notes: title and comment lines of the file.
     catalogs: glass catalogs in the order of the file.
-    ray_aiming: True if the file asks for rays aimed at the real stop.
+    ray_aiming: a key of RAY_AIMING.
     """
 
     surfaces: tuple[Surface, ...]
@@ -76,7 +83,7 @@ class Lens:
     name: str = ""
     notes: tuple[str, ...] = ()
     catalogs: tuple[str, ...] = ()
-    ray_aiming: bool = False
+    ray_aiming: str = "off"
 
 
 def with_object_distance(lens: Lens, object_distance: Tensor) -> Lens:
@@ -99,6 +106,8 @@ def _with_thickness(lens: Lens, number: int, thickness: Tensor) -> Lens:
 def check(lens: Lens) -> None:
     """Refuse a lens that cannot be traced as a whole. Raises ValueError saying what was found and what was expected."""
     last = len(lens.surfaces) - 1
+    if lens.ray_aiming not in RAY_AIMING:
+        raise ValueError(f"ray aiming {lens.ray_aiming!r}: expected one of {', '.join(RAY_AIMING)}")
     if last < 2:
         raise ValueError(f"{last + 1} surfaces found; expected at least the object, one surface and the image")
     if not 1 <= lens.stop < last:

@@ -25,6 +25,7 @@ class FirstOrder:
     front_focal_distance: from surface 1 to the front focal point.
     entrance_pupil_position: from surface 1; entrance_pupil_diameter > 0.
     exit_pupil_position: from the image surface; exit_pupil_diameter > 0.
+    stop_height: of the marginal ray at the stop; negative where the entrance pupil is an inverted image of the stop.
     f_number: |EFL| / entrance pupil diameter; working_f_number: 1/(2 n′ |u′|) of the marginal ray.
     paraxial_image_distance: from the last surface before the image to the paraxial image of the object.
     magnification: of that image (0 for an object at infinity).
@@ -41,6 +42,7 @@ class FirstOrder:
     entrance_pupil_diameter: Tensor
     exit_pupil_position: Tensor
     exit_pupil_diameter: Tensor
+    stop_height: Tensor
     f_number: Tensor
     working_f_number: Tensor
     paraxial_image_distance: Tensor
@@ -130,6 +132,7 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
         entrance_pupil_diameter=diameter,
         exit_pupil_position=exit_pupil,
         exit_pupil_diameter=diameter * (A1 / D2).abs(),
+        stop_height=0.5 * diameter * A1,
         f_number=focal_length.abs() / diameter,
         working_f_number=0.5 / (n_image * slope_image).abs(),
         paraxial_image_distance=image_distance,

@@ -40,7 +40,7 @@ def mean_square_gradient(
     weights: Tensor | None = None,
     sampling: str = "sobol",
     seed: int = 0,
-    ray_aiming: bool | None = None,
+    ray_aiming: str | None = None,
     max_bytes: int = MAX_BYTES,
     progress: Progress | None = None,
 ) -> tuple[Tensor, list[Tensor]]:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from raytrace import pupil
 from raytrace.fused.choice import WORTH_COMPILING, prepare
-from raytrace.launch import is_at_infinity, launch
+from raytrace.launch import is_at_infinity, launch, with_ray_aiming
 from raytrace.lens import Lens
 from raytrace.numerics import safe_divide, safe_sqrt
 from raytrace.rays import Rays
@@ -158,14 +158,14 @@ def _disc(uniform: Tensor) -> Tensor:
     return points.mul_(radius)
 
 
-def shot(lens: Lens, field: Tensor, wavelength: Tensor, *, ray_aiming: bool | None = None) -> Shot:
+def shot(lens: Lens, field: Tensor, wavelength: Tensor, *, ray_aiming: str | None = None) -> Shot:
     """What all rays of one field (2,) and wavelength () µm share. Three rays tell the beam, in float64."""
-    aimed = (lens.ray_aiming if ray_aiming is None else ray_aiming) and not lens.fields.telecentric
-    if aimed:
+    lens = with_ray_aiming(lens, ray_aiming)
+    if lens.ray_aiming != "off" and not lens.fields.telecentric:
         return Shot(lens, field, wavelength, media(lens, wavelength), None)
     exact = to(lens, dtype=torch.float64)
     corners = field.new_tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
-    rays = launch(exact, corners, fields=field.double()[:, None], wavelengths=wavelength[None], ray_aiming=False)
+    rays = launch(exact, corners, fields=field.double()[:, None], wavelengths=wavelength[None], ray_aiming="off")
     position, direction, valid = rays.position[:, 0, 0], rays.direction[:, 0, 0], rays.valid[0, 0].all()
     if is_at_infinity(lens):
         beam = Beam(_affine(position), valid, direction=direction[:, 0])
@@ -183,7 +183,7 @@ def _affine(corners: Tensor) -> Tensor:
 def start(shot: Shot, pupil: Tensor) -> Rays:
     """The rays of `raytrace.launch.launch` through pupil points (2, P), path apart: batch shape (P,)."""
     if shot.beam is None:
-        rays = launch(shot.lens, pupil, fields=shot.field[:, None], wavelengths=shot.wavelength[None], ray_aiming=True)
+        rays = launch(shot.lens, pupil, fields=shot.field[:, None], wavelengths=shot.wavelength[None])
         return Rays(rays.position[:, 0, 0], rays.direction[:, 0, 0], rays.valid[0, 0])
     beam = shot.beam
     position = torch.addmm(beam.place[:, :1], beam.place[:, 1:], pupil)
@@ -300,7 +300,7 @@ def stream_spots(
     sampling: str = "sobol",
     seed: int = 0,
     rim: int = 0,
-    ray_aiming: bool | None = None,
+    ray_aiming: str | None = None,
     max_bytes: int = MAX_BYTES,
     progress: Progress | None = None,
 ) -> tuple[StreamedSpot, StreamedSpot]:
@@ -356,7 +356,7 @@ def shots_of(
     fields: Tensor | None,
     wavelengths: Tensor | None,
     wavelength_weights: Tensor | None,
-    ray_aiming: bool | None,
+    ray_aiming: str | None,
 ) -> tuple[list[Shot], tuple[int, int], Tensor]:
     """Shots of fields × wavelengths, those numbers, and the weights (W,) of the wavelengths, which sum to 1."""
     if rays * len(lens.surfaces) >= WORTH_COMPILING:

@@ -8,7 +8,15 @@ import torch
 from problems import double_gauss, fields, lens, scalar, surface, vector
 
 from raytrace import pupil
-from raytrace.launch import launch, rays_from_infinity, rays_from_point, rays_of_field, stop_radius, vignette
+from raytrace.launch import (
+    MarginalRayLost,
+    launch,
+    rays_from_infinity,
+    rays_from_point,
+    rays_of_field,
+    stop_radius,
+    vignette,
+)
 from raytrace.lens import with_object_distance
 from raytrace.paraxial import first_order
 from raytrace.trace import media, trace, trace_surfaces
@@ -92,7 +100,7 @@ def test_object_at_1e12_mm_is_one_at_infinity():
     assert (one.position - other.position).abs().max() <= 2e-8  # mm: f²/D = 1e-8
 
 
-@pytest.mark.parametrize("aiming", [False, True])
+@pytest.mark.parametrize("aiming", ["off", "paraxial", "real"])
 @pytest.mark.parametrize(
     ("kind", "heights", "distance"),
     [
@@ -112,7 +120,7 @@ def test_every_kind_of_field(kind, heights, distance, aiming):
     if kind == "real_image_height":
         hit = trace(system, rays, system.wavelengths[:, None]).position[1].flatten()
         assert hit.tolist() == pytest.approx(list(heights), abs=1e-10)  # mm
-    if kind == "angle" and not aiming:
+    if kind == "angle" and aiming == "off":
         assert torch.atan2(rays.direction[1], rays.direction[2]).rad2deg().flatten().tolist() == pytest.approx(
             list(heights), abs=1e-12
         )
@@ -139,24 +147,62 @@ def test_paraxial_image_height_of_infinity_is_that_of_a_small_field():
 
 
 @pytest.mark.parametrize("distance", [INF, 300.0])
-def test_aimed_rays_fill_the_stop_evenly(distance):
-    system = double_gauss(object_distance=distance)
-    rays = launch(system, POINTS, ray_aiming=True)
+@pytest.mark.parametrize("aiming", ["paraxial", "real"])
+def test_aimed_rays_fill_the_stop_evenly(distance, aiming):
+    system = double_gauss(object_distance=distance, ray_aiming=aiming)
+    rays = launch(system, POINTS)
     assert rays.valid.all()
     assert aiming_error(system, rays) <= 1e-10  # of the stop radius
-    assert aiming_error(system, launch(system, POINTS, ray_aiming=False)) > 1e-3
+    assert aiming_error(system, launch(system, POINTS, ray_aiming="off")) > 1e-3
+
+
+def test_the_stop_is_as_large_as_the_marginal_ray_that_aims():
+    """Paraxially: a real ray through 1e-4 of the pupil, paraxial to 1e-8, tells it."""
+    system = double_gauss()
+    near, rim = (
+        at_stop(system, rays_of_field(system, vector(0.0, 0.0), vector(0.0, p), wavelength=system.wavelengths[0]))
+        for p in (1e-4, 1.0)
+    )
+    paraxial = stop_radius(dataclasses.replace(system, ray_aiming="paraxial"))
+    assert paraxial.item() == pytest.approx(1e4 * near.position[1].item(), rel=1e-7)
+    for aiming in ("off", "real"):
+        real = stop_radius(dataclasses.replace(system, ray_aiming=aiming))
+        assert real.item() == pytest.approx(rim.position[1].item(), rel=1e-14)
+    assert (real / paraxial - 1).abs() > 1e-3
+
+
+def test_a_lost_marginal_ray_leaves_the_others_aimed():
+    """A ball whose entrance pupil is wider than itself: the rim misses it, what can pass is aimed.
+
+    The stop stands behind the ball's focus and so is seen inverted.
+    """
+    elements = [surface(1 / 5, 10.0, 1.3), surface(-1 / 5, 20.0), surface(None, 5.0)]
+    system = lens(elements, stop=3, aperture=("entrance_pupil_diameter", 11.0), field=fields(y=(0.0, 4.0)))
+    points = vector(0.0, 0.0, 0.0, 0.0, 0.3, 1.0).reshape(2, 3)
+    with pytest.warns(MarginalRayLost, match="paraxial one"):
+        rays = launch(system, points, ray_aiming="real")
+    same = launch(system, points, ray_aiming="paraxial")
+    assert rays.valid[:, 0].tolist() == [[True, True, False], [True, True, False]]
+    assert torch.equal(rays.position, same.position)
+    reached = at_stop(system, same).position[1] / stop_radius(dataclasses.replace(system, ray_aiming="paraxial"))
+    assert torch.where(same.valid, reached + points[1], 0.0).abs().max() <= 1e-10  # of the stop radius
+
+
+def test_an_unknown_kind_of_aiming_is_refused():
+    with pytest.raises(ValueError, match="ray aiming 'on': expected one of off, paraxial, real"):
+        launch(double_gauss(), CENTRE, ray_aiming="on")
 
 
 def test_the_axial_chief_ray_can_be_aimed():
     system = double_gauss(field=fields("angle", (0.0,)))
-    assert launch(system, CENTRE, ray_aiming=True).valid.all()
+    assert launch(system, CENTRE, ray_aiming="real").valid.all()
 
 
 @pytest.mark.parametrize("angle", [0.0, 60.0, 75.0])
 def test_wide_angles_are_aimed(angle):
     system = fisheye(field=fields("angle", (angle,)))
     points = pupil.hexapolar(1)[0]
-    rays = launch(system, points, ray_aiming=True)
+    rays = launch(system, points, ray_aiming="real")
     assert rays.valid.all()
     assert aiming_error(system, rays, points) <= 1e-10  # of the stop radius
 
@@ -166,13 +212,13 @@ def test_rays_that_no_aim_brings_to_the_stop_are_lost_and_others_are_not():
     c = system.surfaces[1].curvature.clone().requires_grad_()
     first = dataclasses.replace(system.surfaces[1], curvature=c)
     changed = dataclasses.replace(system, surfaces=(system.surfaces[0], first, *system.surfaces[2:]))
-    rays = launch(changed, CENTRE, ray_aiming=True)
+    rays = launch(changed, CENTRE, ray_aiming="real")
     assert rays.valid.flatten().tolist() == [True, False]
     assert torch.isfinite(rays.position).all()
     assert torch.isfinite(torch.autograd.grad(rays.position.sum() + rays.direction.sum() + rays.opl.sum(), c)[0])
 
 
-@pytest.mark.parametrize("aiming", [False, True])
+@pytest.mark.parametrize("aiming", ["off", "paraxial", "real"])
 @pytest.mark.parametrize(("back", "distance"), [(2.0, 30.0), (30.0, 30.0), (60.0, 10.0)])
 def test_light_travels_forward_wherever_the_entrance_pupil_lies(back, distance, aiming):
     """Before the lens, behind it, or on the far side of the object; aimed and paraxial rays agree to first order."""
@@ -181,7 +227,7 @@ def test_light_travels_forward_wherever_the_entrance_pupil_lies(back, distance, 
     rays = launch(system, POINTS, ray_aiming=aiming)
     assert rays.valid.all()
     assert (rays.direction[2] > 0).all()
-    other = launch(system, POINTS, ray_aiming=False)
+    other = launch(system, POINTS, ray_aiming="off")
     assert (rays.direction - other.direction).abs().max() <= 0.02, data.entrance_pupil_position
 
 
@@ -273,13 +319,13 @@ def test_batches_broadcast_and_equal_single_rays():
 
 def test_aiming_does_not_depend_on_neighbours():
     system = double_gauss()
-    whole = launch(system, POINTS, ray_aiming=True)
-    alone = launch(system, POINTS[:, 7:8], fields=vector(0.0, 14.0)[:, None], ray_aiming=True)
+    whole = launch(system, POINTS, ray_aiming="real")
+    alone = launch(system, POINTS[:, 7:8], fields=vector(0.0, 14.0)[:, None], ray_aiming="real")
     assert torch.equal(alone.position[:, 0, 0, 0], whole.position[:, 2, 0, 7])
 
 
 @pytest.mark.parametrize("name", ["curvature", "thickness", "object distance", "aperture", "field"])
-@pytest.mark.parametrize("aiming", [False, True])
+@pytest.mark.parametrize("aiming", ["off", "paraxial", "real"])
 def test_derivatives_of_launched_rays(name, aiming):
     """Image points by curvature, thickness, object distance, aperture and field, aiming included: first order."""
     base = double_gauss(object_distance=400.0, aperture=("entrance_pupil_diameter", 15.0))
@@ -309,7 +355,7 @@ def test_derivatives_of_launched_rays(name, aiming):
 
 def test_float32():
     system = to(double_gauss(), dtype=torch.float32)
-    for aiming in (False, True):
+    for aiming in ("off", "paraxial", "real"):
         rays = launch(system, POINTS.float(), ray_aiming=aiming)
         assert rays.position.dtype == torch.float32
         assert rays.valid.all()

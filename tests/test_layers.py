@@ -40,6 +40,7 @@ FLOORS = {
     # 5
     "paraxial": 5,
     "jacobian": 5,
+    "aiming": 5,
     # 6
     "launch": 6,
     "spot": 6,
@@ -198,7 +199,7 @@ def test_importing_the_package_loads_no(library):
 
 #: What may not stand in a physics file, and why (docstrings and comments are not code and are not read).
 FORBIDDEN_CALLS = {"item": "synchronises with the host", "numpy": "leaves the graph", "set_default_dtype": "global"}
-PHYSICS = ["numerics", "surface", "asphere", "trace", "paraxial", "launch", "spot", "focus", "wavefront"]
+PHYSICS = ["numerics", "surface", "asphere", "trace", "paraxial", "aiming", "launch", "spot", "focus", "wavefront"]
 
 
 @pytest.mark.parametrize("name", PHYSICS)

@@ -230,7 +230,7 @@ def _on_axis(lens: Lens, pupil: list[float]) -> Rays:
         torch.stack([torch.zeros_like(y), y]),
         fields=torch.zeros(2, 1, dtype=torch.float64),
         wavelengths=lens.wavelengths[primary : primary + 1],
-        ray_aiming=False,
+        ray_aiming="off",
     )
     return Rays(rays.position[:, 0, 0], rays.direction[:, 0, 0], rays.valid[0, 0])
 

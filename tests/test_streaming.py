@@ -91,7 +91,7 @@ SCENES = {
         aperture=("object_na", 0.1),
         field=fields("object_height", (0.0, 2.0), telecentric=True),
     ),
-    "aimed": double_gauss(ray_aiming=True),
+    "aimed": double_gauss(ray_aiming="real"),
 }
 
 
@@ -367,7 +367,7 @@ curvature = bulge.surfaces[1].curvature.clone().requires_grad_()
 first = dataclasses.replace(bulge.surfaces[1], curvature=curvature)
 bent = dataclasses.replace(bulge, surfaces=(bulge.surfaces[0], first, *bulge.surfaces[2:]))
 field = vector(0.0, 10.0)[:, None]
-aim = {"fields": field, "ray_aiming": True}
+aim = {"fields": field, "ray_aiming": "real"}
 run = lambda n, b: streaming.stream_spot(gauss, n, fields=field[:, :1], max_bytes=b)
 print(growth(run, RAYS, 4 * 10**6))
 # Chunks as large as the budget allows, not as the caches like them: the bytes of a ray are what is measured.

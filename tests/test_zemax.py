@@ -6,7 +6,7 @@ import math
 import pytest
 
 from raytrace.catalog import UnknownGlass, find_glass
-from raytrace.formats import LensFileError, UnsupportedSurface, read_lens_with_report, zemax
+from raytrace.formats import LensFileError, UnsupportedSurface, read_lens, read_lens_with_report, write_lens, zemax
 from raytrace.formats.source import Place, decode
 from raytrace.glass import MIRROR, mil_glass
 
@@ -219,9 +219,21 @@ def test_notes_are_joined_where_the_program_cut_them():
     assert found.name == "title"
 
 
-def test_ray_aiming_and_comment():
-    assert lens(PWAV="PWAV 1\nRAIM 0 2 1 1").ray_aiming
-    assert not lens(PWAV="PWAV 1\nRAIM 0 0 1 1").ray_aiming
+@pytest.mark.parametrize(("number", "kind"), [(0, "off"), (1, "paraxial"), (2, "real")])
+def test_ray_aiming_is_the_second_number_of_raim(number, kind, tmp_path):
+    found = lens(PWAV=f"PWAV 1\nRAIM 0 {number} 1 1 0 0 0 0 0 1")
+    assert found.ray_aiming == kind
+    for name in ("lens.zmx", "lens.csv"):
+        write_lens(found, tmp_path / name)
+        assert read_lens(tmp_path / name).ray_aiming == kind
+
+
+def test_ray_aiming_of_another_kind_is_refused():
+    with pytest.raises(LensFileError, match=r"RAIM of kind 3, expected 0 \(off\), 1 \(paraxial\) or 2 \(real\)"):
+        lens(PWAV="PWAV 1\nRAIM 0 3 1 1")
+
+
+def test_comment():
     assert lens(surface="COMM front of the crown ").surfaces[1].comment == "front of the crown"
 
 

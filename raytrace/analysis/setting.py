@@ -44,7 +44,7 @@ def unvignetted(lens: Lens) -> Lens:
 
 def in_object_space(lens: Lens, fields: Tensor) -> tuple[Lens, Tensor, Tensor]:
     """The lens with fields of a kind that scales with the object, those fields (2, F), and tan θ or mm (2, F)."""
-    extent = object_field(lens, fields, first_order(lens), ray_aiming=lens.ray_aiming)
+    extent = object_field(lens, fields, first_order(lens))
     infinite = is_at_infinity(lens)
     described = torch.rad2deg(torch.atan(extent)) if infinite else extent
     kind = "angle" if infinite else "object_height"

@@ -80,7 +80,7 @@ def field_rays(lens: Lens, count: int) -> Rays:
     wavelength = lens.wavelengths[lens.primary_wavelength]
     points, _ = sobol(count)
     with torch.no_grad():
-        rays = rays_of_field(lens, field, points, wavelength=wavelength, ray_aiming=False)
+        rays = rays_of_field(lens, field, points, wavelength=wavelength, ray_aiming="off")
     return dataclasses.replace(rays, opl=None)
 
 

@@ -106,9 +106,9 @@ def field_points(lens: Lens, arguments: argparse.Namespace, *, on_axis: bool = F
     return torch.stack([lens.fields.x, lens.fields.y])
 
 
-def ray_aiming(arguments: argparse.Namespace) -> bool | None:
+def ray_aiming(arguments: argparse.Namespace) -> str | None:
     """--ray-aiming as the library takes it: None leaves it to the file."""
-    return {"file": None, "on": True, "off": False}[arguments.ray_aiming]
+    return None if arguments.ray_aiming == "file" else arguments.ray_aiming
 
 
 def primary(lens: Lens) -> Tensor:

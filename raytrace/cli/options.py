@@ -175,9 +175,10 @@ def sampling(parser: argparse.ArgumentParser, *, rings: int) -> None:
 def ray_aiming(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--ray-aiming",
-        choices=("file", "on", "off"),
+        choices=("file", "off", "paraxial", "real"),
         default="file",
-        help="aim rays at the real stop: as the file says (default), on, or off",
+        help="aim rays at the stop: as the file says (default), not at all, or over a stop as large as the paraxial or "
+        "the real marginal ray makes it",
     )
 
 

@@ -115,7 +115,7 @@ def _float(entry: object) -> float:
         return math.nan
 
 
-def chief_and_marginal(lens: Lens, ray_aiming: bool | None) -> tuple[list[Batch], int, int]:
+def chief_and_marginal(lens: Lens, ray_aiming: str | None) -> tuple[list[Batch], int, int]:
     """Chief, upper, lower and side ray of every field at the primary wavelength; how many, and how many not aimed.
 
     Their path counts from the wavefront of the object point that passes the vertex of surface 1.

@@ -58,7 +58,7 @@ def spot(arguments: argparse.Namespace) -> None:
             print(f"{'':>10} {'all':>11} {x:>13.7f} {y:>13.7f} {rms:>10.4f} {geometric:>10.4f}")
 
 
-def _to_sensor(lens: Lens, points: Tensor, fields: Tensor, aiming: bool | None) -> tuple[Rays, int, Tensor]:
+def _to_sensor(lens: Lens, points: Tensor, fields: Tensor, aiming: str | None) -> tuple[Rays, int, Tensor]:
     """Rays (3, F, W, P) on the sensor, traced field by field; how many were not aimed; which were vignetted."""
     indices = media(lens, lens.wavelengths[:, None])
     arrived, vignetted, unaimed = [], [], 0

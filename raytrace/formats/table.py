@@ -73,7 +73,7 @@ def build(table: Table, report: Draft, *, catalogs: Sequence[Path] = ()) -> Lens
         name=metadata.get("title", ("", place))[0],
         notes=tuple(table.notes),
         catalogs=names,
-        ray_aiming=table_system.truth(metadata, "ray aiming"),
+        ray_aiming=table_system.ray_aiming(metadata),
     )
     refuse_overflow(lens, place.file)
     return lens

@@ -14,7 +14,7 @@
 # wavelength weights: 1 1
 # primary wavelength: 2          counted from 1
 # catalogs: SCHOTT OHARA
-# ray aiming: yes
+# ray aiming: paraxial
 """
 
 import difflib
@@ -27,7 +27,7 @@ from torch import Tensor
 from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, Place, integer, is_number, number, shown
 from raytrace.glass import LINES
-from raytrace.lens import APERTURE_KINDS, FIELD_UNITS, Fields, SystemAperture
+from raytrace.lens import APERTURE_KINDS, FIELD_UNITS, RAY_AIMING, Fields, SystemAperture
 
 #: Header keys: "once" or "repeated" (notes).
 KEYS = {
@@ -111,6 +111,16 @@ def truth(metadata: Metadata, key: str) -> bool:
     if word not in ("yes", "on", "true", "1", "no", "off", "false", "0", ""):
         raise LensFileError(f"{key} is {shown(value)}, expected yes or no", place)
     return word in ("yes", "on", "true", "1")
+
+
+def ray_aiming(metadata: Metadata) -> str:
+    """off, paraxial or real."""
+    if "ray aiming" not in metadata:
+        return "off"
+    value, place = metadata["ray aiming"]
+    if value.strip().lower() not in RAY_AIMING:
+        raise LensFileError(f"ray aiming is {shown(value)}, expected one of {', '.join(RAY_AIMING)}", place)
+    return value.strip().lower()
 
 
 def aperture(metadata: Metadata, stop_semi_diameter: float | None, unit: float, table: Place, report: Draft):

@@ -72,8 +72,8 @@ def header(lens: Lens, place: Place, catalogs: Sequence[Path] = ()) -> Metadata:
     names = catalogs_needed(lens, catalogs, place.file)
     if names:
         lines.append(("catalogs", " ".join(names)))
-    if lens.ray_aiming:
-        lines.append(("ray aiming", "yes"))
+    if lens.ray_aiming != "off":
+        lines.append(("ray aiming", lens.ray_aiming))
     return lines
 
 

@@ -7,7 +7,7 @@ from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, is_number, shown
 from raytrace.formats.zemax_keywords import FIELD_KINDS, FIELD_NAMES, MILLIMETRES
 from raytrace.formats.zemax_records import Block, Record
-from raytrace.lens import Fields, SystemAperture
+from raytrace.lens import RAY_AIMING, Fields, SystemAperture
 
 #: OpticStudio cuts a long note into pieces of this many characters.
 NOTE_PIECE = 200
@@ -184,10 +184,13 @@ def notes(system: Block) -> tuple[str, ...]:
     return tuple(note for note in stripped if note and note != "Notes...")
 
 
-def ray_aiming(system: Block) -> bool:
-    """True if RAIM asks for rays aimed at the stop, paraxially (1) or really (2)."""
+def ray_aiming(system: Block) -> str:
+    """Whether RAIM, in its second number, asks for rays aimed at the stop: 0 off, 1 paraxial, 2 real reference."""
     record = system.last("RAIM")
-    return bool(record and record.integer(1, "ray aiming", 0))
+    kind = record.integer(1, "ray aiming", 0) if record else 0
+    if not 0 <= kind < len(RAY_AIMING):
+        raise LensFileError(f"RAIM of kind {kind}, expected 0 (off), 1 (paraxial) or 2 (real)", record.place)
+    return list(RAY_AIMING)[kind]
 
 
 def remarks(system: Block, surfaces: list[Block], tail: list[Record], report: Draft) -> None:

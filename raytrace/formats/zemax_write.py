@@ -17,7 +17,7 @@ from raytrace.formats.writing import (
 from raytrace.formats.zemax_keywords import APERTURES, FIELD_KINDS
 from raytrace.formats.zemax_system import NOTE_PIECE
 from raytrace.glass import Glass, mil_glass
-from raytrace.lens import Lens
+from raytrace.lens import RAY_AIMING, Lens
 from raytrace.surface import Aperture, Surface
 
 #: OpticStudio has this many wavelengths.
@@ -72,7 +72,7 @@ def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
         "ENVD 20 1 0",
         "GFAC 0 0",
         f"GCAT {' '.join(catalogs_needed(lens, catalogs, place.file))}".rstrip(),
-        f"RAIM 0 {2 if lens.ray_aiming else 0} 1 1 0 0 0 0 0",
+        f"RAIM 0 {list(RAY_AIMING).index(lens.ray_aiming)} 1 1 0 0 0 0 0",
         "PUSH 0 0 0 0 0 0",
         "SDMA 0 1 0",
         f"FTYP {kind} {int(fields.telecentric)} {len(fields.x)} {len(lens.wavelengths)} 0 0 0",
