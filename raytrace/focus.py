@@ -6,7 +6,7 @@ each spot's own centroid is a parabola in s, so nothing is retraced:
     s = -Σ W cov(x, m) / Σ W var(m)
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import scipy.optimize
 import torch
@@ -14,9 +14,9 @@ from torch import Tensor
 
 from raytrace.launch import launch
 from raytrace.lens import Lens, with_object_distance
-from raytrace.numerics import safe_divide
+from raytrace.numerics import safe_divide, safe_sqrt
 from raytrace.rays import Rays
-from raytrace.spot import Spot, spot_of_points
+from raytrace.spot import EmptySpot, Spot, spot, spot_of_points, where_lit
 from raytrace.trace import media, trace_surfaces
 
 
@@ -31,35 +31,44 @@ def image_rays(lens: Lens, pupil: Tensor, *, fields: Tensor | None = None, wavel
     return trace_surfaces(lens.surfaces[1:], rays, indices=[*indices[:-1], indices[-2]])
 
 
-def focus_moments(rays: Rays, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def focus_moments(rays: Rays, weights: Tensor | None = None, *, empty: str = "nan") -> tuple[Tensor, Tensor]:
     """cov(x, m) in mm and var(m), x the hits and m = (L, M)/N the slopes, over the last axis of rays (3, ..., P).
 
-    The mean square radius on a sensor moved by s is its value at 0 plus 2 s cov + s² var. weights: (P,) or (..., P).
+    The mean square radius on a sensor moved by s is its value at 0 plus 2 s cov + s² var. weights: (P,) or (..., P);
+    empty: what those of a spot without rays are, see `spot`.
     """
     points, slopes = _points_and_slopes(rays)
     weights = torch.ones_like(points[0]) if weights is None else weights.expand(points.shape[1:])
     weights = torch.where(rays.valid, weights, 0.0)
-    share = safe_divide(weights, weights.sum(-1, keepdim=True))
+    total = weights.sum(-1, keepdim=True)
+    share = safe_divide(weights, total)
     centred = points - (share * points).sum(-1, keepdim=True)
     tilted = slopes - (share * slopes).sum(-1, keepdim=True)
-    return (share * (centred * tilted).sum(0)).sum(-1), (share * (tilted * tilted).sum(0)).sum(-1)
+    moments = (share * (centred * tilted).sum(0)).sum(-1), (share * (tilted * tilted).sum(0)).sum(-1)
+    return where_lit(total[..., 0] != 0, *moments, empty=empty)
 
 
-def spot_parabola(rays: Rays, weights: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+def spot_parabola(
+    rays: Rays, weights: Tensor | None = None, *, empty: str = "nan"
+) -> tuple[Tensor, Tensor, Tensor]:
     """Q0 mm², Q1 mm, Q2 of the mean square radius Q0 + 2 s Q1 + s² Q2 on a sensor moved by s mm; each (...).
 
     rays: (3, ..., P) as `image_rays` gives them. Once they are traced, a step of an optimisation of the sensor distance
-    is this polynomial, whatever the number of rays.
+    is this polynomial, whatever the number of rays. empty: as for `spot`.
     """
-    return spot_of_points(rays.position[:2], rays.valid, weights).mean_square_radius, *focus_moments(rays, weights)
+    here = spot(rays, weights, empty=empty)
+    return here.mean_square_radius, *focus_moments(rays, weights)
 
 
-def through_focus(rays: Rays, shifts: Tensor, weights: Tensor | None = None) -> Spot:
-    """Spots (S, ...) on the sensor moved by each of the shifts (S,) mm; rays: (3, ..., P) on the sensor."""
+def through_focus(rays: Rays, shifts: Tensor, weights: Tensor | None = None, *, empty: str = "nan") -> Spot:
+    """Spots (S, ...) on the sensor moved by each of the shifts (S,) mm; rays: (3, ..., P) on the sensor.
+
+    empty: as for `spot`.
+    """
     points, slopes = _points_and_slopes(rays)
     shifts = shifts.reshape(-1, *(1,) * (points.dim() - 1))
     moved = points[:, None] + shifts * slopes[:, None]
-    return spot_of_points(moved, rays.valid.expand(moved.shape[1:]), weights)
+    return spot_of_points(moved, rays.valid.expand(moved.shape[1:]), weights, empty=empty)
 
 
 def focus(
@@ -73,23 +82,102 @@ def focus(
     wavelengths: Tensor | None = None,
     field_weights: Tensor | None = None,
     wavelength_weights: Tensor | None = None,
+    empty: str = "nan",
 ) -> Tensor:
     """Sensor distance (scalar, mm) of least RMS spot over object distances × fields × wavelengths.
 
     pupil, weights: (2, P), (P,) of a rule in `pupil`; object_distances: mm, that of the lens by default; the other
     weights are 1 by default. Differentiable in every number of the lens.
+    empty: "nan" leaves spots without rays out, for they are nowhere in focus; where none is left, or all rays are
+    parallel, the distance is nan with gradient 0. "error" raises EmptySpot for either.
     """
+    covariance = variance = torch.zeros_like(lens.surfaces[-2].thickness)
+    bundles = _bundles(
+        lens,
+        pupil,
+        object_distances=object_distances,
+        distance_weights=distance_weights,
+        fields=fields,
+        wavelengths=wavelengths,
+        field_weights=field_weights,
+        wavelength_weights=wavelength_weights,
+    )
+    for rays, share in bundles:
+        moments = focus_moments(rays, weights, empty=empty)
+        covariance, variance = (
+            total + torch.where(_lit(rays, weights), share * moment, 0.0).sum()
+            for total, moment in zip((covariance, variance), moments, strict=True)
+        )
+    if empty == "error" and not bool(variance > 0):
+        raise EmptySpot("no sensor distance is best: the rays are parallel, or there is only one")
+    return torch.where(variance > 0, lens.surfaces[-2].thickness - safe_divide(covariance, variance), torch.nan)
+
+
+def focus_of_mean_radius(lens: Lens, pupil: Tensor, weights: Tensor, **scene) -> Tensor:
+    """Sensor distance (scalar, mm) of least mean distance of the hits from the centroid of their spot.
+
+    Arguments as for `focus`, from where the search begins. Rays in image space are straight: they are traced once, on
+    the sensor as it stands, and what its rim clips there stays clipped. Not differentiated.
+    Raises EmptySpot where there is no focus of the rays, ValueError as `focus_of_merit`.
+    """
+    with torch.no_grad():
+        start = focus(lens, pupil, weights, **scene)
+        bundles = list(_bundles(lens, pupil, **scene))
+    if not bool(torch.isfinite(start)):
+        raise EmptySpot("no ray reaches the image, or all are parallel: there is no focus")
+
+    def merit(sensor: Tensor) -> Tensor:
+        total = torch.zeros_like(sensor)
+        for rays, share in bundles:
+            found = through_focus(rays, (sensor - lens.surfaces[-2].thickness).reshape(1), weights)
+            x, y = torch.where(found.valid, found.points - found.centroid[..., None], 0.0)
+            light = torch.where(rays.valid, weights, 0.0)
+            radius = safe_divide((light * safe_sqrt(x * x + y * y)).sum(-1), light.sum(-1))
+            total = total + (share * radius).sum()
+        return total
+
+    return focus_of_merit(merit, start).detach()
+
+
+def mean_rms_radius(lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = "nan", **scene) -> Tensor:
+    """√ of the weighted mean of the mean square radii (scalar, mm) over object distances × fields × wavelengths.
+
+    Arguments as for `focus`, which minimises it; spots without rays are left out, and it is nan if none is left, or,
+    with empty = "error", raises EmptySpot.
+    """
+    total = sum_of_shares = torch.zeros_like(lens.surfaces[-2].thickness)
+    for rays, share in _bundles(lens, pupil, **scene):
+        lit = _lit(rays, weights)
+        square = spot(rays, weights, empty=empty).mean_square_radius
+        total = total + torch.where(lit, share * square, 0.0).sum()
+        sum_of_shares = sum_of_shares + torch.where(lit, share, 0.0).sum()
+    return where_lit(sum_of_shares > 0, safe_sqrt(safe_divide(total, sum_of_shares)), empty=empty)[0]
+
+
+def _lit(rays: Rays, weights: Tensor) -> Tensor:
+    """Whether a ray of any weight arrives, (...)."""
+    return (rays.valid & (weights != 0)).any(-1)
+
+
+def _bundles(
+    lens: Lens,
+    pupil: Tensor,
+    *,
+    object_distances: Sequence[Tensor | float] | None = None,
+    distance_weights: Sequence[float] | None = None,
+    fields: Tensor | None = None,
+    wavelengths: Tensor | None = None,
+    field_weights: Tensor | None = None,
+    wavelength_weights: Tensor | None = None,
+) -> Iterator[tuple[Rays, Tensor]]:
+    """The rays (3, F, W, P) of every object distance and what their spots (F, W) count."""
     distances = [lens.surfaces[0].thickness] if object_distances is None else object_distances
     distance_weights = [1.0] * len(distances) if distance_weights is None else distance_weights
-    covariance = variance = torch.zeros_like(lens.surfaces[-2].thickness)
     for distance, distance_weight in zip(distances, distance_weights, strict=True):
         rays = image_rays(with_object_distance(lens, distance), pupil, fields=fields, wavelengths=wavelengths)
-        moments = focus_moments(rays, weights)
-        share = rays.position.new_full(moments[0].shape, distance_weight)
+        share = rays.position.new_full(rays.shape[:-1], distance_weight)
         share = share if field_weights is None else share * field_weights[:, None]
-        share = share if wavelength_weights is None else share * wavelength_weights
-        covariance, variance = covariance + (share * moments[0]).sum(), variance + (share * moments[1]).sum()
-    return lens.surfaces[-2].thickness - safe_divide(covariance, variance)
+        yield rays, share if wavelength_weights is None else share * wavelength_weights
 
 
 def _points_and_slopes(rays: Rays) -> tuple[Tensor, Tensor]:

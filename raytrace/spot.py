@@ -15,6 +15,10 @@ class Spot:
     centroid: (2, ...); rms_radius and geometric_radius (the largest distance) are about the centroid.
     mean_square_radius: mm², smooth where the RMS is 0: minimise this one.
     points: (2, ..., P) and valid: (..., P) what was averaged; rays: how many were valid.
+
+    A spot that no ray of any weight reaches is nan, with gradient 0: it spoils the sum that it is added to, and no
+    derivative of the others. A merit that leaves it out (`nansum`, a mask by `rays`) is rewarded for losing it: keep
+    the lens where `rays` does not fall, add what a lost spot is to cost, or ask for an error (`empty`).
     """
 
     centroid: Tensor
@@ -26,16 +30,23 @@ class Spot:
     rays: Tensor
 
 
-def spot(rays: Rays, weights: Tensor | None = None) -> Spot:
-    """Spot of rays (3, ..., P) over their last axis, invalid ones left out; weights: (P,) or (..., P), 1 by default."""
-    return spot_of_points(rays.position[:2], rays.valid, weights)
+class EmptySpot(ValueError):
+    """No ray of a spot arrives: it has no centroid and no radius."""
 
 
-def spot_of_points(points: Tensor, valid: Tensor, weights: Tensor | None = None) -> Spot:
-    """Spot of points (2, ..., P) mm.
+def spot(rays: Rays, weights: Tensor | None = None, *, empty: str = "nan") -> Spot:
+    """Spot of rays (3, ..., P) over their last axis, invalid ones left out; weights: (P,) or (..., P), 1 by default.
 
-    One point is subtracted before the mean is formed, so that a spot of 1 pm 1 m off the axis keeps its digits; an
-    empty spot, or a spot of one ray, has radius 0 and gradient 0.
+    empty: what a spot without rays is: "nan", or "error", which raises EmptySpot and looks at the numbers to do so.
+    """
+    return spot_of_points(rays.position[:2], rays.valid, weights, empty=empty)
+
+
+def spot_of_points(points: Tensor, valid: Tensor, weights: Tensor | None = None, *, empty: str = "nan") -> Spot:
+    """Spot of points (2, ..., P) mm; `empty` as for `spot`.
+
+    One point is subtracted before the mean is formed, so that a spot of 1 pm 1 m off the axis keeps its digits; a spot
+    of one ray has radius 0 and gradient 0.
     """
     weights = torch.ones_like(points[0]) if weights is None else weights.expand(points.shape[1:])
     weights = torch.where(valid, weights, 0.0)
@@ -52,15 +63,25 @@ def spot_of_points(points: Tensor, valid: Tensor, weights: Tensor | None = None)
     square = (centred[0] / scale) ** 2 + (centred[1] / scale) ** 2
     scaled_mean = (share * square).sum(-1)
     largest = square.amax(-1) if square.shape[-1] else scaled_mean
-    return Spot(
-        centroid=(reference + mean)[..., 0],
-        mean_square_radius=mean_square,
-        rms_radius=scale[..., 0] * safe_sqrt(scaled_mean),
-        geometric_radius=scale[..., 0] * safe_sqrt(largest),
-        points=points,
-        valid=valid,
-        rays=valid.sum(-1),
-    )
+    rms, geometric = (scale[..., 0] * safe_sqrt(t) for t in (scaled_mean, largest))
+    found = where_lit(total[..., 0] != 0, (reference + mean)[..., 0], mean_square, rms, geometric, empty=empty)
+    return Spot(*found, points=points, valid=valid, rays=valid.sum(-1))
+
+
+def where_lit(lit: Tensor, *numbers: Tensor, empty: str = "nan") -> tuple[Tensor, ...]:
+    """The numbers (..., *lit.shape) of spots where light arrives; elsewhere nan with gradient 0.
+
+    empty: "nan", or "error": then EmptySpot is raised if a spot is dark. Raises ValueError for another word.
+    """
+    if empty not in ("nan", "error"):
+        raise ValueError(f"empty = {empty!r}: expected 'nan' or 'error', what a spot without rays is")
+    if empty == "error" and not bool(lit.all()):
+        first = tuple(torch.nonzero(~lit)[0].tolist())
+        raise EmptySpot(
+            f"no ray reaches {int((~lit).sum())} of {lit.numel()} spots, first that of index {first}: it has no centroid "
+            "and no radius"
+        )
+    return tuple(torch.where(lit, number, torch.nan) for number in numbers)
 
 
 def _power_of_two(vectors: Tensor) -> Tensor:

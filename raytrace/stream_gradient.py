@@ -8,6 +8,7 @@ from torch.utils import _pytree as pytree
 
 from raytrace.lens import Lens
 from raytrace.numerics import safe_divide
+from raytrace.spot import where_lit
 from raytrace.streaming import MAX_BYTES, Progress, Shot, chunk_size, hits, pupil_chunks, shots_of, stream_spot
 
 
@@ -43,6 +44,7 @@ def mean_square_gradient(
     ray_aiming: str | None = None,
     max_bytes: int = MAX_BYTES,
     progress: Progress | None = None,
+    empty: str = "nan",
 ) -> tuple[Tensor, list[Tensor]]:
     """Mean square spot radius in mm², averaged over fields and wavelengths, and its first derivatives in the leaves.
 
@@ -51,18 +53,21 @@ def mean_square_gradient(
     lens: made from the leaves by differentiable operations; weights: (F, W), alike by default. The rays are traced
     twice: for the centroids, then for the sum. The graph is cut at the numbers of the lens that rays see, so what made
     the lens is gone through once, not for every chunk.
+    empty: what the mean is if a spot of any weight has no rays: "nan", the derivatives those of the other spots, or
+    "error", which raises EmptySpot.
     """
     common = {"sampling": sampling, "seed": seed, "max_bytes": max_bytes, "progress": progress}
     conditions = {"fields": fields, "wavelengths": wavelengths, "ray_aiming": ray_aiming}
     light = stream_spot(lens, rays, **conditions, **common)
-    share = torch.full_like(light.rms_radius, 1.0) if weights is None else weights
+    share = torch.ones_like(light.rms_radius) if weights is None else weights
+    (whole,) = where_lit(((light.rays > 0) | (share == 0)).all(), torch.ones_like(share[0, 0]), empty=empty)
     share = safe_divide(share / share.sum(), light.rays).flatten()
     with torch.enable_grad():
         shots = shots_of(lens, rays, fields, wavelengths, None, ray_aiming)[0]
     shots, seen, cut = _cut(shots)
     like = lens.surfaces[-2].thickness
     size = chunk_size(shots[0], max_bytes, recorded=True)
-    centroids = light.centroid.flatten(1).to(like.dtype)
+    centroids = torch.where(light.rays > 0, light.centroid, 0.0).flatten(1).to(like.dtype)
 
     def merit(part: tuple[int, Tensor]) -> Tensor:
         k, points = part
@@ -78,7 +83,7 @@ def mean_square_gradient(
 
     total, slopes = stream_gradient(merit, cut, parts())
     found = torch.autograd.grad(seen, leaves, slopes, allow_unused=True)
-    return total, [torch.zeros_like(leaf) if g is None else g for leaf, g in zip(leaves, found, strict=True)]
+    return total * whole, [torch.zeros_like(leaf) if g is None else g for leaf, g in zip(leaves, found, strict=True)]
 
 
 def _cut(shots: list[Shot]) -> tuple[list[Shot], list[Tensor], list[Tensor]]:

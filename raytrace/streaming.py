@@ -18,6 +18,7 @@ from raytrace.launch import is_at_infinity, launch, with_ray_aiming
 from raytrace.lens import Lens
 from raytrace.numerics import safe_divide, safe_sqrt
 from raytrace.rays import Rays
+from raytrace.spot import where_lit
 from raytrace.trace import media, trace_surfaces
 from raytrace.value import to, value
 
@@ -79,7 +80,7 @@ class StreamedSpot:
     in `raytrace.spot.Spot`; rays: how many arrived; launched: how many set out for each entry.
     geometric_radius: distance from the centroid of the ray farthest from the centroid of the first 65,536: exact for so
     many, else not above the largest distance, which is not above geometric_bound; the two differ by twice what the
-    centroid has moved since.
+    centroid has moved since. All is nan where no ray arrives.
     """
 
     centroid: Tensor
@@ -303,12 +304,13 @@ def stream_spots(
     ray_aiming: str | None = None,
     max_bytes: int = MAX_BYTES,
     progress: Progress | None = None,
+    empty: str = "nan",
 ) -> tuple[StreamedSpot, StreamedSpot]:
     """Spots (F, W), and those (F,) of all wavelengths together by their weights.
 
     fields: (2, F) and wavelengths: (W,) µm as for `launch`; sampling: "sobol" or "random"; rim: so many rays on the rim
     count for the largest radius alone, as in `pupil.with_rim`; max_bytes: of memory beside what the process has;
-    progress: called with the number of rays traced since the last call. Nothing is differentiated.
+    progress: called with the number of rays traced since the last call; empty: as for `spot`. No derivatives.
     """
     shots, shape, weights = shots_of(lens, rays, fields, wavelengths, wavelength_weights, ray_aiming)
     like = lens.surfaces[-2].thickness
@@ -333,8 +335,8 @@ def stream_spots(
     whole = _of_colours(Moments(each.count, each.mean + apart, each.scatter), weights)
     reached = each.count.to(torch.int64)
     return (
-        _spot(each, [own for own, _ in far], shape, reached, rays),
-        _spot(whole, [joint for _, joint in far], shape, reached.sum(-1), rays * shape[1]),
+        _spot(each, [own for own, _ in far], shape, reached, rays, empty),
+        _spot(whole, [joint for _, joint in far], shape, reached.sum(-1), rays * shape[1], empty),
     )
 
 
@@ -382,7 +384,9 @@ def _of_colours(each: Moments, weights: Tensor) -> Moments:
     return whole
 
 
-def _spot(m: Moments, far: Sequence[_Far], shape: Sequence[int], rays: Tensor, launched: int) -> StreamedSpot:
+def _spot(
+    m: Moments, far: Sequence[_Far], shape: Sequence[int], rays: Tensor, launched: int, empty: str
+) -> StreamedSpot:
     covariance = safe_divide(m.scatter, m.count)
     square = covariance[0] + covariance[2]
     joint = m.mean.dim() == 2
@@ -392,5 +396,5 @@ def _spot(m: Moments, far: Sequence[_Far], shape: Sequence[int], rays: Tensor, l
     bound = torch.maximum(safe_sqrt(largest) + torch.linalg.vector_norm(moved, dim=0), radius)
     if joint:
         reference, radius, bound = reference[..., 0], radius.amax(-1), bound.amax(-1)
-    radius, bound = (torch.where(m.count > 0, t, 0.0) for t in (radius, bound))
-    return StreamedSpot(reference + m.mean, covariance, square, safe_sqrt(square), radius, bound, rays, launched)
+    found = reference + m.mean, covariance, square, safe_sqrt(square), radius, bound
+    return StreamedSpot(*where_lit(m.count > 0, *found, empty=empty), rays, launched)

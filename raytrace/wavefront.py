@@ -11,6 +11,7 @@ from raytrace.numerics import dot, safe_divide, safe_sqrt
 from raytrace.paraxial import first_order
 from raytrace.rays import Rays
 from raytrace.scene import Scene, beam_share, trace_scene
+from raytrace.spot import where_lit
 from raytrace.trace import media
 from raytrace.value import value
 
@@ -116,22 +117,24 @@ def wavefront(scene: Scene, pupil: Tensor, weights: Tensor | None = None) -> Wav
     )
 
 
-def mean_opd(wavefront: Wavefront) -> Tensor:
-    """Mean OPD (D, F, W) in mm over the light that arrives."""
-    return (_share(wavefront) * wavefront.opd).sum(-1)
+def mean_opd(wavefront: Wavefront, *, empty: str = "nan") -> Tensor:
+    """Mean OPD (D, F, W) in mm over the light that arrives; empty: what it is where none does, see `spot`."""
+    return where_lit(_is_lit(wavefront), (_share(wavefront) * wavefront.opd).sum(-1), empty=empty)[0]
 
 
-def rms(wavefront: Wavefront) -> Tensor:
-    """RMS of the OPD about its mean (D, F, W), mm; 0 with gradient 0 where no light arrives."""
-    centred = torch.where(wavefront.valid, wavefront.opd - mean_opd(wavefront)[..., None], 0.0)
-    return safe_sqrt((_share(wavefront) * centred * centred).sum(-1))
+def rms(wavefront: Wavefront, *, empty: str = "nan") -> Tensor:
+    """RMS of the OPD about its mean (D, F, W), mm; empty: what it is where no light arrives, see `spot`."""
+    share = _share(wavefront)
+    centred = torch.where(wavefront.valid, wavefront.opd - (share * wavefront.opd).sum(-1, keepdim=True), 0.0)
+    return where_lit(_is_lit(wavefront), safe_sqrt((share * centred * centred).sum(-1)), empty=empty)[0]
 
 
-def peak_to_valley(wavefront: Wavefront) -> Tensor:
-    """Largest less smallest OPD (D, F, W), mm, over the rays that arrive; 0 where none does."""
+def peak_to_valley(wavefront: Wavefront, *, empty: str = "nan") -> Tensor:
+    """Largest less smallest OPD (D, F, W), mm, over the rays that arrive; empty: as for `rms`."""
     highest = torch.where(wavefront.valid, wavefront.opd, -torch.inf).amax(-1)
     lowest = torch.where(wavefront.valid, wavefront.opd, torch.inf).amin(-1)
-    return torch.where(wavefront.valid.any(-1), highest - lowest, 0.0)
+    lit = wavefront.valid.any(-1)
+    return where_lit(lit, torch.where(lit, highest - lowest, 0.0), empty=empty)[0]
 
 
 def zernike_coefficients(wavefront: Wavefront, count: int = 37) -> Tensor:
@@ -153,6 +156,10 @@ def _noll_basis(wavefront: Wavefront, count: int) -> Tensor:
     if wavefront.pupil.dim() != 2:
         raise ValueError("Zernike fits need one set of pupil points for all fields, a pupil of shape (2, P)")
     return zernike.polynomials([zernike.noll(j) for j in range(1, count + 1)], *wavefront.pupil)
+
+
+def _is_lit(wavefront: Wavefront) -> Tensor:
+    return wavefront.energy.sum(-1) != 0
 
 
 def _share(wavefront: Wavefront) -> Tensor:

@@ -1,11 +1,14 @@
 """What the commands about spots share: points of the pupil, and how a field and a spot are told."""
 
 import argparse
+import math
 
 from torch import Tensor
 
 from raytrace import pupil
-from raytrace.cli.door import number, numbers
+from raytrace.cli.door import number, numbers, say
+from raytrace.lens import FIELD_UNITS, Lens
+from raytrace.losses import Losses, beam_hint
 from raytrace.spot import Spot
 from raytrace.streaming import StreamedSpot
 
@@ -23,15 +26,41 @@ def pupil_points(arguments: argparse.Namespace) -> tuple[Tensor, Tensor]:
 
 def spot_entry(fields: Tensor, wavelength: float, spots: Spot | StreamedSpot, f: int, w: int) -> dict:
     """What JSON says of any spot (F, W): null where no ray arrives."""
-    arrived = int(spots.rays[f, w])
     return {
         "field": numbers(fields[:, f]),
         "wavelength": wavelength,
-        "centroid": numbers(spots.centroid[:, f, w]) if arrived else [None, None],
-        "rms_radius": number(spots.rms_radius[f, w]) if arrived else None,
-        "geometric_radius": number(spots.geometric_radius[f, w]) if arrived else None,
-        "rays": arrived,
+        "centroid": numbers(spots.centroid[:, f, w]),
+        "rms_radius": number(spots.rms_radius[f, w]),
+        "geometric_radius": number(spots.geometric_radius[f, w]),
+        "rays": int(spots.rays[f, w]),
     }
+
+
+def spot_cells(spots: Spot | StreamedSpot, at: tuple[int, ...]) -> str:
+    """Centroid in mm, RMS and geometric radius in µm of one spot, as the table has them; - where no ray arrives."""
+    x, y = spots.centroid[(slice(None), *at)].tolist()
+    radii = (1000 * float(radius[at]) for radius in (spots.rms_radius, spots.geometric_radius))
+    return " ".join([*(cell(v, ">13.7f") for v in (x, y)), *(cell(v, ">10.4f") for v in radii)])
+
+
+def cell(value: float, form: str) -> str:
+    """A number in a table, or - of the same width where there is none."""
+    return f"{value + 0.0:{form}}" if math.isfinite(value) else f"{'-':>{form.strip('>').split('.')[0]}}"
+
+
+def warn_of_losses(lens: Lens, fields: Tensor, wavelengths: list[float], found: Losses) -> None:
+    """One line for every field of which a wavelength loses all its rays: where, and what to do about a beam too wide."""
+    lost = found.arrived == 0
+    for f in range(fields.shape[1]):
+        said: dict[str, list[str]] = {}
+        for w, wavelength in enumerate(wavelengths):
+            if bool(lost[f, w]):
+                said.setdefault(found.words(f, w), []).append(f"{wavelength:g}")
+        for words, colours in said.items():
+            unit = FIELD_UNITS[lens.fields.kind]
+            say(f"warning: field {field_label(fields[:, f])} {unit}, {', '.join(colours)} µm: {words}")
+    if bool(lost.any()) and (hint := beam_hint(lens)):
+        say(f"warning: {hint}; see --f-number and --entrance-pupil-diameter")
 
 
 def field_label(field: Tensor) -> str:

@@ -131,7 +131,8 @@ def focus_span(lens: Lens, bundle: FocusRays, sensor: float, marks) -> tuple[flo
     least = np.diagonal(bundle.radii(best))
     number = float(first_order(lens).working_f_number)
     number = number if math.isfinite(number) else 0.0
-    blur = max(2 * math.sqrt(8) * number * least.min(), 1e-2 * float(lens.wavelengths.min()) * number**2)
+    sharpest = min(least[np.isfinite(least)], default=0.0)  # no number where no ray arrives
+    blur = max(2 * math.sqrt(8) * number * sharpest, 1e-2 * float(lens.wavelengths.min()) * number**2)
     seen = [x for x in (*(sensor + best), sensor, *marks) if math.isfinite(x)]
     room = max(0.2 * (max(seen) - min(seen)), blur, 1e-6)
     return min(seen) - room, max(seen) + room
@@ -145,7 +146,7 @@ def draw_curves(
     shifts = np.linspace(span[0], span[1], _SAMPLES) - sensor
     radii, best = 1e3 * bundle.radii(shifts), bundle.best
     least = 1e3 * np.diagonal(bundle.radii(best))
-    alive = style.array(bundle.rays.valid.any(-1)).astype(bool)
+    alive = np.isfinite(least)
     for c in np.flatnonzero(alive):
         place = f"{labels[c]}: {sensor + best[c]:.4f} mm, {style.number_text(least[c])} µm"
         width = max(1.9 - 0.3 * c, 1.0)  # so that curves that coincide all show

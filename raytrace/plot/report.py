@@ -138,7 +138,7 @@ def _draw_spots(page, before: Lens, after: Lens, distances: list[float], labels:
                     label = labels[column] if len(distances) == 1 else f"object at {labels[column]}"
                     panel.set_title(label.replace(", ", "\n", 1), color=style.field_colour(column), fontsize=8.5)
             size = panel_size([float(whole.geometric_radius[f])], airy)
-            if int(whole.rays[f]) and half > _MAGNIFY * size:
+            if bool(whole.rms_radius[f].isfinite()) and half > _MAGNIFY * size:
                 inset = panel.inset_axes((0.985 - _INSET, 0.985 - _INSET, _INSET, _INSET), zorder=8)
                 draw_dots(inset, whole, dots, f, half=size, **look)
                 inset.set_facecolor("#fbfbfb")

@@ -109,7 +109,7 @@ def spot_diagram(
 
 def panel_size(radii: Sequence[float], airy: float) -> float:
     """Half width in mm that holds spots of these geometric radii and the Airy disc."""
-    return 1.14 * max(*radii, airy if math.isfinite(airy) else 0.0, 1e-7)
+    return 1.14 * max(1e-7, *(radius for radius in (*radii, airy) if math.isfinite(radius)))
 
 
 def draw_spot(
@@ -119,7 +119,7 @@ def draw_spot(
     draw_dots(axes, whole, dots, number, wavelengths=wavelengths, airy=airy, half=half)
     bar = style.round_length(0.62 * half)
     style.scale_bar(axes, -0.93 * half, -0.93 * half, bar, align="left")
-    if int(whole.rays[number]) == 0:
+    if bool(whole.rms_radius[number].isnan()):
         axes.text(0, 0, "no ray reaches\nthe image", ha="center", va="center", color=style.GREY)
         axes.set_xlabel(" \n ")
         return
