@@ -48,9 +48,7 @@ def focus_moments(rays: Rays, weights: Tensor | None = None, *, empty: str = "na
     return where_lit(total[..., 0] != 0, *moments, empty=empty)
 
 
-def spot_parabola(
-    rays: Rays, weights: Tensor | None = None, *, empty: str = "nan"
-) -> tuple[Tensor, Tensor, Tensor]:
+def spot_parabola(rays: Rays, weights: Tensor | None = None, *, empty: str = "nan") -> tuple[Tensor, Tensor, Tensor]:
     """Q0 mm², Q1 mm, Q2 of the mean square radius Q0 + 2 s Q1 + s² Q2 on a sensor moved by s mm; each (...).
 
     rays: (3, ..., P) as `image_rays` gives them. Once they are traced, a step of an optimisation of the sensor distance

@@ -1,6 +1,7 @@
 """Lens: surfaces, stop, aperture, fields and wavelengths, as one value."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -94,6 +95,13 @@ def with_object_distance(lens: Lens, object_distance: Tensor) -> Lens:
 def with_sensor_distance(lens: Lens, sensor_distance: Tensor) -> Lens:
     """The lens with its sensor at another distance, mm from the last surface before the image."""
     return _with_thickness(lens, len(lens.surfaces) - 2, sensor_distance)
+
+
+def with_wavelengths(lens: Lens, wavelengths: Tensor | Sequence[float], weights: Tensor | None = None) -> Lens:
+    """The lens at other wavelengths (W,) µm, the first one primary, by weights (W,), alike by default."""
+    wavelengths = torch.as_tensor(wavelengths, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device).reshape(-1)
+    weights = torch.ones_like(wavelengths) if weights is None else weights
+    return dataclasses.replace(lens, wavelengths=wavelengths, wavelength_weights=weights, primary_wavelength=0)
 
 
 def _with_thickness(lens: Lens, number: int, thickness: Tensor) -> Lens:

@@ -78,8 +78,8 @@ def where_lit(lit: Tensor, *numbers: Tensor, empty: str = "nan") -> tuple[Tensor
     if empty == "error" and not bool(lit.all()):
         first = tuple(torch.nonzero(~lit)[0].tolist())
         raise EmptySpot(
-            f"no ray reaches {int((~lit).sum())} of {lit.numel()} spots, first that of index {first}: it has no centroid "
-            "and no radius"
+            f"no ray reaches {int((~lit).sum())} of {lit.numel()} spots, first that of index {first}: "
+            "it has no centroid and no radius"
         )
     return tuple(torch.where(lit, number, torch.nan) for number in numbers)
 

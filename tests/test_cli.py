@@ -845,6 +845,26 @@ def test_spot_counts_vignetted_rays(run):
     assert "no ray reaches the image" in run("focus", "closed.zmx").error
 
 
+@pytest.mark.parametrize("rays", [(), ("--rays", 648)])
+def test_a_spot_without_rays_is_a_dash_and_a_warning_says_where_they_end(run, rays):
+    found = run("spot", "cooke_triplet", "--field", 0, 80, *rays)
+    lines = found.out.splitlines()
+    assert lines[-1].split() == ["all", "-", "-", "-", "-"]
+    assert lines[-2].split() == ["80", "0.656273", "-", "-", "-", "-", "648"]
+    assert "nan" not in found.out
+    assert found.err.count("warning") == 1
+    assert "field 80 degrees, 0.486133, 0.587562, 0.656273 µm: all 648 rays lost: missed surface 2" in found.err
+    *_, lost = run("spot", "cooke_triplet", "--field", 0, 80, *rays, "--json").document["results"]
+    assert [lost["rays"], lost["rms_radius"], lost["geometric_radius"]] == [0, None, None]
+
+
+def test_focus_tells_of_a_field_that_is_lost(run):
+    both = run("focus", "cooke_triplet", "--field", 0, 80, "--json")
+    assert "field 80 degrees, 0.587562 µm: all 576 rays lost: missed surface 2" in both.err
+    assert both.document["sensor_after"] == run("focus", "cooke_triplet", "--json").document["sensor_after"]
+    assert run("focus", "cooke_triplet", "--field", 80).error.count("no ray reaches the image") == 1
+
+
 def test_spot_of_every_field_and_wavelength(run):
     results = run("spot", "double_gauss", "--wavelength", 0.486, 0.588, 0.656, "--json").document["results"]
     assert [(r["field"], r["wavelength"]) for r in results] == [

@@ -8,11 +8,20 @@ import torch
 from problems import double_gauss, lens, scalar, surface, vector
 
 from raytrace import pupil
-from raytrace.focus import focus, focus_moments, image_rays, spot_parabola, through_focus
+from raytrace.focus import (
+    focus,
+    focus_moments,
+    focus_of_mean_radius,
+    image_rays,
+    mean_rms_radius,
+    spot_parabola,
+    through_focus,
+)
 from raytrace.glass import MIRROR
 from raytrace.lens import with_object_distance, with_sensor_distance
 from raytrace.paraxial import first_order
-from raytrace.spot import spot
+from raytrace.spot import EmptySpot, spot
+from raytrace.surface import Aperture
 
 POINTS, WEIGHTS = pupil.gauss_rings(6)
 AXIS = torch.zeros(2, 1, dtype=torch.float64)
@@ -132,13 +141,13 @@ def test_derivative_by_object_distance_tends_to_newtons():
     assert torch.autograd.grad(found, D)[0].item() == pytest.approx(-(data.magnification**2).item(), rel=1e-5)
 
 
-def test_all_rays_lost_leaves_the_sensor_where_it_is():
+def test_all_rays_lost_is_no_focus_and_no_derivative_by_the_lens():
     blind = lens([surface(0.1, 5.0, 1.5), surface(-0.01, 40.0)], aperture=("entrance_pupil_diameter", 1000.0))
     points = torch.tensor([[0.9, -0.9], [0.0, 0.0]], dtype=torch.float64)
     c = blind.surfaces[1].curvature.clone().requires_grad_()
     surfaces = (blind.surfaces[0], dataclasses.replace(blind.surfaces[1], curvature=c), *blind.surfaces[2:])
     found = focus(dataclasses.replace(blind, surfaces=surfaces), points, torch.ones(2, dtype=torch.float64))
-    assert found.item() == 40.0
+    assert found.isnan()
     assert torch.autograd.grad(found, c)[0].item() == 0.0
 
 
@@ -149,3 +158,65 @@ def test_the_parabola_of_a_spot_is_its_mean_square_radius_through_focus():
     for shift in (-0.3, 0.0, 0.5):
         traced = rms(with_sensor_distance(system, system.surfaces[-2].thickness + shift))
         torch.testing.assert_close(constant + 2 * shift * linear + shift**2 * square, traced, rtol=1e-11, atol=0)
+
+
+LOST = vector(0.0, 85.0).reshape(2, 1)  # degrees: no ray of the double Gauss arrives
+
+
+def test_focus_leaves_a_field_without_rays_out_or_refuses_it():
+    system = double_gauss(object_distance=25000.0)
+    both = torch.cat([AXIS, LOST], 1)
+    found = focus(system, POINTS, WEIGHTS, fields=both)
+    assert found.item() == focus(system, POINTS, WEIGHTS, fields=AXIS).item()
+    with pytest.raises(EmptySpot, match="no ray reaches 1 of 2 spots"):
+        focus(system, POINTS, WEIGHTS, fields=both, empty="error")
+
+
+def test_no_ray_or_one_ray_has_no_focus_and_no_derivative():
+    system = double_gauss()
+    system = with_sensor_distance(system, system.surfaces[-2].thickness.clone().requires_grad_())
+    for points, fields in ((POINTS, LOST), (POINTS[:, :1], AXIS)):
+        weights = torch.ones_like(points[0])
+        found = focus(system, points, weights, fields=fields)
+        assert found.isnan()
+        assert torch.autograd.grad(found, system.surfaces[-2].thickness)[0] == 0
+        with pytest.raises(EmptySpot):
+            focus(system, points, weights, fields=fields, empty="error")
+        with pytest.raises(EmptySpot):
+            focus_of_mean_radius(system, points, weights, fields=fields)
+
+
+def test_moments_and_parabola_of_a_lost_spot_are_nan():
+    rays = image_rays(double_gauss(), POINTS, fields=LOST)
+    assert all(t.isnan().all() for t in (*focus_moments(rays, WEIGHTS), *spot_parabola(rays, WEIGHTS)))
+    assert mean_rms_radius(double_gauss(), POINTS, WEIGHTS, fields=LOST).isnan()
+
+
+def test_mean_rms_radius_is_what_focus_makes_least():
+    system, distances = double_gauss(), [10000.0, 50000.0]
+    best = focus(system, POINTS, WEIGHTS, fields=AXIS, object_distances=distances)
+    radii = [
+        mean_rms_radius(moved, POINTS, WEIGHTS, fields=AXIS, object_distances=distances)
+        for moved in (with_sensor_distance(system, best + step) for step in (-0.01, 0.0, 0.01))
+    ]
+    assert radii[1] < min(radii[0], radii[2])
+    single = [rms(with_sensor_distance(with_object_distance(system, d), best), fields=AXIS).item() for d in distances]
+    assert radii[1].item() == pytest.approx(math.sqrt(sum(single) / 2), rel=1e-12)
+
+
+@pytest.mark.parametrize("half", [math.inf, 0.05])
+def test_focus_of_mean_radius_is_the_least_mean_distance_retraced(half):
+    """Also where the rim of the sensor clips the blur: rays that reached it stay, wherever the sensor goes."""
+    system = double_gauss(object_distance=25000.0)
+    found = focus_of_mean_radius(system, POINTS, WEIGHTS, fields=AXIS)
+    clip = () if math.isinf(half) else (Aperture("rectangular", (half, half)),)
+    surfaces = (*system.surfaces[:-1], dataclasses.replace(system.surfaces[-1], apertures=clip))
+    clipped = with_sensor_distance(dataclasses.replace(system, surfaces=surfaces), found + 1e-3)
+    assert focus_of_mean_radius(clipped, POINTS, WEIGHTS, fields=AXIS).item() == pytest.approx(found.item(), abs=1e-8)
+
+    def mean(sensor):
+        rays = image_rays(with_sensor_distance(system, sensor), POINTS, fields=AXIS)
+        return (WEIGHTS * torch.hypot(*rays.position[:2])).sum().item()
+
+    here = mean(found)
+    assert here < min(mean(found - 1e-3), mean(found + 1e-3))

@@ -46,6 +46,7 @@ FLOORS = {
     "spot": 6,
     # 7
     "focus": 7,
+    "losses": 7,
     "reuse": 7,
     # 8
     "scene": 8,

@@ -8,7 +8,7 @@ import torch
 from test_hardcases import of_kind
 
 from raytrace.rays import Rays
-from raytrace.spot import spot, spot_of_points
+from raytrace.spot import EmptySpot, spot, spot_of_points
 
 ROUNDING = 2.0**-53
 
@@ -30,8 +30,9 @@ def test_hard_case(case):
     mean_square = torch.autograd.grad(found.mean_square_radius, x, retain_graph=True)[0]
     rms = torch.autograd.grad(found.rms_radius, x)[0]
     assert torch.isfinite(rms).all()
-    if expected["status"] == "undefined":  # documented: an empty spot has radius 0, at the origin
-        assert found.rms_radius == found.mean_square_radius == 0
+    if expected["status"] == "undefined":  # documented: nan with gradient 0
+        assert found.rms_radius.isnan()
+        assert found.mean_square_radius.isnan()
         assert (mean_square == 0).all()
         return
     centroid = tensor(floats(expected["centroid"]))
@@ -85,8 +86,58 @@ def test_one_point_or_identical_points_have_radius_and_gradient_zero(points):
 def test_no_points(shape):
     found = spot_of_points(torch.zeros(shape, dtype=torch.float64), torch.zeros(shape[1:], dtype=torch.bool))
     assert found.rms_radius.shape == shape[1:-1]
-    assert torch.isfinite(found.centroid).all()
+    assert found.centroid.isnan().all()
     assert found.rays.sum() == 0
+
+
+def batch_with_a_lost_spot():
+    """Points (2, 2, 5) of two spots, the second of which no ray reaches, with its exact neighbour."""
+    generator = torch.Generator().manual_seed(7)
+    points = torch.randn(2, 2, 5, generator=generator, dtype=torch.float64).requires_grad_()
+    return points, torch.tensor([[True] * 5, [False] * 5])
+
+
+@pytest.mark.parametrize("name", ["mean_square_radius", "rms_radius", "geometric_radius", "centroid"])
+@pytest.mark.parametrize("reduce", [torch.sum, torch.nansum, torch.nanmean])
+def test_a_lost_spot_is_nan_and_leaves_the_derivatives_of_others_alone(name, reduce):
+    """Nor is it worth anything: 0 with gradient 0 would make losing every ray the best a merit can do."""
+    points, valid = batch_with_a_lost_spot()
+    found = getattr(spot_of_points(points, valid), name)
+    assert found[..., 1].isnan().all()
+    assert found[..., 0].isfinite().all()
+    (gradient,) = torch.autograd.grad(reduce(found), points)
+    one = points[:, 0].detach().requires_grad_()
+    (alone,) = torch.autograd.grad(reduce(getattr(spot_of_points(one, valid[0]), name)), one)
+    assert torch.allclose(gradient[:, 0], alone, rtol=1e-12, atol=1e-15)
+    assert (gradient[:, 1] == 0).all()
+
+
+def test_a_mask_by_rays_makes_a_merit_finite_with_finite_second_derivatives():
+    points, valid = batch_with_a_lost_spot()
+
+    def merit(p):
+        found = spot_of_points(p, valid)
+        return torch.where(found.rays > 0, found.mean_square_radius, 7.0).sum()
+
+    assert merit(points) > 7
+    assert torch.autograd.gradgradcheck(merit, points)
+    assert torch.func.hessian(merit)(points.detach()).isfinite().all()
+
+
+def test_a_lost_spot_can_be_an_error():
+    points, valid = batch_with_a_lost_spot()
+    with pytest.raises(EmptySpot, match=r"1 of 2 spots, first that of index \(1,\)"):
+        spot_of_points(points, valid, empty="error")
+    whole = spot_of_points(points[:, :1], valid[:1], empty="error")
+    assert torch.equal(whole.rms_radius, spot_of_points(points, valid).rms_radius[:1])
+    with pytest.raises(ValueError, match="expected 'nan' or 'error'"):
+        spot_of_points(points, valid, empty="zero")
+
+
+def test_rays_without_weight_make_no_spot():
+    points, _ = batch_with_a_lost_spot()
+    found = spot_of_points(points, torch.ones(2, 5, dtype=torch.bool), tensor([[1.0] * 5, [0.0] * 5]))
+    assert found.rms_radius.isnan().tolist() == [False, True]
 
 
 def test_batches_equal_spots_one_by_one():

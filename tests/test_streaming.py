@@ -17,7 +17,7 @@ from raytrace.launch import launch
 from raytrace.lens import with_object_distance
 from raytrace.psf import psf
 from raytrace.psf.streaming import stream_psf
-from raytrace.spot import spot
+from raytrace.spot import EmptySpot, spot
 from raytrace.stream_gradient import mean_square_gradient, stream_gradient
 from raytrace.streaming import Moments, chunk_size, merge, moments, pupil_chunks, shot, stream_spot, stream_spots
 from raytrace.surface import Aperture
@@ -222,7 +222,10 @@ def test_spot_of_no_rays_is_empty():
     system = clipped(field=fields("angle", (60.0,)))
     found = stream_spot(system, 300)
     assert found.rays.tolist() == [[0]]
-    assert float(found.rms_radius) == float(found.geometric_radius) == float(found.geometric_bound) == 0
+    for name in ("rms_radius", "geometric_radius", "geometric_bound", "centroid", "covariance", "mean_square_radius"):
+        assert getattr(found, name).isnan().all(), name
+    with pytest.raises(EmptySpot, match="no ray reaches 1 of 1 spots"):
+        stream_spots(system, 300, empty="error")
 
 
 def test_float32_rays_are_summed_in_float64():
@@ -309,6 +312,21 @@ def test_gradient_is_that_of_all_rays_at_once(distance):
     for one, other in zip(found[:-1], exact, strict=True):
         assert float(one) == pytest.approx(float(other), rel=1e-8)
     assert float(found[-1]) == 0
+
+
+def test_a_spot_that_no_ray_reaches_makes_the_mean_nan_and_no_derivative():
+    curvatures = [s.curvature.clone().requires_grad_() for s in double_gauss().surfaces if s.curvature is not None]
+    system = bent(curvatures, scalar(1.0))
+    both, one = vector(0.0, 0.0, 0.0, 85.0).reshape(2, 2), vector(0.0, 0.0)[:, None]
+    assert stream_spot(system, 300, fields=both).rays[1].tolist() == [0]
+    value, found = mean_square_gradient(system, curvatures, 300, fields=both)
+    alone = mean_square_gradient(system, curvatures, 300, fields=one)[1]
+    assert value.isnan()
+    assert all(float(2 * a) == pytest.approx(float(b), rel=1e-12) for a, b in zip(found, alone, strict=True))
+    weighed = mean_square_gradient(system, curvatures, 300, fields=both, weights=vector(1.0, 0.0)[:, None])[0]
+    assert weighed.isfinite()
+    with pytest.raises(EmptySpot):
+        mean_square_gradient(system, curvatures, 300, fields=both, empty="error")
 
 
 def test_gradient_of_a_sum_over_chunks():

@@ -1,5 +1,6 @@
 """The wavefront of a scene: perfect lenses, known aberrations, objects at any distance."""
 
+import dataclasses
 import math
 
 import problems
@@ -11,6 +12,7 @@ from raytrace.lens import with_sensor_distance
 from raytrace.numerics import dot
 from raytrace.pupil import gauss_rings
 from raytrace.scene import scene
+from raytrace.spot import EmptySpot
 from raytrace.surface import Aperture
 from raytrace.wavefront import mean_opd, peak_to_valley, rms, wavefront, without, zernike_coefficients
 
@@ -114,6 +116,27 @@ def test_vignetting_and_a_blocked_chief_ray():
         assert (front.opd[~front.valid] == 0).all()
         assert (front.centre == free.centre).all()
         assert torch.isfinite(rms(front)).all()
+
+
+def test_a_field_without_light_has_no_wavefront_and_leaves_the_others_their_derivatives():
+    """0 waves with derivative 0 would be what a merit likes best."""
+    lens = problems.double_gauss()
+    surfaces = list(lens.surfaces)
+    surfaces[1] = dataclasses.replace(surfaces[1], curvature=surfaces[1].curvature.clone().requires_grad_())
+    bent = dataclasses.replace(lens, surfaces=tuple(surfaces))
+    fields = torch.tensor([[0.0, 0.0], [0.0, 85.0]], dtype=torch.float64)
+    both, one = (
+        wavefront(scene(bent, f, vector(25e3), bent.wavelengths), POINTS, WEIGHTS) for f in (fields, fields[:, :1])
+    )
+    for measure in (rms, peak_to_valley):
+        assert measure(both)[0, :, 0].isnan().tolist() == [False, True]
+        slopes = [
+            torch.autograd.grad(measure(front).nansum(), surfaces[1].curvature, retain_graph=True)[0]
+            for front in (both, one)
+        ]
+        assert slopes[0].item() == pytest.approx(slopes[1].item(), rel=1e-9)
+        with pytest.raises(EmptySpot):
+            measure(both, empty="error")
 
 
 def test_vignetting_factors_shrink_the_beam_and_its_light():

@@ -133,7 +133,8 @@ def common_focus(lens: Lens, focus_distance: float, *, wavelength: float | Tenso
         raise ValueError(f"no real image of an object at {focus_distance:g} mm: it lies within the focal length")
     lens = with_sensor_distance(lens, sensor)
     if start == "rms":
-        lens = with_sensor_distance(lens, focus(lens, *gauss_rings(_RINGS), fields=wavelengths.new_zeros(2, 1)))
+        axis = wavelengths.new_zeros(2, 1)
+        lens = with_sensor_distance(lens, focus(lens, *gauss_rings(_RINGS), fields=axis, empty="error"))
     return lens
 
 

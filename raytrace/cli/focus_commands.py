@@ -18,14 +18,12 @@ from raytrace.cli.door import (
     print_json,
     say,
 )
-from raytrace.cli.spots import field_label, pupil_points
+from raytrace.cli.spots import field_label, pupil_points, warn_of_losses
 from raytrace.focus import focus as best_focus
-from raytrace.focus import focus_moments, focus_of_merit, image_rays
+from raytrace.focus import focus_of_mean_radius, image_rays, mean_rms_radius
 from raytrace.formats import read_lens, write_lens
-from raytrace.lens import FIELD_UNITS, Lens, with_object_distance, with_sensor_distance
-from raytrace.numerics import safe_sqrt
+from raytrace.lens import FIELD_UNITS, Lens, with_object_distance, with_sensor_distance, with_wavelengths
 from raytrace.paraxial import first_order, paraxial_image_distance
-from raytrace.spot import spot as spot_of
 
 
 def focus(arguments: argparse.Namespace) -> None:
@@ -48,14 +46,14 @@ def focus(arguments: argparse.Namespace) -> None:
     paraxial = paraxial_image_distance(lens, before.new_tensor(distances))
     if not bool(torch.isfinite(paraxial).all()):
         raise CommandError(f"{arguments.lens}: the lens is afocal for this object distance; there is no focus to find")
-    arrived = _refuse_without_focus(arguments, lens, points, rule)
-    if arrived < 1:
-        say(f"warning: {1 - arrived:.2%} of the rays are lost; the focus is of the rest")
     rms = best_focus(lens, points, weights, **rule)
+    _tell_losses(arguments, lens, points, rule)
+    if not bool(torch.isfinite(rms)):
+        raise CommandError(f"{arguments.lens}: one ray, or parallel rays, have no focus; ask for more rays (--size)")
     shares = paraxial.new_tensor(arguments.distance_weights or [1.0] * len(distances))
     after = {"rms": rms, "paraxial": (shares * paraxial).sum() / shares.sum()}.get(arguments.criterion)
     if after is None:
-        after = focus_of_merit(lambda s: _mean_distance(lens, s, points, weights, rule), rms).detach()
+        after = focus_of_mean_radius(lens, points, weights, **rule)
     result = {
         "object_distance": number(distances[0]) if len(distances) == 1 else [number(d) for d in distances],
         "sensor_before": number(before),
@@ -89,21 +87,20 @@ def focus(arguments: argparse.Namespace) -> None:
         say(f"written: {path}")
 
 
-def _refuse_without_focus(arguments: argparse.Namespace, lens: Lens, points: Tensor, rule: dict) -> float:
-    """The fraction of rays that reach the image. Raises CommandError if too few do, or all are parallel."""
-    valid, variance = [], 0.0
+def _tell_losses(arguments: argparse.Namespace, lens: Lens, points: Tensor, rule: dict) -> None:
+    """Warn of rays that do not reach the image. Raises CommandError if none does."""
+    lens, arrived = with_wavelengths(lens, rule["wavelengths"]), []
     for distance in rule["object_distances"]:
-        rays = image_rays(
-            with_object_distance(lens, distance), points, fields=rule["fields"], wavelengths=rule["wavelengths"]
-        )
-        valid.append(rays.valid.double().mean())
-        variance += float(focus_moments(rays)[1].sum())
-    arrived = float(torch.stack(valid).mean())
-    if arrived == 0:
-        raise CommandError(f"{arguments.lens}: no ray reaches the image; `raytrace trace` says where they are lost")
-    if variance == 0:
-        raise CommandError(f"{arguments.lens}: one ray, or parallel rays, have no focus; ask for more rays (--size)")
-    return arrived
+        trial = with_object_distance(lens, distance)
+        valid = image_rays(trial, points, fields=rule["fields"]).valid
+        at = f"object at {distance:g} mm, " if len(rule["object_distances"]) > 1 else ""
+        warn_of_losses(trial, rule["fields"], points, ~valid.any(-1), at=at)
+        arrived.append(float(valid.double().mean()))
+    lost = 1 - sum(arrived) / len(arrived)
+    if lost == 1:
+        raise CommandError(f"{arguments.lens}: no ray reaches the image")
+    if lost > 0:
+        say(f"warning: {lost:.2%} of the rays are lost; the focus is of the rest")
 
 
 def _as_in_file(focused: Lens, arguments: argparse.Namespace) -> Lens:
@@ -115,35 +112,8 @@ def _as_in_file(focused: Lens, arguments: argparse.Namespace) -> Lens:
 
 
 def _rms(lens: Lens, sensor: Tensor, points: Tensor, weights: Tensor, rule: dict) -> float | None:
-    """Root of the weighted mean of the mean square radii over distances, fields and wavelengths, mm."""
-    square = _average(lens, sensor, points, rule, lambda rays: spot_of(rays, weights).mean_square_radius)
-    return None if square is None else number(safe_sqrt(square))
-
-
-def _mean_distance(lens: Lens, sensor: Tensor, points: Tensor, weights: Tensor, rule: dict) -> Tensor:
-    """Weighted mean distance of the hits from their centroid, mm."""
-
-    def merit(rays):
-        found = spot_of(rays, weights)
-        offset = rays.position[:2] - found.centroid[..., None]
-        distance = torch.where(rays.valid, safe_sqrt(offset[0] ** 2 + offset[1] ** 2), 0.0)
-        return (weights * distance).sum(-1) / torch.where(rays.valid, weights, 0.0).sum(-1).clamp_min(1e-300)
-
-    return _average(lens, sensor, points, rule, merit)
-
-
-def _average(lens: Lens, sensor: Tensor, points: Tensor, rule: dict, merit) -> Tensor | None:
-    """Mean of a merit (F, W) over distances × fields × wavelengths by the rule's weights; None if no ray arrives."""
-    total = share = 0.0
-    distance_weights = rule["distance_weights"] or [1.0] * len(rule["object_distances"])
-    for distance, distance_weight in zip(rule["object_distances"], distance_weights, strict=True):
-        trial = with_sensor_distance(with_object_distance(lens, distance), sensor)
-        rays = image_rays(trial, points, fields=rule["fields"], wavelengths=rule["wavelengths"])
-        portion = rays.valid.any(-1).to(rays.position.dtype) * distance_weight
-        portion = portion if rule["field_weights"] is None else portion * rule["field_weights"][:, None]
-        portion = portion if rule["wavelength_weights"] is None else portion * rule["wavelength_weights"]
-        total, share = total + (portion * merit(rays)).sum(), share + portion.sum()
-    return total / share if float(share) > 0 else None
+    """RMS radius over distances, fields and wavelengths, mm; None where no ray arrives."""
+    return number(mean_rms_radius(with_sensor_distance(lens, sensor), points, weights, **rule))
 
 
 def _print_focus(lens, arguments, distances, fields, wavelengths, paraxial, result, points, weights, rule) -> None:

@@ -8,7 +8,7 @@ from torch import Tensor
 from raytrace import pupil
 from raytrace.cli.door import field_points, open_lens, print_json, ray_aiming, say
 from raytrace.cli.progress import progress
-from raytrace.cli.spots import field_label, pupil_points, spot_entry
+from raytrace.cli.spots import field_label, pupil_points, spot_cells, spot_entry, warn_of_losses
 from raytrace.launch import launch
 from raytrace.lens import FIELD_UNITS, Lens
 from raytrace.rays import Rays
@@ -31,6 +31,7 @@ def spot(arguments: argparse.Namespace) -> None:
     if unaimed:
         say(f"warning: {unaimed} of {rays.valid.numel()} rays found no way to their point of the stop")
     spots = spot_of(rays, weights)
+    warn_of_losses(lens, fields, points, spots.rms_radius.isnan(), aiming=ray_aiming(arguments))
     if arguments.plot:
         from raytrace import plot
 
@@ -44,18 +45,10 @@ def spot(arguments: argparse.Namespace) -> None:
     print(f"{unit:>10} {'µm':>11} {'mm':>13} {'mm':>13} {'µm':>10} {'µm':>10} {'lost':>7}")
     for f in range(fields.shape[1]):
         for w, wavelength in enumerate(lens.wavelengths.tolist()):
-            x, y = spots.centroid[:, f, w].tolist()
-            rms, geometric = 1000 * float(spots.rms_radius[f, w]), 1000 * float(spots.geometric_radius[f, w])
             lost = rays.valid.shape[-1] - int(spots.rays[f, w])
-            print(
-                f"{field_label(fields[:, f]):>10} {wavelength:>11g} {x:>13.7f} {y:>13.7f} {rms:>10.4f} "
-                f"{geometric:>10.4f} {lost:>7}"
-            )
+            print(f"{field_label(fields[:, f]):>10} {wavelength:>11g} {spot_cells(spots, (f, w))} {lost:>7}")
         if len(lens.wavelengths) > 1:
-            whole = polychromatic(lens, spots, weights, f)
-            rms, geometric = 1000 * float(whole.rms_radius), 1000 * float(whole.geometric_radius)
-            x, y = whole.centroid.tolist()
-            print(f"{'':>10} {'all':>11} {x:>13.7f} {y:>13.7f} {rms:>10.4f} {geometric:>10.4f}")
+            print(f"{'':>10} {'all':>11} {spot_cells(polychromatic(lens, spots, weights, f), ())}")
 
 
 def _to_sensor(lens: Lens, points: Tensor, fields: Tensor, aiming: str | None) -> tuple[Rays, int, Tensor]:

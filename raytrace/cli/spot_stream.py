@@ -2,15 +2,16 @@
 
 import argparse
 
-import torch
 from torch import Tensor
 
+from raytrace import pupil
 from raytrace.cli.door import CommandError, field_points, number, open_lens, print_json, ray_aiming
 from raytrace.cli.progress import progress
-from raytrace.cli.spots import field_label, spot_entry
+from raytrace.cli.spots import field_label, spot_cells, spot_entry, warn_of_losses
 from raytrace.lens import FIELD_UNITS, Lens
 from raytrace.streaming import MAX_BYTES, StreamedSpot, stream_spots
 
+_TRIED = 4096  # rays that tell where all are lost
 _RIM = 72  # rays on the rim of the pupil, for the largest radius, as the spot of few rays has them
 
 
@@ -32,6 +33,8 @@ def spot(arguments: argparse.Namespace) -> None:
             max_bytes=MAX_BYTES if arguments.max_bytes is None else arguments.max_bytes,
             progress=bar.update,
         )
+    points = pupil.sobol(min(arguments.rays, _TRIED))[0]
+    warn_of_losses(lens, fields, points, each.rays == 0, aiming=ray_aiming(arguments))
     if arguments.json:
         print_json(_document(lens, fields, each))
     else:
@@ -53,7 +56,7 @@ def _document(lens: Lens, fields: Tensor, spots: StreamedSpot) -> dict:
     results = [
         {
             **spot_entry(fields, wavelength, spots, f, w),
-            "geometric_bound": number(spots.geometric_bound[f, w]) if int(spots.rays[f, w]) else None,
+            "geometric_bound": number(spots.geometric_bound[f, w]),
             "launched": spots.launched,
         }
         for f in range(fields.shape[1])
@@ -71,12 +74,8 @@ def _print(lens: Lens, fields: Tensor, each: StreamedSpot, whole: StreamedSpot) 
     for f in range(fields.shape[1]):
         label = field_label(fields[:, f])
         for w, wavelength in enumerate(lens.wavelengths.tolist()):
-            print(f"{label:>10} {wavelength:>11g} {_numbers(each, (f, w))} {each.launched - int(each.rays[f, w]):>11}")
+            print(
+                f"{label:>10} {wavelength:>11g} {spot_cells(each, (f, w))} {each.launched - int(each.rays[f, w]):>11}"
+            )
         if len(lens.wavelengths) > 1:
-            print(f"{'':>10} {'all':>11} {_numbers(whole, (f,))}")
-
-
-def _numbers(spots: StreamedSpot, at: tuple[int, ...]) -> str:
-    x, y = spots.centroid[(slice(None), *at)].tolist()
-    radii = 1000 * torch.stack([spots.rms_radius[at], spots.geometric_radius[at]])
-    return f"{x:>13.7f} {y:>13.7f} {radii[0]:>10.4f} {radii[1]:>10.4f}"
+            print(f"{'':>10} {'all':>11} {spot_cells(whole, (f,))}")

@@ -3,12 +3,13 @@
 import argparse
 import math
 
+import torch
 from torch import Tensor
 
 from raytrace import pupil
 from raytrace.cli.door import number, numbers, say
 from raytrace.lens import FIELD_UNITS, Lens
-from raytrace.losses import Losses, beam_hint
+from raytrace.losses import beam_hint, losses
 from raytrace.spot import Spot
 from raytrace.streaming import StreamedSpot
 
@@ -45,21 +46,33 @@ def spot_cells(spots: Spot | StreamedSpot, at: tuple[int, ...]) -> str:
 
 def cell(value: float, form: str) -> str:
     """A number in a table, or - of the same width where there is none."""
-    return f"{value + 0.0:{form}}" if math.isfinite(value) else f"{'-':>{form.strip('>').split('.')[0]}}"
+    if not math.isfinite(value):
+        return f"{'-':>{len(f'{0.0:{form}}')}}"
+    shown = f"{value:{form}}"
+    return shown if float(shown) else f"{0.0:{form}}"  # what rounds to 0 has no sign
 
 
-def warn_of_losses(lens: Lens, fields: Tensor, wavelengths: list[float], found: Losses) -> None:
-    """One line for every field of which a wavelength loses all its rays: where, and what to do about a beam too wide."""
-    lost = found.arrived == 0
-    for f in range(fields.shape[1]):
+def warn_of_losses(
+    lens: Lens, fields: Tensor, points: Tensor, dark: Tensor, *, aiming: bool | None = None, at: str = ""
+) -> None:
+    """One line for every field that loses all its rays at a wavelength, where and why; what to do about a wide beam.
+
+    dark: (F, W), which of the lens's wavelengths; points: (2, P) of the pupil, through which rays are traced once more;
+    at: what else is told of the place, as the object distance.
+    """
+    if not bool(dark.any()):
+        return
+    number = torch.nonzero(dark.any(1))[:, 0]
+    found = losses(lens, points, fields=fields[:, number], ray_aiming=aiming)
+    for place, f in enumerate(number.tolist()):
         said: dict[str, list[str]] = {}
-        for w, wavelength in enumerate(wavelengths):
-            if bool(lost[f, w]):
-                said.setdefault(found.words(f, w), []).append(f"{wavelength:g}")
+        for w, wavelength in enumerate(lens.wavelengths.tolist()):
+            if bool(dark[f, w]):
+                said.setdefault(found.words(place, w), []).append(f"{wavelength:g}")
         for words, colours in said.items():
             unit = FIELD_UNITS[lens.fields.kind]
-            say(f"warning: field {field_label(fields[:, f])} {unit}, {', '.join(colours)} µm: {words}")
-    if bool(lost.any()) and (hint := beam_hint(lens)):
+            say(f"warning: {at}field {field_label(fields[:, f])} {unit}, {', '.join(colours)} µm: {words}")
+    if hint := beam_hint(lens):
         say(f"warning: {hint}; see --f-number and --entrance-pupil-diameter")
 
 

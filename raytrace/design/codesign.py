@@ -126,8 +126,8 @@ def lens_at_start(lens: Lens, settings: Settings) -> Lens:
 
 
 def best_focus(lens: Lens) -> Tensor:
-    """Sensor distance of least RMS spot on the axis, mm."""
-    return focus(lens, *gauss_rings(_RINGS), fields=lens.wavelengths.new_zeros(2, 1))
+    """Sensor distance of least RMS spot on the axis, mm. Raises EmptySpot where no ray arrives."""
+    return focus(lens, *gauss_rings(_RINGS), fields=lens.wavelengths.new_zeros(2, 1), empty="error")
 
 
 @torch.no_grad()
