@@ -59,7 +59,7 @@ def losses(
     *,
     fields: Tensor | None = None,
     wavelengths: Tensor | None = None,
-    ray_aiming: bool | None = None,
+    ray_aiming: str | None = None,
 ) -> Losses:
     """Where rays are lost on their way to the image; arguments as for `launch`."""
     wavelengths = lens.wavelengths if wavelengths is None else wavelengths

@@ -53,7 +53,7 @@ def cell(value: float, form: str) -> str:
 
 
 def warn_of_losses(
-    lens: Lens, fields: Tensor, points: Tensor, dark: Tensor, *, aiming: bool | None = None, at: str = ""
+    lens: Lens, fields: Tensor, points: Tensor, dark: Tensor, *, aiming: str | None = None, at: str = ""
 ) -> None:
     """One line for every field that loses all its rays at a wavelength, where and why; what to do about a wide beam.
 
