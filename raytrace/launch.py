@@ -15,11 +15,12 @@ from torch import Tensor
 from raytrace import glass
 from raytrace.aiming import aim_at_stop, at_stop
 from raytrace.lens import RAY_AIMING, Lens
-from raytrace.numerics import broadcast_shape, dot, safe_divide, safe_sqrt, unit
+from raytrace.numerics import broadcast_shape, dot, dot_2, safe_divide, safe_sqrt, unit
 from raytrace.paraxial import FirstOrder, first_order
 from raytrace.rays import Rays
 from raytrace.surface import sag
 from raytrace.trace import start, trace
+from raytrace.vignetting import vignette
 
 
 class MarginalRayLost(UserWarning):
@@ -37,7 +38,7 @@ def launch(
     """Rays of every field, wavelength and pupil point: batch shape (F, W, P).
 
     pupil: (2, P) on the unit disc; fields: (2, F) in the lens's own kind of field, by default those of the lens with
-    their vignetting factors (a field given that equals one of the lens's gets its factors too);
+    their vignetting factors (other fields get those that `raytrace.vignetting` interpolates);
     wavelengths: (W,) µm, by default those of the lens; ray_aiming: a key of RAY_AIMING, by default the lens's.
     """
     fields = torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields
@@ -48,26 +49,6 @@ def launch(
     batch = broadcast_shape(rays.shape, rays.opl.shape)
     position, direction = rays.position.expand(3, *batch), rays.direction.expand(3, *batch)
     return Rays(position, direction, rays.valid.expand(batch), rays.opl.expand(batch))
-
-
-def vignette(lens: Lens, field: Tensor, pupil: Tensor) -> Tensor:
-    """Pupil points shrunk and shifted by the vignetting factors of the lens's field of the same coordinates.
-
-    p' = V + (1 - C) p, in axes turned by VAN;  field: (2, ...), pupil: (2, ...), result (2, ...) broadcast.
-    """
-    factors = lens.fields.vignetting
-    if factors is None:
-        return torch.stack([p.expand(broadcast_shape(field.shape[1:], p.shape)) for p in pupil])
-    own = torch.stack([lens.fields.x, lens.fields.y])
-    same = (own.reshape(2, -1, *(1,) * (field.dim() - 1)) == field[:, None]).all(0)
-    first = same & (same.to(torch.int64).cumsum(0) == 1)
-    vdx, vdy, vcx, vcy, angle = (
-        torch.where(first, factor.reshape(-1, *(1,) * (field.dim() - 1)), 0.0).sum(0) for factor in factors
-    )
-    cosine, sine = torch.cos(torch.deg2rad(angle)), torch.sin(torch.deg2rad(angle))
-    x = vdx + (1 - vcx) * (cosine * pupil[0] + sine * pupil[1])
-    y = vdy + (1 - vcy) * (cosine * pupil[1] - sine * pupil[0])
-    return torch.stack([cosine * x - sine * y, sine * x + cosine * y])
 
 
 def rays_of_field(
@@ -275,11 +256,6 @@ def _field_of_real_height(lens, height: Tensor, estimate: Tensor, paraxial: Firs
 def _scaled(field: Tensor, factor: Tensor) -> Tensor:
     """field (2, ...) times factor (...): the batch axes broadcast behind the component axis."""
     return torch.stack([component * factor for component in field])
-
-
-def dot_2(a: Tensor, b: Tensor) -> Tensor:
-    """Scalar product over a leading axis of length 2."""
-    return a[0] * b[0] + a[1] * b[1]
 
 
 def _value_and_slope(function: Callable[[Tensor], Tensor], point: Tensor) -> tuple[Tensor, Tensor]:

@@ -30,6 +30,11 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
     return torch.addcmul(ax * bx + ay * by, az, bz)
 
 
+def dot_2(a: Tensor, b: Tensor) -> Tensor:
+    """Scalar product over a leading axis of length 2."""
+    return a[0] * b[0] + a[1] * b[1]
+
+
 def differentiating() -> bool:
     """True if derivatives may be asked for: a graph is recorded, or a forward derivative (`jvp`) is under way.
 

@@ -16,11 +16,12 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-from raytrace.launch import rays_of_field, vignette
+from raytrace.launch import rays_of_field
 from raytrace.lens import Lens, with_object_distance
 from raytrace.numerics import broadcast_shape
 from raytrace.rays import Rays
 from raytrace.trace import Crossing, media, steps, trace_surfaces
+from raytrace.vignetting import vignette
 
 _NODES = 10  # object distances that are traced in place of a range
 _CLOSE = 1e-9  # mm and direction cosines: what interpolated rays may err by

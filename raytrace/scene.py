@@ -5,12 +5,12 @@ from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.autograd import forward_ad
 
 from raytrace.grid import Grid
-from raytrace.launch import vignette
 from raytrace.lens import Lens, with_object_distance
 from raytrace.rays import Rays
 from raytrace.reuse import Bundle, Memo, cross_bundle, trace_bundle
 from raytrace.trace import Crossing
 from raytrace.value import value
+from raytrace.vignetting import vignette
 
 
 class EmptyPsf(ValueError):

@@ -15,7 +15,6 @@ from raytrace.launch import (
     rays_from_point,
     rays_of_field,
     stop_radius,
-    vignette,
 )
 from raytrace.lens import with_object_distance
 from raytrace.paraxial import first_order
@@ -277,35 +276,6 @@ def test_telecentric_object_space():
     sine = torch.linalg.vector_norm(rays.direction[:2], dim=0)[..., edge]
     assert (sine - 0.05).abs().max() <= 2e-5  # equal tangents, not sines, off the axis of the cone's own field point
     assert (sine[0] - 0.05).abs().max() <= 1e-15
-
-
-class TestVignetting:
-    FACTORS = torch.tensor([[0.0, 0.1], [0.0, -0.2], [0.0, 0.3], [0.0, 0.5], [0.0, 0.0]], dtype=torch.float64)
-
-    def system(self, factors=FACTORS):
-        return double_gauss(field=fields("angle", (0.0, 14.0), vignetting=factors))
-
-    def test_pupil_is_compressed_and_shifted(self):
-        """p' = V + (1 - C) p."""
-        found = vignette(self.system(), vector(0.0, 14.0)[:, None], POINTS)
-        assert torch.allclose(found[0], 0.1 + 0.7 * POINTS[0], atol=1e-15)
-        assert torch.allclose(found[1], -0.2 + 0.5 * POINTS[1], atol=1e-15)
-
-    def test_each_field_has_its_own(self):
-        rays, plain = launch(self.system(), POINTS), launch(double_gauss(field=fields("angle", (0.0, 14.0))), POINTS)
-        assert torch.equal(rays.position[:, 0], plain.position[:, 0])
-        assert not torch.equal(rays.position[:, 1], plain.position[:, 1])
-
-    def test_a_field_in_between_is_not_vignetted(self):
-        field = vector(0.0, 7.0)[:, None]
-        one, other = launch(self.system(), POINTS, fields=field), launch(double_gauss(), POINTS, fields=field)
-        assert torch.equal(one.position, other.position)
-
-    def test_angle_turns_the_ellipse_by_van(self):
-        factors = torch.tensor([[0.0], [0.0], [0.0], [0.5], [90.0]], dtype=torch.float64)
-        system = double_gauss(field=fields("angle", (0.0,), vignetting=factors))
-        found = vignette(system, CENTRE, POINTS)
-        assert torch.allclose(found, POINTS * vector(0.5, 1.0)[:, None], atol=1e-15)
 
 
 def test_batches_broadcast_and_equal_single_rays():

@@ -41,6 +41,7 @@ FLOORS = {
     "paraxial": 5,
     "jacobian": 5,
     "aiming": 5,
+    "vignetting": 5,
     # 6
     "launch": 6,
     "spot": 6,

@@ -38,7 +38,7 @@ def field_range(lens: Lens, size: int) -> Tensor:
 
 
 def unvignetted(lens: Lens) -> Lens:
-    """The lens without vignetting factors, which belong to single fields and would bend a curve over the field."""
+    """The lens without vignetting factors, which would bend a curve over the field at every field listed."""
     return dataclasses.replace(lens, fields=dataclasses.replace(lens.fields, vignetting=None))
 
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from raytrace.departure import GridSag, ZernikeSag, numbers, sag_of, spline
 from raytrace.glass import index
 from raytrace.grid import Grid
-from raytrace.launch import rays_of_field, vignette
+from raytrace.launch import rays_of_field
 from raytrace.lens import Fields, Lens, SystemAperture, with_object_distance
 from raytrace.numerics import safe_divide
 from raytrace.psf.dft import integrate, nodes_per_pixel, rings_and_arms, sub_pixels
@@ -39,6 +39,7 @@ from raytrace.scene import Scene, symmetry
 from raytrace.surface import Surface, sag_at
 from raytrace.trace import media, trace_surfaces
 from raytrace.value import to, value
+from raytrace.vignetting import vignette
 from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike, is_radial, path, profile_height
 from raytrace.wavefront import Wavefront, wavefront
 from raytrace.zernike import noll
