@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from raytrace.bench import speed, speed_processes
-from raytrace.bench.limit import Limit, NoCompiler, build
+from raytrace.bench.limit import Limit, build
 from raytrace.bench.measure import errors_of, field_rays, surfaces_of
 from raytrace.bench.speed import Bench, Row, Sizes, interleaved, measure, stages
 from raytrace.bench.speed_own import Engine, leaves_of, three_aspheres, with_sensor_leaf
@@ -23,7 +23,7 @@ from raytrace.cli import speed_bench as command
 from raytrace.files import shipped
 from raytrace.focus import spot_parabola
 from raytrace.formats import read_lens
-from raytrace.fused import tracing
+from raytrace.fused import NoCompiler, tracing
 from raytrace.plot.speed import speed_figure
 from raytrace.rays import Rays
 from raytrace.reuse import Memo, trace_bundle

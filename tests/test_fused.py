@@ -328,12 +328,12 @@ def test_it_is_compiled_once_for_work_that_is_worth_it(tmp_path):
     assert not list(tmp_path.iterdir())
     first = probe(tmp_path, 2**20)
     (kept,) = tmp_path.iterdir()
-    stamp = kept.stat().st_mtime_ns
+    made = kept.stat().st_ino  # what is compiled anew takes its place as another file
     assert (first.stdout, kept.suffix) == ("True\n", ".so")
     assert first.stderr in ("", "raytrace: compiling the trace, once for this machine …\n")
     second = probe(tmp_path, 100)
     assert (second.stdout, second.stderr) == ("True\n", "")
-    assert [path.stat().st_mtime_ns for path in tmp_path.iterdir()] == [stamp]
+    assert [path.stat().st_ino for path in tmp_path.iterdir()] == [made]
 
 
 @pytest.mark.parametrize(
@@ -349,10 +349,3 @@ def test_without_a_compiler_torch_traces_and_one_line_says_why(tmp_path, environ
     assert reason in done.stderr
     assert done.stderr.endswith("; tracing by torch alone\n")
     assert len(done.stderr.splitlines()) == 1
-
-
-def test_a_folder_that_cannot_be_written_is_told_of(tmp_path):
-    (tmp_path / "file").write_text("")
-    done = probe(tmp_path / "file", 2**20)
-    assert done.stdout == "False\n"
-    assert "set RAYTRACE_CACHE to a folder to write to" in done.stderr

@@ -5,16 +5,14 @@ Nothing is allocated, dispatched or differentiated there: what a trace of this a
 
 import ctypes
 import dataclasses
-import os
-import shutil
-import subprocess
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from raytrace.fused.library import NoCompiler, compiler, run_compiler
+from raytrace.fused.trust import private_folder
 from raytrace.lens import Lens
 from raytrace.rays import Rays
 from raytrace.surface import Surface
@@ -25,14 +23,9 @@ from raytrace.value import to
 #: arithmetic changes by that. The others are tried first, and left out where a compiler does not know them.
 FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math")
 _WIDEST, _THREADS = "-mprefer-vector-width=512", "-fopenmp"
-_COMPILERS = ("g++", "c++", "clang++")
 _TERMS = 8
 _MOST_STEPS = 24
 _PLANE, _SPHERE, _ASPHERE = range(3)
-
-
-class NoCompiler(RuntimeError):
-    """No compiler of C++ was found, or none that builds the limits."""
 
 
 class _Surface(ctypes.Structure):
@@ -63,32 +56,32 @@ class Built:
         return f"{self.compiler} {' '.join(self.flags)}"
 
 
-def build(compiler: str | None = None) -> Built:
-    """Compile the limits: a second or two. compiler: default `$CXX`, else the first found. Raises NoCompiler."""
-    asked = compiler or os.environ.get("CXX")
-    found = next((name for name in ([asked] if asked else _COMPILERS) if shutil.which(name)), None)
-    if found is None:
-        raise NoCompiler(f"no C++ compiler found (looked for {asked or ', '.join(_COMPILERS)})")
-    for flags in ((*FLAGS, _WIDEST, _THREADS), (*FLAGS, _THREADS), FLAGS):
-        made = _compiled(found, flags)
-        if isinstance(made, ctypes.CDLL):
-            return Built(made, _version(found), flags)
-    raise NoCompiler(f"{found} does not build the limits: {made}")
+def build(named: str | None = None) -> Built:
+    """Compile the limits: a second or two. named: the compiler, as `compiler` takes it. Raises NoCompiler."""
+    program = compiler(named)
+    try:
+        with private_folder() as folder:
+            for flags in ((*FLAGS, _WIDEST, _THREADS), (*FLAGS, _THREADS), FLAGS):
+                made = _compiled(program, flags, folder)
+                if isinstance(made, ctypes.CDLL):
+                    version = run_compiler(*program, "--version", folder=folder).stdout
+                    return Built(made, version.splitlines()[0] if version else program[0], flags)
+    except OSError as error:
+        raise NoCompiler(f"the limits cannot be built: {error}") from None
+    raise NoCompiler(f"{' '.join(program)} does not build the limits: {made}")
 
 
-def _compiled(compiler: str, flags: Sequence[str]) -> ctypes.CDLL | str:
+def _compiled(program: Sequence[str], flags: Sequence[str], folder: Path) -> ctypes.CDLL | str:
     """The limits, or why they cannot be had. Linked without -fopenmp: threads are torch's, as the compiled trace's."""
-    with tempfile.TemporaryDirectory() as folder:
-        source = Path(__file__).with_name("limit.cpp")
-        compiled, file = Path(folder) / "limit.o", Path(folder) / "limit.so"
-        for words in (["-std=c++17", *flags, "-fPIC", "-c", source, "-o", compiled], ["-shared", compiled, "-o", file]):
-            done = subprocess.run([compiler, *map(str, words)], capture_output=True, text=True, timeout=300)
-            if done.returncode:
-                return done.stderr.strip().splitlines()[0] if done.stderr.strip() else f"exit {done.returncode}"
-        try:
-            return ctypes.CDLL(str(file))
-        except OSError as error:
-            return str(error)
+    source, compiled, file = Path(__file__).with_name("limit.cpp").absolute(), folder / "limit.o", folder / "limit.so"
+    for words in (["-std=c++17", *flags, "-fPIC", "-c", source, "-o", compiled], ["-shared", compiled, "-o", file]):
+        done = run_compiler(*program, *map(str, words), folder=folder)
+        if done.returncode:
+            return done.stderr.strip().splitlines()[0] if done.stderr.strip() else f"exit {done.returncode}"
+    try:
+        return ctypes.CDLL(str(file))
+    except OSError as error:
+        return str(error)
 
 
 class Limit:
@@ -174,8 +167,3 @@ def _surface(surface: Surface, number: int, gap: float, n1: Tensor, n2: Tensor) 
         behind=float(n2),
         coefficients=(ctypes.c_double * _TERMS)(*a),
     )
-
-
-def _version(compiler: str) -> str:
-    done = subprocess.run([compiler, "--version"], capture_output=True, text=True, timeout=60)
-    return done.stdout.splitlines()[0] if done.stdout else compiler

@@ -28,6 +28,7 @@ _WARM_UP = 2**14
 _MOST_BYTES = 4 * 2**30
 _SPOT = ("-m", "raytrace", "spot", "lenses/double_gauss.zmx")
 _BARE = ("-c", "import torch, matplotlib.pyplot")
+_SAFE = "-P"  # no modules of the current folder
 
 
 def bytes_per_ray(dtype: torch.dtype, rays: int, *, threads: int) -> tuple[float, int]:
@@ -46,7 +47,7 @@ def spot_process_ratio(repeats: int) -> tuple[float, float, float]:
     for turn in range(repeats + 1):
         for words, seconds in taken.items():
             began = time.perf_counter()
-            subprocess.run([sys.executable, *words], env=_environment(), stdout=subprocess.DEVNULL, check=True)
+            subprocess.run([sys.executable, _SAFE, *words], env=_environment(), stdout=subprocess.DEVNULL, check=True)
             if turn:  # the first brings the files into memory
                 seconds.append(time.perf_counter() - began)
     spot, bare = (statistics.median(seconds) for seconds in taken.values())
@@ -133,7 +134,7 @@ def _start(function: str, dtype: torch.dtype, rays: int, threads: int) -> subpro
     code = f"from raytrace.bench.speed_processes import {function}; {function}({words})"
     environment = _environment() | {"OMP_NUM_THREADS": str(threads)}
     pipe = subprocess.PIPE
-    return subprocess.Popen([sys.executable, "-c", code], env=environment, stdin=pipe, stdout=pipe, text=True)
+    return subprocess.Popen([sys.executable, _SAFE, "-c", code], env=environment, stdin=pipe, stdout=pipe, text=True)
 
 
 def _read(worker: subprocess.Popen) -> str:

@@ -11,12 +11,13 @@ import torch
 
 from raytrace import plot
 from raytrace.bench import less_work, speed, speed_report
-from raytrace.bench.limit import Built, NoCompiler, build
+from raytrace.bench.limit import Built, build
 from raytrace.bench.report import machine
 from raytrace.bench.speed_own import three_aspheres
 from raytrace.cli.door import number, print_json, say
 from raytrace.cli.progress import Bar, Lines, progress
 from raytrace.files import write_atomically
+from raytrace.fused import NoCompiler
 from raytrace.plot.speed import speed_figure
 
 

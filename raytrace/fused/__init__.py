@@ -2,6 +2,7 @@
 
 choice      which trace carries a batch of rays, and the switch to force one
 library     the C++ of this folder, compiled once for a machine
+trust       what may be executed: what nobody else can have written
 structure   a run of surfaces as that code reads it
 run         the code called on tensors, forward and backward
 block.h     what it works on: blocks of rays that stay in the cache
