@@ -12,7 +12,7 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
-from raytrace.files import write_atomically
+from raytrace.files import read_bytes, write_atomically
 from raytrace.glass import AGF_FORMULAS, COEFFICIENT_COUNTS, Glass
 
 _STATUSES = {0: "standard", 1: "preferred", 2: "obsolete", 3: "special", 4: "melt"}
@@ -60,12 +60,9 @@ def read_text(path: str | Path) -> str:
     """The text of a catalog's file, however it is encoded. Raises CatalogError."""
     path = Path(path)
     try:
-        with path.open("rb") as file:
-            content = file.read(_LARGEST_FILE + 1)
+        content = read_bytes(path, _LARGEST_FILE)
     except OSError as error:
         raise CatalogError(f"{path}: cannot be read ({error.strerror or error}); expected a glass catalog") from error
-    if len(content) > _LARGEST_FILE:
-        raise CatalogError(f"{path}: larger than {_LARGEST_FILE >> 20} MB; no glass catalog is")
     return decode(content, path)
 
 

@@ -3,6 +3,7 @@
 import errno
 import os
 import secrets
+import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
@@ -13,6 +14,20 @@ def shipped(folder: str) -> Path:
     package = Path(__file__).resolve().parent
     installed = package / folder
     return installed if installed.is_dir() else package.parent / folder
+
+
+def read_bytes(path: str | os.PathLike, most: int) -> bytes:
+    """All of a regular file of at most `most` bytes. Raises OSError for anything else: a pipe is not waited for."""
+    try:
+        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise OSError(errno.EINVAL, "is not a regular file", str(path))
+            if status.st_size > most:
+                raise OSError(errno.EFBIG, f"is larger than {most >> 20} MB", str(path))
+            return file.read(status.st_size)  # as much as was there: a file may grow
+    except ValueError as error:  # a zero byte in the name
+        raise OSError(errno.EINVAL, str(error), str(path)) from error
 
 
 def write_atomically(path: str | os.PathLike, write: Callable[[BinaryIO], None]) -> None:

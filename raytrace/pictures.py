@@ -6,17 +6,31 @@ process or on many, in a first run or in a resumed one.
 
 import dataclasses
 import functools
+import io
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
+from raytrace.files import read_bytes
+
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 _SPLIT, _ORDER, _CROP, _LEAVES = range(4)  # what a draw is for: the last number of its key
 
 
-class NoPictures(ValueError):
+#: A file is decoded up to so many bytes and pixels, and to so many pixels a byte: what deflate can pack, and no more.
+_MOST_BYTES, _MOST_PIXELS, _PIXELS_PER_BYTE = 2**28, 10**8, 1032
+#: So many pixels cost nothing, however well they are packed.
+_FEW_PIXELS = 2**22
+
+
+class PictureError(ValueError):
+    """A file that is no picture, damaged, or larger than any that is meant; one line."""
+
+
+class NoPictures(PictureError):
     """A folder without pictures, or with pictures that are all too small."""
 
 
@@ -50,7 +64,7 @@ def files(folder: str | Path) -> list[Path]:
 def read(paths: Sequence[str | Path], *, least: int, progress: Callable[[Iterable], Iterable] = iter) -> Pictures:
     """Pictures of at least `least` × `least` pixels; smaller ones are left out.
 
-    progress: wraps the paths, for a bar. Raises ValueError naming a file that is none, NoPictures if none is left.
+    progress: wraps the paths, for a bar. Raises PictureError naming a file that is none, NoPictures if none is left.
     """
     samples = [(read_grey(path), str(path)) for path in progress(paths)]
     kept = [(sample, name) for sample, name in samples if min(sample.shape) >= least]
@@ -60,12 +74,34 @@ def read(paths: Sequence[str | Path], *, least: int, progress: Callable[[Iterabl
 
 
 def read_grey(path: str | Path) -> np.ndarray:
-    """A picture as (H, W) luma of 8 bits (ITU-R BT.601). Raises ValueError naming a file that is none."""
+    """A picture as (H, W) luma of 8 bits (ITU-R BT.601). Raises PictureError naming a file that is none."""
     try:
-        with Image.open(path) as picture:
-            return np.asarray(picture.convert("L"))
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read as a picture ({error}); remove it or convert it") from error
+        return np.asarray(decoded(read_bytes(path, _MOST_BYTES)).convert("L"))
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+        message = f"{path}: cannot be read as a picture ({reason}); remove it or convert it"
+        raise PictureError(message) from error
+
+
+def decoded(content: bytes) -> Image.Image:
+    """The picture in the bytes of a file of `SUFFIXES`; its size is judged before it is decoded.
+
+    Raises PictureError saying why there is none.
+    """
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            picture = Image.open(io.BytesIO(content), formats=("JPEG", "PNG", "BMP", "TIFF"))
+            width, height = picture.size
+            count = width * height
+            if count > _MOST_PIXELS or count > max(_FEW_PIXELS, _PIXELS_PER_BYTE * len(content)) or count < 1:
+                found = f"{width} × {height} pixels in {len(content)} bytes"
+                raise PictureError(f"{found}: damaged, or more than the {_MOST_PIXELS:.0e} that are read")
+            picture.load()
+    except PictureError:
+        raise
+    except Exception as error:  # decoders raise whatever their parsing meets, struct.error and KeyError too
+        raise PictureError(" ".join(str(error).split())[:200] or type(error).__name__) from error
+    return picture
 
 
 def split(pictures: Pictures, *, share: float = 0.8, seed: int = 0) -> tuple[Pictures, Pictures]:

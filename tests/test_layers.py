@@ -18,7 +18,8 @@ FLOORS = {
     "pupil": 0,
     "zernike": 0,
     "files": 0,
-    "pictures": 0,
+    "arrays": 0,
+    "pictures": 1,
     # 1: the nouns
     "image": 1,
     "grid": 1,

@@ -16,16 +16,17 @@ import io
 import json
 import math
 import os
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from PIL import Image, PngImagePlugin, UnidentifiedImageError
+from PIL import Image, PngImagePlugin
 
-from raytrace.files import write_atomically
+from raytrace.arrays import LARGEST, ArrayError, read_npy
+from raytrace.files import read_bytes, write_atomically
+from raytrace.pictures import PictureError, decoded
 from raytrace.wave.element import Pixels, Rings
 
 Map = Pixels | Rings
@@ -36,6 +37,7 @@ _WHITE = 65535
 _LISTED = 256
 #: TIFF tag of the description.
 _DESCRIPTION = 270
+_NO_PITCH = "does not say its pitch; give pitch in mm"
 #: Length unit of a grid sag, in mm, by its flag.
 _UNITS = {0: 1.0, 1: 10.0, 2: 25.4, 3: 1000.0}
 
@@ -74,7 +76,7 @@ def read_heights(
     file = str(path)
     form = _format(file)
     try:
-        content = Path(path).read_bytes()
+        content = read_bytes(path, LARGEST)
     except OSError as error:
         raise HeightMapError(f"cannot be read: {error.strerror or error}", file) from error
     if not content:
@@ -113,15 +115,16 @@ def _write_npy(profile: Map, file: str) -> bytes:
 
 
 def _read_npy(content: bytes, file: str, known: Known) -> Map:
-    stream = io.BytesIO(content)
     try:
-        heights = np.load(stream, allow_pickle=False)
-        # A file of another program ends here.
-        pitch = float(np.load(stream, allow_pickle=False)[0]) if stream.tell() < len(content) else known.pitch
-    except (ValueError, EOFError, OSError, IndexError, TypeError) as error:
-        raise HeightMapError(f"is no .npy file of heights, damaged or cut off ({error})", file) from error
-    if heights.dtype.kind not in "fiu":
+        heights, *rest = read_npy(content)
+    except ArrayError as error:
+        raise HeightMapError(f"is no .npy file of heights: {error}", file) from error
+    if heights.dtype.kind not in "fiu" or heights.dtype.itemsize > 8:
         raise HeightMapError(f"holds numbers of type {heights.dtype}; expected heights in mm", file)
+    if rest and (rest[0].shape != (1,) or rest[0].dtype.kind != "f" or len(rest) > 1):
+        raise HeightMapError("holds more than heights and one pitch in mm; is it damaged?", file)
+    # A file of another program ends with the heights.
+    pitch = float(rest[0][0]) if rest else known.pitch
     heights = heights if heights.dtype in (np.float32, np.float64) else heights.astype(np.float64)
     return _profile(heights.astype(heights.dtype.newbyteorder("=")), pitch, file)
 
@@ -161,22 +164,24 @@ def _grey(profile: Map) -> tuple[np.ndarray, str]:
 
 def _read_picture(content: bytes, file: str, known: Known) -> Map:
     try:
-        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(content)) as picture:
-            mode, grey = picture.mode, np.array(picture)
-            text = picture.info.get("Description") or getattr(picture, "tag_v2", {}).get(_DESCRIPTION) or ""
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        picture = decoded(content)
+    except PictureError as error:
         raise HeightMapError(f"cannot be read as a picture ({error})", file) from error
-    if grey.ndim != 2 or not mode.startswith("I"):
-        raise HeightMapError(f"is a picture of mode {mode}; expected grey values of 16 bits", file)
+    if not picture.mode.startswith("I"):
+        raise HeightMapError(f"is a picture of mode {picture.mode}; expected grey values of 16 bits", file)
+    text = picture.info.get("Description") or getattr(picture, "tag_v2", {}).get(_DESCRIPTION) or ""
     meaning = _meaning(text, file, known)
-    grey = grey.astype(np.int64)
-    heights = meaning["offset"] + meaning["scale"] * grey
+    grey = np.array(picture).astype(np.int64)
+    with np.errstate(all="ignore"):  # heights that are not finite are refused below
+        heights = meaning["offset"] + meaning["scale"] * grey
     if "heights" in meaning:  # as many as there are different grey values, in the same order
         values, place = np.unique(grey, return_inverse=True)
         if len(values) != len(meaning["heights"]):
             count = len(meaning["heights"])
             raise HeightMapError(f"has {len(values)} grey values, but its description lists {count} heights", file)
         heights = np.array(meaning["heights"], np.float64)[place.reshape(grey.shape)]
+    if meaning["profile"] == "rings" and len(heights) != 1:
+        raise HeightMapError(f"is said to hold rings, but has {len(heights)} rows", file)
     heights = heights[0] if meaning["profile"] == "rings" else heights[::-1]
     return _profile(heights, meaning["pitch"], file)
 
@@ -187,8 +192,10 @@ def _meaning(text: str, file: str, known: Known) -> dict:
         found = json.loads(text)
         numbers = {key: float(found[key]) for key in ("offset", "scale", "pitch")}
         listed = {"heights": [float(h) for h in found["heights"]]} if "heights" in found else {}
+        if found["profile"] not in ("rings", "pixels"):
+            raise KeyError(found["profile"])
         return {"profile": found["profile"], **numbers, **listed}
-    except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         if known.span is None:
             message = "does not say which heights its grey values mean; give span (mm of black and white) and pitch"
             raise HeightMapError(message, file) from error
@@ -228,6 +235,8 @@ def _read_csv(content: bytes, file: str, known: Known) -> Map:
     if rest:
         raise HeightMapError(f"has {len(table)} points, no whole number of rows of {columns}", file, len(table) + 1)
     pitch = _pitch_between(table, rows, columns, known, file)
+    if pitch is None:
+        raise HeightMapError(_NO_PITCH, file)
     line = np.arange(len(table)) + 2
     x, y = np.tile(np.arange(columns), rows), np.repeat(np.arange(rows), columns)
     _expect(table[:, 0], (x - 0.5 * (columns - 1)) * pitch, pitch, "x", file, line)
@@ -287,7 +296,7 @@ def _read_grid(content: bytes, file: str, known: Known) -> Map:
             f"has steps of {delx:g}, {dely:g} and decentres {decentre}; only square grids around the axis are read"
         )
         raise HeightMapError(message, file, first)
-    if nx * ny != len(kept) - 1:
+    if nx * ny != len(kept) - 1 or min(nx, ny) < 1 or nx % 1 or ny % 1:
         raise HeightMapError(f"announces {nx:g} × {ny:g} points, but holds {len(kept) - 1}", file, first)
     table = _numbers([line for _, line in kept[1:]], file, first=kept[1][0], counts=(1, 4, 5), separator=None)
     missing = table[:, 4] != 0 if table.shape[1] == 5 else np.zeros(len(table), bool)
@@ -324,7 +333,7 @@ def _array(profile: Map) -> np.ndarray:
 
 def _profile(heights: np.ndarray, pitch: float | None, file: str) -> Map:
     if pitch is None:
-        raise HeightMapError("does not say its pitch; give pitch in mm", file)
+        raise HeightMapError(_NO_PITCH, file)
     tensor = torch.from_numpy(np.array(heights, order="C"))
     kind = Rings if heights.ndim == 1 else Pixels
     return kind(tensor, torch.tensor(pitch, dtype=tensor.dtype))

@@ -1,0 +1,171 @@
+"""Damaged files: every reader gives a value or its own one-line error, in 5 s and 500 MB."""
+
+import io
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from mutations import Reader, survive
+from PIL import Image
+
+from raytrace.agf import CatalogError, read_agf
+from raytrace.arrays import ArrayError, read_npy, read_npz
+from raytrace.pictures import PictureError, read_grey
+from raytrace.wave.element import Pixels, Rings
+from raytrace.wave.exchange import FORMATS as HEIGHTS
+from raytrace.wave.exchange import HeightMapError, read_heights, write_heights
+
+ROOT = Path(__file__).parents[1]
+
+
+def number(x):
+    return torch.tensor(x, dtype=torch.float64)
+
+
+def from_file(read, path):
+    """`read` of the bytes written to a path."""
+
+    def of(content: bytes):
+        path.write_bytes(content)
+        return read(path)
+
+    return of
+
+
+def catalogs(folder: Path) -> Reader:
+    whole = (ROOT / "glass_catalogs" / "SCHOTT.AGF").read_bytes()
+    parts = tuple(whole[: whole.index(b"\nNM", size) + 1] for size in (2_000, 20_000))
+    return Reader(parts, from_file(read_agf, folder / "glass.agf"), (CatalogError,))
+
+
+def heights(suffix: str, folder: Path) -> Reader:
+    random = torch.Generator().manual_seed(0)
+    drawn = 1e-3 * torch.rand(7, 9, dtype=torch.float64, generator=random)
+    maps = [Pixels(drawn, number(0.002)), Pixels(number([[0.0, 1, 0, 1, 1]] * 6), number(0.1))]
+    maps += [] if suffix in (".dat", ".grd") else [Rings(drawn[0], number(0.003))]
+    path = folder / f"map{suffix}"
+    originals = []
+    for profile in maps:
+        write_heights(profile, path)
+        originals.append(path.read_bytes())
+
+    def read(written: Path) -> None:
+        for known in ({}, {"pitch": 0.1, "span": (0.0, 1.0)}):
+            found = read_heights(written, **known)
+            assert bool(torch.isfinite(found.heights).all())
+            assert float(found.pitch) > 0
+
+    return Reader(tuple(originals), from_file(read, path), (HeightMapError,))
+
+
+def pictures(folder: Path) -> Reader:
+    drawn = Image.fromarray(np.random.default_rng(0).integers(0, 255, (40, 50, 3), dtype=np.uint8))
+    kinds = [("PNG", {}), ("JPEG", {}), ("JPEG", {"progressive": True}), ("BMP", {}), ("TIFF", {})]
+    kinds += [("TIFF", {"compression": "tiff_lzw"}), ("TIFF", {"compression": "tiff_deflate"})]
+    originals = []
+    for mode in ("L", "RGB", "P", "1"):
+        for kind, options in kinds:
+            if (mode, kind) not in (("P", "JPEG"), ("1", "JPEG")):
+                stream = io.BytesIO()
+                drawn.convert(mode).save(stream, kind, **options)
+                originals.append(stream.getvalue())
+    return Reader(tuple(originals), from_file(read_grey, folder / "picture.png"), (PictureError,))
+
+
+def arrays(folder: Path) -> Reader:
+    originals = []
+    for save in (np.savez, np.savez_compressed):
+        stream = io.BytesIO()
+        save(stream, heights=np.zeros((9, 9)), pitch=0.1, glass="PMMA")
+        originals.append(stream.getvalue())
+    return Reader(tuple(originals), read_npz, (ArrayError,))
+
+
+READERS = {
+    "agf": catalogs,
+    "pictures": pictures,
+    "npz": arrays,
+    **{f"heights{suffix}": lambda folder, suffix=suffix: heights(suffix, folder) for suffix in HEIGHTS},
+}
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_damaged_files_are_read_or_refused(name, tmp_path, capfd):
+    read, refused = survive(READERS[name](tmp_path), 250, seed=1)
+    assert read  # what is never read tests nothing behind the door
+    assert refused
+    capfd.readouterr()  # libtiff speaks to the terminal
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", READERS)
+def test_very_many_damaged_files_are_read_or_refused(name, tmp_path, capfd):
+    survive(READERS[name](tmp_path), 10_000, seed=2)
+    capfd.readouterr()
+
+
+# -- files that were written to harm ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_a_small_file_that_unpacks_to_gigabytes_is_refused_undecoded(suffix, tmp_path):
+    path = tmp_path / f"bomb{suffix}"
+    options = {"compression": "tiff_deflate"} if suffix == ".tif" else {}
+    stream = io.BytesIO()
+    Image.new("1", (9_000, 9_000)).save(stream, "PNG" if suffix == ".png" else "TIFF", **options)
+    path.write_bytes(stream.getvalue())
+    assert path.stat().st_size < 80_000
+    with pytest.raises(PictureError, match="9000 × 9000 pixels in"):
+        read_grey(path)
+    with pytest.raises(HeightMapError, match="9000 × 9000 pixels in"):
+        read_heights(path)
+
+
+def test_an_array_that_announces_more_than_follows_is_refused():
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": (10**6, 10**6)})
+    with pytest.raises(ArrayError, match="announced, but only 0 bytes follow"):
+        read_npy(stream.getvalue())
+
+
+def test_an_archive_is_no_npy_and_a_bomb_no_npz(tmp_path):
+    path = tmp_path / "map.npy"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.npy", b"")
+    with pytest.raises(HeightMapError, match=r"map\.npy: is no \.npy file"):
+        read_heights(path)
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a.npy", bytes(10**6))
+    content = bytearray(stream.getvalue())
+    entry = content.index(b"PK\x01\x02")
+    content[entry + 24 : entry + 28] = (2**32 - 2).to_bytes(4, "little")  # announces 4 GB
+    with pytest.raises(ArrayError):
+        read_npz(bytes(content))
+
+
+def test_arrays_come_back(tmp_path):
+    given = {"heights": np.arange(6.0).reshape(2, 3), "by_columns": np.asfortranarray(np.eye(3, 2)), "glass": "PMMA"}
+    np.savez_compressed(tmp_path / "a.npz", empty=np.zeros((0, 3)), **given)
+    found = read_npz((tmp_path / "a.npz").read_bytes())
+    assert found.keys() == {"empty", *given}
+    assert all(np.array_equal(found[name], given[name]) for name in given)
+    np.save(tmp_path / "a.npy", np.array([{}]), allow_pickle=True)
+    with pytest.raises(ArrayError, match="expected numbers"):
+        read_npy((tmp_path / "a.npy").read_bytes())
+
+
+def test_a_map_of_one_pixel_without_a_pitch_is_asked_for_it(tmp_path):
+    (tmp_path / "map.csv").write_text("x_mm,y_mm,sag_mm\n0,0,1e-3\n")
+    with pytest.raises(HeightMapError, match="give pitch in mm"):
+        read_heights(tmp_path / "map.csv")
+
+
+@pytest.mark.parametrize("read", [read_heights, read_grey, read_agf])
+def test_a_pipe_is_refused_and_not_waited_for(read, tmp_path):
+    os.mkfifo(tmp_path / "pipe.png")
+    with pytest.raises((HeightMapError, PictureError, CatalogError), match="not a regular file"):
+        read(tmp_path / "pipe.png")
