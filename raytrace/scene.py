@@ -44,7 +44,8 @@ class Kernels:
     kernel: (D, F, W, rows, columns), energy in each pixel; 1 = all light through the entrance pupil.
     grid: its centre is (2,) or (2, D, F, W).
     centroid: (2, D, F, W) mm; covariance: (3, D, F, W) mm², xx, xy, yy, of the model's distribution before it is
-        integrated over pixels.
+        integrated over pixels; of waves, of what lies inside the window: behind a hard edge there is no second moment.
+    ray_centroid, ray_covariance: of waves, the same of the rays they follow, whatever the window; else None.
     rays: how many rays were traced for each kernel; 0 if none.
     residual: (D, F, W) how wrong the model itself is here, where it can tell (relative L1), or None.
     """
@@ -55,6 +56,15 @@ class Kernels:
     covariance: Tensor
     rays: int
     residual: Tensor | None = None
+    ray_centroid: Tensor | None = None
+    ray_covariance: Tensor | None = None
+
+    @property
+    def ray_moments(self) -> tuple[Tensor, Tensor]:
+        """Centroid and covariance of geometric optics: of the rays that waves follow, else the model's own."""
+        if self.ray_centroid is None:
+            return self.centroid, self.covariance
+        return self.ray_centroid, self.ray_covariance
 
 
 def scene(lens: Lens, fields: Tensor, object_distances: Tensor, wavelengths: Tensor, memo: Memo | None = None) -> Scene:

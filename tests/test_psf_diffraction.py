@@ -177,7 +177,7 @@ def test_strehl_is_marechals_for_small_aberrations(diameter):
 
 
 def test_geometric_limit():
-    """16 waves out of focus the wave's encircled energy is the rays' within 2 %; the covariance is theirs."""
+    """16 waves out of focus the wave's encircled energy is the rays' within 2 %; its rays have their covariance."""
     s = scene_of(gauss(59.5, aperture=("entrance_pupil_diameter", 20.0)), 0.0, 25e3)
     front = wavefront(s, *gauss_rings(200, 4))
     rays = torch.linalg.vector_norm(front.landing[:, 0, 0, 0], dim=0)
@@ -188,7 +188,7 @@ def test_geometric_limit():
     for radius in (0.3, 0.5, 0.7, 0.8):
         encircled = result.kernel[0, 0, 0][distance < radius * rays.max()].sum()
         assert abs(encircled - front.energy[0, 0, 0][rays < radius * rays.max()].sum()) < 0.02
-    assert abs(result.covariance[0, 0, 0, 0] - 0.5 * (front.energy[0, 0, 0] * rays**2).sum()) < 1e-9
+    assert abs(result.ray_covariance[0, 0, 0, 0] - 0.5 * (front.energy[0, 0, 0] * rays**2).sum()) < 1e-9
 
 
 def test_longer_paths_at_the_top_move_the_light_up():

@@ -54,7 +54,10 @@ class Comparison(Tabular):
 
     @property
     def sigma(self) -> Tensor:
-        """σ (M, D) mm of each kernel along x or y, before pixels and window: √((σ_x² + σ_y²)/2)."""
+        """σ (M, D) mm of each kernel along x or y, before pixels: √((σ_x² + σ_y²)/2).
+
+        Of "Fourier" and "wave" of the light inside the window, see `Psf.covariance`.
+        """
         covariance = torch.stack([one.covariance[..., 0] for one in self.psfs])
         return safe_sqrt(0.5 * (covariance[:, 0] + covariance[:, 2]))
 
@@ -90,8 +93,9 @@ class Abilities(Tabular):
     """What each model can represent: one number (M,) for each model and question, of the object in focus.
 
     conic: relative L1 change of the kernel when the conic of the most curved surface grows by 0.2 (aberrations).
-    anisotropy: longer over shorter σ of the kernel of the largest field; asymmetry: relative L1 difference of that
-        kernel from itself turned by 180° about the centroid of the light (off axis).
+    anisotropy: longer over shorter σ of the largest field, before pixels and window (of "wave": of its rays);
+        asymmetry: relative L1 difference of that field's kernel from itself turned by 180° about the centroid of the
+        light (off axis).
     dark_ring: radius of the first minimum at F/16 in radii of the Airy disc, nan where there is none (diffraction).
     parameters: how many curvatures, conics and thicknesses move the kernel: have a derivative other than 0.
     rays: traced for one kernel on the axis.
@@ -159,7 +163,7 @@ def abilities(lens: Lens) -> Abilities:
         rows.append(
             {
                 "conic": _relative(_psf(changed, work).kernel, focused.kernel),
-                "anisotropy": _anisotropy(away.covariance[:, 0, 0]),
+                "anisotropy": _anisotropy(away.ray_covariance[:, 0, 0]),
                 "asymmetry": _relative(away.kernel.flip(-2, -1), away.kernel),
                 "dark_ring": _dark_ring(lens, work),
                 "parameters": _parameters(lens, work),

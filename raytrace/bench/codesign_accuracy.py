@@ -189,7 +189,7 @@ def _found(place: Place, entrant: Entrant, distances: Tensor, draw: int) -> Foun
         sensor = forward_ad.make_dual(distances.new_tensor(place.sensor), distances.new_tensor(1.0))
         light = entrant.run(place.scene(distances, sensor=sensor), window, draw)
         kernel, slope = forward_ad.unpack_dual(_shares(light))
-        covariance = forward_ad.unpack_dual(light.covariance).primal
+        covariance = forward_ad.unpack_dual(light.ray_moments[1]).primal
     sigma = torch.sqrt(covariance[0] + covariance[2])[:, 0, 0]
     return Found(kernel, sigma, slope if entrant.has_gradient else None, light.rays)
 

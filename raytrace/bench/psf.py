@@ -288,9 +288,10 @@ def errors_of(truth: Truth, against: str, found: Kernels) -> dict[str, float | N
     if estimate is not None:
         errors["estimate"], errors["own_error"] = float(estimate), own_error(truth, against, found)
     if getattr(found, "covariance", None) is not None and float(truth.sigma.min()) > 0:
-        sigma = torch.sqrt(found.covariance.detach().double().reshape(3)[::2])
-        errors["sigma_error"] = float((sigma / truth.sigma - 1).abs().max())
-        offset = found.centroid.detach().double().reshape(2) - truth.centroid
+        moments = found.ray_moments if isinstance(found, Kernels) else (found.ray_centroid, found.ray_covariance)
+        centroid, covariance = (moment.detach().double().flatten() for moment in moments)
+        errors["sigma_error"] = float((torch.sqrt(covariance[::2]) / truth.sigma - 1).abs().max())
+        offset = centroid - truth.centroid
         errors["centroid_error"] = float(offset.norm() / truth.sigma.norm())
     return errors
 

@@ -1,7 +1,6 @@
 """One call for every PSF model, driven by a tolerance instead of a number of rays."""
 
 import dataclasses
-import functools
 
 import torch
 from torch import Tensor
@@ -37,11 +36,12 @@ def psf(
     wavelengths: Tensor | None = None,
     wavelength_weights: Tensor | None = None,
     grid: Grid | None = None,
-    center: str = "axis",
+    center: str | None = None,
     tol: float | None = None,
     rays: int | None = None,
     order: int | None = None,
     normalise: str = "energy",
+    per_wavelength: bool = False,
     rho: Tensor | float = 0.5,
     zernike: Tensor | None = None,
     memo: Memo | None = None,
@@ -51,9 +51,11 @@ def psf(
 
     model: a key of MODELS, or "auto".
     fields: (2, F) in the lens's kind of field, its own by default; object_distances: (D,) mm, inf allowed, the lens's
-    by default; wavelengths: (W,) µm with wavelength_weights: (W,), summed over; the lens's own by default.
+    by default; wavelengths: (W,) µm with wavelength_weights: (W,), the lens's own by default. Kernels are summed over
+    the wavelengths; per_wavelength: each has a kernel instead, (D, F, W, rows, columns) of energy 1 for all its light.
     grid: pixels, by default 21 × 21 of 5 µm; center: what the grid's centre counts from: "axis", "chief" (the chief
-    ray at the primary wavelength) or "centroid".
+    ray at the primary wavelength) or "centroid" (of the rays). By default "axis" for fields that are given and "chief"
+    for the lens's own.
     tol: bound on the estimated error, 0.01 by default; the coarsest order that meets it is returned. rays: instead,
     about that many rays per kernel (`drt`: plain Sobol rays), the error then estimated from half of them.
     order: instead, an order of the model's ladder, as `Psf.order` of an earlier call tells it: for loops, it estimates
@@ -66,6 +68,7 @@ def psf(
     Raises ValueError for arguments that make no sense, EmptyPsf if no ray of the whole batch reaches the sensor;
     a single empty kernel of a batch is 0 with gradient 0. Warns NotConverged.
     """
+    center = default_center(fields) if center is None else center
     _check(model, center, normalise, tol=tol, rays=rays, order=order)
     fields = torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields
     distances = lens.surfaces[0].thickness.reshape(1) if object_distances is None else object_distances
@@ -85,18 +88,30 @@ def psf(
         "rays": lambda *scene: by_rays(*scene, models, model, rays),
         "tol": lambda *scene: by_tolerance(*scene, models, model, tol or 0.01),
     }["auto" if model == "auto" else "order" if order is not None else "rays" if rays is not None else "tol"]
-    compute = functools.partial(_group, lens, fields, wavelengths, weights / weights.sum(), base, center, memo, drive)
+    shares = weights / weights.sum()
+    kept = None if per_wavelength else shares
+
+    def compute(distances: Tensor) -> Psf:
+        return drive(*_group(lens, fields, distances, wavelengths, shares, base, center, memo), kept)
+
     infinite = torch.isinf(distances)
     if bool(infinite.any()) and not bool(infinite.all()):
         found = _merge(compute(distances[~infinite]), compute(distances[infinite]), infinite)
     else:
         found = compute(distances)
     # Only traced light can be lost; light beside the window is not.
-    if found.rays and not bool((found.energy > 0).any()) and not bool((found.covariance != 0).any()):
+    if found.rays and not bool((found.energy > 0).any()) and not bool((found.ray_covariance != 0).any()):
         raise EmptyPsf("no ray reaches the sensor: the lens is blocked or the field is outside its reach")
     if normalise == "window":
         found = dataclasses.replace(found, kernel=_of_its_window(found.kernel), normalised="window")
-    return found
+    return dataclasses.replace(found, wavelengths=wavelengths, wavelength_weights=shares)
+
+
+def default_center(fields: Tensor | None) -> str:
+    """What windows are centred on by default: the axis for fields that are given, and else, of the lens's own fields,
+    which may lie far from it, the chief ray.
+    """
+    return "chief" if fields is None else "axis"
 
 
 def _of_its_window(kernel: Tensor) -> Tensor:
@@ -151,12 +166,11 @@ def _check_shares(*numbers) -> None:
         raise ValueError("processes share kernels of one rho and one zernike only: leave share out")
 
 
-def _group(lens, fields, wavelengths, weights, base, center, memo, drive, distances) -> Psf:
-    """The PSFs of object distances (D,) that are all finite or all infinite."""
+def _group(lens, fields, distances, wavelengths, weights, base, center, memo) -> tuple[Scene, Grid]:
+    """The scene and the pixels of object distances (D,) that are all finite or all infinite."""
     batch = scene(lens, fields, distances, wavelengths, memo)
     place = _centre(batch, lens, center, weights)
-    pixels = dataclasses.replace(base, centre=_with_centre(base.centre, place, len(wavelengths)))
-    return drive(batch, pixels, weights)
+    return batch, dataclasses.replace(base, centre=_with_centre(base.centre, place, len(wavelengths)))
 
 
 def _centre(batch: Scene, lens: Lens, center: str, weights: Tensor) -> Tensor | None:
@@ -198,6 +212,8 @@ def _merge(finite: Psf, infinite: Psf, mask: Tensor) -> Psf:
         error=place(finite.error, infinite.error, 0),
         centroid=place(finite.centroid, infinite.centroid, 1),
         covariance=place(finite.covariance, infinite.covariance, 1),
+        ray_centroid=place(finite.ray_centroid, infinite.ray_centroid, 1),
+        ray_covariance=place(finite.ray_covariance, infinite.ray_covariance, 1),
         residual=None if finite.residual is None else place(finite.residual, infinite.residual, 0),
         rays=max(finite.rays, infinite.rays),
         reason="; ".join(dict.fromkeys(filter(None, (finite.reason, infinite.reason)))),

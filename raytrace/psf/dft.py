@@ -154,6 +154,23 @@ def integrate(intensity: Tensor, weight: Tensor, pitch: Tensor) -> Tensor:
     return torch.einsum("...iajb,a,b->...ij", pixels, weight, weight) * pitch**2
 
 
+def window_moments(intensity: Tensor, x: Tensor, y: Tensor, weight: Tensor, pitch: Tensor) -> tuple[Tensor, Tensor]:
+    """Centroid (2, ...) mm and covariance (3, ...) mm², xx, xy, yy, of the light inside a window, pixels or not.
+
+    intensity: (..., Y, X) per mm² at the nodes x (..., X), y (..., Y) mm of `sub_pixels`; weight: of one pixel. 0 where
+    there is no light.
+    """
+    intensity = intensity * pitch**2
+    along_x, along_y = (weight.repeat(t.shape[-1] // len(weight)) for t in (x, y))
+    by_x, by_y = (intensity.mT @ along_y[:, None])[..., 0] * along_x, (intensity @ along_x[:, None])[..., 0] * along_y
+    energy = by_x.sum(-1)
+    x_mean, y_mean = safe_divide((by_x * x).sum(-1), energy), safe_divide((by_y * y).sum(-1), energy)
+    x, y = x - x_mean[..., None], y - y_mean[..., None]
+    cross = ((intensity @ (along_x * x)[..., None])[..., 0] * along_y * y).sum(-1)
+    moments = [(by_x * x * x).sum(-1), cross, (by_y * y * y).sum(-1)]
+    return torch.stack([x_mean, y_mean]), torch.stack([safe_divide(moment, energy) for moment in moments])
+
+
 def _fraction(waves: Tensor) -> Tensor:
     return waves - torch.round(waves.detach())
 

@@ -30,8 +30,9 @@ from raytrace.psf.dft import (
     sub_pixels,
     to_grid,
     to_grid_mirrored,
+    window_moments,
 )
-from raytrace.psf.radial import is_centred, radii_of_waves, unfold
+from raytrace.psf.radial import is_centred, radii_of_waves, round_moments, second_moments_of_waves, unfold
 from raytrace.psf.sharing import symmetry
 from raytrace.pupil import gauss_rings
 from raytrace.scene import Kernels, Scene, trace_scene
@@ -63,16 +64,15 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0) -> Kernels:
     """Kernels of the wave model; a kernel whose light is blocked altogether is 0 with gradient 0.
 
     order: from -2 on; each one adds rays and pixel nodes, successive ones estimate the error.
-    centroid and covariance are those of the rays: the mean of the wave is theirs (Ehrenfest), its second moment does
-    not exist behind a hard edge. residual: size of the terms that Debye's integral leaves out.
+    centroid and covariance are those of the light inside the window. Those of the rays are
+    given beside them: the mean of the whole wave is theirs (Ehrenfest), its second moment does not exist behind a hard
+    edge. residual: size of the terms that Debye's integral leaves out.
     Raises ValueError where the window or the blur would need too many rays.
     """
     fields = [_field_kernels(one_field(scene, f), one_field_grid(grid, f), order) for f in range(scene.shape[1])]
-    kernel, centroid, covariance, residual = (
-        torch.cat(parts, axis)
-        for parts, axis in zip(zip(*(entries for _, *entries in fields), strict=True), (1, 2, 2, 1), strict=True)
-    )
-    found = Kernels(kernel, grid, centroid, covariance, max(rays for rays, *_ in fields), residual)
+    axes = {"kernel": 1, "centroid": 2, "covariance": 2, "residual": 1, "ray_centroid": 2, "ray_covariance": 2}
+    joined = {name: torch.cat([getattr(one, name) for one in fields], axis) for name, axis in axes.items()}
+    found = Kernels(grid=grid, rays=max(one.rays for one in fields), **joined)
     return dataclasses.replace(to(found, dtype=grid.pitch.dtype), grid=grid)
 
 
@@ -131,30 +131,35 @@ def phase_along_radius(probe: Wavefront, reach: Tensor | float) -> float:
         return float(largest(phase.max()))
 
 
-def _field_kernels(scene: Scene, grid: Grid, order: int) -> tuple:
-    """Rays, kernel (D, 1, W, rows, columns), centroid, covariance and residual of one field."""
+def _field_kernels(scene: Scene, grid: Grid, order: int) -> Kernels:
+    """Kernels (D, 1, W, rows, columns) of one field."""
     probe = _probe(scene)
     centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))) - probe.centre[:2]
     local = Grid(grid.pitch, grid.rows, grid.columns, centre)
     cutoff = 2e3 * float(largest((half_spread(probe) * probe.index / probe.wavelength).max()))
-    if symmetry(scene) == "round" and is_centred(grid):
+    is_round = symmetry(scene) == "round" and is_centred(grid)
+    if is_round:
         # One radius tells all: as a row of points, without pixels.
         radii, matrix = radii_of_waves(grid, cutoff, order)
         x, y = radii, torch.zeros_like(radii[:1])
         corner = radii.detach().max()
     else:
         x, y, weight = sub_pixels(local, nodes_per_pixel(float(grid.pitch.detach()), cutoff, order))
-        matrix, corner = None, largest(torch.hypot(x.detach().abs().amax(-1), y.detach().abs().amax(-1)).max())
+        corner = largest(torch.hypot(x.detach().abs().amax(-1), y.detach().abs().amax(-1)).max())
     light = _waves(scene, probe, corner, order)
     U = amplitude(light, x, y)
     intensity = U.real**2 + U.imag**2
-    centroid, covariance = _moments(light)
-    residual = _debye_residual(light.wavefront, probe, corner)
-    if matrix is None:
-        kernel = integrate(intensity, weight, grid.pitch)
-    else:
+    if is_round:
         kernel = unfold(grid, intensity[..., 0, :] @ matrix.mT)
-    return light.amplitude.shape[-1], kernel, centroid, covariance, residual
+        centroid, covariance = round_moments(
+            intensity[..., 0, :] @ second_moments_of_waves(grid, cutoff, order).mT, kernel
+        )
+    else:
+        kernel = integrate(intensity, weight, grid.pitch)
+        centroid, covariance = window_moments(intensity, x, y, weight, grid.pitch)
+        centroid = centroid + probe.centre[:2]
+    residual = _debye_residual(light.wavefront, probe, corner)
+    return Kernels(kernel, grid, centroid, covariance, light.amplitude.shape[-1], residual, *_moments(light))
 
 
 def _probe(scene: Scene) -> Wavefront:

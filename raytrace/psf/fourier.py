@@ -30,9 +30,10 @@ from raytrace.psf.dft import (
     rings_to_grid,
     sub_pixels,
     to_grid,
+    window_moments,
 )
 from raytrace.psf.paraxial import chief_ray_height
-from raytrace.psf.radial import is_centred, radii_of_waves, reach, unfold
+from raytrace.psf.radial import is_centred, radii_of_waves, reach, round_moments, second_moments_of_waves, unfold
 from raytrace.psf.sharing import symmetry
 from raytrace.pupil import gauss_rings, with_rim
 from raytrace.scene import Kernels, Scene
@@ -61,39 +62,43 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0, zernike: Tensor | None 
 
     zernike: Noll coefficients from 1 on, (J,) or (J, D, F, W) with axes of length 1 to broadcast, mm RMS of path.
     order: from -2 on; each one adds pupil points and pixel nodes, successive ones estimate the error.
-    centroid and covariance are those of the geometric limit: the second moment of a hard-edged diffraction pattern
-    does not exist. Raises ValueError where the window or the blur would need too many pupil points.
+    centroid and covariance are those of the light inside the window, for the second moment of
+    a hard-edged diffraction pattern does not exist; those of the geometric limit are given beside them.
+    Raises ValueError where the window or the blur would need too many pupil points.
     """
     # Phases of hundreds of radians leave single precision three digits.
     single = grid.pitch.dtype != torch.float64 or scene.wavelengths.dtype != torch.float64
     scene, window = (to(each, dtype=torch.float64) if single else each for each in (scene, grid))
     lens = paraxial(scene)
     waves = None if zernike is None else _aberrations(scene, zernike.to(torch.float64))
-    centroid, covariance = _moments(lens, waves)
+    shift, blur = _moments(lens, waves)
     if waves is None and symmetry(scene) == "round" and is_centred(window):
-        kernel = _round_kernels(lens, window, order)
+        kernel, centroid, covariance = _round_kernels(lens, window, order)
     else:
-        kernel = _kernels(lens, window, waves, order)
-    found = Kernels(kernel, grid, lens.chief + centroid, covariance, rays=0)
+        kernel, centroid, covariance = _kernels(lens, window, waves, order)
+    limit = {"ray_centroid": lens.chief + shift, "ray_covariance": blur}
+    found = Kernels(kernel, grid, lens.chief + centroid, covariance, rays=0, **limit)
     return dataclasses.replace(to(found, dtype=grid.pitch.dtype), grid=grid) if single else found
 
 
-def _kernels(lens: Paraxial, window: Grid, waves: Tensor | None, order: int) -> Tensor:
-    """Kernels (D, F, W, rows, columns), one after the other: each has its own phases."""
+def _kernels(lens: Paraxial, window: Grid, waves: Tensor | None, order: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Kernels (D, F, W, rows, columns), one after the other, for each has its own phases; centroid and covariance."""
     shape = lens.defocus.shape
     centre = window.centre.reshape(2, *(window.centre.shape[1:] or (1, 1, 1))) - lens.chief
     steepest = float(largest(lens.frequency.detach().abs().max()))
     nodes = nodes_per_pixel(float(window.pitch.detach()), 2 * steepest, order)
     x, y, weight = sub_pixels(Grid(window.pitch, window.rows, window.columns, centre), nodes)
-    pixels = []
+    pixels, moments = [], []
     for place in itertools.product(*map(range, shape)):
         own = None if waves is None else waves[(slice(None), *place)]
         intensity = _intensity(x[place], y[place], lens.defocus[place], lens.frequency[place], own, order=order)
         pixels.append(integrate(intensity, weight, window.pitch))
-    return torch.stack(pixels).unflatten(0, shape)
+        moments.append(window_moments(intensity, x[place], y[place], weight, window.pitch))
+    centroid, covariance = (torch.stack(parts, -1).unflatten(-1, shape) for parts in zip(*moments, strict=True))
+    return torch.stack(pixels).unflatten(0, shape), centroid, covariance
 
 
-def _round_kernels(lens: Paraxial, window: Grid, order: int) -> Tensor:
+def _round_kernels(lens: Paraxial, window: Grid, order: int) -> tuple[Tensor, Tensor, Tensor]:
     """The same on the axis, along one radius; Bessel functions are shared by all object distances.
 
     Sensor and pupil decide the frequency a, an object distance only the defocus.
@@ -109,7 +114,8 @@ def _round_kernels(lens: Paraxial, window: Grid, order: int) -> Tensor:
     J0 = bessel_j0(2 * math.pi * (frequency * radii)[..., None] * radius)
     real, imag = (torch.einsum("dfwkj,dfwj->dfwk", J0, part) for part in (spectrum.real, spectrum.imag))
     intensity = math.pi * lens.frequency[..., None] ** 2 * (real * real + imag * imag)
-    return unfold(window, intensity @ matrix.mT)
+    kernel = unfold(window, intensity @ matrix.mT)
+    return kernel, *round_moments(intensity @ second_moments_of_waves(window, 2 * steepest, order).mT, kernel)
 
 
 def paraxial(scene: Scene) -> Paraxial:

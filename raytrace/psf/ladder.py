@@ -26,18 +26,24 @@ class NotConverged(UserWarning):
 
 @value
 class Psf:
-    """PSFs over object distance × field.
+    """PSFs over object distance × field, or object distance × field × wavelength: (D, F, W) for each (D, F) below.
 
-    kernel: (D, F, rows, columns), integrated over pixels.
+    kernel: (D, F, rows, columns), integrated over pixels; summed over the wavelengths by their weights, or with an
+        axis of them, (D, F, W, rows, columns).
     grid: where the pixels lie on the sensor, centre (2,) or (2, D, F) mm.
     energy: (D, F) inside the window, of the light through the entrance pupil.
     error: (D, F) estimated relative L1 error of the kernel against the model's own limit (`gaussian`: relative error
         of σ); nan where it was not estimated. How far it can be believed is measured in docs/psf_error.md.
-    centroid: (2, D, F) mm; covariance: (3, D, F) xx, xy, yy in mm², of the distribution before pixel integration.
+    centroid: (2, D, F) mm; covariance: (3, D, F) xx, xy, yy in mm², of the distribution before pixel integration:
+        of all its light; of "fourier" and "wave" of the light inside the window, because behind a hard edge the second
+        moment grows with the window without limit. 0 where there is no light at all.
+    ray_centroid, ray_covariance: the same of geometric optics, whatever the window: of "wave" those of the rays, of
+        "fourier" of its geometric limit, of the other models again centroid and covariance.
     residual: (D, F) how wrong the model itself is, where it can tell, or None.
     model: its name; order: of its ladder, to repeat with `psf(order=…)`, None for plain rays; rays: traced for each
         kernel; reason: why `auto` chose the model, or a remark on convergence.
     normalised: "energy" (1 = all light through the entrance pupil) or "window" (each kernel sums to 1).
+    wavelengths, wavelength_weights: (W,) µm and shares of 1, that the kernels are summed over or have an axis of.
     """
 
     kernel: Tensor
@@ -46,12 +52,21 @@ class Psf:
     error: Tensor
     centroid: Tensor
     covariance: Tensor
+    ray_centroid: Tensor
+    ray_covariance: Tensor
     residual: Tensor | None = None
     model: str = ""
     order: int | None = None
     rays: int = 0
     reason: str = ""
     normalised: str = "energy"
+    wavelengths: Tensor | None = None
+    wavelength_weights: Tensor | None = None
+
+    @property
+    def wavelengths_summed(self) -> bool:
+        """Whether each kernel is a sum over wavelengths; otherwise their axis is behind that of the fields."""
+        return self.kernel.dim() == 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,7 +161,9 @@ def with_shares(models: Mapping[str, Model], share: Share, *, kernels: int) -> d
     return {name: of(model) for name, model in models.items()}
 
 
-def by_order(batch: Scene, pixels: Grid, weights: Tensor, models: Mapping[str, Model], model: str, order: int) -> Psf:
+def by_order(
+    batch: Scene, pixels: Grid, weights: Tensor | None, models: Mapping[str, Model], model: str, order: int
+) -> Psf:
     """The kernels of one order, for loops that have planned it: no error is estimated, and no residual."""
     ladder = models[model]
     if order not in ladder.orders:
@@ -156,7 +173,7 @@ def by_order(batch: Scene, pixels: Grid, weights: Tensor, models: Mapping[str, M
 
 
 def by_tolerance(
-    batch: Scene, pixels: Grid, weights: Tensor, models: Mapping[str, Model], model: str, tol: float
+    batch: Scene, pixels: Grid, weights: Tensor | None, models: Mapping[str, Model], model: str, tol: float
 ) -> Psf:
     """Climb the orders until the estimated error of the last meets the tolerance; see `_estimate`."""
     ladder = models[model]
@@ -231,7 +248,9 @@ def _rounding(batch: Scene, pixels: Grid, found: Psf, ladder: Model) -> Tensor:
     return error.clamp_min(ladder.floor).expand(found.energy.shape)
 
 
-def by_rays(batch: Scene, pixels: Grid, weights: Tensor, models: Mapping[str, Model], model: str, count: int) -> Psf:
+def by_rays(
+    batch: Scene, pixels: Grid, weights: Tensor | None, models: Mapping[str, Model], model: str, count: int
+) -> Psf:
     """About `count` rays a kernel; the error is the change from half as many."""
     ladder, before = models[model], None
     if ladder.plain is not None:
@@ -254,7 +273,7 @@ def by_rays(batch: Scene, pixels: Grid, weights: Tensor, models: Mapping[str, Mo
     return dataclasses.replace(before, error=change.detach())
 
 
-def climb(batch: Scene, pixels: Grid, weights: Tensor, models: Mapping[str, Model], tol: float) -> Psf:
+def climb(batch: Scene, pixels: Grid, weights: Tensor | None, models: Mapping[str, Model], tol: float) -> Psf:
     """The first rung of LADDER whose kernels differ from those of the next by less than the tolerance."""
     here = by_tolerance(batch, pixels, weights, models, LADDER[0], tol)
     for name in LADDER[1:]:
@@ -272,34 +291,51 @@ def _diffracts(batch: Scene, pixels: Grid, light: Psf) -> bool:
     """Whether somewhere neither a pixel nor the blur is twice as wide as the Airy disc: rays alike prove nothing."""
     with torch.no_grad():
         airy = 1.22e-3 * batch.wavelengths.max() * first_order(batch.lens).working_f_number.max()
-        blur = 2 * safe_sqrt(light.covariance[0] + light.covariance[2])
+        blur = 2 * safe_sqrt(light.ray_covariance[0] + light.ray_covariance[2])
         return bool((torch.maximum(blur, pixels.pitch) < 4 * airy).any())
 
 
-def polychromatic(found: Kernels, weights: Tensor, model: str) -> Psf:
-    """Sum over wavelengths by their weights; moments are those of the sum of the distributions."""
-    share = weights / weights.sum()
-    centroid = (share * found.centroid).sum(-1)
-    offset = found.centroid - centroid[..., None]
-    spread = torch.stack([offset[0] * offset[0], offset[0] * offset[1], offset[1] * offset[1]])
-    kernel = (share[:, None, None] * found.kernel).sum(-3)
+def polychromatic(found: Kernels, weights: Tensor | None, model: str) -> Psf:
+    """Sum over wavelengths by their weights, moments being those of the sum of the distributions; None keeps each."""
+    own, energy = (found.centroid, found.covariance), found.kernel.sum((-2, -1))
+    rays, is_geometric = found.ray_moments, found.ray_centroid is None
+    kernel, residual = found.kernel, found.residual
+    if weights is not None:
+        share = weights / weights.sum()
+        kernel = (share[:, None, None] * kernel).sum(-3)
+        residual = None if residual is None else (share * residual).sum(-1)
+        rays = _summed_moments(*rays, share)
+        # What lies inside a window counts by its light there.
+        own = rays if is_geometric else _summed_moments(*own, share * energy)
+        energy = kernel.sum((-2, -1))
     centre = found.grid.centre if found.grid.centre.dim() == 1 else found.grid.centre[..., 0]
-    energy = kernel.sum((-2, -1))
     return Psf(
         kernel=kernel,
         grid=dataclasses.replace(found.grid, centre=centre),
         energy=energy,
         error=torch.full_like(energy.detach(), torch.nan),
-        centroid=centroid,
-        covariance=(share * (found.covariance + spread)).sum(-1),
-        residual=None if found.residual is None else (share * found.residual).sum(-1),
+        centroid=own[0],
+        covariance=own[1],
+        ray_centroid=rays[0],
+        ray_covariance=rays[1],
+        residual=residual,
         model=model,
         rays=found.rays,
     )
 
 
+def _summed_moments(centroid: Tensor, covariance: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
+    """Moments (2, D, F), (3, D, F) of a sum of distributions (2, D, F, W), (3, D, F, W), by shares."""
+    part = safe_divide(share, share.sum(-1, keepdim=True).expand(share.shape))
+    x, y = centroid
+    mean_x, mean_y = (part * x).sum(-1), (part * y).sum(-1)
+    x, y = x - mean_x[..., None], y - mean_y[..., None]
+    spread = torch.stack([x * x, x * y, y * y])
+    return torch.stack([mean_x, mean_y]), (part * (covariance + spread)).sum(-1)
+
+
 def _kernel_change(one: Psf, other: Psf) -> Tensor:
-    """Relative L1 difference (D, F) of two kernels, in units of the second's energy; 0 where both are empty."""
+    """Relative L1 difference of two kernels, in units of the second's energy; 0 where both are empty."""
     return safe_divide((one.kernel - other.kernel).abs().sum((-2, -1)), other.energy)
 
 

@@ -38,12 +38,30 @@ def radii_of_waves(grid: Grid, cutoff: float, order: int) -> tuple[Tensor, Tenso
 
     Even Chebyshev terms up to degree 2K - 2 hold exp(iat) up to J_2K(a), a = 2π · cutoff · reach.
     """
+    radii, matrix, _ = (grid.pitch.new_tensor(a) for a in _rule_of(grid, cutoff, order))
+    return radii * grid.pitch, matrix * grid.pitch**2
+
+
+def second_moments_of_waves(grid: Grid, cutoff: float, order: int) -> Tensor:
+    """Matrix (2, K) mm⁴ from the intensity at the same radii to ∬ I x² and ∬ I y² over the window."""
+    return grid.pitch.new_tensor(_rule_of(grid, cutoff, order)[2]) * grid.pitch**4
+
+
+def round_moments(second: Tensor, kernel: Tensor) -> tuple[Tensor, Tensor]:
+    """Centroid (2, ...) mm and covariance (3, ...) mm² of round light about the axis inside the window; 0 if there is
+    none. second: (..., 2) of `second_moments_of_waves`; kernel: (..., rows, columns).
+    """
+    xx, yy = (safe_divide(part, kernel.sum((-2, -1))) for part in second.unbind(-1))
+    zero = torch.zeros_like(xx)
+    return torch.stack([zero, zero]), torch.stack([xx, zero, yy])
+
+
+def _rule_of(grid: Grid, cutoff: float, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     pitch = float(grid.pitch.detach())
     argument = 2 * math.pi * cutoff * pitch * reach(grid)
     count = math.ceil(0.5 * argument + max(1.5, 2 + order) * (4 + argument ** (1 / 3)))
     nodes = math.ceil(0.5 * math.pi * cutoff * pitch) + 4 + order
-    radii, matrix = (grid.pitch.new_tensor(a) for a in _wave_rule(grid.rows, grid.columns, nodes, count))
-    return radii * grid.pitch, matrix * grid.pitch**2
+    return _wave_rule(grid.rows, grid.columns, nodes, count)
 
 
 def energy_of_rings(grid: Grid, first: Tensor, last: Tensor, energy: Tensor) -> Tensor:
@@ -101,8 +119,10 @@ def _distinct(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @functools.lru_cache(maxsize=16)
-def _wave_rule(rows: int, columns: int, nodes: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Chebyshev radii (K,) in pixels; and the matrix (U, K) to pixels, by Gauss-Legendre nodes read off the series."""
+def _wave_rule(rows: int, columns: int, nodes: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Chebyshev radii (K,) in pixels; and the matrices (U, K) to pixels and (2, K) to the second moments of all of them
+    along x and y, by Gauss-Legendre nodes read off the series.
+    """
     corner = 0.5 * math.hypot(rows, columns)
     angle = (2 * np.arange(count) + 1) * (np.pi / (4 * count))
     terms = 2 * np.arange(count)
@@ -114,11 +134,25 @@ def _wave_rule(rows: int, columns: int, nodes: int, count: int) -> tuple[np.ndar
     # T_2m by its recurrence in T_2: a tenth of the time of as many cosines.
     twice = 2 * (2 * np.minimum(np.hypot(x[:, :, None], y[:, None, :]) / corner, 1.0) ** 2 - 1)
     previous, current = 0.5 * twice, np.ones_like(twice)  # T_-2 = T_2, T_0
-    pixels = np.empty((len(places), count))
+    pixels, second = np.empty((len(places), count)), np.empty((2, count))
+    share_of_x, share_of_y = _squares(rows, columns, x, y, weight)
     for m in range(count):
         pixels[:, m] = np.einsum("uab,a,b->u", current, weight, weight, optimize=True)
+        second[:, m] = [np.einsum("uab,uab->", current, share, optimize=True) for share in (share_of_x, share_of_y)]
         previous, current = current, twice * current - previous
-    return corner * np.cos(angle), pixels @ series
+    return corner * np.cos(angle), pixels @ series, second @ series
+
+
+def _squares(rows: int, columns: int, x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Weights (U, A, A) by which an intensity at the nodes of the pixels that differ makes ∬ I x² and ∬ I y².
+
+    x, y: (U, A) of `_distinct`, x <= y: a pixel with |x| > |y| on the sensor is the image of one with both exchanged.
+    """
+    own = np.abs(np.arange(columns) - 0.5 * (columns - 1)) <= np.abs(np.arange(rows) - 0.5 * (rows - 1))[:, None]
+    index = _distinct(rows, columns)[1]
+    as_is, exchanged = (np.bincount(index[mask], minlength=len(x))[:, None, None] for mask in (own, ~own))
+    x, y, rule = x[:, :, None] ** 2, y[:, None, :] ** 2, weight[:, None] * weight
+    return rule * (as_is * x + exchanged * y), rule * (as_is * y + exchanged * x)
 
 
 @functools.lru_cache(maxsize=16)

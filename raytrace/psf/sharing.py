@@ -127,5 +127,8 @@ def _joined(found: Kernels, grid: Grid, shape: Sequence[int], block: tuple[slice
             joined[(slice(None),) * before + block] = part.detach()
         return total(joined)
 
-    residual = None if found.residual is None else whole(found.residual, 0)
-    return Kernels(whole(found.kernel, 0), grid, whole(found.centroid, 1), whole(found.covariance, 1), rays, residual)
+    axes = {"kernel": 0, "centroid": 1, "covariance": 1, "residual": 0, "ray_centroid": 1, "ray_covariance": 1}
+    parts = {name: getattr(found, name) for name in axes}
+    return Kernels(
+        grid=grid, rays=rays, **{name: None if t is None else whole(t, axes[name]) for name, t in parts.items()}
+    )

@@ -110,5 +110,7 @@ def _psf(
         )
         for k in (kernels / rays, half.unflatten(0, m.count.shape))
     )
+    wavelengths = torch.stack([s.wavelength for s in shots[: m.count.shape[2]]])
     error = safe_divide((found.kernel - before.kernel).abs().sum((-2, -1)), found.energy)
-    return StreamedPsf(dataclasses.replace(found, error=error), (weights * light * m.count / rays).sum(-1))
+    found = dataclasses.replace(found, error=error, wavelengths=wavelengths, wavelength_weights=weights)
+    return StreamedPsf(found, (weights * light * m.count / rays).sum(-1))
