@@ -291,13 +291,13 @@ def test_results_are_tables():
 
 
 COMMANDS = {
-    "fan": ["--size", "5"],
-    "opd": ["--size", "5"],
+    "fan": ["--points", "5"],
+    "opd": ["--points", "5"],
     "wavefront": ["--size", "16"],
-    "distortion": ["--size", "3"],
-    "curvature": ["--size", "3"],
-    "lateral": ["--size", "3"],
-    "illumination": ["--size", "2"],
+    "distortion": ["--samples", "3"],
+    "curvature": ["--samples", "3"],
+    "lateral": ["--samples", "3"],
+    "illumination": ["--samples", "2"],
     "mtf": ["--geometric", "--frequency", "5", "10"],
     "encircled": ["--geometric", "--radius", "0.05"],
 }

@@ -318,8 +318,8 @@ def test_examples_of_the_help_parse():
         ("spot", "double_gauss", "--wavelength", "0"),
         ("spot", "double_gauss", "--wavelength", "0.5", "nan"),
         ("spot", "double_gauss", "--field", "nan"),
-        ("spot", "double_gauss", "--size", "0"),
-        ("spot", "double_gauss", "--size", "1.5"),
+        ("spot", "double_gauss", "--rings", "0"),
+        ("spot", "double_gauss", "--points", "1.5"),
         ("spot", "double_gauss", "--sampling", "dartboard"),
         ("focus", "double_gauss", "--criterion", "best"),
         ("focus", "double_gauss", "--field-weights", "0"),
@@ -821,7 +821,7 @@ def test_rms_is_the_radius_about_the_centroid(run):
     aims = np.column_stack([points * 33.33 / 2, np.full(len(points), depth)])
     starts = aims - np.array(direction) * (aims[:, 2:] / direction[2])
     centroid, rms = reference_spot(document, [(*s, *direction) for s in starts], weights)
-    (found,) = run("spot", "double_gauss", "--field", 10, "--size", 8, "--json").document["results"]
+    (found,) = run("spot", "double_gauss", "--field", 10, "--rings", 8, "--json").document["results"]
     assert found["field"] == [0, 10]
     np.testing.assert_allclose(found["centroid"], centroid, rtol=0, atol=NANOMETRE)
     assert found["rms_radius"] == pytest.approx(rms, rel=1e-6)
@@ -1016,7 +1016,7 @@ def test_focus_of_finite_objects_and_object_heights(run):
 
 
 def test_focus_without_a_focus_is_refused(run):
-    assert "no focus" in run("focus", "double_gauss", "--sampling", "square", "--size", 1).error
+    assert "no focus" in run("focus", "double_gauss", "--sampling", "square", "--points", 1).error
     assert "no ray reaches the image" in run("focus", "double_gauss", "--f-number", 0.1).error
     partly = run("focus", "double_gauss", "--f-number", 0.5, "--json")
     assert partly.code == 0
@@ -1169,9 +1169,9 @@ def _write(name: str, text: str) -> str:
 @pytest.mark.parametrize(
     "arguments",
     [
-        ("layout", "double_gauss", "-o"),
-        ("spot", "double_gauss", "--field", "0", "--size", "4", "--plot"),
-        ("focus", "double_gauss", "--object-distance", "25000", "--size", "4", "--plot"),
+        ("layout", "double_gauss", "--plot"),
+        ("spot", "double_gauss", "--field", "0", "--rings", "4", "--plot"),
+        ("focus", "double_gauss", "--object-distance", "25000", "--rings", "4", "--plot"),
     ],
     ids=lambda arguments: arguments[0],
 )

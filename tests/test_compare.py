@@ -151,7 +151,7 @@ def strict(text: str) -> dict:
 def test_json_and_figure(capsys, tmp_path, monkeypatch, measured):
     monkeypatch.setattr(psf_commands, "abilities", lambda lens: measured)  # seconds of work done above
     picture = tmp_path / "compare.png"
-    words = ["compare", "singlet", "--distances", "20000", "inf", "--start", "rms", "--plot", str(picture)]
+    words = ["compare", "singlet", "--object-distance", "20000", "inf", "--start", "rms", "--plot", str(picture)]
     assert main([*words, "--json"]) == 0
     said = capsys.readouterr()
     document = strict(said.out)
@@ -195,5 +195,5 @@ def test_every_number_means_something_on_other_lenses(name, focus_distance):
 
 @pytest.mark.slow
 def test_rms_start_of_the_double_gauss(capsys):
-    assert main(["compare", "double_gauss", "--start", "rms", "--distances", "25000", "--json"]) == 0
+    assert main(["compare", "double_gauss", "--start", "rms", "--object-distance", "25000", "--json"]) == 0
     assert strict(capsys.readouterr().out)["sensor_distance"] == pytest.approx(RMS_SENSOR, abs=0.1 * MICROMETRE)

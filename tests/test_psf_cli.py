@@ -80,7 +80,7 @@ def test_default_window_is_centred_on_the_axis_with_a_pixel_at_its_centre(tmp_pa
         (["--object-distance", "0", "--model", "paraxial"], 2, "--object-distance"),
         (["--model", "paraxial", "-o", "no/such/folder/psf.npz"], 1, "no/such/folder"),
         (["--model", "paraxial", "--plot", "no/such/folder/psf.png"], 1, "no/such/folder"),
-        (["--model", "paraxial", "--plot", "psf.bmp"], 1, ".png, .pdf, .svg"),
+        (["--model", "paraxial", "--plot", "psf.bmp"], 2, ".png, .pdf, .svg"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_one_line(capsys, words, code, message):
@@ -108,7 +108,7 @@ def test_an_even_window_has_the_axis_between_its_pixels(tmp_path):
     [
         (["--focus-distance", "10"], 1, "within the focal length"),
         (["--focus-distance", "-1"], 2, "--focus-distance"),
-        (["--distances", "0"], 2, "--distances"),
+        (["--object-distance", "0"], 2, "--object-distance"),
         (["--start", "best"], 2, "invalid choice"),
     ],
 )

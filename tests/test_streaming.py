@@ -427,7 +427,7 @@ def test_memory_stays_within_the_budget(rays):
 
 def test_command_gives_the_spot_of_few_rays(command):
     common = ("spot", "cooke_triplet", "--seed", 2)
-    few = json.loads(command(*common, "--sampling", "sobol", "--size", 3000, "--json")[1])
+    few = json.loads(command(*common, "--sampling", "sobol", "--points", 3000, "--json")[1])
     many = json.loads(command(*common, "--rays", "3e3", "--max-bytes", "1MB", "--json")[1])
     for one, other in zip(few["results"], many["results"], strict=True):
         assert one["field"] == other["field"]
@@ -435,7 +435,9 @@ def test_command_gives_the_spot_of_few_rays(command):
         assert one["rms_radius"] == pytest.approx(other["rms_radius"], rel=1e-9)
         assert one["geometric_radius"] == pytest.approx(other["geometric_radius"], rel=1e-9)
         assert other["launched"] == 3000
-    lines = [command(*common, *a)[1].splitlines() for a in (("--sampling", "sobol", "--size", 3000), ("--rays", 3000))]
+    lines = [
+        command(*common, *a)[1].splitlines() for a in (("--sampling", "sobol", "--points", 3000), ("--rays", 3000))
+    ]
     assert [line.split() for line in lines[0]] == [line.split() for line in lines[1]]
 
 
@@ -450,7 +452,7 @@ def test_command_shows_a_bar_beside_the_results(command):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--rays", 100, "--size", 3), "--rays and --size exclude each other"),
+        (("--rays", 100, "--points", 3), "--rays and --points exclude each other"),
         (("--rays", 100, "--sampling", "square"), "sobol (its default) or random, not square"),
         (("--rays", 100, "--plot", "spot.png"), "--plot needs the rays"),
         (("--max-bytes", "1MB"), "--max-bytes belongs to --rays"),

@@ -41,7 +41,7 @@ def library(elements, depths, wavelengths, size=128):
 
 
 def test_fixed_form_gives_the_librarys_kernels(run, tmp_path):
-    code, out, err = run("psf", "--element", "singlet", *FORM, "--json", "-o", "psf.npz", "psf.png")
+    code, out, err = run("psf", "--element", "singlet", *FORM, "--json", "-o", "psf.npz", "--plot", "psf.png")
     assert code == 0, err
     found = library(baseline("singlet", aim()), [500.0, 1000.0, math.inf], [0.46, 0.55, 0.64])
     with np.load(tmp_path / "psf.npz") as arrays:
@@ -101,7 +101,7 @@ def test_exact_spheres_and_paraboloids_differ(run):
 def test_text_and_the_other_figures(run, tmp_path):
     names = {"--heights": "h.png", "--encircled": "e.svg"}
     words = [word for pair in names.items() for word in pair]
-    code, out, err = run("psf", "--element", "fresnel", "--aperture", "1", *SMALL, "-o", "k.pdf", *words)
+    code, out, err = run("psf", "--element", "fresnel", "--aperture", "1", *SMALL, "--plot", "k.pdf", *words)
     assert code == 0, err
     assert "radial engine" in out
     assert "1000 mm" in out
@@ -121,7 +121,7 @@ def test_text_and_the_other_figures(run, tmp_path):
         (["--levels", "16"], 1, "the element singlet is smooth"),
         (["--glass", "F_SILICA"], 1, "--glass belongs to a height map"),
         (["-o", "psf.txt"], 1, "psf.txt: expected a name that ends in .npz"),
-        (["--caustic", "psf.npz"], 1, "psf.npz: expected a name that ends in .png"),
+        (["--caustic", "psf.npz"], 2, "'psf.npz' is no picture (.png, .pdf, .svg)"),
         (["-o", "no/psf.npz"], 1, "no/psf.npz: cannot be written"),
         (["--depth", "0"], 2, "not above 0"),
         (["--wavelength", "green"], 2, "not a number"),

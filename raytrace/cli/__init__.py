@@ -7,11 +7,14 @@ only when the command runs, so that `raytrace --help` answers at once.
 import argparse
 import importlib
 import os
+import re
 import sys
 import warnings
 from collections.abc import Sequence
 
 from raytrace.cli.commands import COMMANDS
+from raytrace.cli.options import did_you_mean
+from raytrace.cli.several import each_distance
 
 DESCRIPTION = "A sequential, differentiable ray tracer: read a lens file, trace it, focus it, plot it."
 
@@ -30,11 +33,29 @@ traces by torch alone, =fused always by C++, and RAYTRACE_CACHE is the folder th
 
 
 class _Parser(argparse.ArgumentParser):
-    """argparse, with its usage errors in one line like every other error."""
+    """argparse, with its usage errors in one line like every other error, that knows what may have been meant."""
+
+    def __init__(self, *arguments, **settings):
+        super().__init__(*arguments, **settings)
+        self._negative_number_matcher = re.compile(r"-[\d.][\d.,eE+-]*$")  # -3,4 and -1e-3 are no options
 
     def error(self, message: str):
         print(f"raytrace: error: {message}; see `{self.prog} --help`", file=sys.stderr)
         raise SystemExit(2)
+
+    def parse_known_args(self, args=None, namespace=None):
+        found, unknown = super().parse_known_args(args, namespace)
+        option = next((word for word in unknown if word.startswith("-")), None)
+        if option is not None:
+            name = option.partition("=")[0]
+            self.error(f"unknown option {name}{did_you_mean(name, self._option_string_actions)}")
+        return found, unknown
+
+    def _check_value(self, action, value):
+        if action.choices is not None and value not in action.choices:
+            listed = ", ".join(map(str, action.choices))
+            meant = did_you_mean(str(value), map(str, action.choices))
+            raise argparse.ArgumentError(action, f"invalid choice: {value!r}{meant} (choose from {listed})")
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -72,7 +93,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         warnings.showwarning = _show_warning
         try:
             with importlib.import_module("raytrace.cli.progress").heartbeat(arguments.command):
-                getattr(importlib.import_module(f"raytrace.cli.{module}"), function)(arguments)
+                run = getattr(importlib.import_module(f"raytrace.cli.{module}"), function)
+            if getattr(arguments, "object_distance", None) and not arguments.distances_together:
+                each_distance(run, arguments)
+            else:
+                run(arguments)
         except KeyboardInterrupt:
             return _fail("interrupted", 130)
         except BrokenPipeError:
@@ -85,7 +110,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             if isinstance(error, (ValueError, LookupError, OSError)) and not isinstance(error, KeyError | IndexError):
                 return _fail(_one_line(error), 1)
             if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
-                return _fail("not enough memory for this many rays; ask for fewer (--size, --rays)", 1)
+                return _fail("not enough memory for this many rays; ask for fewer (--rings, --points, --rays)", 1)
             kind = type(error).__name__
             return _fail(
                 f"{kind}: {_one_line(error)} (a defect of raytrace; RAYTRACE_TRACEBACK=1 shows where, please report)", 1

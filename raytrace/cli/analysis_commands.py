@@ -39,14 +39,14 @@ def mtf(arguments: argparse.Namespace) -> None:
 def fan(arguments: argparse.Namespace) -> None:
     """Ray fans."""
     lens, fields = _opened(arguments)
-    found = analysis.ray_fan(lens, fields=fields, size=arguments.size)
+    found = analysis.ray_fan(lens, fields=fields, size=arguments.points)
     _report(arguments, lens, found, "fan_plot", every=5, unit="mm")
 
 
 def opd(arguments: argparse.Namespace) -> None:
     """OPD fans."""
     lens, fields = _opened(arguments)
-    found = analysis.opd_fan(lens, fields=fields, size=arguments.size)
+    found = analysis.opd_fan(lens, fields=fields, size=arguments.points)
     _report(arguments, lens, found, "fan_plot", every=5, unit="waves")
 
 
@@ -93,10 +93,10 @@ def _opened(arguments: argparse.Namespace) -> tuple[Lens, Tensor]:
 
 
 def _over_field(arguments: argparse.Namespace, analyse: Callable, figure: str) -> None:
-    """Report an analysis at the fields of --field, else at --size fields; its figure is drawn through many."""
+    """Report an analysis at the fields of --field, else at --samples fields; its figure is drawn through many."""
     lens = open_lens(arguments)
     fields = field_points(lens, arguments) if arguments.field else None
-    found = analyse(lens, fields=fields, size=arguments.size)
+    found = analyse(lens, fields=fields, size=arguments.samples)
     dense = analyse(lens, fields=fields, size=_DENSE) if arguments.plot else None
     _report(arguments, lens, found, figure, unit="mm", dense=dense)
 

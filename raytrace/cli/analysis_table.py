@@ -1,6 +1,6 @@
 """The commands that analyse a lens: name, summary, description, examples, arguments, and what runs it. No torch."""
 
-from raytrace.cli.options import conditions, count, fields, lens, plot, positive_finite
+from raytrace.cli.options import conditions, count, fields, lens, plot, points, positive_finite, size
 
 
 def _analysis(parser, figure: str) -> None:
@@ -10,16 +10,25 @@ def _analysis(parser, figure: str) -> None:
     plot(parser, figure)
 
 
-def _sized(figure: str, size: int, what: str):
-    def add_arguments(parser) -> None:
-        _analysis(parser, figure)
-        parser.add_argument("--size", metavar="N", type=count, default=size, help=f"{what} (default {size})")
-
-    return add_arguments
+def _fans(parser) -> None:
+    _analysis(parser, "the fans")
+    points(parser, "rays across the pupil (default 41)", default=41)
 
 
-_FANS = _sized("the fans", 41, "rays across the pupil")
-_CURVES = _sized("the curves", 11, "fields from the axis to the largest")
+def _maps(parser) -> None:
+    _analysis(parser, "the maps")
+    size(parser, "a map (default 96)", default=96)
+
+
+def _curves(parser) -> None:
+    _analysis(parser, "the curves")
+    parser.add_argument(
+        "--samples",
+        metavar="N",
+        type=count,
+        default=11,
+        help="fields from the axis to the largest, without --field (default 11)",
+    )
 
 
 def _light(parser) -> None:
@@ -74,8 +83,8 @@ ANALYSES = (
         "Transverse ray aberration over the pupil, from the chief ray of the primary wavelength.",
         """examples:
   raytrace fan tessar --plot fan.png
-  raytrace fan double_gauss --field 0 14 --size 21 --json""",
-        _FANS,
+  raytrace fan double_gauss --field 0 14 -10,5 --points 21 --json""",
+        _fans,
         "analysis_commands.fan",
     ),
     (
@@ -85,7 +94,7 @@ ANALYSES = (
         """examples:
   raytrace opd tessar --plot opd.png
   raytrace opd double_gauss --object-distance 25000 --json""",
-        _FANS,
+        _fans,
         "analysis_commands.opd",
     ),
     (
@@ -96,7 +105,7 @@ ANALYSES = (
         """examples:
   raytrace wavefront tessar --plot wavefront.png
   raytrace wavefront double_gauss --field 0 --json""",
-        _sized("the maps", 96, "points across a map"),
+        _maps,
         "analysis_commands.wavefront",
     ),
     (
@@ -106,7 +115,7 @@ ANALYSES = (
         """examples:
   raytrace distortion phone --plot distortion.png
   raytrace distortion double_gauss --field 5 10 14 --json""",
-        _CURVES,
+        _curves,
         "analysis_commands.distortion",
     ),
     (
@@ -116,7 +125,7 @@ ANALYSES = (
         """examples:
   raytrace curvature tessar --plot curvature.png
   raytrace curvature double_gauss --field 0 10 14 --json""",
-        _CURVES,
+        _curves,
         "analysis_commands.curvature",
     ),
     (
@@ -126,7 +135,7 @@ ANALYSES = (
         """examples:
   raytrace lateral tessar --plot lateral.png
   raytrace lateral double_gauss --wavelength 0.5876 0.4861 0.6563 --json""",
-        _CURVES,
+        _curves,
         "analysis_commands.lateral",
     ),
     (
@@ -136,7 +145,7 @@ ANALYSES = (
         """examples:
   raytrace illumination phone --plot illumination.png
   raytrace illumination double_gauss --field 0 10 14 --json""",
-        _CURVES,
+        _curves,
         "analysis_commands.illumination",
     ),
     (

@@ -55,7 +55,7 @@ def experiment(arguments: argparse.Namespace, settings: Settings) -> Experiment:
     lens = open_lens(argparse.Namespace(lens=arguments.lens, catalog=arguments.catalog))
     if settings.near >= settings.far:
         raise CommandError(f"--near {settings.near:g} is not nearer than --far {settings.far:g}")
-    field_points(lens, argparse.Namespace(field=settings.fields))
+    field_points(lens, argparse.Namespace(field=[(0.0, y) for y in settings.fields]))
     camera(lens, settings)  # refuses bad variables, starts and networks
     refuse_untraceable(lens_at_start(lens, settings), str(path))
     pictures = _pictures(arguments, settings)
@@ -88,7 +88,13 @@ def settings_of(arguments: argparse.Namespace, begun: Path) -> Settings:
         if getattr(arguments, words):
             given[words] = " ".join(getattr(arguments, words))
     if arguments.field:
-        given["fields"] = tuple(arguments.field)
+        if any(x for x, _ in arguments.field):
+            raise CommandError("--field X,Y: co-design takes field points along y, --field Y")
+        given["fields"] = tuple(y for _, y in arguments.field)
+    if arguments.wavelength:
+        if len(arguments.wavelength) > 1:
+            raise CommandError("--wavelength: co-design takes one wavelength")
+        given["wavelength"] = arguments.wavelength[0]
     if arguments.precision == "auto":
         shape = RedNetShape(given["depth"], given["width"])
         given["precision"] = _agreed(lambda: recorded(begun).get("precision") or faster_precision(shape))

@@ -1,6 +1,18 @@
 """The arguments of `raytrace codesign`. Imports no torch."""
 
-from raytrace.cli.options import catalog, count, file_name, finite, json, positive_finite, seed_number, window
+from raytrace.cli.options import (
+    catalog,
+    count,
+    fields,
+    file_name,
+    json,
+    output_folder,
+    positive,
+    positive_finite,
+    seed_number,
+    wavelength,
+    window,
+)
 
 MODELS = ("paraxial", "fourier", "gaussian", "drt")
 AFTER_PARAXIAL = "gaussian-after-paraxial"
@@ -37,9 +49,7 @@ def _add_arguments(parser) -> None:
     )
     catalog(parser)
     json(parser)
-    parser.add_argument(
-        "-o", "--output", metavar="FOLDER", type=file_name, help="folder of the run, or of all runs of compare"
-    )
+    output_folder(parser, "folder of the run, or of all runs of compare")
     parser.add_argument("--resume", action="store_true", help="only go on with a run that was begun in FOLDER")
     parser.add_argument("--model", choices=MODELS, help="PSF model of step 1 (default gaussian)")
     parser.add_argument(
@@ -86,14 +96,12 @@ def _scene(group) -> None:
         help="where the sensor begins: paraxial (default; the image of --focus-distance), rms (its least RMS spot), "
         "spectral (the optimum of the closed form), or a sensor distance in mm",
     )
-    group.add_argument("--focus-distance", metavar="MM", type=positive_finite, help="of --start (default 25000)")
+    group.add_argument("--focus-distance", metavar="MM", type=positive, help="of --start (default 25000); inf allowed")
     group.add_argument("--f-number", metavar="N", type=positive_finite, help="other than the file's")
-    group.add_argument("--wavelength", metavar="UM", type=positive_finite, help="in µm (default 0.53)")
+    wavelength(group)
     group.add_argument("--near", metavar="MM", type=positive_finite, help="nearest object (default 10000)")
     group.add_argument("--far", metavar="MM", type=positive_finite, help="furthest object (default 50000)")
-    group.add_argument(
-        "--field", "--fields", metavar="Y", type=finite, nargs="+", help="field points, taken in turn (default 0)"
-    )
+    fields(group, default="0; several are taken in turn")
     window(group, normalise="window")
     group.add_argument(
         "--noise", metavar="S", type=positive_finite, help="standard deviation, of pictures from 0 to 1 (default 0.1)"

@@ -17,6 +17,7 @@ from raytrace.cli.options import (
     lens,
     many,
     memory,
+    object_distance,
     output,
     plot,
     positive,
@@ -63,14 +64,7 @@ def _layout(parser):
     lens(parser)
     conditions(parser)
     fields(parser)
-    parser.add_argument(
-        "-o",
-        "--output",
-        "--plot",
-        metavar="FILE",
-        type=file_name,
-        help="picture to write: .png, .pdf or .svg (default: LENS_layout.png in this folder)",
-    )
+    plot(parser, "the cross section (default LENS_layout.png in this folder)")
 
 
 def _spot(parser):
@@ -82,7 +76,7 @@ def _spot(parser):
         "--rays",
         metavar="N",
         type=many,
-        help="instead of --size, any number of sobol or random rays for each field and wavelength, as 1e9: "
+        help="instead of --points, any number of sobol or random rays for each field and wavelength, as 1e9: "
         "traced in chunks, none kept",
     )
     parser.add_argument(
@@ -192,6 +186,9 @@ def _bench(parser):
 def _compare(parser):
     lens(parser)
     group = parser.add_argument_group("conditions other than the file's")
+    distances = [10000.0, 20000.0, 30000.0, 40000.0, 50000.0]
+    object_distance(group, "the columns (default 10000 20000 30000 40000 50000)", default=distances)
+    parser.set_defaults(distances_together=True)
     aperture(group)
     wavelength(group)
     parser.add_argument(
@@ -202,14 +199,6 @@ def _compare(parser):
     )
     parser.add_argument(
         "--focus-distance", metavar="MM", type=positive, default=25000.0, help="object in focus (default 25000)"
-    )
-    parser.add_argument(
-        "--distances",
-        metavar="MM",
-        type=positive,
-        nargs="+",
-        default=[10000.0, 20000.0, 30000.0, 40000.0, 50000.0],
-        help="object distances, the columns (default 10000 20000 30000 40000 50000)",
     )
     plot(parser, "the grid of kernels")
 
@@ -252,8 +241,8 @@ COMMANDS = (
         "draw the lens with rays",
         "Draw the cross section of a lens with the rays of its fields.",
         """examples:
-  raytrace layout double_gauss -o layout.png
-  raytrace layout lens.zmx --field 0 14 -o layout.pdf""",
+  raytrace layout double_gauss --plot layout.png
+  raytrace layout lens.zmx --field 0 14 -14,0 --plot layout.pdf""",
         _layout,
         "lens_commands.layout",
     ),

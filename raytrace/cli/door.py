@@ -10,8 +10,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from raytrace.cli.options import did_you_mean
 from raytrace.files import shipped
-from raytrace.formats import read_lens
+from raytrace.formats import FORMATS, read_lens
 from raytrace.glass import check_wavelengths
 from raytrace.lens import Lens, SystemAperture, check, with_object_distance, with_sensor_distance
 
@@ -32,8 +33,10 @@ def find_lens(name: str) -> Path:
         for candidate in (folder / path.name, folder / f"{path.name}.zmx"):
             if path.name and candidate.is_file():
                 return candidate
-    names = ", ".join(sorted({lens.stem for lens in folder.glob("*.zmx")}))
-    raise CommandError(f"{name}: no such lens file; the shipped lenses are {names}")
+    names = sorted({lens.stem for lens in folder.glob("*.zmx")})
+    beside = [str(file) for file in path.parent.glob("*") if file.suffix.lower() in FORMATS]
+    meant = did_you_mean(name, [*names, *beside])
+    raise CommandError(f"{name}: no such lens file{meant or ';'} the shipped lenses are {', '.join(names)}")
 
 
 def open_lens(arguments: argparse.Namespace) -> Lens:
@@ -90,17 +93,16 @@ def catalogs(arguments: argparse.Namespace) -> tuple[Path, ...]:
 
 
 def field_points(lens: Lens, arguments: argparse.Namespace, *, on_axis: bool = False) -> Tensor:
-    """(2, F) field points: those of --field along y, else the axis alone or the lens's own."""
+    """(2, F) field points: those of --field, else the axis alone or the lens's own."""
     given = getattr(arguments, "field", None)
     if given:
-        for angle in given:
+        for angle in (angle for point in given for angle in point):
             if lens.fields.kind == "angle" and abs(angle) >= 90:
                 raise CommandError(
                     f"--field {angle:g}: a field angle is below 90 degrees, for rays start from the plane "
                     "of the entrance pupil"
                 )
-        y = lens.fields.y.new_tensor(given)
-        return torch.stack([torch.zeros_like(y), y])
+        return lens.fields.y.new_tensor(given).T
     if on_axis:
         return lens.fields.y.new_zeros(2, 1)
     return torch.stack([lens.fields.x, lens.fields.y])

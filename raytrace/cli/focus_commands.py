@@ -49,7 +49,7 @@ def focus(arguments: argparse.Namespace) -> None:
     rms = best_focus(lens, points, weights, **rule)
     _tell_losses(arguments, lens, points, rule)
     if not bool(torch.isfinite(rms)):
-        raise CommandError(f"{arguments.lens}: one ray, or parallel rays, have no focus; ask for more rays (--size)")
+        raise CommandError(f"{arguments.lens}: one ray, or parallel rays, have no focus; give more --rings or --points")
     shares = paraxial.new_tensor(arguments.distance_weights or [1.0] * len(distances))
     after = {"rms": rms, "paraxial": (shares * paraxial).sum() / shares.sum()}.get(arguments.criterion)
     if after is None:

@@ -155,7 +155,7 @@ def layout(arguments: argparse.Namespace) -> None:
     lens = open_lens(arguments)
     from raytrace import plot
 
-    output = arguments.output or f"{Path(arguments.lens).stem}_layout.png"
+    output = arguments.plot or f"{Path(arguments.lens).stem}_layout{arguments.suffix}.png"
     fields = field_points(lens, arguments)
     figure = plot.layout(lens, fields=fields)
     plot.save(figure, output)

@@ -1,8 +1,19 @@
-"""Arguments that commands share. Imports argparse alone: the help must not wait for torch."""
+"""Arguments that commands share: one name means the same everywhere. No torch: the help must not wait for it."""
 
 import argparse
+import difflib
+from collections.abc import Iterable
+from pathlib import PurePath
 
 SAMPLINGS = ("gauss", "hexapolar", "square", "sobol", "random")
+PICTURES = (".png", ".pdf", ".svg")
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """What may have been meant by a word, of the known ones, as the end of a message; empty if nothing is near."""
+    spelled = {name.lower(): name for name in known}
+    near = difflib.get_close_matches(word.lower(), spelled, n=1, cutoff=0.7)
+    return f"; did you mean {spelled[near[0]]}?" if near else ""
 
 
 def positive(text: str) -> float:
@@ -71,6 +82,32 @@ def file_name(text: str) -> str:
     return text
 
 
+def data_file(text: str) -> str:
+    """The name of a file of data; that of a picture is refused."""
+    if PurePath(file_name(text)).suffix.lower() in PICTURES:
+        raise argparse.ArgumentTypeError(f"{text!r} is a picture: figures are saved by --plot, data by -o")
+    return text
+
+
+def picture_file(text: str) -> str:
+    """The name of a figure: .png, .pdf or .svg."""
+    if PurePath(file_name(text)).suffix.lower() not in PICTURES:
+        listed = ", ".join(PICTURES)
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no picture ({listed}); data are written by -o, where there is one"
+        )
+    return text
+
+
+def field_point(text: str) -> tuple[float, float]:
+    """A field point (x, y): `Y` alone, or `X,Y`."""
+    parts = text.split(",")
+    if len(parts) > 2:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a field point, Y or X,Y; several have spaces between them")
+    x, y = (0.0, finite(text)) if len(parts) == 1 else map(finite, parts)
+    return x, y
+
+
 def _whole(text: str) -> int:
     try:
         return int(text)
@@ -113,21 +150,27 @@ def json(parser: argparse.ArgumentParser) -> None:
 def conditions(parser: argparse.ArgumentParser, *, several: str = "") -> None:
     """What may be set other than in the file: distances, aperture, wavelength.
 
-    several: what a command does with several object distances; it takes one if this is empty.
+    several: what a command does with several object distances together; it is run for one after the other if empty.
     """
     group = parser.add_argument_group("conditions other than the file's")
-    group.add_argument(
-        "--object-distance",
-        metavar="MM",
-        type=positive,
-        nargs="+" if several else None,
-        help="from the object to the vertex of surface 1; inf allowed" + (f"; {several}" if several else ""),
-    )
+    object_distance(group, several or "several: one result after the other")
+    parser.set_defaults(distances_together=bool(several), suffix="")
     group.add_argument(
         "--sensor-distance", metavar="MM", type=finite, help="from the last vertex before the image to the image"
     )
     aperture(group)
     wavelength(group)
+
+
+def object_distance(group, several: str, *, default: list[float] | None = None) -> None:
+    group.add_argument(
+        "--object-distance",
+        metavar="MM",
+        type=positive,
+        nargs="+",
+        default=default,
+        help=f"from the object to the vertex of surface 1; inf allowed; {several}",
+    )
 
 
 def aperture(group) -> None:
@@ -146,13 +189,14 @@ def wavelength(group) -> None:
     )
 
 
-def fields(parser: argparse.ArgumentParser) -> None:
+def fields(parser: argparse.ArgumentParser, *, default: str = "") -> None:
     parser.add_argument(
         "--field",
-        metavar="Y",
-        type=finite,
+        metavar="F",
+        type=field_point,
         nargs="+",
-        help="field points along y in the file's own kind of field (degrees or mm), never an index",
+        help="field points, Y or X,Y, in the file's own kind of field (degrees or mm), never an index"
+        + (f" (default {default})" if default else ""),
     )
 
 
@@ -164,12 +208,18 @@ def sampling(parser: argparse.ArgumentParser, *, rings: int) -> None:
         help="rule of the pupil points: Gaussian quadrature (default), or another",
     )
     parser.add_argument(
-        "--size",
-        metavar="N",
-        type=count,
-        help=f"rings (gauss, hexapolar; default {rings}), points across (square) or points (sobol, random)",
+        "--rings", metavar="N", type=count, help=f"rings of the pupil, of gauss and hexapolar (default {rings})"
     )
+    points(parser, "points of the pupil: across it of square (default 32), in all of sobol and random (default 1024)")
     parser.add_argument("--seed", metavar="N", type=seed_number, default=0, help="seed of sobol and random (default 0)")
+
+
+def points(parser: argparse.ArgumentParser, what: str, *, default: int | None = None) -> None:
+    parser.add_argument("--points", metavar="N", type=count, default=default, help=what)
+
+
+def size(group, what: str, *, default: int | None = None) -> None:
+    group.add_argument("--size", metavar="N", type=count, default=default, help=f"pixels across {what}")
 
 
 def ray_aiming(parser: argparse.ArgumentParser) -> None:
@@ -183,11 +233,15 @@ def ray_aiming(parser: argparse.ArgumentParser) -> None:
 
 
 def plot(parser: argparse.ArgumentParser, what: str) -> None:
-    parser.add_argument("--plot", metavar="FILE", type=file_name, help=f"save {what} as .png, .pdf or .svg")
+    parser.add_argument("--plot", metavar="FILE", type=picture_file, help=f"save {what} as .png, .pdf or .svg")
 
 
 def output(parser: argparse.ArgumentParser, what: str) -> None:
-    parser.add_argument("-o", "--output", metavar="FILE", type=file_name, help=what)
+    parser.add_argument("-o", "--output", metavar="FILE", type=data_file, help=what)
+
+
+def output_folder(parser: argparse.ArgumentParser, what: str, *, required: bool = False) -> None:
+    parser.add_argument("-o", "--output", metavar="FOLDER", type=data_file, help=what, required=required)
 
 
 def window(group, *, normalise: str) -> None:
@@ -196,7 +250,7 @@ def window(group, *, normalise: str) -> None:
     normalise: what the command takes then, for the help.
     """
     group.add_argument("--pixel", metavar="MM", type=positive_finite, help="pixel pitch (default 0.005)")
-    group.add_argument("--size", metavar="N", type=count, help="pixels across the window of the PSF (default 21)")
+    size(group, "the window of the PSF (default 21)")
     group.add_argument(
         "--normalise",
         choices=("energy", "window"),

@@ -140,7 +140,7 @@ def compare(arguments: argparse.Namespace) -> None:
     lens = common_focus(lens, arguments.focus_distance, wavelength=wavelength, start=arguments.start)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotConverged)  # the estimated errors are printed
-        found = compare_models(lens, lens.wavelengths.new_tensor(arguments.distances))
+        found = compare_models(lens, lens.wavelengths.new_tensor(arguments.object_distance))
         able = abilities(lens)
     where = f"one sensor at {float(found.sensor_distance):.7f} mm, {float(found.wavelength):g} µm"
     if arguments.plot:

@@ -44,8 +44,9 @@ def spot(arguments: argparse.Namespace) -> None:
 def _check(arguments: argparse.Namespace) -> None:
     if arguments.rays is None:
         raise CommandError("--max-bytes belongs to --rays: without it all rays are kept")
-    if arguments.size is not None:
-        raise CommandError("--rays and --size exclude each other: both are a number of rays")
+    for name in ("rings", "points"):
+        if getattr(arguments, name) is not None:
+            raise CommandError(f"--rays and --{name} exclude each other: both are a number of rays")
     if arguments.sampling in ("hexapolar", "square"):
         raise CommandError(f"--rays takes --sampling sobol (its default) or random, not {arguments.sampling}")
     if arguments.plot:

@@ -7,19 +7,25 @@ import torch
 from torch import Tensor
 
 from raytrace import pupil
-from raytrace.cli.door import number, numbers, say
+from raytrace.cli.door import CommandError, number, numbers, say
 from raytrace.lens import FIELD_UNITS, Lens
 from raytrace.losses import beam_hint, losses
 from raytrace.spot import Spot
 from raytrace.streaming import StreamedSpot
 
 _RINGS = 12
-_DEFAULT_SIZE = {"gauss": _RINGS, "hexapolar": _RINGS, "square": 32, "sobol": 1024, "random": 1024}
+_IN_RINGS = ("gauss", "hexapolar")
+_POINTS = {"square": 32, "sobol": 1024, "random": 1024}
 
 
 def pupil_points(arguments: argparse.Namespace) -> tuple[Tensor, Tensor]:
     """Points and weights of the sampling asked for."""
-    size = arguments.size or _DEFAULT_SIZE[arguments.sampling]
+    in_rings = arguments.sampling in _IN_RINGS
+    if in_rings and arguments.points:
+        raise CommandError(f"--points belongs to --sampling {', '.join(_POINTS)}; {arguments.sampling} takes --rings")
+    if arguments.rings and not in_rings:
+        raise CommandError(f"--rings belongs to --sampling {', '.join(_IN_RINGS)}; {arguments.sampling} takes --points")
+    size = arguments.rings or _RINGS if in_rings else arguments.points or _POINTS[arguments.sampling]
     if arguments.sampling in ("sobol", "random"):
         return pupil.SAMPLINGS[arguments.sampling](size, seed=arguments.seed)
     return pupil.SAMPLINGS[arguments.sampling](size)

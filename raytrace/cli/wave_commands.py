@@ -16,7 +16,6 @@ from raytrace.cli.wave_setup import elements, kernels, scene
 from raytrace.design.focusing import Learned, Setting, learn_to_focus
 from raytrace.files import write_atomically
 from raytrace.grid import Grid, centres
-from raytrace.plot import SUFFIXES
 from raytrace.plot import wave as figures
 from raytrace.plot.style import object_text
 from raytrace.wave.caustic import caustic
@@ -30,24 +29,21 @@ _SHOWN = (0, 5, 10, 20, 40, 80, 160)  # steps of learning that the figure shows
 
 def psf(arguments: argparse.Namespace) -> None:
     """Kernels over depth × wavelength: print, draw, save."""
-    arrays, pictures = _outputs(arguments.output)
-    more = {name: getattr(arguments, name) for name in ("heights", "caustic", "encircled") if getattr(arguments, name)}
-    for name, path in more.items():
-        _refuse_suffix(f"--{name}", path, tuple(SUFFIXES))
+    if arguments.output:
+        _refuse_suffix("-o", arguments.output, (".npz",))
+    drawn = {draw: path for name, draw in _FIGURES.items() if (path := getattr(arguments, name))}
     parts = elements(arguments)
     seen = scene(arguments, parts)
     found = kernels(seen, engine=arguments.engine, samples=arguments.samples, tol=arguments.tol)
-    for path in arrays:
-        write_atomically(path, lambda file: save(found, arguments.element, file))
-    for path in pictures:
-        plot.save(figures.psf_figure(found, title=_title(arguments)), path)
-    for name, path in more.items():
-        plot.save(_FIGURES[name](arguments, seen, found), path)
+    if arguments.output:
+        write_atomically(arguments.output, lambda file: save(found, arguments.element, file))
+    for draw, path in drawn.items():
+        plot.save(draw(arguments, seen, found), path)
     if arguments.json:
         print_json(_document(found, arguments))
     else:
         _print(found, arguments)
-    for path in (*arguments.output, *more.values()):
+    for path in filter(None, (arguments.output, *drawn.values())):
         say(f"written: {path}")
 
 
@@ -74,19 +70,15 @@ def _caustic(arguments: argparse.Namespace, seen: WaveScene, found: WavePsf):
     )
 
 
+def _kernels(arguments: argparse.Namespace, seen: WaveScene, found: WavePsf):
+    return figures.psf_figure(found, title=_title(arguments))
+
+
 def _encircled(arguments: argparse.Namespace, seen: WaveScene, found: WavePsf):
     return figures.encircled_figure(found, title=_title(arguments))
 
 
-_FIGURES = {"heights": _heights, "caustic": _caustic, "encircled": _encircled}
-
-
-def _outputs(paths: list[str]) -> tuple[list[str], list[str]]:
-    """Names of arrays and of figures, by suffix."""
-    for path in paths:
-        _refuse_suffix("-o", path, (".npz", *SUFFIXES))
-    arrays = [path for path in paths if Path(path).suffix.lower() == ".npz"]
-    return arrays, [path for path in paths if path not in arrays]
+_FIGURES = {"plot": _kernels, "heights": _heights, "caustic": _caustic, "encircled": _encircled}
 
 
 def _refuse_suffix(option: str, path: str, known: tuple[str, ...]) -> None:
@@ -175,8 +167,6 @@ def _print(found: WavePsf, arguments: argparse.Namespace) -> None:
 
 def focus(arguments: argparse.Namespace) -> None:
     """A flat plate learns to be a lens: print, draw, save."""
-    if arguments.plot:
-        _refuse_suffix("--plot", arguments.plot, tuple(SUFFIXES))
     if arguments.output:
         _refuse_suffix("-o", arguments.output, tuple(FORMATS))
     setting = Setting(

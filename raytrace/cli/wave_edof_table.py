@@ -2,7 +2,7 @@
 
 import argparse
 
-from raytrace.cli.options import count, file_name, json, plot, positive_finite, seed_number
+from raytrace.cli.options import count, file_name, json, output_folder, plot, positive_finite, seed_number
 
 KINDS = ("rings", "smooth", "zernike")
 STEPS, STARTS = 120, 4
@@ -75,7 +75,7 @@ def _edof(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--steps", metavar="N", type=count, default=STEPS, help=f"default {STEPS}")
     group.add_argument("--starts", metavar="N", type=count, default=STARTS, help=f"random starts (default {STARTS})")
     _pictures(parser.add_argument_group("pictures"))
-    parser.add_argument("-o", "--output", metavar="FOLDER", type=file_name, help="folder of the run", required=True)
+    output_folder(parser, "folder of the run", required=True)
     json(parser)
     plot(parser, "height map, PSFs over depth and colour, PSNR over depth")
 
@@ -92,7 +92,7 @@ def _table(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--steps", metavar="N", type=count, default=STEPS, help=f"of learning (default {STEPS})")
     parser.add_argument("--starts", metavar="N", type=count, default=STARTS, help=f"random starts (default {STARTS})")
     _pictures(parser.add_argument_group("pictures"))
-    parser.add_argument("-o", "--output", metavar="FOLDER", type=file_name, help="folder of learned elements")
+    output_folder(parser, "folder of learned elements")
     parser.add_argument("--docs", metavar="DOCS", type=file_name, help="folder for wave_edof.md and wave/")
     json(parser)
 

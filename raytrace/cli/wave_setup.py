@@ -2,7 +2,6 @@
 
 import argparse
 import dataclasses
-import difflib
 import math
 import os
 from collections.abc import Sequence
@@ -13,6 +12,7 @@ from torch import Tensor
 
 from raytrace.catalog import find_glass
 from raytrace.cli.door import CommandError, catalogs
+from raytrace.cli.options import did_you_mean
 from raytrace.cli.progress import progress
 from raytrace.glass import Glass, check_wavelengths
 from raytrace.glass_table import from_table
@@ -52,11 +52,9 @@ def elements(arguments: argparse.Namespace) -> tuple[Element, ...]:
         return _named(arguments)
     if Path(name).suffix.lower() in FORMATS:
         return (_from_file(arguments),)
-    near = difflib.get_close_matches(name, BASELINES, n=2, cutoff=0.5)
-    did_you_mean = f"; did you mean {' or '.join(near)}?" if near else ""
     raise CommandError(
         f"--element {name}: neither a named element ({', '.join(BASELINES)}) nor a height map "
-        f"({', '.join(FORMATS)}){did_you_mean}"
+        f"({', '.join(FORMATS)}){did_you_mean(name, BASELINES)}"
     )
 
 

@@ -159,7 +159,7 @@ def _document(block: _Block) -> dict:
 
 
 def _draw(arguments, block: _Block, kind: str, noises: list[dict], blocks: Sequence[_Block]) -> None:
-    if not (arguments.output or arguments.docs):
+    if not (arguments.plot or arguments.docs):
         return
     from raytrace.plot.style import save
     from raytrace.plot.superres import superres_figure
@@ -173,9 +173,9 @@ def _draw(arguments, block: _Block, kind: str, noises: list[dict], blocks: Seque
         {"plain lens": drawn["lens"][middle], "learned": drawn["learned"][middle], "plate": drawn["plate"][middle]},
         drawn["sensor"][middle],
     )
-    if arguments.output:
-        save(figure, arguments.output)
-        say(f"written: {arguments.output}")
+    if arguments.plot:
+        save(figure, arguments.plot)
+        say(f"written: {arguments.plot}")
     if arguments.docs:
         docs, folder = folders(arguments.docs)
         if kind == "dead leaves":  # pictures of others are not for pages

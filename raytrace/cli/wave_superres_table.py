@@ -2,7 +2,7 @@
 
 import argparse
 
-from raytrace.cli.options import count, file_name, json, positive_finite, seed_number
+from raytrace.cli.options import count, file_name, json, output_folder, plot, positive_finite, seed_number
 
 _SUPERRES_DESCRIPTION = """\
 Pictures finer than the pixels of the sensor, from one exposure: 5 mm PMMA lens, sensor at 35.5 mm, one depth of 1 m,
@@ -15,7 +15,7 @@ the joint inversion of these views: wedges on sectors, the phase of all waves ad
 
 _SUPERRES_EXAMPLES = """examples:
   raytrace wave superres --json
-  raytrace wave superres --factor 3 --places 4 --noise 0.003 -o superres.png
+  raytrace wave superres --factor 3 --places 4 --noise 0.003 --plot superres.png
   raytrace wave superres --wavelength 0.46 0.55 0.64 --data pictures
   raytrace wave superres --factor 2 3 --wavelength 0.55 --wavelength 0.46 0.55 0.64 --docs docs"""
 
@@ -88,7 +88,7 @@ def _superres(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--starts", metavar="N", type=_steps, default=1, help="random starts, full frame (default 1)")
     _pictures(parser, 96)
     parser.add_argument("--docs", metavar="DOCS", type=file_name, help="folder for wave_superres.md and wave/")
-    parser.add_argument("-o", "--output", metavar="FILE", type=file_name, help="figure to write: .png, .pdf or .svg")
+    plot(parser, "pictures and elements")
     json(parser)
 
 
@@ -141,7 +141,7 @@ def _quantise(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--starts", metavar="N", type=count, default=2, help="random starts of it (default 2)")
     _pictures(parser, 128)
     parser.add_argument("--docs", metavar="DOCS", type=file_name, help="folder for wave_quantise.md and wave/")
-    parser.add_argument("-o", "--output", metavar="FOLDER", type=file_name, help="folder of the learned element")
+    output_folder(parser, "folder of the learned element")
     json(parser)
 
 

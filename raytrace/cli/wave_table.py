@@ -5,7 +5,19 @@ SUBCOMMANDS holds (name, summary, description, examples, add_arguments, "module.
 
 import argparse
 
-from raytrace.cli.options import catalog, count, file_name, json, output, plot, positive, positive_finite, seed_number
+from raytrace.cli.options import (
+    catalog,
+    count,
+    file_name,
+    json,
+    output,
+    picture_file,
+    plot,
+    positive,
+    positive_finite,
+    seed_number,
+    size,
+)
 from raytrace.cli.wave_edof_table import EDOF
 from raytrace.cli.wave_superres_table import SUPERRES
 
@@ -28,7 +40,7 @@ Waves behind a thin phase element: point spread functions over depth and colour,
 what a camera makes of pictures. `raytrace wave SUB --help` teaches each by example."""
 
 _EXAMPLES = """examples:
-  raytrace wave psf --element singlet --focus 1000 --depth 500 1000 inf -o psf.npz psf.png
+  raytrace wave psf --element singlet --focus 1000 --depth 500 1000 inf -o psf.npz --plot psf.png
   raytrace wave psf --element fresnel --wavelength 0.46 0.55 0.64 --json
   raytrace wave focus --json"""
 
@@ -114,15 +126,13 @@ def light(parser: argparse.ArgumentParser, *, depths: tuple[float, ...] = (500.0
     )
 
 
-def pixels(parser: argparse.ArgumentParser, *, size: int = 128) -> None:
+def pixels(parser: argparse.ArgumentParser, *, across: int = 128) -> None:
     """--pixel, --size: the window of the PSF."""
     group = parser.add_argument_group("window")
     group.add_argument(
         "--pixel", metavar="MM", type=positive_finite, default=0.00369, help="pixel pitch (default 0.00369)"
     )
-    group.add_argument(
-        "--size", metavar="N", type=count, default=size, help=f"pixels across, centred on the axis (default {size})"
-    )
+    size(group, f"the window, centred on the axis (default {across})", default=across)
 
 
 def engine(parser: argparse.ArgumentParser) -> None:
@@ -162,19 +172,14 @@ def _psf(parser: argparse.ArgumentParser) -> None:
     pixels(parser)
     engine(parser)
     json(parser)
-    parser.add_argument(
-        "-o",
-        "--output",
-        metavar="FILE",
-        type=file_name,
-        nargs="+",
-        default=[],
-        help="arrays to write (.npz): psf[depth, wavelength, y, x], pixel_pitch, energy, depths, wavelengths, engine, "
-        "error; and a figure of them (.png, .pdf, .svg)",
+    output(
+        parser,
+        "arrays to write (.npz): psf[depth, wavelength, y, x], pixel_pitch, energy, depths, wavelengths, engine, error",
     )
+    plot(parser, "the kernels")
     figures = parser.add_argument_group("more figures")
     for name, what in _FIGURES.items():
-        figures.add_argument(f"--{name}", metavar="FILE", type=file_name, help=f"save {what} as .png, .pdf or .svg")
+        figures.add_argument(f"--{name}", metavar="FILE", type=picture_file, help=f"save {what} as .png, .pdf or .svg")
 
 
 def _focus(parser: argparse.ArgumentParser) -> None:
@@ -188,7 +193,13 @@ def _focus(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", metavar="N", type=seed_number, default=0, help="of the pictures (default 0)")
     json(parser)
-    output(parser, "height map to write: .npy, .csv, .png, .tif, .dat or .grd")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="FILE",
+        type=file_name,
+        help="height map to write: .npy, .csv, .dat, .grd, or as the grey of a picture: .png, .tif",
+    )
     plot(parser, "height map, PSF and image over the steps")
 
 
@@ -201,10 +212,10 @@ The engine is chosen by the scene, its sampling by --tol; a sampling that would 
 refused. --samples sets it by hand."""
 
 _PSF_EXAMPLES = """examples:
-  raytrace wave psf --element singlet --focus 1000 --depth 500 1000 inf -o psf.npz psf.png
+  raytrace wave psf --element singlet --focus 1000 --depth 500 1000 inf -o psf.npz --plot psf.png
   raytrace wave psf --element fresnel --levels 16 --depth 1000 --wavelength 0.46 0.55 0.64 --json
   raytrace wave psf --element cubic --focus 1000 --pixel 0.00369 --size 128 --exact -o cubic.npz
-  raytrace wave psf --element heights.npy --glass F_SILICA --design-wavelength 0.55 --levels 16 -o made.png
+  raytrace wave psf --element heights.npy --glass F_SILICA --design-wavelength 0.55 --levels 16 --plot made.png
   raytrace wave psf --element ideal --depth 500 --engine fresnel --samples 2500 --json"""
 
 _FOCUS_DESCRIPTION = """\

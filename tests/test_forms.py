@@ -1,0 +1,135 @@
+"""The forms of the command line: one name, one meaning over all commands; several values; what was meant."""
+
+import argparse
+import json
+import re
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+
+from raytrace.cli import build_parser
+from raytrace.cli.options import PICTURES, data_file, did_you_mean, picture_file
+
+#: Options whose form differs between commands, and why.
+DIFFERENT = {
+    "--rays": "a fixed form of trace is a table of rays; elsewhere a number, of bench several",
+    "--output": "a folder, where what a command makes is a run; height maps may be pictures",
+    "--start": "compare chooses from two places, codesign takes a distance, too",
+    "--element": "named elements, kinds that are learned, and several of either",
+    "--levels": "quantise compares several",
+    "--tolerance": "quantise compares several",
+    "--steps": "quantise may take none",
+    "--starts": "superres may take none",
+    "--depth": "layers of a network, and distances of points",
+}
+
+
+def parsers(parser=None, name=()):
+    """Every command and subcommand with its parser."""
+    parser = parser or build_parser()
+    children = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    if not children:
+        yield " ".join(name), parser
+    for child in children:
+        for word, one in child.choices.items():
+            yield from parsers(one, (*name, word))
+
+
+PARSERS = dict(parsers())
+
+
+def actions(option):
+    """The actions of an option by command."""
+    return {name: parser._option_string_actions.get(option) for name, parser in PARSERS.items()}
+
+
+def test_an_option_means_the_same_everywhere():
+    forms = defaultdict(lambda: defaultdict(list))
+    for name, parser in PARSERS.items():
+        for action in parser._actions:
+            for option in action.option_strings:
+                if option.startswith("--"):
+                    forms[option][action.type, action.metavar, action.nargs].append(name)
+    different = {option: dict(found) for option, found in forms.items() if len(found) > 1}
+    assert set(different) == set(DIFFERENT)
+
+
+@pytest.mark.parametrize("name", PARSERS)
+def test_data_pixels_and_figures_have_their_own_options(name):
+    known = PARSERS[name]._option_string_actions
+    if "-o" in known:
+        assert known["-o"].dest == "output"
+        assert "figure" not in known["-o"].help
+        assert known["-o"].type is data_file or name == "wave focus"
+    if "--size" in known:
+        assert known["--size"].help.startswith("pixels across")
+    if "--plot" in known:
+        assert known["--plot"].type is picture_file
+
+
+@pytest.mark.parametrize("option", ["--field", "--object-distance", "--wavelength"])
+def test_conditions_take_several_values(option):
+    taken = {name: action for name, action in actions(option).items() if action is not None}
+    assert len(taken) > 10
+    assert {action.nargs for action in taken.values()} == {"+"}
+
+
+def test_field_points_may_lie_off_the_axis_of_y(command):
+    words = ("spot", "double_gauss", "--rings", 4, "--json", "--wavelength", 0.55, "--field")
+    code, out, err = command(*words, 7, "-7", "-7,0", "-3,4", "4,-3", "-1e-3")
+    assert code == 0, err
+    found = json.loads(out)["results"]
+    assert [one["field"] for one in found] == [[0, 7], [0, -7], [-7, 0], [-3, 4], [4, -3], [0, -0.001]]
+    radii = [one["rms_radius"] for one in found]
+    assert radii[1] == pytest.approx(radii[0], rel=1e-12)  # a lens of revolution
+    assert radii[2] == pytest.approx(radii[0], rel=1e-9)
+    assert radii[3] == pytest.approx(radii[4], rel=1e-9)
+    assert found[2]["centroid"] == pytest.approx([found[1]["centroid"][1], 0], abs=1e-12)
+
+
+def test_several_object_distances_are_one_result_each(command):
+    words = ("info", "double_gauss", "--json", "--object-distance")
+    both = json.loads(command(*words, 25000, "inf")[1])["results_by_object_distance"]
+    alone = [json.loads(command(*words, distance)[1]) for distance in (25000, "inf")]
+    assert both == [{"object_distance": 25000, **alone[0]}, {"object_distance": None, **alone[1]}]
+    code, out, err = command("fan", "tessar", "--object-distance", 1000.5, "inf", "--plot", "fan.png")
+    assert code == 0, err
+    assert re.findall("^object at .*", out, re.M) == ["object at 1000.5 mm", "object at infinity"]
+    names = sorted(path.name for path in Path().glob("*.png"))
+    assert names == ["fan_1000.5mm.png", "fan_infinity.png"]
+    assert all(f"written: {name}" in err for name in names)
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        ("spto", 2, "did you mean spot?"),
+        ("wave psff", 2, "did you mean psf?"),
+        ("spot duble_gauss", 1, "did you mean double_gauss?"),
+        ("spot DOUBLE_GAUS", 1, "did you mean double_gauss?"),
+        ("spot mien.zmx", 1, "did you mean mine.zmx?"),
+        ("spot double_gauss --sampling gaus", 2, "did you mean gauss?"),
+        ("spot double_gauss --plto spot.png", 2, "unknown option --plto; did you mean --plot?"),
+        ("wave psf --elment=cubic", 2, "unknown option --elment; did you mean --element?"),
+        ("wave psf --element cubc", 1, "did you mean cubic?"),
+        ("psf double_gauss -o psf.png", 2, "'psf.png' is a picture: figures are saved by --plot"),
+        ("mtf tessar --plot mtf.npz", 2, "'mtf.npz' is no picture (.png, .pdf, .svg)"),
+        ("spot double_gauss --field 1,2,3", 2, "'1,2,3' is not a field point, Y or X,Y"),
+        ("spot double_gauss --field 0,91", 1, "--field 91: a field angle is below 90 degrees"),
+        ("spot double_gauss --points 30", 1, "gauss takes --rings"),
+        ("spot double_gauss --sampling sobol --rings 3", 1, "sobol takes --points"),
+    ],
+)
+def test_errors_say_what_may_have_been_meant(command, words, code, message):
+    Path("mine.zmx").write_text("not read")
+    found, out, err = command(*words.split())
+    assert (found, out) == (code, "")
+    assert message in err
+    assert err.count("\n") == 1
+
+
+def test_nothing_near_is_nothing_said():
+    assert did_you_mean("--colour", ["--field", "--plot"]) == ""
+    assert did_you_mean("Plot", ["plot"]) == "; did you mean plot?"
+    assert set(PICTURES) == {".png", ".pdf", ".svg"}
