@@ -104,6 +104,17 @@ def with_wavelengths(lens: Lens, wavelengths: Tensor | Sequence[float], weights:
     return dataclasses.replace(lens, wavelengths=wavelengths, wavelength_weights=weights, primary_wavelength=0)
 
 
+def with_field_kind(lens: Lens, kind: str) -> Lens:
+    """The lens with the same numbers for its fields, told as another kind of FIELD_UNITS."""
+    return dataclasses.replace(lens, fields=dataclasses.replace(lens.fields, kind=kind))
+
+
+def largest_field(lens: Lens) -> Tensor:
+    """The field point (2, 1) along y that is as far from the axis as the lens's outermost, in its own unit."""
+    largest = torch.hypot(lens.fields.x, lens.fields.y).amax()
+    return torch.stack([torch.zeros_like(largest), largest])[:, None]
+
+
 def _with_thickness(lens: Lens, number: int, thickness: Tensor) -> Lens:
     surfaces = list(lens.surfaces)
     thickness = torch.as_tensor(thickness, dtype=surfaces[number].thickness.dtype, device=lens.wavelengths.device)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from raytrace.departure import numbers, sag_of
-from raytrace.lens import Lens
+from raytrace.lens import Lens, largest_field
 from raytrace.surface import Surface
 from raytrace.trace import media
 from raytrace.value import value
@@ -29,6 +29,9 @@ class FirstOrder:
     f_number: |EFL| / entrance pupil diameter; working_f_number: 1/(2 n′ |u′|) of the marginal ray.
     paraxial_image_distance: from the last surface before the image to the paraxial image of the object.
     magnification: of that image (0 for an object at infinity).
+    angular_magnification: ū′/ū of the chief ray, the slopes through the centres of the pupils.
+    optical_invariant: |H| = |n (ū y - u ȳ)| of the marginal ray and the chief ray of the largest field, Lagrange's; the
+        field of a lens whose fields are image heights is that height in the paraxial image.
     object_na, image_na: n sin θ of the paraxial marginal ray.
     petzval_radius: radius of the Petzval surface, signed like a surface's.
     front_principal_plane, rear_principal_plane: from surface 1, and from the last surface before the image.
@@ -47,6 +50,8 @@ class FirstOrder:
     working_f_number: Tensor
     paraxial_image_distance: Tensor
     magnification: Tensor
+    angular_magnification: Tensor
+    optical_invariant: Tensor
     object_na: Tensor
     image_na: Tensor
     petzval_radius: Tensor
@@ -117,8 +122,7 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
     image_distance = -n_image * y / omega
 
     diameter = _entrance_pupil_diameter(lens, focal_length, entrance_pupil, A1, n_object, n_image, vergence, omega)
-    # Marginal ray: y = 1, ω = vergence at surface 1 is scaled so that it passes the edge of the entrance pupil.
-    scale = 0.5 * diameter / (1 + entrance_pupil * vergence / n_object)
+    scale = _marginal_height(lens, entrance_pupil, diameter, n_object, vergence)
     slope_object, slope_image = scale * vergence / n_object, scale * omega / n_image
     petzval = sum(
         vertex_curvature(s) * (n[i + 1] - n[i]) / (n[i] * n[i + 1]) for i, s in enumerate(surfaces)
@@ -137,12 +141,24 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
         working_f_number=0.5 / (n_image * slope_image).abs(),
         paraxial_image_distance=image_distance,
         magnification=vergence / omega,
+        angular_magnification=n_object * D2 / (n_image * A1),
+        optical_invariant=_optical_invariant(lens, 0.5 * diameter, n_object, slope_object, n_image * slope_image),
         object_na=(n_object * torch.sin(torch.atan(slope_object))).abs(),
         image_na=(n_image * torch.sin(torch.atan(slope_image))).abs(),
         petzval_radius=-1 / (n_image * petzval),
         front_principal_plane=n_object * (D - 1) / C,
         rear_principal_plane=n_image * (1 - A) / C,
     )
+
+
+def marginal_ray(lens: Lens) -> tuple[Tensor, Tensor]:
+    """(y, ω) in mm and 1 of the marginal ray in front of surface 1, at the primary wavelength."""
+    wavelength = lens.wavelengths[lens.primary_wavelength]
+    n_object = media(lens, wavelength)[0]
+    data = first_order(lens)
+    vergence = n_object / lens.surfaces[0].thickness
+    y = _marginal_height(lens, data.entrance_pupil_position, data.entrance_pupil_diameter, n_object, vergence)
+    return y, y * vergence
 
 
 def paraxial_image_distance(lens: Lens, object_distance: Tensor, wavelength: Tensor | None = None) -> Tensor:
@@ -153,6 +169,32 @@ def paraxial_image_distance(lens: Lens, object_distance: Tensor, wavelength: Ten
     A, B, C, D = system_matrix(surfaces, n)
     vergence = n[0] / object_distance
     return -n[-1] * (A + B * vergence) / (C + D * vergence)
+
+
+def _marginal_height(lens: Lens, entrance_pupil, diameter, n_object, vergence) -> Tensor:
+    """Height in mm at surface 1 of the ray from the axial object point through the edge of the entrance pupil.
+
+    The cone of an object NA or angle needs no pupil, which may lie at infinity.
+    """
+    if lens.aperture.kind in ("object_na", "object_cone_angle"):
+        pupil_before_object = 1 + entrance_pupil * vergence / n_object < 0
+        height = (lens.surfaces[0].thickness * torch.tan(_cone_angle(lens, n_object))).abs()
+        return torch.where(pupil_before_object, -height, height)
+    return 0.5 * diameter / (1 + entrance_pupil * vergence / n_object)
+
+
+def _cone_angle(lens: Lens, n_object: Tensor) -> Tensor:
+    """Half angle of the cone at the object, radians, of an aperture that is given as one."""
+    kind, number = lens.aperture.kind, lens.aperture.value
+    return torch.asin(number / n_object) if kind == "object_na" else torch.deg2rad(number)
+
+
+def _optical_invariant(lens: Lens, radius, n_object, slope_object, omega_image) -> Tensor:
+    """|n u h| at the object, |n ū y| at the entrance pupil or |n′ u′ h′| at the image, as the largest field is told."""
+    largest = largest_field(lens)[1, 0]
+    if lens.fields.kind == "angle":
+        return (n_object * radius * torch.tan(torch.deg2rad(largest))).abs()
+    return ((n_object * slope_object if lens.fields.kind == "object_height" else omega_image) * largest).abs()
 
 
 def _to_next_vertex(surfaces: Sequence[Surface], indices: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
@@ -177,5 +219,4 @@ def _entrance_pupil_diameter(lens, focal_length, entrance_pupil, A1, n_object, n
         slope = 0.5 / (number * n_image.abs())
         return 2 * (slope * n_image / omega * (1 + entrance_pupil * vergence / n_object)).abs()
     distance = lens.surfaces[0].thickness + entrance_pupil
-    angle = torch.asin(number / n_object) if kind == "object_na" else torch.deg2rad(number)
-    return 2 * (distance * torch.tan(angle)).abs()
+    return 2 * (distance * torch.tan(_cone_angle(lens, n_object))).abs()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from problems import aspheric_singlet, double_gauss, lens, scalar, surface, vector
+from problems import aspheric_singlet, double_gauss, fields, lens, scalar, surface, vector
 
 from raytrace.formats import read_lens
 from raytrace.glass import MIRROR
@@ -219,3 +219,43 @@ def test_every_entry_is_differentiable_and_per_wavelength():
 
     assert torch.autograd.gradcheck(numbers, c, eps=1e-7, atol=1e-2, rtol=1e-5)
     assert first_order(system, vector(0.5, 0.6, 0.7)).effective_focal_length.shape == (3,)
+
+
+@each
+def test_the_chief_ray_s_slope_and_the_pupils_keep_lagrange_s_invariant(system):
+    """n ū r = n′ ū′ r′ at the two pupils of radius r and r′."""
+    data = first_order(with_object_distance(system, 300.0))
+    n, n_image = (float(media(system, system.wavelengths[0])[k]) for k in (0, -2))
+    ratio = n * data.entrance_pupil_diameter / (n_image * data.exit_pupil_diameter)
+    assert data.angular_magnification.abs().item() == pytest.approx(ratio.item(), rel=1e-12)
+
+
+def test_the_invariant_is_the_same_however_the_field_is_told():
+    """Angle, object height and image height of one field: |n ū y| = |n u h| = |n′ u′ h′|."""
+    system = with_object_distance(thick_lens(), 300.0)
+    data = first_order(system)
+    angle = 6.0
+    height = math.tan(math.radians(angle)) * (300.0 + float(data.entrance_pupil_position))
+    told = {"angle": angle, "object_height": height, "paraxial_image_height": height * float(data.magnification)}
+    found = [
+        first_order(dataclasses.replace(system, fields=fields(kind, (y,)))).optical_invariant.item()
+        for kind, y in told.items()
+    ]
+    assert found == pytest.approx([found[0]] * 3, rel=1e-12)
+
+
+def test_a_lens_telecentric_in_object_space_keeps_its_cone():
+    """The stop in the rear focal plane, entrance pupil at infinity: NA, F/# and invariant are those of the cone."""
+    front = lens([surface(0.02, 5.0, 1.5), surface(-0.02, 49.0)], object_distance=60.0)
+    focus = float(first_order(front).back_focal_distance)
+    system = lens(
+        [surface(0.02, 5.0, 1.5), surface(-0.02, focus), surface(None, 50.0)],
+        stop=3,
+        object_distance=60.0,
+        aperture=("object_na", 0.1),
+        field=fields("object_height", (3.0,), telecentric=True),
+    )
+    data = first_order(system)
+    assert data.object_na.item() == pytest.approx(0.1, rel=1e-12)
+    assert data.optical_invariant.item() == pytest.approx(3.0 * 0.1 / math.sqrt(0.99), rel=1e-12)
+    assert bool(torch.isfinite(data.working_f_number))

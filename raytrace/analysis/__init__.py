@@ -35,5 +35,7 @@ from raytrace.analysis.mtf import cutoff as cutoff
 from raytrace.analysis.mtf import diffraction_limit as diffraction_limit
 from raytrace.analysis.mtf import mtf as mtf
 from raytrace.analysis.mtf import mtf_through_focus as mtf_through_focus
+from raytrace.analysis.seidel import Seidel as Seidel
+from raytrace.analysis.seidel import seidel as seidel
 from raytrace.analysis.wavefronts import WavefrontMap as WavefrontMap
 from raytrace.analysis.wavefronts import wavefront_map as wavefront_map

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from raytrace.launch import is_at_infinity, object_field
-from raytrace.lens import Lens
+from raytrace.lens import Lens, largest_field, with_field_kind
 from raytrace.paraxial import first_order
 from raytrace.scene import Scene
 from raytrace.scene import scene as make_scene
@@ -32,7 +32,7 @@ def primary_number(lens: Lens, wavelengths: Tensor | None) -> int:
 
 def field_range(lens: Lens, size: int) -> Tensor:
     """Fields (2, size) along y from the axis to the lens's largest."""
-    largest = torch.hypot(lens.fields.x, lens.fields.y).amax()
+    largest = largest_field(lens)[1, 0]
     y = largest * torch.linspace(0.0, 1.0, size, dtype=largest.dtype, device=largest.device)
     return torch.stack([torch.zeros_like(y), y])
 
@@ -48,4 +48,4 @@ def in_object_space(lens: Lens, fields: Tensor) -> tuple[Lens, Tensor, Tensor]:
     infinite = is_at_infinity(lens)
     described = torch.rad2deg(torch.atan(extent)) if infinite else extent
     kind = "angle" if infinite else "object_height"
-    return dataclasses.replace(lens, fields=dataclasses.replace(lens.fields, kind=kind)), described, extent
+    return with_field_kind(lens, kind), described, extent

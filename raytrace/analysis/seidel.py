@@ -1,0 +1,206 @@
+"""Seidel: the five third-order aberrations and the two first-order colours, surface by surface, and their sums.
+
+With marginal ray (y, u), chief ray (ȳ, ū), A = n i = n (u + y c), Ā likewise and H = n (ū y - u ȳ), at every surface
+
+    S1 = -A² y Δ(u/n),  S2 = -A Ā y Δ(u/n),  S3 = -Ā² y Δ(u/n),  S4 = -H² c Δ(1/n),
+    S5 = -Ā³ y Δ(1/n²) + Ā ȳ c Δ(1/n) (H + Ā y),  C1 = A y Δ(δn/n),  C2 = Ā y Δ(δn/n)
+
+and where the sag departs from that of the vertex sphere by G r⁴ also 8 G Δn (y⁴, y³ ȳ, y² ȳ², 0, y ȳ³). Indices are
+negative while light travels towards -z. Source: Welford, Aberrations of Optical Systems (1986), chapters 8 and 10; S5
+is his (Ā/A)(S3 + S4), written so that A may be 0. C1 and C2 are positive where S1 and S2 would be: some programs print
+them with the other sign.
+"""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from raytrace.analysis.frame import Tabular, axis
+from raytrace.launch import object_field
+from raytrace.lens import Lens, largest_field, with_field_kind
+from raytrace.paraxial import FirstOrder, first_order, marginal_ray, signed, vertex_curvature
+from raytrace.surface import Surface
+from raytrace.trace import media
+from raytrace.value import value
+
+
+@value
+class Seidel(Tabular):
+    """Contributions (J, F, K) of surfaces 1 … K to J aberrations of F fields; their sums over K are the lens's.
+
+    names: of the aberrations; kind: a key of KINDS, which says what they are; unit: "mm" or "waves".
+    marginal_yni, chief_yni: (F, K) mm, y n i and ȳ n ī at every surface.
+    marginal_height, chief_height: (F, K) mm, y and ȳ there.
+    invariant: (F,) mm, H; fields: (2, F); wavelength: () µm, of the rays.
+    """
+
+    contributions: Tensor
+    marginal_yni: Tensor
+    chief_yni: Tensor
+    marginal_height: Tensor
+    chief_height: Tensor
+    invariant: Tensor
+    fields: Tensor
+    wavelength: Tensor
+    names: tuple[str, ...]
+    kind: str
+    unit: str
+
+    def columns(self) -> dict[str, Tensor]:
+        surfaces = torch.arange(1, self.contributions.shape[-1] + 1, device=self.fields.device)
+        return {
+            "field_x": axis(self.fields[0], 0, 2),
+            "field_y": axis(self.fields[1], 0, 2),
+            "surface": axis(surfaces, 1, 2),
+            **dict(zip(self.names, self.contributions, strict=True)),
+            "marginal_yni": self.marginal_yni,
+            "chief_yni": self.chief_yni,
+        }
+
+    def sums(self) -> dict[str, Tensor]:
+        """The columns of a table with a row for every field: the lens's aberrations and its invariant."""
+        total = self.contributions.sum(-1)
+        heads = {"field_x": self.fields[0], "field_y": self.fields[1]}
+        return {**heads, **dict(zip(self.names, total, strict=True)), "optical_invariant": self.invariant}
+
+
+def seidel(lens: Lens, *, fields: Tensor | None = None, kind: str = "coefficients") -> Seidel:
+    """Third-order aberrations at the primary wavelength, colours between the shortest and the longest wavelength.
+
+    kind: "coefficients": S1 … S5, C1, C2 in mm. "waves": W040 = S1/8, W131 = S2/2, W222 = S3/2, W220P = S4/4,
+    W311 = S5/2, W020 = C1/2, W111 = C2. "transverse": mm by which rays of the rim miss the paraxial image point, the
+    upper one where there is a choice, in the order of `_transverse`. "longitudinal": mm along z from the paraxial
+    focus to theirs. The last two are nan where image space is afocal.
+    fields: (2, F), of which the distance from the axis counts; the largest of the lens by default. Image heights are
+    those of the paraxial image. Raises ValueError for a kind not named here, and for a surface with a departure.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"Seidel aberrations as {kind!r}: expected one of {', '.join(KINDS)}")
+    for number, surface in enumerate(lens.surfaces):
+        if surface.departure is not None:
+            raise ValueError(f"surface {number} has a departure: Seidel's theory is of surfaces that are round")
+    paraxial = first_order(lens)
+    fields = largest_field(lens) if fields is None else fields
+    marginal, chief = marginal_ray(lens), _chief_ray(lens, fields, paraxial)
+    H = chief[1] * marginal[0] - marginal[1] * chief[0]
+    n, dispersion = _indices(lens)
+    names, convert, unit = KINDS[kind]
+    rows = []
+    for k, surface in enumerate(lens.surfaces[1:-1]):
+        row, marginal, chief = _cross(surface, marginal, chief, H, n[k : k + 2], dispersion[k : k + 2])
+        rows.append(row)
+    found = torch.stack([torch.stack(torch.broadcast_tensors(*row, H)[:-1]) for row in rows], -1)
+    wavelength = lens.wavelengths[lens.primary_wavelength]
+    return Seidel(
+        contributions=convert(found[:7], marginal[1], n[-1], 1e-3 * wavelength),
+        marginal_yni=found[7],
+        chief_yni=found[8],
+        marginal_height=found[9],
+        chief_height=found[10],
+        invariant=H,
+        fields=fields,
+        wavelength=wavelength,
+        names=names,
+        kind=kind,
+        unit=unit,
+    )
+
+
+def _chief_ray(lens: Lens, fields: Tensor, paraxial: FirstOrder) -> tuple[Tensor, Tensor]:
+    """(ȳ, ω̄) (F,) in front of surface 1, of fields in the direction of +y."""
+    upwards = torch.stack([torch.zeros_like(fields[0]), torch.hypot(*fields)])
+    if lens.fields.kind == "real_image_height":
+        lens = with_field_kind(lens, "paraxial_image_height")
+    extent = object_field(lens, upwards, paraxial)[1]
+    distance, pupil = lens.surfaces[0].thickness, paraxial.entrance_pupil_position
+    n = media(lens, lens.wavelengths[lens.primary_wavelength])[0]
+    if bool(torch.isinf(distance)):
+        return -pupil * extent, n * extent
+    if lens.fields.telecentric or not bool(torch.isfinite(pupil)):
+        return extent, torch.zeros_like(extent)
+    slope = -extent / (distance + pupil)
+    return -pupil * slope, n * slope
+
+
+def _indices(lens: Lens) -> tuple[list[Tensor], list[Tensor]]:
+    """Signed n of the primary wavelength before every surface and behind the last, and δn from longest to shortest."""
+    primary, shortest, longest = (
+        signed(lens.surfaces[1:-1], media(lens, wavelength)[:-1])
+        for wavelength in (lens.wavelengths[lens.primary_wavelength], lens.wavelengths.amin(), lens.wavelengths.amax())
+    )
+    return primary, [short - long for short, long in zip(shortest, longest, strict=True)]
+
+
+def _cross(surface: Surface, marginal, chief, H: Tensor, n, dispersion):
+    """S1 … S5, C1, C2, y n i, ȳ n ī, y, ȳ at one surface, and both rays (y, ω) before the next one."""
+    (y, omega), (y_bar, omega_bar) = marginal, chief
+    c, step = vertex_curvature(surface), n[1] - n[0]
+    A, A_bar = omega + n[0] * y * c, omega_bar + n[0] * y_bar * c
+    behind, behind_bar = omega - y * c * step, omega_bar - y_bar * c * step
+    bending = y * (behind / n[1] ** 2 - omega / n[0] ** 2)
+    inverse = 1 / n[1] - 1 / n[0]
+    colour = y * (dispersion[1] / n[1] - dispersion[0] / n[0])
+    asphere = 8 * _departure_from_sphere(surface, c) * step
+    row = (
+        -A * A * bending + asphere * y**4,
+        -A * A_bar * bending + asphere * y**3 * y_bar,
+        -A_bar * A_bar * bending + asphere * y**2 * y_bar**2,
+        -H * H * c * inverse,
+        -(A_bar**3) * y * (1 / n[1] ** 2 - 1 / n[0] ** 2)
+        + A_bar * y_bar * c * inverse * (H + A_bar * y)
+        + asphere * y * y_bar**3,
+        A * colour,
+        A_bar * colour,
+        y * A,
+        y_bar * A_bar,
+        y,
+        y_bar,
+    )
+    gap = surface.thickness / n[1]
+    return row, (y + gap * behind, behind), (y_bar + gap * behind_bar, behind_bar)
+
+
+def _departure_from_sphere(surface: Surface, vertex: Tensor) -> Tensor:
+    """G in 1/mm³: the r⁴ term (1+k) c³/8 + a₂ of the sag less that of the sphere of the vertex curvature."""
+    G = -(vertex**3) / 8
+    if surface.curvature is not None:
+        shape = 1 if surface.conic is None else 1 + surface.conic
+        G = G + shape * surface.curvature**3 / 8
+    if surface.coefficients is not None and len(surface.coefficients) > 1:
+        G = G + surface.coefficients[1]
+    return G
+
+
+def _waves(S: Tensor, omega: Tensor, n: Tensor, wavelength: Tensor) -> Tensor:
+    """W040, W131, W222, W220P, W311, W020, W111 of S1 … C2, wavelength in mm."""
+    return S / S.new_tensor([8, 2, 2, 4, 2, 2, 1]).reshape(-1, 1, 1) / wavelength
+
+
+def _transverse(S: Tensor, omega: Tensor, n: Tensor, wavelength: Tensor) -> Tensor:
+    """ε of the third order = (S1, S2, 3 S2, 2 S3, S4, S3 + S4, 3 S3 + S4, S5)/(2 n′u′), and (C1, C2)/(n′u′).
+
+    Spherical aberration, sagittal and tangential coma, astigmatism, Petzval, sagittal and tangential field curvature,
+    distortion, axial and lateral colour (the shortest less the longest wavelength).
+    """
+    S1, S2, S3, S4, S5, C1, C2 = S
+    mixed = torch.stack([S1, S2, 3 * S2, 2 * S3, S4, S3 + S4, 3 * S3 + S4, S5, 2 * C1, 2 * C2])
+    return mixed / torch.where(omega == 0, torch.nan, 2 * omega)
+
+
+def _longitudinal(S: Tensor, omega: Tensor, n: Tensor, wavelength: Tensor) -> Tensor:
+    """-ε/u′ of spherical aberration, astigmatism, Petzval, sagittal and tangential field curvature, axial colour."""
+    return -_transverse(S, omega, n, wavelength)[[0, 3, 4, 5, 6, 8]] * n / torch.where(omega == 0, torch.nan, omega)
+
+
+#: What the contributions may be told as: names, conversion of S1 … C2 by n′u′, n′ and the wavelength in mm, and unit.
+KINDS: dict[str, tuple[tuple[str, ...], Callable, str]] = {
+    "coefficients": (("S1", "S2", "S3", "S4", "S5", "C1", "C2"), lambda S, *_: S, "mm"),
+    "waves": (("W040", "W131", "W222", "W220P", "W311", "W020", "W111"), _waves, "waves"),
+    "transverse": (
+        ("TSPH", "TSCO", "TTCO", "TAST", "TPFC", "TSFC", "TTFC", "TDIS", "TAXC", "TLAC"),
+        _transverse,
+        "mm",
+    ),
+    "longitudinal": (("LSPH", "LAST", "LPFC", "LSFC", "LTFC", "LAXC"), _longitudinal, "mm"),
+}
