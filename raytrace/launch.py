@@ -7,19 +7,18 @@ of the real marginal ray.
 
 import dataclasses
 import warnings
-from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from raytrace import glass
-from raytrace.aiming import aim_at_stop, at_stop
+from raytrace.aiming import aim_at_image, aim_at_stop, at_stop
 from raytrace.lens import RAY_AIMING, Lens
 from raytrace.numerics import broadcast_shape, dot, dot_2, safe_divide, safe_sqrt, unit
 from raytrace.paraxial import FirstOrder, first_order
 from raytrace.rays import Rays
 from raytrace.surface import sag
-from raytrace.trace import start, trace
+from raytrace.trace import start
 from raytrace.vignetting import vignette
 
 
@@ -63,16 +62,16 @@ def rays_of_field(
     lens = with_ray_aiming(lens, ray_aiming)
     paraxial = first_order(lens)
     index = glass.refractive_index(lens.surfaces[0].glass, wavelength).to(pupil.dtype)
-    field = object_field(lens, field, paraxial)
+    field, reached = object_field(lens, field, paraxial)
 
     def through(pupil: Tensor, fraction: float = 1.0) -> Rays:
         return _through_entrance_pupil(lens, _part_of_field(lens, field, fraction), pupil, paraxial, index)
 
-    if lens.ray_aiming == "off" or lens.fields.telecentric:
-        return through(pupil)
-    aimed, found = aim_at_stop(lens, through, pupil, wavelength, _aimed_radius(lens, paraxial))
-    rays = through(aimed)
-    return dataclasses.replace(rays, valid=rays.valid & found)
+    if lens.ray_aiming != "off" and not lens.fields.telecentric:
+        pupil, found = aim_at_stop(lens, through, pupil, wavelength, _aimed_radius(lens, paraxial))
+        reached = reached & found
+    rays = through(pupil)
+    return dataclasses.replace(rays, valid=rays.valid & reached)
 
 
 def rays_from_point(point: Tensor, aim: Tensor, *, index: Tensor) -> Rays:
@@ -105,8 +104,19 @@ def is_at_infinity(lens: Lens) -> bool:
     return False
 
 
-def object_field(lens: Lens, field: Tensor, paraxial: FirstOrder) -> Tensor:
-    """Field points (2, ...) as slopes (tan θx, tan θy) for an object at infinity, else as object heights in mm."""
+def object_field(lens: Lens, field: Tensor, paraxial: FirstOrder) -> tuple[Tensor, Tensor]:
+    """Field points (2, ...) as slopes (tan θx, tan θy) for an object at infinity, else as object heights in mm.
+
+    And whether there are such (...): no chief ray may reach a real image height; then the axis comes.
+    """
+    if lens.fields.kind == "real_image_height":
+        return _field_of_real_height(lens, field, _paraxial_field(lens, field, paraxial), paraxial)
+    found = _paraxial_field(lens, field, paraxial)
+    return found, torch.ones_like(found[0], dtype=torch.bool)
+
+
+def _paraxial_field(lens: Lens, field: Tensor, paraxial: FirstOrder) -> Tensor:
+    """As `object_field`, real image heights as if they were paraxial ones."""
     distance, kind = lens.surfaces[0].thickness, lens.fields.kind
     at_infinity = is_at_infinity(lens)
     if kind == "angle":
@@ -118,10 +128,7 @@ def object_field(lens: Lens, field: Tensor, paraxial: FirstOrder) -> Tensor:
         return field
     index = glass.refractive_index(lens.surfaces[0].glass, lens.wavelengths[lens.primary_wavelength])
     scale = paraxial.power / index if at_infinity else 1 / paraxial.magnification
-    estimate = _scaled(field, scale)
-    if kind == "paraxial_image_height":
-        return estimate
-    return _field_of_real_height(lens, field, estimate, paraxial)
+    return _scaled(field, scale)
 
 
 def _part_of_field(lens: Lens, field: Tensor, fraction: float) -> Tensor:
@@ -228,37 +235,18 @@ def _telecentric_radius(lens: Lens, paraxial: FirstOrder, index: Tensor) -> Tens
     )
 
 
-def _field_of_real_height(lens, height: Tensor, estimate: Tensor, paraxial: FirstOrder) -> Tensor:
-    """Scale the paraxial field (2, ...) until the real chief ray meets the image at `height` (2, ...) mm."""
+def _field_of_real_height(lens, height: Tensor, estimate: Tensor, paraxial: FirstOrder) -> tuple[Tensor, Tensor]:
+    """The field (2, ...) whose real chief ray meets the image at `height` (2, ...) mm, and whether there is one."""
     wavelength = lens.wavelengths[lens.primary_wavelength]
     index = glass.refractive_index(lens.surfaces[0].glass, wavelength).to(height.dtype)
-    wanted = dot_2(height, height)
-    radius = None if lens.ray_aiming == "off" else _aimed_radius(lens, paraxial)
 
-    def image_height(scale: Tensor) -> Tensor:
-        def through(pupil: Tensor, fraction: float = 1.0) -> Rays:
-            part = _part_of_field(lens, _scaled(estimate, scale), fraction)
-            return _through_entrance_pupil(lens, part, pupil, paraxial, index)
+    def through(field: Tensor, pupil: Tensor) -> Rays:
+        return _through_entrance_pupil(lens, field, pupil, paraxial, index)
 
-        centre = torch.zeros_like(height)
-        rays = through(aim_at_stop(lens, through, centre, wavelength, radius)[0] if radius is not None else centre)
-        return safe_divide(dot_2(trace(lens, rays, wavelength).position[:2], height), wanted)
-
-    scale = torch.ones_like(wanted.detach())
-    for _ in range(12):
-        reached, slope = _value_and_slope(image_height, scale)
-        scale = (scale - safe_divide(reached - 1, slope)).detach()
-    _, slope = _value_and_slope(image_height, scale)
-    scale = scale - safe_divide(image_height(scale) - 1, slope)
-    return _scaled(estimate, torch.where(wanted > 0, scale, 1.0))
+    aimed = lens.ray_aiming != "off" and not lens.fields.telecentric
+    return aim_at_image(lens, through, height, estimate, _aimed_radius(lens, paraxial) if aimed else None)
 
 
 def _scaled(field: Tensor, factor: Tensor) -> Tensor:
     """field (2, ...) times factor (...): the batch axes broadcast behind the component axis."""
     return torch.stack([component * factor for component in field])
-
-
-def _value_and_slope(function: Callable[[Tensor], Tensor], point: Tensor) -> tuple[Tensor, Tensor]:
-    """f(p) and f'(p) of a function that acts on each entry alone, outside the graph."""
-    value, pull = torch.func.vjp(function, point)
-    return value.detach(), pull(torch.ones_like(value))[0].detach()

@@ -12,10 +12,12 @@ from problems import MICROMETRE, NANOMETRE, vector
 from raytrace import analysis
 from raytrace.cli import main
 from raytrace.focus import image_rays
+from raytrace.launch import launch
 from raytrace.lens import Lens, with_sensor_distance
 from raytrace.numerics import safe_sqrt
 from raytrace.paraxial import first_order
 from raytrace.pupil import gauss_rings
+from raytrace.trace import trace
 
 WAVELENGTH = 0.55e-3  # mm
 
@@ -198,6 +200,26 @@ def test_distortion_of_a_finite_object_is_against_its_height():
     near = analysis.distortion(lens, fields=vector(0.0, 0.01)[:, None])
     assert near.f_tan.abs().max() < 1e-6
     assert 1e-4 < found.f_tan[-1].abs().max() < 0.1
+
+
+@pytest.mark.parametrize("aiming", ["off", "real"])
+@pytest.mark.parametrize("distance", [math.inf, 500.0])
+@pytest.mark.parametrize("kind", ["angle", "object_height", "paraxial_image_height", "real_image_height"])
+def test_heights_of_chief_rays_have_the_sign_of_the_trace(kind, distance, aiming):
+    """Of fields to both sides, with an object at a finite distance too; the distortion has one sign on both sides."""
+    if kind == "object_height" and distance == math.inf:
+        return
+    field = problems.fields(kind, (4.5, -4.5, 0.0, 2.0), x=(0.0, 0.0, -3.0, -1.0))
+    lens = problems.double_gauss(object_distance=distance, field=field, wavelengths=(0.5876, 0.45), ray_aiming=aiming)
+    points = torch.stack([field.x, field.y])
+    found = analysis.distortion(lens, fields=points)
+    chief = trace(lens, launch(lens, torch.zeros(2, 1, dtype=torch.float64)), lens.wavelengths[:, None])
+    x, y = chief.position[:2, :, :, 0]
+    meridian = torch.stack([y[0], y[1], x[2], (2 * y[3] - x[3]) / math.sqrt(5)])
+    assert (found.height - meridian).abs().max() <= 1e-12  # mm
+    assert (found.f_tan[0] - found.f_tan[1]).abs().max() <= 1e-12
+    shift = analysis.lateral_colour(lens, fields=points).shift[:, 1]
+    assert (shift - (meridian[:, 1] - meridian[:, 0])).abs().max() <= 1e-12  # mm
 
 
 @pytest.mark.parametrize("angle", [0.0, 10.0, 25.0])

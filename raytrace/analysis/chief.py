@@ -8,7 +8,7 @@ from raytrace.analysis.setting import field_range, in_object_space, primary_numb
 from raytrace.focus import image_rays
 from raytrace.launch import is_at_infinity
 from raytrace.lens import Lens
-from raytrace.numerics import safe_divide, safe_sqrt
+from raytrace.numerics import dot_2, safe_divide, safe_sqrt
 from raytrace.value import value
 
 _NEAR_AXIS = 1e-4  # of the field: its chief ray gives the scale of the image; it leaves 1e-8 of the distortion
@@ -19,6 +19,7 @@ _NEAR_CHIEF = 1e-3  # of the pupil: close rays leave 1e-6 of the spherical aberr
 class Distortion(Tabular):
     """Heights (F, W) in mm of chief rays on the sensor, and by how much they miss the ideal image.
 
+    height: along the meridian of the field, positive towards +y (+x where it is the x axis), as the ray's own y.
     f_tan: relative, height/(f tan θ) - 1, of an object at a finite distance height/(m h) - 1; 0 on the axis.
     f_theta: relative, height/(f θ) - 1; None for an object at a finite distance.
     fields: (2, F); wavelengths: (W,) µm; valid: (F, W) bool.
@@ -59,6 +60,7 @@ class FieldCurvature(Tabular):
 class LateralColour(Tabular):
     """Height (F, W) in mm of each wavelength's chief ray on the sensor, less the primary wavelength's.
 
+    Heights along the meridian of the field, positive towards +y (+x where it is the x axis).
     fields: (2, F); wavelengths: (W,) µm; valid: (F, W) bool.
     """
 
@@ -82,16 +84,16 @@ def distortion(
     lens = unvignetted(lens)
     fields = field_range(lens, size) if fields is None else fields
     wavelengths = lens.wavelengths if wavelengths is None else wavelengths
-    described, angles, extent = in_object_space(lens, fields)
-    near = in_object_space(lens, field_range(lens, 2)[:, 1:] * _NEAR_AXIS)
-    length = safe_sqrt((extent * extent).sum(0))
-    height, valid = _height(described, angles, wavelengths, extent)
-    close, _ = _height(near[0], near[1], wavelengths, near[2])
-    scale = close / safe_sqrt((near[2] * near[2]).sum(0))[:, None]
+    described, angles, extent, found = in_object_space(lens, fields)
+    close = field_range(lens, 2)[:, 1:] * _NEAR_AXIS
+    _, close_angles, close_extent, _ = in_object_space(lens, close)
+    length = dot_2(fields, _meridian(fields)).sign() * safe_sqrt(dot_2(extent, extent))
+    height, valid = _height(described, angles, wavelengths, fields)
+    scale = _height(described, close_angles, wavelengths, close)[0] / safe_sqrt(dot_2(close_extent, close_extent))
     f_tan = _relative(height, scale * length[:, None])
     infinite = is_at_infinity(lens)
     f_theta = _relative(height, scale * torch.atan(length)[:, None]) if infinite else None
-    return Distortion(height, f_tan, f_theta, fields, wavelengths, valid)
+    return Distortion(height, f_tan, f_theta, fields, wavelengths, valid & found[:, None])
 
 
 def field_curvature(
@@ -132,13 +134,19 @@ def lateral_colour(
 
 
 def _height(lens: Lens, fields: Tensor, wavelengths: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
-    """Heights (F, W) of chief rays in the direction `along` (2, F), and whether they arrive or were only vignetted."""
+    """Heights (F, W) of chief rays in the meridians of `along` (2, F), and whether they arrive or are but vignetted."""
     rays = image_rays(lens, fields.new_zeros(2, 1), fields=fields, wavelengths=wavelengths)
-    length = safe_sqrt((along * along).sum(0))
-    unit = torch.stack([safe_divide(a, length) for a in along])[:, :, None]
-    height = (rays.position[:2, ..., 0] * unit).sum(0)
+    height = dot_2(rays.position[:2, ..., 0], _meridian(along)[:, :, None])
     on_axis = (fields == 0).all(0)[:, None]
     return height, (rays.valid | _kept(rays.direction))[..., 0] | on_axis
+
+
+def _meridian(fields: Tensor) -> Tensor:
+    """Unit vectors (2, F) along fields (2, F), turned to +y, or to +x on the x axis; 0 for the axis."""
+    x, y = fields
+    side = torch.where((y < 0) | (y == 0) & (x < 0), -1.0, 1.0)
+    length = safe_sqrt(dot_2(fields, fields))
+    return torch.stack([safe_divide(side * x, length), safe_divide(side * y, length)])
 
 
 def _kept(direction: Tensor) -> Tensor:

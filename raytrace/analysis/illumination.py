@@ -44,12 +44,9 @@ def relative_illumination(
 
     (L, M) the directions from the reference sphere at the exit pupil to the chief ray's point (Born & Wolf §4.8.3): the
     pupil as the sensor sees it, whatever the aberrations. fields: (2, F); by default `size` from the
-    axis to the lens's largest, or the lens's own where they carry vignetting factors, which belong to single fields.
-    Vignetting by a hard edge is resolved to about 1e-3.
+    axis to the lens's largest. Vignetting by a hard edge is resolved to about 1e-3.
     """
-    if fields is None:
-        own = torch.stack([lens.fields.x, lens.fields.y])
-        fields = field_range(lens, size) if lens.fields.vignetting is None else own
+    fields = field_range(lens, size) if fields is None else fields
     like = {"dtype": lens.wavelengths.dtype, "device": lens.wavelengths.device}
     points, weights = gauss_rings(*_RINGS, **like)
     view = scene_of(lens, torch.cat([torch.zeros_like(fields[:, :1]), fields], 1), wavelengths)

@@ -42,10 +42,13 @@ def unvignetted(lens: Lens) -> Lens:
     return dataclasses.replace(lens, fields=dataclasses.replace(lens.fields, vignetting=None))
 
 
-def in_object_space(lens: Lens, fields: Tensor) -> tuple[Lens, Tensor, Tensor]:
-    """The lens with fields of a kind that scales with the object, those fields (2, F), and tan θ or mm (2, F)."""
-    extent = object_field(lens, fields, first_order(lens))
+def in_object_space(lens: Lens, fields: Tensor) -> tuple[Lens, Tensor, Tensor, Tensor]:
+    """The lens with fields of a kind that scales with the object, those fields (2, F), and tan θ or mm (2, F).
+
+    And whether they exist (F,): no chief ray may reach a real image height.
+    """
+    extent, found = object_field(lens, fields, first_order(lens))
     infinite = is_at_infinity(lens)
     described = torch.rad2deg(torch.atan(extent)) if infinite else extent
     kind = "angle" if infinite else "object_height"
-    return with_field_kind(lens, kind), described, extent
+    return with_field_kind(lens, kind), described, extent, found

@@ -49,7 +49,7 @@ def chief_ray_height(scene: Scene) -> Tensor:
     if is_on_axis(scene):
         return wavelengths.new_zeros(2, *scene.shape)
     paraxial = first_order(lens)
-    field = object_field(lens, scene.fields[:, :, None], paraxial)
+    field, _ = object_field(lens, scene.fields[:, :, None], paraxial)
     distance, pupil = lens.surfaces[0].thickness, paraxial.entrance_pupil_position
     n = signed(lens.surfaces[1:-1], media(lens, wavelengths)[:-1])
     A, B, C, D = system_matrix(lens.surfaces[1:-1], n)
