@@ -112,7 +112,7 @@ def _chief_ray(lens: Lens, fields: Tensor, paraxial: FirstOrder) -> tuple[Tensor
     upwards = torch.stack([torch.zeros_like(fields[0]), torch.hypot(*fields)])
     if lens.fields.kind == "real_image_height":
         lens = with_field_kind(lens, "paraxial_image_height")
-    extent = object_field(lens, upwards, paraxial)[1]
+    extent = object_field(lens, upwards, paraxial)[0][1]
     distance, pupil = lens.surfaces[0].thickness, paraxial.entrance_pupil_position
     n = media(lens, lens.wavelengths[lens.primary_wavelength])[0]
     if bool(torch.isinf(distance)):
