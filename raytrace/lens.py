@@ -1,11 +1,12 @@
 """Lens: surfaces, stop, aperture, fields and wavelengths, as one value."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
 
+from raytrace.glass import Glass, check_wavelengths
 from raytrace.surface import Surface
 from raytrace.value import value
 
@@ -33,6 +34,15 @@ APERTURE_KINDS = {
     "object_cone_angle": "degrees, half angle of the marginal ray at the object",
     "float_by_stop": "mm, semi-diameter of the stop",
 }
+
+
+#: µm: wavelengths between these are traced; glasses end at 39, x-ray mirrors begin at 1e-4.
+_SHORTEST, _LONGEST = 3e-5, 100.0
+_UNITS, _LIKELY = (1e-3, 1e6), (0.1, 20.0)  # µm of a nm and of a m, and what is likely to be meant by them
+
+
+class ImplausibleWavelength(ValueError):
+    """A wavelength that no lens is for: most likely it is in another unit than µm."""
 
 
 @value
@@ -97,9 +107,15 @@ def with_sensor_distance(lens: Lens, sensor_distance: Tensor) -> Lens:
     return _with_thickness(lens, len(lens.surfaces) - 2, sensor_distance)
 
 
-def with_wavelengths(lens: Lens, wavelengths: Tensor | Sequence[float], weights: Tensor | None = None) -> Lens:
-    """The lens at other wavelengths (W,) µm, the first one primary, by weights (W,), alike by default."""
+def with_wavelengths(
+    lens: Lens, wavelengths: Tensor | Sequence[float], weights: Tensor | None = None, *, where: str = ""
+) -> Lens:
+    """The lens at other wavelengths (W,) µm, the first one primary, by weights (W,), alike by default.
+
+    Those that the lens does not have yet are checked as by `check_media`, whose place `where` is.
+    """
     wavelengths = torch.as_tensor(wavelengths, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device).reshape(-1)
+    check_media(lens, wavelengths[~torch.isin(wavelengths, lens.wavelengths)], where=where)
     weights = torch.ones_like(wavelengths) if weights is None else weights
     return dataclasses.replace(lens, wavelengths=wavelengths, wavelength_weights=weights, primary_wavelength=0)
 
@@ -113,6 +129,40 @@ def largest_field(lens: Lens) -> Tensor:
     """The field point (2, 1) along y that is as far from the axis as the lens's outermost, in its own unit."""
     largest = torch.hypot(lens.fields.x, lens.fields.y).amax()
     return torch.stack([torch.zeros_like(largest), largest])[:, None]
+
+
+def check_media(lens: Lens, wavelengths: Tensor, *, where: str = "") -> None:
+    """Refuse wavelengths (W,) µm at which a glass of the lens has no index; warn of glasses used outside their range.
+
+    where: the lens, to name in the message. Raises ImplausibleWavelength, also for a lens without glass, and
+    `glass.InvalidIndex`; warns `glass.OutOfRange`, once for each glass.
+    """
+    media = [surface.glass for surface in lens.surfaces[:-1]]
+    check_unit(wavelengths, media, where=where)
+    seen = set()
+    for number, medium in enumerate(media):
+        key = (medium.name, medium.catalog)
+        if medium.formula != "constant" and key not in seen:
+            seen.add(key)
+            place = f"{where}, surface {number}" if where else f"surface {number}"
+            check_wavelengths(medium, wavelengths, where=place)
+
+
+def check_unit(wavelengths: Tensor, media: Iterable[Glass] = (), *, where: str = "") -> None:
+    """Refuse wavelengths in another unit than µm: shorter than hard x-rays, or longer than any glass lets through.
+
+    media: glasses whose range, where it reaches further, is believed. Raises ImplausibleWavelength, with a guess.
+    """
+    spans = [medium.wavelength_range for medium in media if medium.wavelength_range]
+    shortest, longest = min([_SHORTEST, *(s[0] for s in spans)]), max([_LONGEST, *(s[1] for s in spans)])
+    for wavelength in wavelengths.detach().flatten().tolist():
+        if not shortest <= wavelength <= longest:
+            guesses = (wavelength * factor for factor in _UNITS)
+            guess = next((f"did you mean {g:.7g}?" for g in guesses if _LIKELY[0] <= g <= _LIKELY[1]), None)
+            raise ImplausibleWavelength(
+                f"{where}{': ' if where else ''}a wavelength of {wavelength:g} µm: expected "
+                f"{shortest:g} to {longest:g}; wavelengths are in µm" + (f"; {guess}" if guess else "")
+            )
 
 
 def _with_thickness(lens: Lens, number: int, thickness: Tensor) -> Lens:
@@ -131,8 +181,7 @@ def check(lens: Lens) -> None:
         raise ValueError(f"{last + 1} surfaces found; expected at least the object, one surface and the image")
     if not 1 <= lens.stop < last:
         raise ValueError(f"the stop is surface {lens.stop}; expected one from 1 to {last - 1}")
-    if not bool((lens.wavelengths > 0).all()) or not bool(torch.isfinite(lens.wavelengths).all()):
-        raise ValueError(f"wavelengths {lens.wavelengths.tolist()}: expected numbers above 0, in µm")
+    check_unit(lens.wavelengths, (surface.glass for surface in lens.surfaces))
     if not 0 <= lens.primary_wavelength < len(lens.wavelengths):
         raise ValueError(f"primary wavelength {lens.primary_wavelength + 1} of {len(lens.wavelengths)}")
     if not float(lens.aperture.value) > 0:

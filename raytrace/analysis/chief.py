@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.frame import Tabular, axis, masked
-from raytrace.analysis.setting import field_range, in_object_space, primary_number, unvignetted
+from raytrace.analysis.setting import field_range, in_object_space, primary_number, unvignetted, wavelengths_of
 from raytrace.focus import image_rays
 from raytrace.launch import is_at_infinity
 from raytrace.lens import Lens
@@ -83,7 +83,7 @@ def distortion(
     """
     lens = unvignetted(lens)
     fields = field_range(lens, size) if fields is None else fields
-    wavelengths = lens.wavelengths if wavelengths is None else wavelengths
+    wavelengths = wavelengths_of(lens, wavelengths)
     described, angles, extent, found = in_object_space(lens, fields)
     close = field_range(lens, 2)[:, 1:] * _NEAR_AXIS
     _, close_angles, close_extent, _ = in_object_space(lens, close)
@@ -108,7 +108,7 @@ def field_curvature(
     fields = field_range(lens, size) if fields is None else fields
     if bool((fields[0] != 0).any()):
         raise ValueError("field curvature is drawn for fields along y; found a field with x other than 0")
-    wavelengths = lens.wavelengths if wavelengths is None else wavelengths
+    wavelengths = wavelengths_of(lens, wavelengths)
     step = fields.new_tensor([[0.0, 0.0, 1.0, -1.0], [1.0, -1.0, 0.0, 0.0]]) * _NEAR_CHIEF
     rays = image_rays(lens, step, fields=fields, wavelengths=wavelengths)
     slope = safe_divide(rays.direction[:2], rays.direction[2].expand_as(rays.direction[:2]))
@@ -126,7 +126,7 @@ def lateral_colour(
     lens = unvignetted(lens)
     fields = field_range(lens, size) if fields is None else fields
     primary = primary_number(lens, wavelengths)
-    wavelengths = lens.wavelengths if wavelengths is None else wavelengths
+    wavelengths = wavelengths_of(lens, wavelengths)
     height, valid = _height(lens, fields, wavelengths, fields)
     valid = valid & valid[:, primary : primary + 1]
     shift = torch.where(valid, height - height[:, primary : primary + 1], 0.0)

@@ -9,7 +9,7 @@ from torch import Tensor
 from raytrace.analysis.frame import Tabular, axis, numbered
 from raytrace.focus import focus
 from raytrace.grid import Grid, grid
-from raytrace.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
+from raytrace.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance, with_wavelengths
 from raytrace.numerics import safe_divide, safe_sqrt
 from raytrace.paraxial import first_order, paraxial_image_distance
 from raytrace.psf import Psf, psf
@@ -127,17 +127,14 @@ def common_focus(lens: Lens, focus_distance: float, *, wavelength: float | Tenso
     """
     if start not in STARTS:
         raise ValueError(f"start {start!r} is not known; expected {' or '.join(STARTS)}")
-    wavelengths = lens.wavelengths.new_tensor([float(wavelength)])
-    shares = torch.ones_like(wavelengths)
-    lens = dataclasses.replace(lens, wavelengths=wavelengths, wavelength_weights=shares, primary_wavelength=0)
-    lens = with_object_distance(lens, focus_distance)
-    sensor = paraxial_image_distance(lens, wavelengths.new_tensor(focus_distance))
+    lens = with_object_distance(with_wavelengths(lens, [float(wavelength)]), focus_distance)
+    sensor = paraxial_image_distance(lens, lens.surfaces[0].thickness)
     ahead = -1 if sum(surface.is_mirror for surface in lens.surfaces) % 2 else 1
     if not 0 < ahead * float(sensor) < math.inf:
         raise ValueError(f"no real image of an object at {focus_distance:g} mm: it lies within the focal length")
     lens = with_sensor_distance(lens, sensor)
     if start == "rms":
-        axis = wavelengths.new_zeros(2, 1)
+        axis = lens.wavelengths.new_zeros(2, 1)
         lens = with_sensor_distance(lens, focus(lens, *gauss_rings(_RINGS), fields=axis, empty="error"))
     return lens
 

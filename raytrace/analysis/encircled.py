@@ -7,7 +7,7 @@ from torch import Tensor
 
 from raytrace.analysis.aperture import ExitPupil, exit_pupil
 from raytrace.analysis.frame import Tabular, axis
-from raytrace.analysis.setting import scene_of, wavelength_weights
+from raytrace.analysis.setting import scene_of, wavelength_weights, wavelengths_of
 from raytrace.focus import image_rays
 from raytrace.lens import Lens
 from raytrace.numerics import safe_divide, safe_sqrt
@@ -59,6 +59,7 @@ def encircled_energy(
     """
     if kind not in ("diffraction", "geometric"):
         raise ValueError(f"unknown kind of encircled energy {kind!r}; expected diffraction or geometric")
+    wavelengths_of(lens, wavelengths)
     distance, energy, centroid = _rays(lens, fields, wavelengths)
     if radii is None:
         airy = 6e-3 * lens.wavelengths[lens.primary_wavelength] * first_order(lens).working_f_number

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from raytrace.analysis.aperture import MARGIN, exit_pupil
 from raytrace.analysis.frame import Tabular, axis
-from raytrace.analysis.setting import primary_number, scene_of, wavelength_weights
+from raytrace.analysis.setting import primary_number, scene_of, wavelength_weights, wavelengths_of
 from raytrace.focus import image_rays
 from raytrace.lens import Lens, with_sensor_distance
 from raytrace.numerics import safe_divide, safe_sqrt
@@ -92,6 +92,7 @@ def mtf(
     functions = {"diffraction": _diffraction, "geometric": _geometric}
     if kind not in functions:
         raise ValueError(f"unknown kind of MTF {kind!r}; expected one of {', '.join(functions)}")
+    wavelengths_of(lens, wavelengths)
     if frequencies is None:
         frequencies = frequency_range(lens, 41, fields=fields)
     tangential, sagittal = functions[kind](lens, frequencies, fields, wavelengths)

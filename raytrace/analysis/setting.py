@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from raytrace.launch import is_at_infinity, object_field
-from raytrace.lens import Lens, largest_field, with_field_kind
+from raytrace.lens import Lens, check_media, largest_field, with_field_kind
 from raytrace.paraxial import first_order
 from raytrace.scene import Scene
 from raytrace.scene import scene as make_scene
@@ -15,8 +15,15 @@ from raytrace.scene import scene as make_scene
 def scene_of(lens: Lens, fields: Tensor | None, wavelengths: Tensor | None) -> Scene:
     """The scene (1, F, W) of the lens at its own object distance; fields (2, F), wavelengths (W,) µm."""
     fields = torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields
-    wavelengths = lens.wavelengths if wavelengths is None else wavelengths
-    return make_scene(lens, fields, lens.surfaces[0].thickness[None], wavelengths)
+    return make_scene(lens, fields, lens.surfaces[0].thickness[None], wavelengths_of(lens, wavelengths))
+
+
+def wavelengths_of(lens: Lens, wavelengths: Tensor | None) -> Tensor:
+    """The wavelengths (W,) µm: the lens's own, or those given, checked as by `check_media`."""
+    if wavelengths is None:
+        return lens.wavelengths
+    check_media(lens, wavelengths)
+    return wavelengths
 
 
 def wavelength_weights(lens: Lens, wavelengths: Tensor | None) -> Tensor:

@@ -10,7 +10,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from raytrace.cli.commands import COMMANDS
 from raytrace.cli.options import did_you_mean
@@ -90,7 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     module, function = arguments.run.rsplit(".", 1)
     with warnings.catch_warnings():
         warnings.simplefilter("always")
-        warnings.showwarning = _show_warning
+        warnings.showwarning = _shower()
         try:
             with importlib.import_module("raytrace.cli.progress").heartbeat(arguments.command):
                 run = getattr(importlib.import_module(f"raytrace.cli.{module}"), function)
@@ -139,10 +139,17 @@ def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
-    """Warnings of this package, one line each; those of libraries speak to programmers and are left out."""
-    if category.__module__.startswith("raytrace"):
-        print(f"raytrace: warning: {_one_line(message)}", file=sys.stderr)
+def _shower() -> Callable[..., None]:
+    """Shows warnings of this package, one line each and none twice; those of libraries speak to programmers."""
+    said = set()
+
+    def show(message, category, filename, lineno, file=None, line=None) -> None:
+        words = _one_line(message)
+        if category.__module__.startswith("raytrace") and words not in said:
+            said.add(words)
+            print(f"raytrace: warning: {words}", file=sys.stderr)
+
+    return show
 
 
 def _version() -> str:

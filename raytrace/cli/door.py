@@ -13,8 +13,15 @@ from torch import Tensor
 from raytrace.cli.options import did_you_mean
 from raytrace.files import shipped
 from raytrace.formats import FORMATS, read_lens
-from raytrace.glass import check_wavelengths
-from raytrace.lens import Lens, SystemAperture, check, with_object_distance, with_sensor_distance
+from raytrace.lens import (
+    Lens,
+    SystemAperture,
+    check,
+    check_media,
+    with_object_distance,
+    with_sensor_distance,
+    with_wavelengths,
+)
 
 
 class CommandError(ValueError):
@@ -45,12 +52,7 @@ def open_lens(arguments: argparse.Namespace) -> Lens:
     lens = read_lens(path, catalogs=catalogs(arguments))
     wavelengths = getattr(arguments, "wavelength", None)
     if wavelengths:
-        lens = dataclasses.replace(
-            lens,
-            wavelengths=lens.wavelengths.new_tensor(wavelengths),
-            wavelength_weights=lens.wavelengths.new_ones(len(wavelengths)),
-            primary_wavelength=0,
-        )
+        lens = with_wavelengths(lens, wavelengths, where=str(path))
     if getattr(arguments, "f_number", None):
         lens = _with_aperture(lens, "image_f_number", arguments.f_number)
     if getattr(arguments, "entrance_pupil_diameter", None):
@@ -61,26 +63,16 @@ def open_lens(arguments: argparse.Namespace) -> Lens:
     if getattr(arguments, "sensor_distance", None) is not None:
         lens = with_sensor_distance(lens, arguments.sensor_distance)
     refuse_untraceable(lens, str(path))
+    check_media(lens, lens.wavelengths, where=str(path))
     return lens
 
 
 def refuse_untraceable(lens: Lens, path: str) -> None:
-    """Raise for a lens that makes no sense as a whole; warn of glasses used outside their range."""
+    """Raise for a lens that makes no sense as a whole."""
     try:
         check(lens)
     except ValueError as error:
         raise CommandError(f"{path}: {error}") from error
-    check_glasses(lens, lens.wavelengths, path)
-
-
-def check_glasses(lens: Lens, wavelengths: Tensor, path: str) -> None:
-    """Raise for a wavelength (W,) µm at which a glass of the lens has no index; warn of those outside its range."""
-    seen = set()
-    for number, surface in enumerate(lens.surfaces[:-1]):
-        key = (surface.glass.name, surface.glass.catalog)
-        if surface.glass.formula != "constant" and key not in seen:
-            seen.add(key)
-            check_wavelengths(surface.glass, wavelengths, where=f"{path}, surface {number}")
 
 
 def catalogs(arguments: argparse.Namespace) -> tuple[Path, ...]:

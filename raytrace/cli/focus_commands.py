@@ -22,7 +22,7 @@ from raytrace.cli.spots import field_label, pupil_points, warn_of_losses
 from raytrace.focus import focus as best_focus
 from raytrace.focus import focus_of_mean_radius, image_rays, mean_rms_radius
 from raytrace.formats import read_lens, write_lens
-from raytrace.lens import FIELD_UNITS, Lens, with_object_distance, with_sensor_distance, with_wavelengths
+from raytrace.lens import FIELD_UNITS, Lens, with_object_distance, with_sensor_distance
 from raytrace.paraxial import first_order, paraxial_image_distance
 
 
@@ -89,12 +89,12 @@ def focus(arguments: argparse.Namespace) -> None:
 
 def _tell_losses(arguments: argparse.Namespace, lens: Lens, points: Tensor, rule: dict) -> None:
     """Warn of rays that do not reach the image. Raises CommandError if none does."""
-    lens, arrived = with_wavelengths(lens, rule["wavelengths"]), []
+    arrived = []
     for distance in rule["object_distances"]:
         trial = with_object_distance(lens, distance)
-        valid = image_rays(trial, points, fields=rule["fields"]).valid
+        valid = image_rays(trial, points, fields=rule["fields"], wavelengths=rule["wavelengths"]).valid
         at = f"object at {distance:g} mm, " if len(rule["object_distances"]) > 1 else ""
-        warn_of_losses(trial, rule["fields"], points, ~valid.any(-1), at=at)
+        warn_of_losses(trial, rule["fields"], points, ~valid.any(-1), wavelengths=rule["wavelengths"], at=at)
         arrived.append(float(valid.double().mean()))
     lost = 1 - sum(arrived) / len(arrived)
     if lost == 1:

@@ -8,6 +8,7 @@ import torch
 from raytrace.catalog import find_glass
 from raytrace.cli.door import catalogs, number, print_json
 from raytrace.glass import LINES, abbe_number, check_wavelengths, mil_glass, nd, refractive_index
+from raytrace.lens import check_unit
 
 
 def glass(arguments: argparse.Namespace) -> None:
@@ -16,6 +17,7 @@ def glass(arguments: argparse.Namespace) -> None:
     found = mil_glass(arguments.name) if is_code else find_glass(arguments.name, user=catalogs(arguments))
     asked = arguments.wavelength or [LINES[line] for line in "FdC"]
     wavelengths = torch.tensor(asked, dtype=torch.float64)
+    check_unit(wavelengths, [found])
     check_wavelengths(found, wavelengths)
     indices = refractive_index(found, wavelengths).tolist()
     if arguments.json:

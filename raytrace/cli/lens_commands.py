@@ -18,7 +18,7 @@ from raytrace.cli.door import (
     say,
 )
 from raytrace.formats import LensFileWarning, read_lens_with_report, write_lens
-from raytrace.lens import FIELD_UNITS, Lens
+from raytrace.lens import FIELD_UNITS, Lens, check_media
 from raytrace.paraxial import first_order, vertex_curvature
 from raytrace.trace import media
 
@@ -131,6 +131,7 @@ def check(arguments: argparse.Namespace) -> None:
     path = find_lens(arguments.lens)
     lens, report = read_lens_with_report(path, catalogs=catalogs(arguments), strict=arguments.strict)
     refuse_untraceable(lens, str(path))
+    check_media(lens, lens.wavelengths, where=str(path))
     if arguments.json:
         print_json({**report.to_dict(), "surfaces": len(lens.surfaces), "stop_surface": lens.stop})
     else:

@@ -11,9 +11,9 @@ import numpy as np
 import pandas
 import torch
 
-from raytrace.cli.door import CommandError, check_glasses, primary
+from raytrace.cli.door import CommandError, primary
 from raytrace.launch import launch
-from raytrace.lens import Lens
+from raytrace.lens import Lens, check_media
 from raytrace.rays import Rays
 from raytrace.trace import axial_path, media, start, steps
 
@@ -85,7 +85,7 @@ def read(path: str, lens: Lens) -> tuple[Iterator[Batch], int]:
     if len(negative):
         raise CommandError(f"{path}:{lines[negative[0]]}: wavelength {wavelengths[negative[0]]:g}: expected µm above 0")
 
-    check_glasses(lens, torch.from_numpy(np.unique(wavelengths)), path)
+    check_media(lens, torch.from_numpy(np.unique(wavelengths)), where=path)
 
     def batches() -> Iterator[Batch]:
         for first in range(0, len(values), _BATCH):

@@ -59,20 +59,28 @@ def cell(value: float, form: str) -> str:
 
 
 def warn_of_losses(
-    lens: Lens, fields: Tensor, points: Tensor, dark: Tensor, *, aiming: str | None = None, at: str = ""
+    lens: Lens,
+    fields: Tensor,
+    points: Tensor,
+    dark: Tensor,
+    *,
+    wavelengths: Tensor | None = None,
+    aiming: str | None = None,
+    at: str = "",
 ) -> None:
     """One line for every field that loses all its rays at a wavelength, where and why; what to do about a wide beam.
 
-    dark: (F, W), which of the lens's wavelengths; points: (2, P) of the pupil, through which rays are traced once more;
-    at: what else is told of the place, as the object distance.
+    dark: (F, W), at which of the wavelengths (W,), the lens's by default; points: (2, P) of the pupil, through which
+    rays are traced once more; at: what else is told of the place, as the object distance.
     """
     if not bool(dark.any()):
         return
     number = torch.nonzero(dark.any(1))[:, 0]
-    found = losses(lens, points, fields=fields[:, number], ray_aiming=aiming)
+    wavelengths = lens.wavelengths if wavelengths is None else wavelengths
+    found = losses(lens, points, fields=fields[:, number], wavelengths=wavelengths, ray_aiming=aiming)
     for place, f in enumerate(number.tolist()):
         said: dict[str, list[str]] = {}
-        for w, wavelength in enumerate(lens.wavelengths.tolist()):
+        for w, wavelength in enumerate(wavelengths.tolist()):
             if bool(dark[f, w]):
                 said.setdefault(found.words(place, w), []).append(f"{wavelength:g}")
         for words, colours in said.items():

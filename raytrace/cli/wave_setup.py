@@ -17,6 +17,7 @@ from raytrace.cli.progress import progress
 from raytrace.glass import Glass, check_wavelengths
 from raytrace.glass_table import from_table
 from raytrace.grid import grid
+from raytrace.lens import check_unit
 from raytrace.wave.aim import Aim
 from raytrace.wave.aim import aim as aim_of
 from raytrace.wave.baselines import BASELINES, baseline
@@ -112,14 +113,15 @@ def _glass(arguments: argparse.Namespace) -> Glass:
 def check_colours(parts: Sequence[Element], wavelengths: Sequence[float]) -> None:
     """Raises CommandError for a wavelength (µm) outside what a material is known for: thin elements live by n - 1."""
     for glass in {element.glass.name: element.glass for element in parts}.values():
+        check_unit(torch.tensor(wavelengths), [glass])
         if glass.formula == "constant":
             continue
-        check_wavelengths(glass, wavelengths)
         low, high = glass.wavelength_range or (0.0, math.inf)
         outside = [wavelength for wavelength in wavelengths if not low <= wavelength <= high]
         if outside:
             listed = ", ".join(f"{wavelength:g}" for wavelength in outside)
             raise CommandError(f"{glass.name} is known from {low:g} to {high:g} µm, not at {listed} µm")
+        check_wavelengths(glass, wavelengths)
 
 
 def scene(arguments: argparse.Namespace, parts: Sequence[Element]) -> WaveScene:

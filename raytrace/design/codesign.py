@@ -26,7 +26,7 @@ from raytrace.design.variables import Variables, parse_bounds
 from raytrace.files import write_atomically
 from raytrace.focus import focus
 from raytrace.grid import grid
-from raytrace.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
+from raytrace.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance, with_wavelengths
 from raytrace.paraxial import paraxial_image_distance
 from raytrace.pictures import Pictures, crop, draws
 from raytrace.pupil import gauss_rings
@@ -104,15 +104,12 @@ class Outcome:
 
 def lens_at_start(lens: Lens, settings: Settings) -> Lens:
     """The lens at the wavelength and aperture of the experiment, focused as it begins."""
-    wavelength = lens.wavelengths.new_tensor([settings.wavelength])
-    lens = dataclasses.replace(
-        lens, wavelengths=wavelength, wavelength_weights=torch.ones_like(wavelength), primary_wavelength=0
-    )
+    lens = with_wavelengths(lens, [settings.wavelength])
     if settings.f_number is not None:
-        number = SystemAperture("image_f_number", wavelength.new_tensor(settings.f_number))
+        number = SystemAperture("image_f_number", lens.wavelengths.new_tensor(settings.f_number))
         lens = dataclasses.replace(lens, aperture=number)
     lens = with_object_distance(lens, settings.focus_distance)
-    paraxial = paraxial_image_distance(lens, wavelength.new_tensor(settings.focus_distance))
+    paraxial = paraxial_image_distance(lens, lens.surfaces[0].thickness)
     if settings.start in ("paraxial", "spectral"):
         return with_sensor_distance(lens, paraxial.detach())
     if settings.start == "rms":

@@ -13,7 +13,7 @@ from raytrace.formats.source import LensFileError as LensFileError
 from raytrace.formats.source import LensFileWarning as LensFileWarning
 from raytrace.formats.source import Place, read_text
 from raytrace.formats.source import UnsupportedSurface as UnsupportedSurface
-from raytrace.lens import Lens
+from raytrace.lens import Lens, check_unit
 
 
 class Format(NamedTuple):
@@ -51,7 +51,9 @@ def read_lens_with_report(
     """As `read_lens`, with the report of what became of every keyword; its warnings are in it, and not issued."""
     path = Path(path)
     form = _format(path)
-    return form.read(read_text(path), str(path), catalogs=tuple(catalogs), strict=strict)
+    lens, report = form.read(read_text(path), str(path), catalogs=tuple(catalogs), strict=strict)
+    _refuse_other_units(lens, path)
+    return lens, report
 
 
 def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | Path] = ()) -> None:
@@ -61,11 +63,19 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
     hold and where the file cannot be written.
     """
     path = Path(path)
+    _refuse_other_units(lens, path)
     content = _format(path).write(lens, str(path), catalogs=tuple(catalogs))
     try:
         write_atomically(path, lambda file: file.write(content))
     except OSError as error:
         raise LensFileError(error.strerror or str(error), Place(str(path))) from error
+
+
+def _refuse_other_units(lens: Lens, path: Path) -> None:
+    try:
+        check_unit(lens.wavelengths, (surface.glass for surface in lens.surfaces))
+    except ValueError as error:
+        raise LensFileError(str(error), Place(str(path))) from error
 
 
 def _format(path: Path) -> Format:

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from raytrace.glass import index
 from raytrace.grid import Grid
+from raytrace.lens import check_unit
 from raytrace.value import value
 from raytrace.wave.element import Element, Pixels, Rings, is_radial, path
 
@@ -52,6 +53,7 @@ def check(scene: WaveScene) -> None:
     for name, numbers in positive.items():
         if not bool((numbers > 0).all()):
             raise ValueError(f"{name} must be greater than 0, found {numbers.detach().flatten().tolist()}")
+    check_unit(scene.wavelengths, (element.glass for element in scene.elements))
     if not bool(torch.isfinite(scene.sensor_distance)):
         raise ValueError("the sensor distance is infinite: put the sensor at a focal length of a lens in the aperture")
     for element in scene.elements:

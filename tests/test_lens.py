@@ -1,0 +1,105 @@
+"""Lens: wavelengths in another unit are refused, glasses used outside their range are told of, at every door."""
+
+import dataclasses
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+from problems import lens, surface, vector
+
+from raytrace.analysis import distortion
+from raytrace.formats import LensFileError, read_lens, write_lens
+from raytrace.glass import MIRROR, InvalidIndex, OutOfRange
+from raytrace.glass import constant as medium
+from raytrace.lens import ImplausibleWavelength, check, check_media, check_unit, with_wavelengths
+
+LENSES = Path(__file__).parents[1] / "lenses"
+MIRRORS = lens([surface(-0.01, -50.0, MIRROR), surface(-0.01, 60.0, MIRROR)])
+AIR_ALONE = lens([surface(None, 50.0)])
+CONSTANT = lens([surface(0.02, 5.0, 1.5), surface(None, 50.0)])
+
+
+@pytest.mark.parametrize("system", [MIRRORS, AIR_ALONE, CONSTANT], ids=["mirrors", "air", "constant"])
+@pytest.mark.parametrize(
+    ("wavelength", "guess"),
+    [(550.0, "did you mean 0.55?"), (10600.0, "did you mean 10.6?"), (5.876e-7, "did you mean 0.5876?"), (1e9, None)],
+)
+def test_another_unit_is_refused_with_a_guess_also_where_no_glass_would_know(system, wavelength, guess):
+    for refuse in (
+        lambda: with_wavelengths(system, [0.55, wavelength]),
+        lambda: check(dataclasses.replace(system, wavelengths=vector(wavelength))),
+        lambda: distortion(system, fields=vector(0.0, 1.0)[:, None], wavelengths=vector(wavelength)),
+    ):
+        with pytest.raises(ImplausibleWavelength) as error:
+            refuse()
+        assert f"a wavelength of {wavelength:g} µm" in str(error.value)
+        assert (guess in str(error.value)) if guess else ("did you mean" not in str(error.value))
+
+
+@pytest.mark.parametrize("wavelength", [1e-4, 0.0135, 0.193, 0.55, 5.0, 10.6, 39.0])
+def test_wavelengths_that_lenses_and_mirrors_are_made_for_pass(wavelength):
+    check(with_wavelengths(MIRRORS, [wavelength]))
+
+
+@pytest.mark.parametrize("wrong", [0.0, -0.55, float("inf"), float("nan")])
+def test_what_is_no_wavelength_is_refused(wrong):
+    with pytest.raises(ImplausibleWavelength):
+        check_unit(vector(0.55, wrong))
+
+
+def test_the_range_of_a_glass_is_believed_beyond_the_bounds():
+    """Plastics for terahertz waves, say."""
+    clear = dataclasses.replace(medium(1.43, "TPX"), wavelength_range=(20.0, 3000.0))
+    with pytest.raises(ImplausibleWavelength):
+        check_unit(vector(300.0))
+    check_unit(vector(300.0), [clear])
+    with_wavelengths(lens([surface(0.02, 5.0, clear), surface(None, 50.0)]), [300.0])
+
+
+def test_extrapolated_glasses_are_named_with_their_range_each_once():
+    gauss = read_lens(LENSES / "double_gauss.zmx")
+    with pytest.warns(OutOfRange) as told:
+        moved = with_wavelengths(gauss, [3.0], where="gauss")
+    assert [str(w.message).split(" is ")[0] for w in told] == [
+        "gauss, surface 1: SK2 (SCHOTT)",
+        "gauss, surface 3: SK16 (SCHOTT)",
+        "gauss, surface 4: F5 (SCHOTT)",
+    ]
+    assert "extrapolated to 3 µm; its coefficients hold from 0.31 to 2.325 µm" in str(told[0].message)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with_wavelengths(moved, [3.0, 0.55])  # known since the lens has it
+    with warnings.catch_warnings(), pytest.raises(InvalidIndex, match="surface 1: SK2"):
+        warnings.simplefilter("ignore", OutOfRange)
+        check_media(gauss, vector(9.0))
+    with pytest.warns(OutOfRange, match="surface 1: SK2"):
+        distortion(gauss, fields=vector(0.0, 1.0)[:, None], wavelengths=vector(3.0))
+
+
+def test_other_wavelengths_count_alike_and_the_first_is_primary():
+    found = with_wavelengths(read_lens(LENSES / "cooke_triplet.zmx"), [0.6, 0.5])
+    assert found.wavelengths.tolist() == [0.6, 0.5]
+    assert found.wavelength_weights.tolist() == [1.0, 1.0]
+    assert found.primary_wavelength == 0
+    assert torch.equal(with_wavelengths(found, vector(0.5), vector(2.0)).wavelength_weights, vector(2.0))
+
+
+def test_files_with_wavelengths_in_nanometres_are_refused_when_read_and_written(tmp_path):
+    text = (LENSES / "singlet.zmx").read_text(encoding="utf-8")
+    wrong = tmp_path / "nm.zmx"
+    wrong.write_text(text.replace("WAVM 1 0.4861327 1", "WAVM 1 486.1327 1"), encoding="utf-8")
+    with pytest.raises(LensFileError, match=r"nm\.zmx: a wavelength of 486\.133 µm.*did you mean 0\.4861327\?"):
+        read_lens(wrong)
+    table = tmp_path / "nm.csv"
+    table.write_text(
+        "# wavelengths: 587.6\nsurface,radius,thickness,glass\n1,50,5,N-BK7\n2,,100,\nimage,,,\n", encoding="utf-8"
+    )
+    with pytest.raises(LensFileError, match=r"nm\.csv:1.*in nm write '587\.6 nm'"):
+        read_lens(table)
+    table.write_text(table.read_text(encoding="utf-8").replace("587.6", "587.6 nm"), encoding="utf-8")
+    assert read_lens(table).wavelengths.tolist() == [0.5876]
+    for name in ("out.zmx", "out.csv"):
+        with pytest.raises(LensFileError, match=r"did you mean 0\.55"):
+            write_lens(dataclasses.replace(CONSTANT, wavelengths=vector(550.0)), tmp_path / name)
+        assert not (tmp_path / name).exists()
