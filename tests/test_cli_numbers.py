@@ -57,7 +57,7 @@ def test_nanometres_are_refused_by_every_command(run, command):
 @pytest.mark.parametrize("command", ["info", "spot", "focus", "trace", "psf --model paraxial", "lateral", "layout"])
 def test_extrapolation_is_told_once_for_each_glass(run, command):
     verb, *options = command.split()
-    found = run(verb, "double_gauss", "--wavelength", 3, *options, *(["-o", "x.png"] if verb == "layout" else []))
+    found = run(verb, "double_gauss", "--wavelength", 3, *options, *(["--plot", "x.png"] if verb == "layout" else []))
     assert found.code == 0
     told = [line for line in found.err.splitlines() if "extrapolated" in line]
     assert [line.split(": ")[3].split(" is ")[0] for line in told] == ["SK2 (SCHOTT)", "SK16 (SCHOTT)", "F5 (SCHOTT)"]
