@@ -191,7 +191,8 @@ def _constant(coefficients: Tensor, wavelength: Tensor) -> Tensor:
 
 
 #: The lines of the model-glass fit, µm, rounded as the programs that wrote the files round them.
-_D, _F, _C, _G = 0.5876, 0.4861, 0.6563, 0.4358
+MODEL_LINES = {"d": 0.5876, "F": 0.4861, "C": 0.6563, "g": 0.4358}
+_D, _F, _C, _G = MODEL_LINES.values()
 
 
 def _model(coefficients: Tensor, wavelength: Tensor) -> Tensor:

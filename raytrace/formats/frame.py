@@ -49,9 +49,9 @@ def lens_from_frame(
         add_metadata(table, key, _text(value), _PLACE, report)
     if not isinstance(frame.index, pd.RangeIndex) or frame.index.name is not None:
         frame = frame.reset_index(names=frame.index.name or "surface")
-    columns = header([str(column) for column in frame.columns], _PLACE, report)
+    header(table, [str(column) for column in frame.columns], _PLACE, report)
     for cells in frame.itertuples(index=False, name=None):
-        add_row(table, columns, [_text(cell) for cell in cells], _PLACE)
+        add_row(table, [_text(cell) for cell in cells], _PLACE)
     lens = build(table, report, catalogs=catalogs)
     report.finished(strict=strict)
     return lens

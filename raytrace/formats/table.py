@@ -6,18 +6,21 @@ apertures, type, comment. Header lines '# key: value' hold the system (`table_sy
 with what is stated in warnings: on axis, the d line, F/10 unless the stop row has a semi-diameter.
 
 - An empty curvature, radius `inf` or 0 is a plane; lengths are mm unless '# units:' says otherwise.
+- A column of numbers whose heading is not known, or may mean two things, is an error; '# ignore: NAME' leaves it out.
 - Glass: empty or `air`; a catalog name; `MIRROR`; a number, the constant index; `1.5168/64.17` (nd/Vd) or
   `1.5168/64.17/0.0008` (nd/Vd/ΔPgF), a model glass; six digits, a MIL code; `NAME=1.33` or `NAME=1.5168/64.17`, the
-  same with a name. Columns nd and Vd define the glass of a row that names none.
+  same with a name. Columns of indices and Abbe numbers define the glass of a row that names none (`table_media`).
 - The stop is the row marked in a `stop` column, or called stop, aperture, diaphragm, iris; or '# stop: 6'.
 - A first row called object, or numbered 0, is the object; otherwise the object lies at '# object distance', or at
   infinity.
-- The last row is the image: it is called image, sensor or detector, or has no thickness.
+- The last row is the image: it is called image, sensor or detector, or is a plane in air without a thickness. Where
+  the last row has a thickness, the image is added behind it.
 - Apertures: `circular 0 12.5` (inner, outer radius), `rectangular 3 4`, `elliptic 3 4` (half-widths), with
   `obscuration` before and `at 1 2` (centre) after; several are joined by ` + `.
 - A row of a type that is not modelled (coordinate break, toroid, grating …) raises UnsupportedSurface.
 """
 
+import dataclasses
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,19 +28,21 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from raytrace.formats import table_surface, table_system
+from raytrace.formats import table_surface, table_system, texts
 from raytrace.formats.finite import refuse_overflow
 from raytrace.formats.media import report_missing_catalogs
 from raytrace.formats.report import Draft, ImportReport
 from raytrace.formats.source import LensFileError, Place, integer, is_infinite, is_number, number, shown
+from raytrace.formats.table_rows import cleaned
 from raytrace.formats.table_text import Row, Table, parse
 from raytrace.formats.zemax_keywords import MILLIMETRES
+from raytrace.glass import AIR
 from raytrace.lens import Lens
 from raytrace.surface import Surface
 
-_STOP = re.compile(r"\b(stop|sto|aperture|diaphragm|iris)\b", re.IGNORECASE)
-_IMAGE = re.compile(r"\b(image|ima|img|sensor|detector)\b", re.IGNORECASE)
-_OBJECT = re.compile(r"\b(object|obj)\b", re.IGNORECASE)
+_STOP = re.compile(r"\b(stop|sto|aperture|diaphragm|iris|blende|diaphragme)\b|絞り|光阑|光圈", re.IGNORECASE)
+_IMAGE = re.compile(r"\b(image|ima|img|sensor|detector|bild|bildebene)\b|像面|成像|撮像|センサ", re.IGNORECASE)
+_OBJECT = re.compile(r"\b(object|obj|objekt|objet)\b|物体|物面", re.IGNORECASE)
 
 
 def read(text: str, file: str, *, catalogs: Sequence[Path] = (), strict: bool = False) -> tuple[Lens, ImportReport]:
@@ -58,8 +63,10 @@ def build(table: Table, report: Draft, *, catalogs: Sequence[Path] = ()) -> Lens
     names = tuple(word for word in re.split(r"[\s,;]+", metadata.get("catalogs", ("", place))[0]) if word)
     report_missing_catalogs(names, catalogs, report)
     surfaces = [table_surface.build(row, unit, names, catalogs, report) for row in rows]
+    _refuse_all_air(table, surfaces)
     surfaces = _with_object(surfaces, rows, metadata, unit)
-    _check_image(rows, surfaces)
+    surfaces += _missing_image(rows, surfaces, report)
+    _warn_of_zero_radii(rows, surfaces, report)
     stop = _stop(rows, metadata, len(surfaces), place)
     wavelengths, weights, primary = table_system.wavelengths(metadata, place, report)
     lens = Lens(
@@ -70,7 +77,7 @@ def build(table: Table, report: Draft, *, catalogs: Sequence[Path] = ()) -> Lens
         wavelengths=wavelengths,
         wavelength_weights=weights,
         primary_wavelength=primary,
-        name=metadata.get("title", ("", place))[0],
+        name=texts.read(metadata.get("title", ("", place))[0]),
         notes=tuple(table.notes),
         catalogs=names,
         ray_aiming=table_system.ray_aiming(metadata),
@@ -100,8 +107,10 @@ def _numbered(table: Table) -> list[Row]:
         )
     first = table.rows[0]
     label = first.cells.get("label", "")
-    start = 0 if _OBJECT.search(_words(first)) or (is_number(label) and float(label) == 0) else 1
-    rows = [Row(row.place._replace(surface=k), row.cells) for k, row in enumerate(table.rows, start)]
+    start = (
+        0 if _OBJECT.search(_words(first)) or (is_number(label) and number(label, "surface", first.place) == 0) else 1
+    )
+    rows = cleaned([Row(row.place._replace(surface=k), row.cells) for k, row in enumerate(table.rows, start)])
     table_surface.refuse_unsupported(rows)
     return rows
 
@@ -111,30 +120,70 @@ def _with_object(
 ) -> list[Surface]:
     """The surfaces with the object before them, at the distance of its row or of the header."""
     has_row = rows[0].place.surface == 0
+    empty = has_row and rows[0].cells.get("thickness", "-").lower() in ("-", "nan", "none")
     if "object distance" not in metadata:
-        return surfaces if has_row else [Surface(thickness=_scalar(float("inf"))), *surfaces]
+        infinite = _scalar(float("inf"))
+        if has_row:
+            return [dataclasses.replace(surfaces[0], thickness=infinite), *surfaces[1:]] if empty else surfaces
+        return [Surface(thickness=infinite), *surfaces]
     value, place = metadata["object distance"]
     infinite = is_infinite(value) and not value.startswith("-")
     distance = float("inf") if infinite else number(value.removesuffix("mm").strip(), "object distance", place) * unit
     if not has_row:
         return [Surface(thickness=_scalar(distance)), *surfaces]
-    if "thickness" in rows[0].cells and float(surfaces[0].thickness) != distance:
+    if not empty and float(surfaces[0].thickness) != distance:
         raise LensFileError(f"object distance {value}, but the row of the object says otherwise", place)
-    return surfaces
+    return [dataclasses.replace(surfaces[0], thickness=_scalar(distance)), *surfaces[1:]]
 
 
-def _check_image(rows: list[Row], surfaces: list[Surface]) -> None:
-    image = rows[-1]
-    if not _IMAGE.search(_words(image)) and surfaces[-1].thickness != 0:
-        message = "the last row has a thickness and is not called image: the image is missing; add a row 'Image'"
-        raise LensFileError(message, image.place)
+def _refuse_all_air(table: Table, surfaces: list[Surface]) -> None:
+    """A table that names no medium would bend no ray: its column was lost, or its heading not understood."""
+    told = any(column == "glass" or column.startswith("index ") for column in table.columns if column)
+    curved = any(surface.curvature is not None for surface in surfaces)
+    if curved and not told and all(surface.glass is AIR for surface in surfaces):
+        message = "no column names a medium, and every surface would stand in air"
+        raise LensFileError(f"{message}; add a column 'glass', or 'nd' and 'Vd'", table.place)
+
+
+def _missing_image(rows: list[Row], surfaces: list[Surface], report: Draft) -> list[Surface]:
+    """The image, if the table ends with the last lens surface and its distance from it."""
+    last = rows[-1]
     for row in rows[:-1]:
         if _IMAGE.search(row.cells.get("type", "")):
             raise LensFileError("rows after the image; expected the image in the last row", row.place)
         if row.place.surface > 0 and "thickness" not in row.cells:
             raise LensFileError("no thickness; expected a number (0 for surfaces in contact)", row.place)
     if rows[0].place.surface == 0 and len(rows) < 3:
-        raise LensFileError("only object and image; expected a surface between them", image.place)
+        raise LensFileError("only object and image; expected a surface between them", last.place)
+    if _IMAGE.search(_words(last)):
+        return []
+    if surfaces[-1].thickness != 0:
+        message = f"no row of the image: added {float(surfaces[-1].thickness):g} mm behind the last surface"
+        report.warn(message, last.place)
+        return [Surface(thickness=_scalar(0.0))]
+    label = last.cells.get("label", "")
+    ends_glass = len(surfaces) > 1 and surfaces[-2].glass.formula not in ("mirror",) and surfaces[-2].glass is not AIR
+    if surfaces[-1].curvature is not None or ends_glass or surfaces[-1].glass is not AIR:
+        message = "the last row is a surface of the lens without a distance to the image"
+        raise LensFileError(f"{message}; fill in its thickness, or add a row 'Image'", last.place)
+    if label and not re.fullmatch(r"[^\d=:]{0,12}\d+\W*", label):
+        raise LensFileError(f"the last row is called {shown(label)}; call it 'Image' if it is the image", last.place)
+    return []
+
+
+def _warn_of_zero_radii(rows: list[Row], surfaces: list[Surface], report: Draft) -> None:
+    """Radius 0 is how programs and people write a plane, and how a lost number looks."""
+    found = [
+        row
+        for row in rows
+        if is_number(row.cells.get("radius", "")) and number(row.cells["radius"], "radius", row.place) == 0
+    ]
+    bends = [k for k in range(1, len(surfaces)) if surfaces[k].glass is not surfaces[k - 1].glass]
+    found = [row for row in found if row.place.surface in bends]
+    if found:
+        listed = ", ".join(str(row.place.surface) for row in found)
+        message = f"radius 0 of surface {listed} is taken as a plane; write inf if it is one"
+        report.warn(message, found[0].place._replace(surface=None))
 
 
 def _stop(rows: list[Row], metadata: table_system.Metadata, count: int, table: Place) -> int:

@@ -11,18 +11,20 @@ from raytrace.formats.media import listed_glass
 from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, Place, UnsupportedSurface, is_infinite, is_number, number, shown
 from raytrace.formats.table_columns import order
+from raytrace.formats.table_media import figures as figures_of
+from raytrace.formats.table_media import medium
 from raytrace.formats.table_text import Row
-from raytrace.glass import AIR, MIRROR, Glass, constant, mil_glass, model_glass
-from raytrace.glass import nd as index_at_d
+from raytrace.glass import AIR, LINES, MIRROR, Glass, constant, mil_glass, model_glass, refractive_index
 from raytrace.surface import Aperture, Surface
 
+_AIR = ("", "air", "-", "none", "nan", "vacuum", "luft", "空気", "空气")
 _MIRROR = re.compile(r"\b(mirror|reflect|reflecting|refl)\b", re.IGNORECASE)
 
 #: What a type may be called. Any other word is a shape that is not modelled.
 _TYPE = re.compile(
     r"standard|spher(e|ical)|plan(e|o)?|flat|conic(oid)?|aspher(e|ic|ical)|even|evenasph|lens|surface|s"
     r"|stop|sto|aperture|diaphragm|iris|image|ima|img|sensor|detector|object|obj"
-    r"|mirror|refl|reflect(ing)?|refract(ing)?|dummy"
+    r"|mirror|refl|reflect(ing)?|refr|refract(ing)?|dummy|planar"
 )
 _UNSUPPORTED = re.compile(
     r"coord|toroid|toric|cylind|grating|biconic|anamorph|paraxial|zernike|free.?form|odd.?asph|fresnel|binary|\bgrin\b"
@@ -60,12 +62,10 @@ def build(row: Row, unit: float, catalogs: tuple[str, ...], user: Sequence[Path]
 
 
 def _cell(row: Row, column: str) -> float | None:
-    """The number of a cell, None if it is empty; a decimal comma is taken where it can be nothing else."""
+    """The number of a cell, None if it is empty."""
     text = row.cells.get(column)
     if text is None or text.lower() in ("-", "nan", "none"):
         return None
-    if re.fullmatch(r"[+-]?\d*,\d+([eE][+-]?\d+)?", text):
-        text = text.replace(",", ".")
     return number(text, column, row.place)
 
 
@@ -112,9 +112,12 @@ def _semi_diameter(row: Row, unit: float) -> float | None:
 
 def _glass(row: Row, catalogs: tuple[str, ...], user: Sequence[Path], report: Draft) -> Glass:
     text, place = row.cells.get("glass", ""), row.place
-    if text.lower() in ("", "air", "-", "none", "nan", "vacuum"):
-        mirror = _MIRROR.search(row.cells.get("type", ""))
-        return MIRROR if mirror else _by_figures("", _figures_of(row), place, report) if "nd" in row.cells else AIR
+    given = figures_of(row.cells)
+    if text.lower() in _AIR or (given and text.lower() == "unknown"):
+        found = MIRROR if _MIRROR.search(row.cells.get("type", "")) else medium(row.cells, place, report)
+        if text and text.lower() in _AIR[1:] and text != "-" and found not in (AIR, MIRROR):
+            raise LensFileError(f"the medium is {shown(text)}, but its figures are {', '.join(given.values())}", place)
+        return found
     if text.lower() in ("mirror", "refl", "reflect"):
         return MIRROR
     name, equals, figures = text.partition("=")
@@ -126,16 +129,12 @@ def _glass(row: Row, catalogs: tuple[str, ...], user: Sequence[Path], report: Dr
     if equals or all(is_number(part.strip()) for part in figures.split("/")):
         return _by_figures(name, figures, place, report)
     glass = listed_glass(text, catalogs=catalogs, user=user, place=place, report=report)
-    stated = _cell(row, "nd")
-    if stated is not None and abs(float(index_at_d(glass)) - stated) > 2e-3:
-        message = f"index {stated:g} stated for {text}, whose nd is {float(index_at_d(glass)):.5f}; the catalog is used"
-        report.warn(message, place)
+    for name, cell in given.items():
+        kind, _, line = name.partition(" ")
+        listed = float(refractive_index(glass, _scalar(LINES[line]))) if kind == "index" else 0.0
+        if kind == "index" and abs(listed - number(cell, name, place)) > 2e-3:
+            report.warn(f"index {cell} stated for {text}, whose n{line} is {listed:.5f}; the catalog is used", place)
     return glass
-
-
-def _figures_of(row: Row) -> str:
-    """The columns nd, Vd, ΔPgF of a row as nd/Vd/ΔPgF."""
-    return "/".join(row.cells[column] for column in ("nd", "vd", "dpgf") if column in row.cells)
 
 
 def _by_figures(name: str, figures: str, place: Place, report: Draft) -> Glass:

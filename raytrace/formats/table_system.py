@@ -2,6 +2,7 @@
 
 # title: Double Gauss            # note: free text; so is a '#' line that is not one of these
 # units: mm                      mm, cm, in, m; of every length in the table and the header
+# ignore: weight, price          columns to leave out
 # object distance: inf           if the table has no row of the object
 # stop: 6                        if no row is marked as the stop
 # aperture: EPD 33.33            or: F/3 · working F/3 · NA 0.1 · cone angle 5 · stop 10.2, or a name of
@@ -34,6 +35,7 @@ KEYS = {
     "title": "once",
     "note": "repeated",
     "units": "once",
+    "ignore": "once",
     "object distance": "once",
     "stop": "once",
     "aperture": "once",

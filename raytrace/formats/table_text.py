@@ -4,10 +4,12 @@ import csv
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
-from raytrace.formats.report import IGNORED, READ, UNKNOWN, Draft
+from raytrace.formats import texts
+from raytrace.formats.report import READ, Draft
 from raytrace.formats.source import MAX_SURFACES, LensFileError, Place, is_number, shown
-from raytrace.formats.table_columns import is_header, meaning, order
+from raytrace.formats.table_columns import UNREAD, columns, is_header, squeezed
 from raytrace.formats.table_system import KEYS, key_of
 
 #: Lines before the headings beyond which the file is no table.
@@ -30,60 +32,65 @@ class Table:
     metadata: dict[str, tuple[str, Place]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     rows: list[Row] = field(default_factory=list)
+    headings: tuple[str, ...] = ()
+    columns: tuple[str | None, ...] = ()
 
 
 def parse(text: str, file: str, report: Draft) -> Table:
-    """Take a text apart. Separators are tabs, semicolons, commas or aligned blanks, as the headings show."""
+    """Take a text apart. Separators are tabs, semicolons, commas, bars or aligned blanks, as the headings show."""
     table = Table(Place(file))
-    split = None
-    for line_number, line in enumerate(text.split("\n"), 1):
+    lines = text.split("\n")
+    split, skipped = None, 0
+    for line_number, line in enumerate(lines, 1):
         place = Place(file, line_number)
-        if not line.strip(" \t,;"):
+        if skipped or not line.strip(" \t,;|:+-="):
+            skipped = 0
             continue
-        if split is None:
-            split = _header_splitter(line, place)
-            if split is not None:
-                heading = line.replace("#", " ", 1) if line.lstrip().startswith("#") else line
-                columns = header(split(heading, place), place, report)
-            elif not metadata_line(table, line, place, report):
-                _preamble(table, line, place, report)
+        following = lines[line_number : line_number + 1]
+        if split is None and not _is_metadata(line) and (found := _headings(line, following, place)):
+            split, headings, skipped = found
+            header(table, headings, place, report)
         elif not metadata_line(table, line, place, report):
-            add_row(table, columns, split(line, place), place)
+            if split is None:
+                _preamble(table, line, place, report)
+            else:
+                add_row(table, split(line, place), place)
     if split is None:
         raise LensFileError("no line of headings; expected one naming thickness and curvature or radius", table.place)
     return table
 
 
-def header(cells: Sequence[str], place: Place, report: Draft) -> list[str | None]:
-    """The meaning of each column; every column is reported."""
-    columns: list[str | None] = []
-    for cell in cells:
-        found = meaning(cell, place) if len(cell) < 60 else None
-        term = order(found) if found else None
-        if found in columns and found is not None:
-            report.met(f"column {cell[:40]}", IGNORED, place, f"a second column of the {found}")
-            report.warn(f"a second column of the {found} ({shown(cell)}) is left out", place)
-            found = None
-        elif found is None:
-            if cell:
-                report.met(f"column {cell[:40]}", UNKNOWN, place)
-        elif term is not None and not 2 <= term <= 60:
-            raise LensFileError(f"column {shown(cell)}: expected a coefficient of r² to r^60", place)
-        else:
-            report.met(f"column {cell[:40] or '(unnamed)'}", READ, place)
-        columns.append(found)
-    return columns
+def header(table: Table, cells: Sequence[str], place: Place, report: Draft) -> None:
+    """Take a line of headings; every column is reported."""
+    units, ignored = (table.metadata.get(key, ("", place))[0] for key in ("units", "ignore"))
+    ignored = [squeezed(part).casefold() for part in re.split(r"[,;]", ignored)]
+    table.headings = tuple(cells)
+    table.columns = tuple(columns(cells, units, ignored, place, report))
 
 
-def add_row(table: Table, columns: Sequence[str | None], cells: Sequence[str], place: Place) -> None:
+def add_row(table: Table, cells: Sequence[str], place: Place) -> None:
     """Add the surface of a line; its number is its place among the rows, from 1 unless it is the object."""
     if len(table.rows) >= MAX_SURFACES:
         raise LensFileError(f"more than {MAX_SURFACES} surfaces; no sequential lens has so many", place)
-    extra = [cell for cell in cells[len(columns) :] if cell]
+    count = len(table.columns)
+    extra = [cell.strip() for cell in cells[count:] if cell.strip()]
     if extra:
-        raise LensFileError(f"{len(cells)} cells under {len(columns)} headings; {shown(extra[0])} has no column", place)
-    named = {column: cell for column, cell in zip(columns, cells, strict=False) if column and cell}
+        raise LensFileError(f"{len(cells)} cells under {count} headings; {shown(extra[0])} has no column", place)
+    named: dict[str, str] = {}
+    for heading, column, cell in zip(table.headings, table.columns, cells, strict=False):
+        cell = texts.read(cell) if column == "comment" else " ".join(cell.split())
+        if column == UNREAD and is_number(cell.replace(",", ".").strip("*")):
+            message = f"column {shown(heading)} holds numbers ({cell}), but what they are is not known"
+            fix = f"name it, as radius, thickness, nd, Vd, conic, A4, or write the header line '# ignore: {heading}'"
+            raise LensFileError(f"{message}; {fix}", place)
+        if column and column != UNREAD and cell:
+            named[column] = f"{named[column]} {cell}" if column in named else cell
     table.rows.append(Row(place, named))
+
+
+def _is_metadata(line: str) -> bool:
+    """True for a line '# key: value' of a key that is known; other lines with '#' may be headings."""
+    return line.strip().startswith(("#", '"#')) and key_of(line.strip('"# \t').partition(":")[0])[0] is not None
 
 
 def metadata_line(table: Table, line: str, place: Place, report: Draft) -> bool:
@@ -113,7 +120,7 @@ def add_metadata(table: Table, name: str, value: str, place: Place, report: Draf
         report.met("note", READ, place)
     elif KEYS[key] == "repeated":
         if value:
-            table.notes.append(value)
+            table.notes.append(texts.read(value))
         report.met(key, READ, place)
     else:
         if key in table.metadata:
@@ -130,30 +137,45 @@ def _preamble(table: Table, line: str, place: Place, report: Draft) -> None:
     report.met("text before the table", READ, place)
 
 
-def _header_splitter(line: str, place: Place):
-    """The function that splits lines like this one into cells, or None if this is no line of headings."""
+def _headings(line: str, following: list[str], place: Place):
+    """(what splits lines like these into cells, the headings, lines they take beyond the first), or None.
+
+    A second line of words or units, as "curvature" and "(mm)" under "Radius of", belongs to the headings.
+    """
     commented = line.lstrip().startswith("#")
-    if commented:
-        if key_of(line.strip("# \t").partition(":")[0])[0]:
-            return None
-        line = line.replace("#", " ", 1)
+    line = line.replace("#", " ", 1) if commented else line
     line = line.expandtabs() if "\t" not in line.strip() else line
-    for separator in "\t;,":
-        if separator in line and is_header(line.replace('"', "").split(separator), place, known=0.5 + 0.5 * commented):
-            return lambda text, where: _cells(text, separator, where)
+    for separator in "\t;,|":
+        if separator not in line:
+            continue
+        cells = _plain_cells(line, separator)
+        below = [
+            _plain_cells(text, separator) for text in following if separator in text and not re.search(r"\d", text)
+        ]
+        joined = [" ".join(pair).strip() for pair in zip(cells, *below, strict=False)] if below else []
+        if len(joined) == len(cells) and is_header(joined, known=1.0) and any(below[0]):
+            return partial(_cells, separator), joined, 1
+        if is_header(cells, known=0.5 + 0.5 * commented):
+            return partial(_cells, separator), _cells(separator, line, place), 0
     for gap in (r"\s{2,}", r"\s+"):
         spans = _spans(line, gap)
-        if is_header([line[start:end] for start, end in spans], place, known=1.0):
-            return lambda text, where, gap=gap, spans=spans: _aligned(text, gap, spans, where)
+        if is_header([line[start:end] for start, end in spans], known=1.0):
+            headings = [line[start:end] for start, end in spans]
+            return partial(_aligned, gap, spans), headings, 0
     return None
 
 
-def _cells(line: str, separator: str, place: Place) -> list[str]:
+def _plain_cells(line: str, separator: str) -> list[str]:
+    line = line.strip().strip("|") if separator == "|" else line
+    return [cell.strip() for cell in line.replace('"', "").split(separator)]
+
+
+def _cells(separator: str, line: str, place: Place) -> list[str]:
+    line = line.strip().strip("|") if separator == "|" else line
     try:
-        cells = next(csv.reader([line], delimiter=separator, strict=True))
+        return next(csv.reader([line], delimiter=separator, strict=True))
     except (csv.Error, StopIteration) as error:
         raise LensFileError(f"the quotes of this line do not match ({error})", place) from error
-    return [" ".join(cell.split()) for cell in cells]
 
 
 def _spans(line: str, gap: str) -> list[tuple[int, int]]:
@@ -167,7 +189,7 @@ def _spans(line: str, gap: str) -> list[tuple[int, int]]:
     return spans
 
 
-def _aligned(line: str, gap: str, spans: list[tuple[int, int]], place: Place) -> list[str]:
+def _aligned(gap: str, spans: list[tuple[int, int]], line: str, place: Place) -> list[str]:
     """Cells of a line aligned under headings: in order if each column has one, else by the heading they stand under."""
     line = line.expandtabs()
     words = _spans(line, gap)
