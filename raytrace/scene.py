@@ -66,6 +66,20 @@ class Kernels:
             return self.centroid, self.covariance
         return self.ray_centroid, self.ray_covariance
 
+    @property
+    def dark(self) -> Tensor:
+        """Which kernels no traced ray reaches, (D, F, W): their moments are 0 and mean nothing."""
+        return is_dark(self.kernel, *self.ray_moments, self.rays, of_waves=self.ray_centroid is not None)
+
+
+def is_dark(kernel: Tensor, centroid: Tensor, covariance: Tensor, rays: int, *, of_waves: bool) -> Tensor:
+    """Which kernels (..., rows, columns) no ray reaches, by their light and the moments of their rays, all exactly 0.
+
+    Light beside the window is not lost: it has a place. of_waves: whose reference, the chief ray, has one in any case.
+    """
+    empty = (kernel == 0).all(-1).all(-1) & (covariance == 0).all(0)
+    return empty & (of_waves | (centroid == 0).all(0)) & (rays > 0)
+
 
 def scene(lens: Lens, fields: Tensor, object_distances: Tensor, wavelengths: Tensor, memo: Memo | None = None) -> Scene:
     """A scene; object_distances: (D,) mm, all finite or all inf; fields: (2, F); wavelengths: (W,) µm."""

@@ -311,13 +311,38 @@ def test_one_empty_kernel_of_a_batch_is_zero_with_derivative_zero(model):
         found = psf(lens, model, fields=far_out, object_distances=number([1e4]), grid=grid(0.02, 5), tol=0.1)
     assert float(found.energy[0, 0].detach()) > 0
     assert float(found.energy[0, 1].detach()) == 0
-    for tensor in (found.kernel, found.energy, found.centroid, found.covariance, found.error):
+    for tensor in (found.kernel, found.energy, found.error, found.centroid[..., 0], found.covariance[..., 0]):
         assert bool(torch.isfinite(tensor).all())
     (empty,) = torch.autograd.grad(found.kernel[0, 1].square().sum(), curvature, retain_graph=True)
     assert float(empty) == 0
     (whole,) = torch.autograd.grad(found.kernel.square().sum(), curvature)
     assert math.isfinite(float(whole))
     assert float(whole) != 0
+
+
+@pytest.mark.parametrize(
+    ("model", "work"),
+    [("gaussian", {"order": 3}), ("drt", {"order": 0}), ("drt", {"rays": 200}), ("wave", {"order": -2})],
+)
+def test_a_kernel_without_light_has_no_place_and_no_width(model, work):
+    """nan, not 0: a width of 0 is what a merit likes best; the width of its neighbour keeps its derivative."""
+    lens = double_gauss()
+    surfaces = list(lens.surfaces)
+    curvature = surfaces[1].curvature.clone().requires_grad_()
+    surfaces[1] = dataclasses.replace(surfaces[1], curvature=curvature)
+    lens = dataclasses.replace(lens, surfaces=tuple(surfaces))
+    work = {**work, "object_distances": number([25e3])}
+    both, one = (psf(lens, model, fields=fields, **work) for fields in (field(0, 85), field(0)))
+    for name in ("centroid", "covariance", "ray_centroid", "ray_covariance"):
+        assert getattr(both, name)[:, 0, 1].isnan().all()
+        assert torch.allclose(getattr(both, name)[:, 0, 0], getattr(one, name)[:, 0, 0], rtol=1e-6, atol=1e-12)
+    assert both.energy[0, 1] == 0
+    slope = torch.autograd.grad(both.ray_covariance.nansum(), curvature)[0]
+    assert slope.item() == pytest.approx(torch.autograd.grad(one.ray_covariance.sum(), curvature)[0].item(), rel=1e-6)
+    with pytest.raises(EmptyPsf, match=r"1 of 2 PSFs, those of index \(0, 1\)"):
+        psf(lens, model, fields=field(0, 85), empty="error", **work)
+    with pytest.raises(EmptyPsf, match="all 144 rays lost: 86 missed surface 1, 58 totally reflected at surface 2"):
+        psf(lens, model, fields=field(85), **work)
 
 
 # Derivatives ----------------------------------------------------------------------------------------------------------

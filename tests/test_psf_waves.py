@@ -111,7 +111,8 @@ def test_one_empty_kernel_of_a_batch_is_zero_with_derivative_zero():
                 center="chief")  # fmt: skip
     assert float(found.energy[0, 0].detach()) > 0.5
     assert float(found.energy[0, 1].detach()) == 0
-    for tensor in (found.kernel, found.energy, found.centroid, found.covariance, found.error, found.residual):
+    moments = (t[..., 0] for t in (found.centroid, found.covariance, found.ray_centroid, found.ray_covariance))
+    for tensor in (found.kernel, found.energy, found.error, found.residual, *moments):
         assert bool(torch.isfinite(tensor).all())
     (empty,) = torch.autograd.grad(found.kernel[0, 1].square().sum(), curvature, retain_graph=True)
     assert float(empty) == 0

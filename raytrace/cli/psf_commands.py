@@ -1,19 +1,21 @@
 """`raytrace psf` and `raytrace compare`."""
 
 import argparse
-import math
 import warnings
 
 import numpy as np
+from torch import Tensor
 
 from raytrace.analysis import Abilities, Comparison, abilities, common_focus
 from raytrace.analysis import compare as compare_models
 from raytrace.cli.door import field_points, number, numbers, open_lens, primary, print_json, say
+from raytrace.cli.spots import cell, warn_of_losses
 from raytrace.files import write_atomically
 from raytrace.grid import grid
-from raytrace.lens import FIELD_UNITS
+from raytrace.lens import FIELD_UNITS, Lens, with_object_distance
 from raytrace.psf import NotConverged, Psf
 from raytrace.psf import psf as compute
+from raytrace.pupil import gauss_rings
 from raytrace.shards import Share, processes
 
 
@@ -45,6 +47,7 @@ def _psf(arguments: argparse.Namespace, share: Share) -> None:
     )
     if share.rank:
         return
+    _warn(lens, fields, distances, found)
     labels = [f"{y:g}" if x == 0 else f"{x:g},{y:g}" for x, y in fields.T.tolist()]
     if arguments.output:
         write_atomically(arguments.output, lambda file: save(found, distances, fields, file))
@@ -61,6 +64,16 @@ def _psf(arguments: argparse.Namespace, share: Share) -> None:
         _print(found, distances, labels, FIELD_UNITS[lens.fields.kind])
     for path in filter(None, (arguments.plot, arguments.output)):
         say(f"written: {path}")
+
+
+def _warn(lens: Lens, fields: Tensor, distances: list[float], found: Psf) -> None:
+    """Say of every field that no ray of a wavelength brings to the sensor where they end."""
+    points = gauss_rings(6)[0]
+    for d, distance in enumerate(distances):
+        dark = found.ray_centroid[0, d].isnan()
+        at = f"object at {distance:g} mm, " if len(distances) > 1 else ""
+        trial = with_object_distance(lens, distance)
+        warn_of_losses(trial, fields, points, dark[:, None].expand(-1, len(lens.wavelengths)), at=at)
 
 
 def results(found: Psf, distances: list[float], fields) -> list[dict]:
@@ -113,11 +126,11 @@ def _print(found: Psf, distances: list[float], labels: list[str], unit: str) -> 
     print(f"{'mm':>12} {unit:>9} {'mm':>12} {'mm':>12} {'µm':>9} {'µm':>9} {'window':>8} {'est.':>9} {'':>7}")
     for d, distance in enumerate(distances):
         for f, label in enumerate(labels):
-            x, y = (value + 0.0 for value in found.centroid[:, d, f].tolist())
-            xx, yy = (1000 * math.sqrt(max(0.0, value)) for value in found.covariance[::2, d, f].tolist())
+            places = [cell(value, ">12.6f") for value in found.centroid[:, d, f].tolist()]
+            widths = (1000 * found.covariance[::2, d, f].clamp_min(0.0).sqrt()).tolist()
             print(
-                f"{distance:>12g} {label:>9} {x:>12.6f} {y:>12.6f} {xx:>9.4f} {yy:>9.4f} "
-                f"{float(found.energy[d, f]):>8.4f} {float(found.error[d, f]):>9.1e} {found.rays:>7}"
+                " ".join([f"{distance:>12g} {label:>9}", *places, *(cell(value, ">9.4f") for value in widths)]),
+                f"{float(found.energy[d, f]):>8.4f} {cell(float(found.error[d, f]), '>9.1e')} {found.rays:>7}",
             )
 
 

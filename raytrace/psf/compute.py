@@ -8,7 +8,8 @@ from torch.utils import _pytree as pytree
 
 from raytrace.grid import Grid
 from raytrace.grid import grid as make_grid
-from raytrace.lens import Lens
+from raytrace.lens import Lens, with_object_distance
+from raytrace.losses import beam_hint, losses
 from raytrace.numerics import safe_divide
 from raytrace.psf import gaussian
 from raytrace.psf.ladder import (
@@ -21,7 +22,9 @@ from raytrace.psf.ladder import (
     polychromatic,
     with_options,
     with_shares,
+    without_dark,
 )
+from raytrace.pupil import gauss_rings
 from raytrace.reuse import Memo
 from raytrace.scene import EmptyPsf, Scene, scene, trace_scene
 from raytrace.shards import Share
@@ -46,6 +49,7 @@ def psf(
     zernike: Tensor | None = None,
     memo: Memo | None = None,
     share: Share | None = None,
+    empty: str = "nan",
 ) -> Psf:
     """PSFs of a lens, differentiable in every number of the lens, its sensor distance and the grid.
 
@@ -65,8 +69,9 @@ def psf(
     memo: rays of earlier calls, which are not traced again where nothing before them has changed.
     share: of this process (`shards.share()`), if all processes call psf alike to compute the kernels together; each
     gets all of them, equal to those of one process to rounding, without gradient.
-    Raises ValueError for arguments that make no sense, EmptyPsf if no ray of the whole batch reaches the sensor;
-    a single empty kernel of a batch is 0 with gradient 0. Warns NotConverged.
+    empty: what a PSF of a batch is that no ray reaches: "nan", its kernel 0 and its moments nan, all with gradient 0,
+    or "error". Raises ValueError for arguments that make no sense, EmptyPsf if no ray at all reaches the sensor. Warns
+    NotConverged.
     """
     center = default_center(fields) if center is None else center
     _check(model, center, normalise, tol=tol, rays=rays, order=order)
@@ -101,10 +106,18 @@ def psf(
         found = compute(distances)
     # Only traced light can be lost; light beside the window is not.
     if found.rays and not bool((found.energy > 0).any()) and not bool((found.ray_covariance != 0).any()):
-        raise EmptyPsf("no ray reaches the sensor: the lens is blocked or the field is outside its reach")
+        raise EmptyPsf(f"no ray reaches the sensor: {_lost(lens, fields, distances, wavelengths)}")
     if normalise == "window":
         found = dataclasses.replace(found, kernel=_of_its_window(found.kernel), normalised="window")
-    return dataclasses.replace(found, wavelengths=wavelengths, wavelength_weights=shares)
+    return dataclasses.replace(without_dark(found, empty), wavelengths=wavelengths, wavelength_weights=shares)
+
+
+def _lost(lens: Lens, fields: Tensor, distances: Tensor, wavelengths: Tensor) -> str:
+    """Where the rays of the first field and wavelength end, and what to do about a beam too wide."""
+    lens = with_object_distance(lens, distances[0].detach())
+    points = gauss_rings(6, dtype=fields.dtype, device=fields.device)[0]
+    found = losses(lens, points, fields=fields[:, :1].detach(), wavelengths=wavelengths[:1].detach())
+    return "; ".join(filter(None, (found.words(0, 0), beam_hint(lens))))
 
 
 def default_center(fields: Tensor | None) -> str:

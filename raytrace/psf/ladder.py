@@ -15,8 +15,9 @@ from raytrace.numerics import safe_divide, safe_sqrt
 from raytrace.paraxial import first_order
 from raytrace.psf import diffraction, fourier, gaussian, paraxial, raymap, rays
 from raytrace.psf.sharing import shared
-from raytrace.scene import Kernels, Scene, varies
+from raytrace.scene import EmptyPsf, Kernels, Scene, is_dark, varies
 from raytrace.shards import Share
+from raytrace.spot import where_lit
 from raytrace.value import value
 
 
@@ -36,7 +37,7 @@ class Psf:
         of σ); nan where it was not estimated. How far it can be believed is measured in docs/psf_error.md.
     centroid: (2, D, F) mm; covariance: (3, D, F) xx, xy, yy in mm², of the distribution before pixel integration:
         of all its light; of "fourier" and "wave" of the light inside the window, because behind a hard edge the second
-        moment grows with the window without limit. 0 where there is no light at all.
+        moment grows with the window without limit. nan with gradient 0 where no ray reaches the sensor.
     ray_centroid, ray_covariance: the same of geometric optics, whatever the window: of "wave" those of the rays, of
         "fourier" of its geometric limit, of the other models again centroid and covariance.
     residual: (D, F) how wrong the model itself is, where it can tell, or None.
@@ -304,7 +305,7 @@ def polychromatic(found: Kernels, weights: Tensor | None, model: str) -> Psf:
         share = weights / weights.sum()
         kernel = (share[:, None, None] * kernel).sum(-3)
         residual = None if residual is None else (share * residual).sum(-1)
-        rays = _summed_moments(*rays, share)
+        rays = _summed_moments(*rays, torch.where(found.dark, 0.0, share))
         # What lies inside a window counts by its light there.
         own = rays if is_geometric else _summed_moments(*own, share * energy)
         energy = kernel.sum((-2, -1))
@@ -321,6 +322,21 @@ def polychromatic(found: Kernels, weights: Tensor | None, model: str) -> Psf:
         residual=residual,
         model=model,
         rays=found.rays,
+    )
+
+
+def without_dark(found: Psf, empty: str = "nan") -> Psf:
+    """The PSFs with moments that are nan where no ray reaches the sensor; empty: as for `psf`."""
+    rays = found.ray_centroid, found.ray_covariance
+    dark = is_dark(found.kernel, *rays, found.rays, of_waves=found.model in ("fourier", "wave"))
+    if empty == "error" and bool(dark.any()):
+        places = ", ".join(str(tuple(place)) for place in torch.nonzero(dark)[:3].tolist())
+        raise EmptyPsf(
+            f"no ray reaches the sensor in {int(dark.sum())} of {dark.numel()} PSFs, those of index {places}"
+        )
+    centroid, covariance, *rays = where_lit(~dark, found.centroid, found.covariance, *rays, empty=empty)
+    return dataclasses.replace(
+        found, centroid=centroid, covariance=covariance, ray_centroid=rays[0], ray_covariance=rays[1]
     )
 
 

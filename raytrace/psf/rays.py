@@ -260,10 +260,11 @@ def _kernels_of_points(scene: Scene, grid: Grid, count: int, sampling: Callable,
     points = torch.where(traced.valid, traced.position[:2], 0.0).expand(2, *scene.shape, -1)
     kernel = splat_smooth(grid, points, energy, width=width) if width else histogram(grid, points, energy)
     light = spot(traced, weights)
+    found = torch.where(light.rays > 0, light.centroid, 0.0)
     part = safe_divide(energy, energy.sum(-1, keepdim=True))
-    x, y = torch.where(energy > 0, points - light.centroid[..., None], 0.0)
+    x, y = torch.where(energy > 0, points - found[..., None], 0.0)
     covariance = torch.stack([(part * a * b).sum(-1) for a, b in ((x, x), (x, y), (y, y))])
-    centroid = light.centroid.expand(2, *scene.shape)
+    centroid = found.expand(2, *scene.shape)
     if share.processes > 1:
         kernel, (centroid, covariance) = total(kernel), pooled(energy.sum(-1), centroid, covariance)
     kernel = kernel * beam_share(scene)[..., None, None]

@@ -8,7 +8,7 @@ from torch import Tensor
 from raytrace.grid import Grid
 from raytrace.lens import Lens, with_object_distance
 from raytrace.numerics import safe_divide
-from raytrace.psf.ladder import Psf, polychromatic
+from raytrace.psf.ladder import Psf, polychromatic, without_dark
 from raytrace.psf.splat import histogram, splat_smooth
 from raytrace.scene import Kernels, beam_share, scene
 from raytrace.streaming import (
@@ -113,4 +113,4 @@ def _psf(
     wavelengths = torch.stack([s.wavelength for s in shots[: m.count.shape[2]]])
     error = safe_divide((found.kernel - before.kernel).abs().sum((-2, -1)), found.energy)
     found = dataclasses.replace(found, error=error, wavelengths=wavelengths, wavelength_weights=weights)
-    return StreamedPsf(found, (weights * light * m.count / rays).sum(-1))
+    return StreamedPsf(without_dark(found), (weights * light * m.count / rays).sum(-1))
