@@ -1,15 +1,25 @@
 """The forms of the command line: one name, one meaning over all commands; several values; what was meant."""
 
 import argparse
+import io
 import json
+import math
 import re
 from collections import defaultdict
 from pathlib import Path
 
+import numpy as np
+import pandas
 import pytest
+import torch
 
+from raytrace.analysis.arrivals import STATUS, arrivals
 from raytrace.cli import build_parser
+from raytrace.cli.door import find_lens
 from raytrace.cli.options import PICTURES, data_file, did_you_mean, picture_file
+from raytrace.formats import read_lens
+from raytrace.losses import losses
+from raytrace.pupil import hexapolar
 
 #: Options whose form differs between commands, and why.
 DIFFERENT = {
@@ -99,6 +109,74 @@ def test_several_object_distances_are_one_result_each(command):
     names = sorted(path.name for path in Path().glob("*.png"))
     assert names == ["fan_1000.5mm.png", "fan_infinity.png"]
     assert all(f"written: {name}" in err for name in names)
+
+
+def test_the_ray_table_of_a_spot_holds_its_spot(command):
+    """The weighted moments of the rows are the spot; rays that are lost are named, without a place."""
+    words = ("spot", "double_gauss", "--field", "3,13", 0, "--rings", 5)
+    code, out, err = command(*words, "--json", "-o", "rays.csv")
+    assert code == 0, err
+    table = pandas.read_csv("rays.csv")
+    assert [*table][-2:] == ["weight", "status"]
+    assert table.groupby(["field_x", "field_y"]).weight.sum().tolist() == pytest.approx([1, 1])
+    for found in json.loads(out)["results"]:
+        rows = table[(table.field_y == found["field"][1]) & (table.wavelength == found["wavelength"])]
+        assert len(rows) == found["launched"]
+        assert (rows.status == "vignetted").sum() == found["vignetted"]
+        rows = rows[rows.status == "ok"]
+        assert len(rows) == found["rays"]
+        centre = [np.average(rows[name], weights=rows.weight) for name in "xy"]
+        assert centre == pytest.approx(found["centroid"], abs=1e-12)
+        square = (rows.x - centre[0]) ** 2 + (rows.y - centre[1]) ** 2
+        assert math.sqrt(np.average(square, weights=rows.weight)) == pytest.approx(found["rms_radius"], rel=1e-9)
+    for words in (("-o", "rays.npz"), ("--rays", "100", "-o", "rays.csv")):
+        assert command("spot", "double_gauss", *words)[0] == 1
+    assert [path.name for path in Path().iterdir()] == ["rays.csv"]
+
+
+def test_fates_of_a_ray_table_are_those_that_rays_are_counted_by():
+    lens = read_lens(find_lens("cooke_triplet"))
+    field = torch.tensor([[0.0, 0.0], [80.0, 25.0]], dtype=torch.float64)
+    points, weights = hexapolar(4)
+    found, lost = arrivals(lens, points, weights, fields=field), losses(lens, points, fields=field)
+    for name, key in (("vignetted", "vignetted"), ("miss", "missed"), ("tir", "totally_reflected")):
+        counted = (found.status == STATUS.index(name)).sum(-1)
+        assert counted.tolist() == getattr(lost, key).sum(0).tolist(), name
+    assert not (found.status[0] == 0).any()
+    assert torch.equal(found.rays.valid, found.status == 0)
+    shown = found.to_frame()
+    assert not shown[shown.status.isin(["miss", "tir", "unaimed"])].x.notna().any()
+
+
+def test_chief_and_marginal_rays_say_which_they_are(command):
+    words = ("trace", "double_gauss", "--object-distance", 25000, "inf", "--field", "3,4", 10, "--wavelength", 0.5, 0.6)
+    code, out, err = command(*words)
+    assert code == 0, err
+    table = pandas.read_csv(io.StringIO(out))
+    names = ["object_distance", "field_x", "field_y", "wavelength", "pupil_x", "pupil_y"]
+    assert ",".join(table) == ",".join(["ray,surface,x,y,z,l,m,n,opl,status", *names])
+    first = table[table.surface == 1]
+    assert len(first) == first.ray.nunique() == len(first[names].drop_duplicates()) == 2 * 2 * 2 * 4
+    chief = (first.pupil_x == 0) & (first.pupil_y == 0)
+    # From infinity, in air, the direction in front of surface 1 is the field; behind it the ray still leans that way.
+    assert (first[chief & (first.field_x == 0)].l == 0).all()
+    assert (first[chief & (first.field_x == 3)].l > 0).all()
+    rows = json.loads(command(*words, "--json")[1])["results"]
+    assert {row["object_distance"] for row in rows} == {25000, None}
+    one = command("trace", "double_gauss", "--object-distance", "inf", "--field", 10, "--wavelength", 0.5)[1]
+    alone = pandas.read_csv(io.StringIO(one))
+    same = table[(table.object_distance == math.inf) & (table.field_y == 10) & (table.wavelength == 0.5)]
+    assert alone.drop(columns="ray").equals(same.drop(columns="ray").reset_index(drop=True))
+
+
+def test_rays_of_a_table_keep_their_form(command):
+    Path("in.csv").write_text("x,y,z,l,m,n\n0,1,-5,0,0,1\n")
+    code, out, err = command("trace", "singlet", "--rays", "in.csv", "--field", 3)
+    assert code == 0
+    assert out.splitlines()[0] == "ray,surface,x,y,z,l,m,n,opl,status"
+    assert "change nothing" in err
+    Path("in.csv").write_text("x,y,z,l,m,n\n")
+    assert command("trace", "singlet", "--rays", "in.csv")[1] == "ray,surface,x,y,z,l,m,n,opl,status\n"
 
 
 @pytest.mark.parametrize(

@@ -83,6 +83,7 @@ def _spot(parser):
         "--max-bytes", metavar="BYTES", type=memory, help="memory that --rays may take, as 200MB (default 256MB)"
     )
     ray_aiming(parser)
+    output(parser, "table of the rays to write (.csv): field, wavelength, pupil point, x, y, weight, status")
     plot(parser, "the spot diagram")
 
 
@@ -114,7 +115,8 @@ def _trace(parser):
         "by default the chief and marginal rays of every field",
     )
     output(parser, "table to write (.csv); default: standard output")
-    conditions(parser)
+    conditions(parser, several="rays from each")
+    fields(parser)
     ray_aiming(parser)
 
 
@@ -249,10 +251,13 @@ COMMANDS = (
     Command(
         "spot",
         "spot sizes and the spot diagram",
-        "Trace each field and wavelength to the sensor: centroid, RMS and geometric radius about it.",
+        "Trace each field and wavelength to the sensor: centroid, RMS and geometric radius about it. -o writes the "
+        "rays: field_x,field_y,wavelength,pupil_x,pupil_y,x,y,weight,status; x and y are empty for a ray that "
+        "does not reach the sensor. status: ok, vignetted, miss, tir, unaimed.",
         """examples:
   raytrace spot double_gauss --plot spot.png
   raytrace spot lens.zmx --object-distance 25000 --field 0 10 14 --json
+  raytrace spot double_gauss --field 0,10 7,7 --sampling hexapolar --rings 6 -o rays.csv
   raytrace spot double_gauss --field 14 --rays 1e9 --max-bytes 200MB""",
         _spot,
         "spot_commands.spot",
@@ -273,9 +278,11 @@ COMMANDS = (
         "trace rays of a table, surface by surface",
         "Trace rays and write one row per ray and surface: ray,surface,x,y,z,l,m,n,opl,status in each surface's own "
         "frame, direction after the surface, opl the optical path from the given start. status: ok, miss, tir, "
-        "vignetted. A vignetted ray keeps its coordinates; a missed or totally reflected one ends with an empty row.",
+        "vignetted. A vignetted ray keeps its coordinates; a missed or totally reflected one ends with an empty row. "
+        "Chief and marginal rays, at the primary wavelength or those of --wavelength, are named in further columns: "
+        "object_distance,field_x,field_y,wavelength,pupil_x,pupil_y.",
         """examples:
-  raytrace trace double_gauss
+  raytrace trace double_gauss --field 0 14 0,-7
   raytrace trace lens.zmx --rays rays.csv -o traced.csv""",
         _trace,
         "trace_commands.trace",

@@ -110,6 +110,12 @@ def primary(lens: Lens) -> Tensor:
     return lens.wavelengths[lens.primary_wavelength]
 
 
+def refuse_suffix(option: str, path: str | None, known: tuple[str, ...]) -> None:
+    """Raise CommandError for the name of a file, if one is given, with another suffix than the known ones."""
+    if path and Path(path).suffix.lower() not in known:
+        raise CommandError(f"{option} {path}: expected a name that ends in {', '.join(filter(None, known))}")
+
+
 def number(value) -> float | None:
     """A number for JSON; null for what is undefined, infinite or not there."""
     if value is None:

@@ -4,7 +4,7 @@ import json
 import math
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,7 +13,7 @@ import torch
 
 from raytrace.cli.door import CommandError, primary
 from raytrace.launch import launch
-from raytrace.lens import Lens, check_media
+from raytrace.lens import Lens, check_media, with_object_distance
 from raytrace.rays import Rays
 from raytrace.trace import axial_path, media, start, steps
 
@@ -24,11 +24,12 @@ _BATCH = 20_000
 
 @dataclass(frozen=True)
 class Batch:
-    """Rays (3, P) in front of surface 1 with their wavelengths (P,) µm, and the number of the first."""
+    """Rays (3, P) in front of surface 1 with their wavelengths (P,) µm, the number of the first, and names (P,)."""
 
     rays: Rays
     wavelength: torch.Tensor
     first: int
+    names: dict[str, torch.Tensor] = field(default_factory=dict)
 
 
 @dataclass
@@ -115,19 +116,38 @@ def _float(entry: object) -> float:
         return math.nan
 
 
-def chief_and_marginal(lens: Lens, ray_aiming: str | None) -> tuple[list[Batch], int, int]:
-    """Chief, upper, lower and side ray of every field at the primary wavelength; how many, and how many not aimed.
+def chief_and_marginal(
+    lens: Lens,
+    *,
+    object_distances: Sequence[float],
+    fields: torch.Tensor,
+    wavelengths: torch.Tensor,
+    ray_aiming: str | None,
+) -> tuple[list[Batch], int, int]:
+    """Chief, upper, lower and side ray from every distance, field (2, F) and wavelength (W,); how many, and unaimed.
 
     Their path counts from the wavefront of the object point that passes the vertex of surface 1.
     """
     pupil = lens.wavelengths.new_tensor([[0.0, 0.0, 0.0, 1.0], [0.0, 1.0, -1.0, 0.0]])
-    wavelength = lens.wavelengths[lens.primary_wavelength][None]
-    rays = launch(lens, pupil, wavelengths=wavelength, ray_aiming=ray_aiming)
-    found = rays.valid.flatten()
-    position, direction = rays.position.reshape(3, -1)[:, found], rays.direction.reshape(3, -1)[:, found]
-    count = int(found.sum())
-    kept = Rays(position, direction, found[found], rays.opl.flatten()[found])
-    return [Batch(kept, wavelength.expand(count), 0)], count, len(found) - count
+    batches, count, unaimed = [], 0, 0
+    for distance in object_distances:
+        seen = with_object_distance(lens, distance)
+        rays = launch(seen, pupil, fields=fields, wavelengths=wavelengths, ray_aiming=ray_aiming)
+        aimed = rays.valid.flatten()
+        names = {
+            "object_distance": pupil.new_tensor(distance),
+            "field_x": fields[0, :, None, None],
+            "field_y": fields[1, :, None, None],
+            "wavelength": wavelengths[:, None],
+            "pupil_x": pupil[0],
+            "pupil_y": pupil[1],
+        }
+        names = {name: column.expand(rays.shape).flatten()[aimed] for name, column in names.items()}
+        position, direction = rays.position.reshape(3, -1)[:, aimed], rays.direction.reshape(3, -1)[:, aimed]
+        kept = Rays(position, direction, aimed[aimed], rays.opl.flatten()[aimed])
+        batches.append(Batch(kept, names["wavelength"], count, names))
+        count, unaimed = count + int(aimed.sum()), unaimed + int((~aimed).sum())
+    return batches, count, unaimed
 
 
 def traced(lens: Lens, batch: Batch, fates: Fates) -> pandas.DataFrame:
@@ -152,6 +172,8 @@ def traced(lens: Lens, batch: Batch, fates: Fates) -> pandas.DataFrame:
         frame.insert(0, "ray", batch.first + torch.arange(count)[shown].numpy())
         frame.insert(1, "surface", k)
         frame["status"] = status[shown.numpy()]
+        for name, column in batch.names.items():
+            frame[name] = column[shown].numpy()
         frames.append(frame)
         for name, mask in (
             ("miss", crossing.missed),
@@ -170,13 +192,13 @@ def write_json(put: Callable[[str], object], lens: Lens, batches: Iterable[Batch
     separator = "\n"
     for batch in batches:
         rows = traced(lens, batch, fates).to_dict("records")
-        put(separator + ",\n".join(json.dumps(_without_nan(row)) for row in rows))
+        put(separator + ",\n".join(json.dumps(_for_json(row)) for row in rows))
         separator = ",\n"
     put(f'\n], "lost": {json.dumps(fates.counts())}}}\n')
 
 
-def _without_nan(row: dict) -> dict:
-    return {name: None if isinstance(entry, float) and math.isnan(entry) else entry for name, entry in row.items()}
+def _for_json(row: dict) -> dict:
+    return {k: None if isinstance(entry, float) and not math.isfinite(entry) else entry for k, entry in row.items()}
 
 
 def write_csv(
@@ -186,7 +208,12 @@ def write_csv(
 
     progress: called with the number of rays of each batch.
     """
-    put(",".join(OUTPUT) + "\n")
+    header = ",".join(OUTPUT)
     for batch in batches:
+        if header:
+            put(",".join([header, *batch.names]) + "\n")
+            header = ""
         put(traced(lens, batch, fates).to_csv(header=False, index=False))
         progress(len(batch.wavelength))
+    if header:
+        put(header + "\n")

@@ -49,8 +49,9 @@ def _check(arguments: argparse.Namespace) -> None:
             raise CommandError(f"--rays and --{name} exclude each other: both are a number of rays")
     if arguments.sampling in ("hexapolar", "square"):
         raise CommandError(f"--rays takes --sampling sobol (its default) or random, not {arguments.sampling}")
-    if arguments.plot:
-        raise CommandError("--plot needs the rays, and --rays keeps none: leave one out")
+    for option, given in (("--plot", arguments.plot), ("-o", arguments.output)):
+        if given:
+            raise CommandError(f"{option} needs the rays, and --rays keeps none: leave one out")
 
 
 def _document(lens: Lens, fields: Tensor, spots: StreamedSpot) -> dict:

@@ -4,7 +4,7 @@ import argparse
 import sys
 
 from raytrace.cli import ray_table
-from raytrace.cli.door import open_lens, print_json, ray_aiming, say
+from raytrace.cli.door import field_points, open_lens, primary, print_json, ray_aiming, say
 from raytrace.cli.progress import Lines, progress
 from raytrace.files import write_atomically
 
@@ -13,9 +13,17 @@ def trace(arguments: argparse.Namespace) -> None:
     """Rays of a table, or the chief and marginal rays of the fields, surface by surface."""
     lens = open_lens(arguments)
     if arguments.rays is not None:
+        if arguments.object_distance or arguments.field:
+            say("warning: --object-distance and --field change nothing: the rays of a table begin where it says")
         batches, total = ray_table.read(arguments.rays, lens)
     else:
-        batches, total, unaimed = ray_table.chief_and_marginal(lens, ray_aiming(arguments))
+        batches, total, unaimed = ray_table.chief_and_marginal(
+            lens,
+            object_distances=arguments.object_distance or [float(lens.surfaces[0].thickness)],
+            fields=field_points(lens, arguments),
+            wavelengths=lens.wavelengths if arguments.wavelength else primary(lens)[None],
+            ray_aiming=ray_aiming(arguments),
+        )
         if unaimed:
             say(f"warning: {unaimed} rays found no way to their point of the stop and are left out")
     fates = ray_table.Fates()

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from raytrace import plot
-from raytrace.cli.door import CommandError, number, print_json, say
+from raytrace.cli.door import number, print_json, refuse_suffix, say
 from raytrace.cli.progress import progress
 from raytrace.cli.wave_setup import elements, kernels, scene
 from raytrace.design.focusing import Learned, Setting, learn_to_focus
@@ -29,8 +29,7 @@ _SHOWN = (0, 5, 10, 20, 40, 80, 160)  # steps of learning that the figure shows
 
 def psf(arguments: argparse.Namespace) -> None:
     """Kernels over depth × wavelength: print, draw, save."""
-    if arguments.output:
-        _refuse_suffix("-o", arguments.output, (".npz",))
+    refuse_suffix("-o", arguments.output, (".npz",))
     drawn = {draw: path for name, draw in _FIGURES.items() if (path := getattr(arguments, name))}
     parts = elements(arguments)
     seen = scene(arguments, parts)
@@ -79,11 +78,6 @@ def _encircled(arguments: argparse.Namespace, seen: WaveScene, found: WavePsf):
 
 
 _FIGURES = {"plot": _kernels, "heights": _heights, "caustic": _caustic, "encircled": _encircled}
-
-
-def _refuse_suffix(option: str, path: str, known: tuple[str, ...]) -> None:
-    if Path(path).suffix.lower() not in known:
-        raise CommandError(f"{option} {path}: expected a name that ends in {', '.join(known)}")
 
 
 def save(found: WavePsf, element: str, file) -> None:
@@ -167,8 +161,7 @@ def _print(found: WavePsf, arguments: argparse.Namespace) -> None:
 
 def focus(arguments: argparse.Namespace) -> None:
     """A flat plate learns to be a lens: print, draw, save."""
-    if arguments.output:
-        _refuse_suffix("-o", arguments.output, tuple(FORMATS))
+    refuse_suffix("-o", arguments.output, tuple(FORMATS))
     setting = Setting(
         method=arguments.method, samples=arguments.samples, seed=arguments.seed, collimator=arguments.collimator
     )

@@ -1,0 +1,91 @@
+"""Arrivals: where every ray of a spot meets the sensor, from which field, colour and point of the pupil."""
+
+from collections.abc import Callable, Iterable, Sequence
+
+import torch
+from torch import Tensor
+
+from raytrace.analysis.frame import Tabular, axis, masked, numbered
+from raytrace.launch import launch
+from raytrace.lens import Lens
+from raytrace.rays import Rays
+from raytrace.trace import media, steps
+from raytrace.value import value
+
+#: What became of a ray, by its number in `Arrivals.status`.
+STATUS = ("ok", "vignetted", "miss", "tir", "unaimed")
+_OK = STATUS.index("ok")
+
+
+@value
+class Arrivals(Tabular):
+    """Rays (3, F, W, P) on the sensor, every ray of the pupil for every field and wavelength.
+
+    status: (F, W, P), place in STATUS of what befell it first; reached: (F, W, P), whether it has a place on the
+    sensor, as a vignetted ray that goes on may have. weight: (W, P), 1 in all for a field.
+    pupil: (2, P); fields: (2, F); wavelengths: (W,) µm.
+    """
+
+    rays: Rays
+    status: Tensor
+    reached: Tensor
+    weight: Tensor
+    pupil: Tensor
+    fields: Tensor
+    wavelengths: Tensor
+
+    def columns(self) -> dict[str, Tensor]:
+        return {
+            "field_x": axis(self.fields[0], 0, 3),
+            "field_y": axis(self.fields[1], 0, 3),
+            "wavelength": axis(self.wavelengths, 1, 3),
+            "pupil_x": axis(self.pupil[0], 2, 3),
+            "pupil_y": axis(self.pupil[1], 2, 3),
+            "x": masked(self.rays.position[0], self.reached),
+            "y": masked(self.rays.position[1], self.reached),
+            "weight": self.weight,
+            "status": self.status,
+        }
+
+    def to_frame(self):
+        """A row a ray, its status in words; x and y are empty where it is not on the sensor."""
+        return numbered(self.columns(), status=STATUS)
+
+
+def arrivals(
+    lens: Lens,
+    pupil: Tensor,
+    weights: Tensor,
+    *,
+    fields: Tensor | None = None,
+    ray_aiming: str | None = None,
+    progress: Callable[[Sequence[Tensor]], Iterable[Tensor]] = iter,
+) -> Arrivals:
+    """Trace points (2, P) of the pupil and their weights (P,) to the sensor, field by field.
+
+    fields, ray_aiming: as for `launch`; progress: goes over the fields one by one, as a bar does.
+    """
+    fields = torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields
+    each = [_field(lens, pupil, field[:, None], ray_aiming) for field in progress(fields.unbind(1))]
+    joined = Rays(
+        torch.cat([rays.position for rays, *_ in each], 1),
+        torch.cat([rays.direction for rays, *_ in each], 1),
+        torch.cat([rays.valid for rays, *_ in each]),
+    )
+    shares = lens.wavelength_weights / lens.wavelength_weights.sum()
+    weight = shares[:, None] * weights / weights.sum()
+    status, reached = (torch.cat(found) for found in zip(*(rest for _, *rest in each), strict=True))
+    return Arrivals(joined, status, reached, weight, pupil, fields, lens.wavelengths)
+
+
+def _field(lens: Lens, pupil: Tensor, field: Tensor, ray_aiming: str | None) -> tuple[Rays, Tensor, Tensor]:
+    """Rays (3, 1, W, P) of one field (2, 1) on the sensor, their status, and whether they reach it."""
+    rays = launch(lens, pupil, fields=field, ray_aiming=ray_aiming)
+    reached, status = rays.valid, torch.where(rays.valid, _OK, STATUS.index("unaimed"))
+    for crossing in steps(lens.surfaces[1:], rays, indices=media(lens, lens.wavelengths[:, None])):
+        fates = {"miss": crossing.missed, "tir": crossing.totally_reflected, "vignetted": crossing.clipped}
+        for name, fate in fates.items():
+            status = torch.where((status == _OK) & fate, STATUS.index(name), status)
+        reached = reached & ~crossing.missed & ~crossing.totally_reflected
+        rays = crossing.rays
+    return rays, status, reached
