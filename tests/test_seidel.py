@@ -10,8 +10,9 @@ from problems import aspheric_singlet, double_gauss, fields, lens, scalar, surfa
 from raytrace.analysis import seidel
 from raytrace.departure import ZernikeSag
 from raytrace.focus import image_rays
+from raytrace.formats import read_lens
 from raytrace.glass import MIRROR, model_glass
-from raytrace.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
+from raytrace.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance, with_wavelengths
 from raytrace.paraxial import first_order, marginal_ray, signed, system_matrix
 from raytrace.trace import media
 
@@ -108,7 +109,7 @@ def test_the_sum_of_s4_is_petzvals(name):
 
 @pytest.mark.parametrize("distance", [INF, 300.0])
 def test_colours_are_the_first_order_of_close_wavelengths(distance):
-    """C1/n′u′ and C2/n′u′: by how much a paraxial marginal and chief ray of a shorter wavelength land higher."""
+    """TAXC and TLAC: by how much a paraxial marginal and chief ray of a shorter wavelength land higher."""
     glass = model_glass(1.6, 35.0)
     system = lens(
         [surface(0.02, 5.0, glass), surface(-0.01, 9.0), surface(None, 95.0)],
@@ -153,3 +154,20 @@ def test_what_does_not_exist_is_nan_and_what_is_no_seidel_theory_is_refused():
     bumpy = surface(0.02, 5.0, 1.5, departure=ZernikeSag(vector(0.0, 0.0, 0.0, 1e-3), scalar(5.0)))
     with pytest.raises(ValueError, match="surface 1 has a departure"):
         seidel(lens([bumpy, surface(None, 90.0)]))
+
+
+#: Surfaces 1 and 2 of the 28 degree double Gauss (SK2, SK16, F5; Smith 1990 after Mandler) as OpticStudio prints them
+#: at 0.5876 µm with F and C, quoted in a public repository's notes on parsing such tables: S1 … S5, CLA, CTR.
+PRINTED = [
+    [0.114175, -0.008176, 0.000586, 0.120467, -0.008669, -0.034, 0.002],
+    [0.000396, -0.005093, 0.065502, -0.042772, -0.292349, -0.002, 0.029],
+]
+
+
+def test_the_signs_and_units_are_those_that_designers_print():
+    """The media are those of the shipped lens by name; catalogs of another edition leave 2e-5 of the figures."""
+    system = with_wavelengths(read_lens("lenses/double_gauss.zmx"), [0.5876, 0.4861, 0.6563])
+    found = seidel(system).contributions[:, 0, :2].T
+    expected = torch.tensor(PRINTED, dtype=torch.float64)
+    torch.testing.assert_close(found[:, :5], expected[:, :5], rtol=2e-5, atol=6e-7)
+    torch.testing.assert_close(found[:, 5:], expected[:, 5:], rtol=0, atol=6e-4)

@@ -9,6 +9,10 @@
 | encircled_energy                          | light within a radius, of diffraction or of rays               |
 | distortion, field_curvature, lateral_colour | what chief rays and the close rays about them show           |
 | relative_illumination                     | light of a field against the axis                              |
+| seidel                                    | third-order aberrations and colours by surface, their sums     |
+| longitudinal_aberration                   | where rays cross the axis, over the pupil                      |
+| grid_distortion                           | a square grid of object points as the sensor sees it           |
+| incidence                                 | angles at which beams meet every surface and the sensor        |
 | compare, abilities                        | PSF models side by side, and what each of them can represent   |
 """
 
@@ -30,8 +34,14 @@ from raytrace.analysis.encircled import encircled_energy as encircled_energy
 from raytrace.analysis.fans import Fan as Fan
 from raytrace.analysis.fans import opd_fan as opd_fan
 from raytrace.analysis.fans import ray_fan as ray_fan
+from raytrace.analysis.grid import GridDistortion as GridDistortion
+from raytrace.analysis.grid import grid_distortion as grid_distortion
 from raytrace.analysis.illumination import RelativeIllumination as RelativeIllumination
 from raytrace.analysis.illumination import relative_illumination as relative_illumination
+from raytrace.analysis.incidence import Incidence as Incidence
+from raytrace.analysis.incidence import incidence as incidence
+from raytrace.analysis.longitudinal import LongitudinalAberration as LongitudinalAberration
+from raytrace.analysis.longitudinal import longitudinal_aberration as longitudinal_aberration
 from raytrace.analysis.mtf import Mtf as Mtf
 from raytrace.analysis.mtf import ThroughFocusMtf as ThroughFocusMtf
 from raytrace.analysis.mtf import cutoff as cutoff

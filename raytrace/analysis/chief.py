@@ -133,12 +133,17 @@ def lateral_colour(
     return LateralColour(shift, fields, wavelengths, valid)
 
 
+def chief_points(lens: Lens, fields: Tensor, wavelengths: Tensor) -> tuple[Tensor, Tensor]:
+    """Where chief rays of fields (2, F) meet the sensor, (2, F, W) mm; whether they arrive or were only vignetted."""
+    rays = image_rays(lens, fields.new_zeros(2, 1), fields=fields, wavelengths=wavelengths)
+    on_axis = (fields == 0).all(0)[:, None]
+    return rays.position[:2, ..., 0], (rays.valid | _kept(rays.direction))[..., 0] | on_axis
+
+
 def _height(lens: Lens, fields: Tensor, wavelengths: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
     """Heights (F, W) of chief rays in the meridians of `along` (2, F), and whether they arrive or are but vignetted."""
-    rays = image_rays(lens, fields.new_zeros(2, 1), fields=fields, wavelengths=wavelengths)
-    height = dot_2(rays.position[:2, ..., 0], _meridian(along)[:, :, None])
-    on_axis = (fields == 0).all(0)[:, None]
-    return height, (rays.valid | _kept(rays.direction))[..., 0] | on_axis
+    points, valid = chief_points(lens, fields, wavelengths)
+    return dot_2(points, _meridian(along)[:, :, None]), valid
 
 
 def _meridian(fields: Tensor) -> Tensor:

@@ -7,8 +7,8 @@ With marginal ray (y, u), chief ray (ȳ, ū), A = n i = n (u + y c), Ā likewise
 
 and where the sag departs from that of the vertex sphere by G r⁴ also 8 G Δn (y⁴, y³ ȳ, y² ȳ², 0, y ȳ³). Indices are
 negative while light travels towards -z. Source: Welford, Aberrations of Optical Systems (1986), chapters 8 and 10; S5
-is his (Ā/A)(S3 + S4), written so that A may be 0. C1 and C2 are positive where S1 and S2 would be: some programs print
-them with the other sign.
+is his (Ā/A)(S3 + S4), written so that A may be 0. δn runs from the shortest wavelength to the longest, as in the tables
+of OpticStudio, so that C1 of a single positive lens is negative; Welford's C has the other sign.
 """
 
 from collections.abc import Callable
@@ -124,12 +124,12 @@ def _chief_ray(lens: Lens, fields: Tensor, paraxial: FirstOrder) -> tuple[Tensor
 
 
 def _indices(lens: Lens) -> tuple[list[Tensor], list[Tensor]]:
-    """Signed n of the primary wavelength before every surface and behind the last, and δn from longest to shortest."""
+    """Signed n of the primary wavelength before every surface and behind the last, and δn from shortest to longest."""
     primary, shortest, longest = (
         signed(lens.surfaces[1:-1], media(lens, wavelength)[:-1])
         for wavelength in (lens.wavelengths[lens.primary_wavelength], lens.wavelengths.amin(), lens.wavelengths.amax())
     )
-    return primary, [short - long for short, long in zip(shortest, longest, strict=True)]
+    return primary, [long - short for short, long in zip(shortest, longest, strict=True)]
 
 
 def _cross(surface: Surface, marginal, chief, H: Tensor, n, dispersion):
@@ -178,13 +178,13 @@ def _waves(S: Tensor, omega: Tensor, n: Tensor, wavelength: Tensor) -> Tensor:
 
 
 def _transverse(S: Tensor, omega: Tensor, n: Tensor, wavelength: Tensor) -> Tensor:
-    """ε of the third order = (S1, S2, 3 S2, 2 S3, S4, S3 + S4, 3 S3 + S4, S5)/(2 n′u′), and (C1, C2)/(n′u′).
+    """ε of the third order = (S1, S2, 3 S2, 2 S3, S4, S3 + S4, 3 S3 + S4, S5)/(2 n′u′), and -(C1, C2)/(n′u′).
 
     Spherical aberration, sagittal and tangential coma, astigmatism, Petzval, sagittal and tangential field curvature,
     distortion, axial and lateral colour (the shortest less the longest wavelength).
     """
     S1, S2, S3, S4, S5, C1, C2 = S
-    mixed = torch.stack([S1, S2, 3 * S2, 2 * S3, S4, S3 + S4, 3 * S3 + S4, S5, 2 * C1, 2 * C2])
+    mixed = torch.stack([S1, S2, 3 * S2, 2 * S3, S4, S3 + S4, 3 * S3 + S4, S5, -2 * C1, -2 * C2])
     return mixed / torch.where(omega == 0, torch.nan, 2 * omega)
 
 

@@ -14,94 +14,95 @@ from raytrace.numerics import broadcast_shape
 
 _UNITS = {
     "wavelength": "µm", "frequency": "1/mm", "sensor_distance": "mm", "radius": "mm", "height": "mm", "shift": "mm",
-    "f_tan": "%", "f_theta": "%", "projected_solid_angle": "sr",
+    "f_tan": "%", "f_theta": "%", "projected_solid_angle": "sr", "crossing": "mm", "lower": "°", "chief": "°",
+    "upper": "°",
 }  # fmt: skip
-_DENSE = 65  # fields of a curve over the field, when it is drawn
+DENSE = 65  # fields of a curve over the field, when it is drawn
 
 
 def mtf(arguments: argparse.Namespace) -> None:
     """Modulation through frequency or through focus."""
-    lens, fields = _opened(arguments)
+    lens, fields = opened(arguments)
     kind = "geometric" if arguments.geometric else "diffraction"
     frequencies = None if arguments.frequency is None else lens.wavelengths.new_tensor(arguments.frequency)
     if arguments.through_focus is None:
         found = analysis.mtf(lens, frequencies, kind=kind, fields=fields)
-        _report(arguments, lens, found, "mtf_curves", every=5)
+        report(arguments, lens, found, "mtf_curves", every=5)
         return
     if frequencies is None or len(frequencies) != 1:
         raise CommandError("--through-focus needs one spatial frequency: add --frequency F")
     here = lens.surfaces[-2].thickness
     distances = here + arguments.through_focus * torch.linspace(-1, 1, 21, dtype=here.dtype)
     found = analysis.mtf_through_focus(lens, frequencies[0], distances, kind=kind, fields=fields)
-    _report(arguments, lens, found, "mtf_through_focus_curves", every=1)
+    report(arguments, lens, found, "mtf_through_focus_curves", every=1)
 
 
 def fan(arguments: argparse.Namespace) -> None:
     """Ray fans."""
-    lens, fields = _opened(arguments)
+    lens, fields = opened(arguments)
     found = analysis.ray_fan(lens, fields=fields, size=arguments.points)
-    _report(arguments, lens, found, "fan_plot", every=5, unit="mm")
+    report(arguments, lens, found, "fan_plot", every=5, unit="mm")
 
 
 def opd(arguments: argparse.Namespace) -> None:
     """OPD fans."""
-    lens, fields = _opened(arguments)
+    lens, fields = opened(arguments)
     found = analysis.opd_fan(lens, fields=fields, size=arguments.points)
-    _report(arguments, lens, found, "fan_plot", every=5, unit="waves")
+    report(arguments, lens, found, "fan_plot", every=5, unit="waves")
 
 
 def wavefront(arguments: argparse.Namespace) -> None:
     """Wavefront maps; the text is RMS, peak to valley and the Strehl ratio, the JSON also the coefficients."""
-    lens, fields = _opened(arguments)
+    lens, fields = opened(arguments)
     found = analysis.wavefront_map(lens, fields=fields, size=arguments.size)
-    _report(arguments, lens, found, "wavefront_maps", summary=found.summary(), unit="waves")
+    report(arguments, lens, found, "wavefront_maps", summary=found.summary(), unit="waves")
 
 
 def distortion(arguments: argparse.Namespace) -> None:
     """Distortion of the chief ray."""
-    _over_field(arguments, analysis.distortion, "distortion_curves")
+    over_field(arguments, analysis.distortion, "distortion_curves")
 
 
 def curvature(arguments: argparse.Namespace) -> None:
     """Foci of close rays."""
-    _over_field(arguments, analysis.field_curvature, "curvature_curves")
+    over_field(arguments, analysis.field_curvature, "curvature_curves")
 
 
 def lateral(arguments: argparse.Namespace) -> None:
     """Lateral colour, with the Airy radius in the figure."""
-    _over_field(arguments, analysis.lateral_colour, "lateral_curves")
+    over_field(arguments, analysis.lateral_colour, "lateral_curves")
 
 
 def illumination(arguments: argparse.Namespace) -> None:
     """Relative illumination."""
-    _over_field(arguments, analysis.relative_illumination, "illumination_curve")
+    over_field(arguments, analysis.relative_illumination, "illumination_curve")
 
 
 def encircled(arguments: argparse.Namespace) -> None:
     """Encircled energy."""
-    lens, fields = _opened(arguments)
+    lens, fields = opened(arguments)
     kind = "geometric" if arguments.geometric else "diffraction"
     radii = None if arguments.radius is None else lens.wavelengths.new_tensor(arguments.radius)
     found = analysis.encircled_energy(lens, radii, kind=kind, fields=fields)
-    _report(arguments, lens, found, "encircled_curves", every=5)
+    report(arguments, lens, found, "encircled_curves", every=5)
 
 
-def _opened(arguments: argparse.Namespace) -> tuple[Lens, Tensor]:
+def opened(arguments: argparse.Namespace) -> tuple[Lens, Tensor]:
     """The lens, and the fields of --field, else the lens's own."""
     lens = open_lens(arguments)
     return lens, field_points(lens, arguments)
 
 
-def _over_field(arguments: argparse.Namespace, analyse: Callable, figure: str) -> None:
+def over_field(arguments: argparse.Namespace, analyse: Callable, figure: str) -> None:
     """Report an analysis at the fields of --field, else at --samples fields; its figure is drawn through many."""
     lens = open_lens(arguments)
     fields = field_points(lens, arguments) if arguments.field else None
     found = analyse(lens, fields=fields, size=arguments.samples)
-    dense = analyse(lens, fields=fields, size=_DENSE) if arguments.plot else None
-    _report(arguments, lens, found, figure, unit="mm", dense=dense)
+    dense = analyse(lens, fields=fields, size=DENSE) if arguments.plot else None
+    report(arguments, lens, found, figure, unit="mm", dense=dense)
 
 
-def _report(
+def report(
     arguments,
     lens: Lens,
     found: Tabular,
@@ -114,28 +115,32 @@ def _report(
 ) -> None:
     """Print the result as JSON, or every so many-th row of its table; save the figure of it, or of the dense one."""
     if arguments.json:
-        document = {"analysis": arguments.command, "results": _rows(found.columns())}
-        print_json(document if summary is None else {**document, "summary": _rows(summary)})
+        document = {"analysis": arguments.command, "results": rows(found.columns())}
+        print_json(document if summary is None else {**document, "summary": rows(summary)})
     else:
-        _print(summary or found.columns(), FIELD_UNITS[lens.fields.kind], every if summary is None else 1, unit)
+        print_table(summary or found.columns(), FIELD_UNITS[lens.fields.kind], every if summary is None else 1, unit)
+    draw(arguments, lens, found if dense is None else dense, figure)
+
+
+def draw(arguments, lens: Lens, found: Tabular, figure: str, **options) -> None:
+    """Save the figure of that name in `raytrace.plot`, if --plot asks for it."""
     if arguments.plot:
         from raytrace import plot
 
-        draw: Callable = getattr(plot, figure)
-        plot.save(draw(lens, found if dense is None else dense), arguments.plot)
+        plot.save(getattr(plot, figure)(lens, found, **options), arguments.plot)
         say(f"written: {arguments.plot}")
 
 
-def _rows(columns: dict[str, Tensor]) -> list[dict]:
+def rows(columns: dict[str, Tensor]) -> list[dict]:
     table = flat(columns)
     return [dict(zip(table, map(number, row), strict=True)) for row in zip(*table.values(), strict=True)]
 
 
-def _print(columns: dict[str, Tensor], field_unit: str, every: int, unit: str) -> None:
+def print_table(columns: dict[str, Tensor], field_unit: str, every: int, unit: str) -> None:
     length = broadcast_shape(*(c.shape for c in columns.values()))[-1]
     thin = every if length > 2 * every else 1
     table = flat({name: c[..., ::thin] if c.shape[-1] == length else c for name, c in columns.items()})
-    if not table["field_x"].any():
+    if "field_x" in table and not table["field_x"].any():
         del table["field_x"]
     widths = {name: max(len(name), 9) for name in table}
     print("  ".join(f"{name:>{width}}" for name, width in widths.items()))

@@ -31,6 +31,39 @@ def _curves(parser) -> None:
     )
 
 
+def _seidel(parser) -> None:
+    _analysis(parser, "a bar for each surface")
+    parser.add_argument(
+        "--as",
+        dest="told",
+        choices=("coefficients", "waves", "transverse", "longitudinal"),
+        default="coefficients",
+        help="S1 to C2 in mm (default), wavefront coefficients in waves, or ray aberrations in mm",
+    )
+
+
+def _longitudinal(parser) -> None:
+    lens(parser)
+    conditions(parser)
+    plot(parser, "the curves")
+    points(parser, "rays from the axis to the rim of the pupil (default 41)", default=41)
+
+
+def _grid(parser) -> None:
+    lens(parser)
+    conditions(parser)
+    plot(parser, "the ideal and the real grid")
+    points(parser, "points across the grid (default 11)", default=11)
+    parser.add_argument(
+        "--exaggerate", metavar="N", type=positive_finite, default=1.0, help="draw the distortion N times as large"
+    )
+
+
+def _incidence(parser) -> None:
+    _curves(parser)
+    parser.add_argument("--surfaces", action="store_true", help="list every surface, not the sensor alone")
+
+
 def _light(parser) -> None:
     _analysis(parser, "the curves")
     parser.add_argument("--geometric", action="store_true", help="of rays alone, without diffraction")
@@ -147,6 +180,47 @@ ANALYSES = (
   raytrace illumination double_gauss --field 0 10 14 --json""",
         _curves,
         "analysis_commands.illumination",
+    ),
+    (
+        "seidel",
+        "Seidel aberrations by surface",
+        "Third-order aberrations S1 to S5 and colours C1, C2 of every surface and their sums, with y n i of the "
+        "marginal and chief ray, at the largest field or those of --field.",
+        """examples:
+  raytrace seidel tessar --plot seidel.png
+  raytrace seidel double_gauss --as waves --field 10 14 --json""",
+        _seidel,
+        "aberration_commands.seidel",
+    ),
+    (
+        "longitudinal",
+        "longitudinal aberration",
+        "Where rays of the axial object point cross the axis, mm from the sensor, over their height in the pupil.",
+        """examples:
+  raytrace longitudinal tessar --plot longitudinal.png
+  raytrace longitudinal cooke_triplet --wavelength 0.55 --json""",
+        _longitudinal,
+        "aberration_commands.longitudinal",
+    ),
+    (
+        "grid",
+        "grid distortion",
+        "Where a square grid of object points up to the largest field lands on the sensor, against its ideal image.",
+        """examples:
+  raytrace grid phone --plot grid.png --exaggerate 10
+  raytrace grid retrofocus --points 5 --json""",
+        _grid,
+        "aberration_commands.grid",
+    ),
+    (
+        "incidence",
+        "angles of incidence",
+        "Angles at which the chief ray and the rim of each field's beam meet the sensor, or every surface, in degrees.",
+        """examples:
+  raytrace incidence phone --plot incidence.png
+  raytrace incidence double_gauss --field 0 14 --surfaces --json""",
+        _incidence,
+        "aberration_commands.incidence",
     ),
     (
         "encircled",

@@ -4,6 +4,10 @@ This folder is the only place that imports matplotlib, and it never touches pypl
 nothing behind.
 """
 
+from raytrace.plot.aberrations import distorted_grid as distorted_grid
+from raytrace.plot.aberrations import incidence_curves as incidence_curves
+from raytrace.plot.aberrations import longitudinal_curves as longitudinal_curves
+from raytrace.plot.aberrations import seidel_bars as seidel_bars
 from raytrace.plot.analysis import curvature_curves as curvature_curves
 from raytrace.plot.analysis import distortion_curves as distortion_curves
 from raytrace.plot.analysis import encircled_curves as encircled_curves

@@ -1,7 +1,5 @@
 """Figures of the analyses: fans, wavefronts, MTF, encircled energy, and curves over the field."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -19,14 +17,24 @@ from raytrace.analysis import (
     cutoff,
 )
 from raytrace.lens import Lens
+from raytrace.plot.panels import (
+    DASHES,
+    chart,
+    field_axis,
+    field_labels,
+    field_name,
+    legend_below,
+    over_field,
+    ruled,
+    titled,
+    wavelength_label,
+)
 from raytrace.plot.style import (
     FAINT,
     GREY,
     INK,
     array,
     field_colour,
-    field_label,
-    field_title,
     new_figure,
     number_text,
     styled,
@@ -34,14 +42,12 @@ from raytrace.plot.style import (
 )
 
 _SAGITTAL = (0, (4, 2))
-#: Dashes of wavelengths, in order, for readers who do not tell their colours apart.
-_DASHES = ("solid", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)))
 
 
 @styled
 def fan_plot(lens: Lens, found: Fan) -> Figure:
     """A row for each field: the tangential fan on the left, the sagittal one on the right, one scale for all."""
-    labels = _labels(lens, found.fields)
+    labels = field_labels(lens, found.fields)
     ray = found.quantity == "ray"
     figure = new_figure(6.6, 1.45 * len(labels) + 1.1)
     axes = figure.subplots(len(labels), 2, sharex=True, sharey=True, squeeze=False)
@@ -51,10 +57,10 @@ def fan_plot(lens: Lens, found: Fan) -> Figure:
     for column, (values, valid) in enumerate(curves):
         shown = np.where(array(valid).astype(bool), scale * array(values), np.nan)
         for row, label in enumerate(labels):
-            panel = _ruled(axes[row][column])
+            panel = ruled(axes[row][column])
             for w, colour in enumerate(colours):
-                style = {"color": colour, "linewidth": 1.2, "linestyle": _DASHES[w % len(_DASHES)]}
-                panel.plot(pupil, shown[row, w], label=_wavelength(found, w), **style)
+                style = {"color": colour, "linewidth": 1.2, "linestyle": DASHES[w % len(DASHES)]}
+                panel.plot(pupil, shown[row, w], label=wavelength_label(found, w), **style)
             panel.axhline(0, color=GREY, linewidth=0.6)
             panel.axvline(0, color=GREY, linewidth=0.6)
             if column == 0:
@@ -65,14 +71,14 @@ def fan_plot(lens: Lens, found: Fan) -> Figure:
         panel.set_xlim(-1, 1)
         panel.set_xlabel("pupil coordinate")
     figure.supylabel("transverse aberration (µm)" if ray else "OPD (waves)", fontsize=8.5)
-    _legend(figure, axes[0][0], len(colours))
-    return _titled(figure, lens, "ray fans" if ray else "OPD fans")
+    legend_below(figure, axes[0][0], len(colours))
+    return titled(figure, lens, "ray fans" if ray else "OPD fans")
 
 
 @styled
 def wavefront_maps(lens: Lens, found: WavefrontMap) -> Figure:
     """A panel for each field (rows) and wavelength (columns), one scale for all, RMS, P-V and Strehl below."""
-    labels, count = _labels(lens, found.fields), len(found.wavelengths)
+    labels, count = field_labels(lens, found.fields), len(found.wavelengths)
     figure = new_figure(max(4.2, 1.9 * count + 1.4), 2.05 * len(labels) + 0.6)
     axes = figure.subplots(len(labels), count, squeeze=False)
     opd = np.where(array(found.valid).astype(bool), array(found.opd), np.nan)
@@ -92,55 +98,55 @@ def wavefront_maps(lens: Lens, found: WavefrontMap) -> Figure:
             )
             panel.set_xlabel(f"RMS {rms}, P–V {valley}\nStrehl {strehl}", fontsize=7.5, color=GREY)
             if row == 0:
-                panel.set_title(_wavelength(found, w), color=INK)
+                panel.set_title(wavelength_label(found, w), color=INK)
             if w == 0:
                 panel.set_ylabel(label)
     bar = figure.colorbar(drawn, ax=axes, shrink=0.8, aspect=30, pad=0.02)
     bar.set_label("OPD (waves)")
     bar.outline.set_visible(False)
-    return _titled(figure, lens, "wavefront")
+    return titled(figure, lens, "wavefront")
 
 
 @styled
 def mtf_curves(lens: Lens, found: Mtf) -> Figure:
     """Modulation over spatial frequency: tangential solid, sagittal dashed, the diffraction limit grey."""
-    figure, panel = _chart(6.4, 4.0, "spatial frequency (cycles/mm)", "modulation")
+    figure, panel = chart(6.4, 4.0, "spatial frequency (cycles/mm)", "modulation")
     frequency = array(found.frequencies)
     if found.limit is not None:
         panel.plot(frequency, array(found.limit), color=GREY, linewidth=1.0, linestyle=":", label="diffraction limit")
     _pairs(panel, lens, found, frequency, array(found.tangential), array(found.sagittal))
     panel.set_xlim(0, frequency.max())
     panel.set_ylim(0, 1.0)
-    _legend(figure, panel, 4)
-    return _titled(figure, lens, f"{found.kind} MTF")
+    legend_below(figure, panel, 4)
+    return titled(figure, lens, f"{found.kind} MTF")
 
 
 @styled
 def mtf_through_focus_curves(lens: Lens, found: ThroughFocusMtf) -> Figure:
     """Modulation at one frequency over the sensor distance."""
     modulation = f"modulation at {number_text(float(found.frequency), 4)} cycles/mm"
-    figure, panel = _chart(6.4, 4.0, "sensor distance (mm)", modulation)
+    figure, panel = chart(6.4, 4.0, "sensor distance (mm)", modulation)
     distance = array(found.sensor_distances)
     _pairs(panel, lens, found, distance, array(found.tangential).T, array(found.sagittal).T)
     panel.axvline(float(lens.surfaces[-2].thickness), color=GREY, linewidth=0.8)
     panel.set_xlim(distance.min(), distance.max())
     panel.set_ylim(0, 1.0)
-    _legend(figure, panel, 4)
-    return _titled(figure, lens, f"{found.kind} MTF through focus")
+    legend_below(figure, panel, 4)
+    return titled(figure, lens, f"{found.kind} MTF through focus")
 
 
 @styled
 def encircled_curves(lens: Lens, found: EncircledEnergy) -> Figure:
     """Share of the light over the radius about the centroid."""
-    figure, panel = _chart(6.0, 3.8, "radius from the centroid (µm)", "encircled energy")
+    figure, panel = chart(6.0, 3.8, "radius from the centroid (µm)", "encircled energy")
     radii = 1e3 * array(found.radii)
-    for f, label in enumerate(_labels(lens, found.fields)):
+    for f, label in enumerate(field_labels(lens, found.fields)):
         panel.plot(radii, array(found.share[f]), color=field_colour(f), linewidth=1.5, label=label)
     panel.axhline(0.8, color=GREY, linewidth=0.7, linestyle=":")
     panel.set_xlim(0, radii.max())
     panel.set_ylim(0, 1.02)
-    _legend(figure, panel, 6)
-    return _titled(figure, lens, f"{found.kind} encircled energy")
+    legend_below(figure, panel, 6)
+    return titled(figure, lens, f"{found.kind} encircled energy")
 
 
 @styled
@@ -150,39 +156,39 @@ def distortion_curves(lens: Lens, found: Distortion) -> Figure:
     curves += [] if found.f_theta is None else [("F-θ", found.f_theta)]
     figure = new_figure(3.1 * len(curves) + 0.9, 4.2)
     for panel, (name, values) in zip(figure.subplots(1, len(curves), squeeze=False)[0], curves, strict=True):
-        _over_field(panel, lens, found, 100 * array(values), array(found.valid), dashes=_DASHES)
+        over_field(panel, lens, found, 100 * array(values), array(found.valid), dashes=DASHES)
         panel.set_xlabel(f"{name} distortion (%)")
-    _legend(figure, panel, len(found.wavelengths))
-    return _titled(figure, lens, "distortion")
+    legend_below(figure, panel, len(found.wavelengths))
+    return titled(figure, lens, "distortion")
 
 
 @styled
 def curvature_curves(lens: Lens, found: FieldCurvature) -> Figure:
     """Foci of close rays over the field: tangential solid, sagittal dashed."""
-    figure, panel = _chart(4.6, 4.4, "focus from the sensor (mm)", "")
+    figure, panel = chart(4.6, 4.4, "focus from the sensor (mm)", "")
     valid = array(found.valid)
-    _over_field(panel, lens, found, array(found.tangential), valid, suffix=" T", dashes=("solid",))
-    _over_field(panel, lens, found, array(found.sagittal), valid, suffix=" S", dashes=(_SAGITTAL,))
-    _legend(figure, panel, 2 if len(found.wavelengths) < 3 else 3)
-    return _titled(figure, lens, "field curvature")
+    over_field(panel, lens, found, array(found.tangential), valid, suffix=" T", dashes=("solid",))
+    over_field(panel, lens, found, array(found.sagittal), valid, suffix=" S", dashes=(_SAGITTAL,))
+    legend_below(figure, panel, 2 if len(found.wavelengths) < 3 else 3)
+    return titled(figure, lens, "field curvature")
 
 
 @styled
 def lateral_curves(lens: Lens, found: LateralColour) -> Figure:
     """Chief rays' heights less the primary wavelength's over the field, beside the Airy radius of that one in grey."""
-    figure, panel = _chart(4.6, 4.4, "lateral colour (µm)", "")
+    figure, panel = chart(4.6, 4.4, "lateral colour (µm)", "")
     airy = 1.22e3 / float(cutoff(lens, lens.wavelengths[lens.primary_wavelength]))
     panel.axvspan(-airy, airy, color=FAINT, alpha=0.35, linewidth=0, label="Airy radius")
-    _over_field(panel, lens, found, 1e3 * array(found.shift), array(found.valid), dashes=_DASHES)
-    _legend(figure, panel, 4)
-    return _titled(figure, lens, "lateral colour")
+    over_field(panel, lens, found, 1e3 * array(found.shift), array(found.valid), dashes=DASHES)
+    legend_below(figure, panel, 4)
+    return titled(figure, lens, "lateral colour")
 
 
 @styled
 def illumination_curve(lens: Lens, found: RelativeIllumination) -> Figure:
     """Relative illumination over the field, beside cos⁴θ where fields are angles."""
-    figure, panel = _chart(5.4, 3.6, _field_name(lens), "relative illumination")
-    field = _field_axis(found)
+    figure, panel = chart(5.4, 3.6, field_name(lens), "relative illumination")
+    field = field_axis(found)
     line = {"linewidth": 1.5} if len(field) > 5 else {"linestyle": "none", "marker": "o", "markersize": 3.5}
     panel.plot(
         field, array(found.illumination), color=field_colour(0), clip_on=False, zorder=3, label="this lens", **line
@@ -192,67 +198,11 @@ def illumination_curve(lens: Lens, found: RelativeIllumination) -> Figure:
         panel.plot(fine, np.cos(np.deg2rad(fine)) ** 4, color=GREY, linewidth=1.0, linestyle=":", label="cos⁴θ")
     panel.set_xlim(0, max(field.max(), 1e-9))
     panel.set_ylim(0, 1.05 * max(1.0, float(found.illumination.max())))
-    _legend(figure, panel, 2)
-    return _titled(figure, lens, "relative illumination")
+    legend_below(figure, panel, 2)
+    return titled(figure, lens, "relative illumination")
 
 
 def _pairs(panel: Axes, lens: Lens, found, x: np.ndarray, tangential: np.ndarray, sagittal: np.ndarray) -> None:
-    for f, label in enumerate(_labels(lens, found.fields)):
+    for f, label in enumerate(field_labels(lens, found.fields)):
         panel.plot(x, tangential[f], color=field_colour(f), linewidth=1.5, label=f"{label} T")
         panel.plot(x, sagittal[f], color=field_colour(f), linewidth=1.5, linestyle=_SAGITTAL, label=f"{label} S")
-
-
-def _over_field(panel: Axes, lens: Lens, found, values: np.ndarray, valid: np.ndarray, *, dashes, suffix="") -> None:
-    """Curves (F, W) drawn upwards over the field, as lens designers do; dashes: one after another by wavelength."""
-    _ruled(panel)
-    field, shown = _field_axis(found), np.where(valid.astype(bool), values, np.nan)
-    for w, colour in enumerate(wavelength_colours(found.wavelengths.tolist())):
-        style = {"color": colour, "linewidth": 1.4, "linestyle": dashes[w % len(dashes)]}
-        panel.plot(shown[:, w], field, label=_wavelength(found, w) + suffix, **style)
-    panel.axvline(0, color=GREY, linewidth=0.6)
-    panel.set_ylim(0, max(field.max(), 1e-9))
-    panel.set_ylabel(_field_name(lens))
-    widest = np.nanmax(np.abs(shown), initial=0.0)
-    if widest < 1e-9:
-        panel.set_xlim(-1, 1)
-
-
-def _field_axis(found) -> np.ndarray:
-    return np.hypot(*array(found.fields))
-
-
-def _field_name(lens: Lens) -> str:
-    return f"{field_title(lens)} ({'°' if lens.fields.kind == 'angle' else 'mm'})"
-
-
-def _labels(lens: Lens, fields) -> Sequence[str]:
-    return [field_label(lens, field) for field in array(fields).T]
-
-
-def _wavelength(found, w: int) -> str:
-    return f"{number_text(1e3 * float(found.wavelengths[w]), 4)} nm"
-
-
-def _chart(width: float, height: float, x: str, y: str) -> tuple[Figure, Axes]:
-    """A figure of one ruled panel, its axes named."""
-    figure = new_figure(width, height)
-    panel = _ruled(figure.add_subplot())
-    panel.set_xlabel(x)
-    panel.set_ylabel(y)
-    return figure, panel
-
-
-def _ruled(panel: Axes) -> Axes:
-    panel.grid(color="#ececec", linewidth=0.6, zorder=0)
-    panel.set_axisbelow(True)
-    return panel
-
-
-def _legend(figure: Figure, panel: Axes, columns: int) -> None:
-    handles, labels = panel.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=max(columns, 1))
-
-
-def _titled(figure: Figure, lens: Lens, what: str) -> Figure:
-    figure.suptitle(f"{lens.name}\n{what}" if lens.name else what.capitalize(), fontweight="bold", fontsize=10)
-    return figure
