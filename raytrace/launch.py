@@ -110,12 +110,12 @@ def object_field(lens: Lens, field: Tensor, paraxial: FirstOrder) -> tuple[Tenso
     And whether there are such (...): no chief ray may reach a real image height; then the axis comes.
     """
     if lens.fields.kind == "real_image_height":
-        return _field_of_real_height(lens, field, _paraxial_field(lens, field, paraxial), paraxial)
-    found = _paraxial_field(lens, field, paraxial)
+        return _field_of_real_height(lens, field, paraxial_field(lens, field, paraxial), paraxial)
+    found = paraxial_field(lens, field, paraxial)
     return found, torch.ones_like(found[0], dtype=torch.bool)
 
 
-def _paraxial_field(lens: Lens, field: Tensor, paraxial: FirstOrder) -> Tensor:
+def paraxial_field(lens: Lens, field: Tensor, paraxial: FirstOrder) -> Tensor:
     """As `object_field`, real image heights as if they were paraxial ones."""
     distance, kind = lens.surfaces[0].thickness, lens.fields.kind
     at_infinity = is_at_infinity(lens)

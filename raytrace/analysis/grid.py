@@ -60,7 +60,7 @@ def grid_distortion(lens: Lens, *, wavelengths: Tensor | None = None, size: int 
     """
     lens = unvignetted(lens)
     wavelengths = lens.wavelengths[lens.primary_wavelength][None] if wavelengths is None else wavelengths
-    lens, _, corner = in_object_space(lens, field_range(lens, 2)[:, 1:])
+    lens, _, corner, found = in_object_space(lens, field_range(lens, 2)[:, 1:])
     half = safe_sqrt((corner * corner).sum() / 2)
     line = half * (2 * torch.arange(size, dtype=half.dtype, device=half.device) + 1 - size) / max(size - 1, 1)
     y, x = torch.meshgrid(line, line, indexing="ij")
@@ -71,6 +71,7 @@ def grid_distortion(lens: Lens, *, wavelengths: Tensor | None = None, size: int 
     points, valid = chief_points(
         lens, torch.rad2deg(torch.atan(wanted)) if is_at_infinity(lens) else wanted, wavelengths
     )
+    valid = valid & found
     points = (points - points[:, :1]).movedim(1, -1)  # (2, W, 3 + N²)
     along_x, along_y = points[..., 1:2] / step, points[..., 2:3] / step
     ideal = along_x * wanted[0, 3:] + along_y * wanted[1, 3:]

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.frame import Tabular, axis
-from raytrace.launch import object_field
-from raytrace.lens import Lens, largest_field, with_field_kind
+from raytrace.launch import paraxial_field
+from raytrace.lens import Lens, largest_field
 from raytrace.paraxial import FirstOrder, first_order, marginal_ray, signed, vertex_curvature
 from raytrace.surface import Surface
 from raytrace.trace import media
@@ -110,9 +110,7 @@ def seidel(lens: Lens, *, fields: Tensor | None = None, kind: str = "coefficient
 def _chief_ray(lens: Lens, fields: Tensor, paraxial: FirstOrder) -> tuple[Tensor, Tensor]:
     """(ȳ, ω̄) (F,) in front of surface 1, of fields in the direction of +y."""
     upwards = torch.stack([torch.zeros_like(fields[0]), torch.hypot(*fields)])
-    if lens.fields.kind == "real_image_height":
-        lens = with_field_kind(lens, "paraxial_image_height")
-    extent = object_field(lens, upwards, paraxial)[0][1]
+    extent = paraxial_field(lens, upwards, paraxial)[1]
     distance, pupil = lens.surfaces[0].thickness, paraxial.entrance_pupil_position
     n = media(lens, lens.wavelengths[lens.primary_wavelength])[0]
     if bool(torch.isinf(distance)):
