@@ -164,7 +164,7 @@ def test_texts_of_any_language_come_back(suffix, tmp_path):
         ({"curvature": number([0.1, 0.2])}, ".zmx", "a file holds one lens"),
         ({"coefficients": number([[0.1, 0.2]])}, ".csv", "a file holds one lens"),
         ({"coefficients": number([1e-9] * 9)}, ".zmx", "EVENASPH has 8"),
-        ({"comment": "two\nlines"}, ".csv", "line break"),
+        ({"comment": "two\nlines"}, ".zmx", "line break"),
         ({"glass": constant(1.5, "two words")}, ".zmx", "one word"),
         ({"apertures": (Aperture("circular", (0.0, 1.0)),) * 2}, ".zmx", "has one"),
     ],

@@ -6,12 +6,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from raytrace.catalog import UnknownGlass
 from raytrace.files import write_atomically
 from raytrace.formats import table, table_write, zemax, zemax_write
 from raytrace.formats.report import ImportReport as ImportReport
 from raytrace.formats.source import LensFileError as LensFileError
 from raytrace.formats.source import LensFileWarning as LensFileWarning
-from raytrace.formats.source import Place, read_text
+from raytrace.formats.source import Place, decode, read_text, shown
 from raytrace.formats.source import UnsupportedSurface as UnsupportedSurface
 from raytrace.lens import Lens, check_unit
 
@@ -60,11 +61,17 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
     """Write a lens in the format of the suffix. The file is replaced as a whole or not at all.
 
     catalogs: the glass catalogs (.agf) that the lens was read with. Raises LensFileError for what the format cannot
-    hold and where the file cannot be written.
+    hold, for what would not be read again, and where the file cannot be written. Warns LensFileWarning of a text that
+    a .zmx file does not bring back, such as blanks around it.
     """
     path = Path(path)
     _refuse_other_units(lens, path)
-    content = _format(path).write(lens, str(path), catalogs=tuple(catalogs))
+    form = _format(path)
+    content = form.write(lens, str(path), catalogs=tuple(catalogs))
+    changed = _changed_texts(lens, content, form, path, tuple(catalogs))
+    if changed:
+        message = f"{path}: {', '.join(changed)}: not brought back as it is by a {path.suffix} file"
+        warnings.warn(message, LensFileWarning, stacklevel=2)
     try:
         write_atomically(path, lambda file: file.write(content))
     except OSError as error:
@@ -76,6 +83,22 @@ def _refuse_other_units(lens: Lens, path: Path) -> None:
         check_unit(lens.wavelengths, (surface.glass for surface in lens.surfaces))
     except ValueError as error:
         raise LensFileError(str(error), Place(str(path))) from error
+
+
+def _changed_texts(lens: Lens, content: bytes, form: Format, path: Path, catalogs: tuple) -> list[str]:
+    """The texts of a lens that the content of its file does not bring back. Raises LensFileError if it is not read."""
+    try:
+        again, _ = form.read(decode(content, Place(str(path))), str(path), catalogs=catalogs)
+    except UnknownGlass:  # of a catalog that is not at hand
+        return []
+    except LensFileError as error:
+        found = str(error).removeprefix(f"{Place(error.file, error.line, error.surface)}: ")
+        message = f"the file would not be read again: {found}"
+        raise LensFileError(message, Place(str(path), None, error.surface)) from error
+    pairs = [("the title", lens.name, again.name), ("a note", lens.notes, again.notes)]
+    comments = zip(lens.surfaces, again.surfaces, strict=True)
+    pairs += [(f"the comment of surface {k}", a.comment, b.comment) for k, (a, b) in enumerate(comments)]
+    return [f"{what} ({shown(str(before))})" for what, before, after in pairs if before != after]
 
 
 def _format(path: Path) -> Format:

@@ -60,7 +60,7 @@ def build(table: Table, report: Draft, *, catalogs: Sequence[Path] = ()) -> Lens
     metadata, place = table.metadata, table.place
     unit = _unit(metadata)
     rows = _numbered(table)
-    names = tuple(word for word in re.split(r"[\s,;]+", metadata.get("catalogs", ("", place))[0]) if word)
+    names = tuple(texts.words(metadata.get("catalogs", ("", place))[0]))
     report_missing_catalogs(names, catalogs, report)
     surfaces = [table_surface.build(row, unit, names, catalogs, report) for row in rows]
     _refuse_all_air(table, surfaces)

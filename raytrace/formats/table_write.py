@@ -5,6 +5,7 @@ import io
 from collections.abc import Sequence
 from pathlib import Path
 
+from raytrace.formats import texts
 from raytrace.formats.source import LensFileError, Place
 from raytrace.formats.writing import (
     catalogs_needed,
@@ -13,7 +14,6 @@ from raytrace.formats.writing import (
     is_air,
     is_listed,
     listed_name,
-    one_line,
     refuse_departure,
     thickness,
 )
@@ -28,8 +28,8 @@ def write_comma(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> byte
     """The content of a .csv file: header lines '# key: value', headings, one row per surface; UTF-8.
 
     file: its name, for messages. catalogs: the user's glass catalogs that the lens was read with.
-    Raises LensFileError for what a table cannot hold: a batch of lenses, nan, a line break in a text, a glass whose
-    figures are not those of its catalog.
+    Raises LensFileError for what a table cannot hold: a batch of lenses, nan, a glass whose figures are not those
+    of its catalog. Texts come back whatever they hold (`texts`).
     """
     return _write(lens, ",", file, catalogs)
 
@@ -42,7 +42,7 @@ def write_tab(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
 def _write(lens: Lens, separator: str, file: str, catalogs: Sequence[Path]) -> bytes:
     text = io.StringIO()
     for key, value in header(lens, Place(file), catalogs):
-        text.write(f"# {key}: {value}".rstrip() + "\n")
+        text.write(f"# {key}: {value}\n")
     writer = csv.writer(text, delimiter=separator, lineterminator="\n")
     columns = rows(lens, file)
     writer.writerow(columns)
@@ -53,8 +53,8 @@ def _write(lens: Lens, separator: str, file: str, catalogs: Sequence[Path]) -> b
 def header(lens: Lens, place: Place, catalogs: Sequence[Path] = ()) -> Metadata:
     """The system of a lens as keys and values of header lines."""
     fields = lens.fields
-    lines = [("title", _text(lens.name, place))] if lens.name else []
-    lines += [("note", _text(note, place)) for note in lens.notes]
+    lines = [("title", texts.written(lens.name))] if lens.name else []
+    lines += [("note", texts.written(note)) for note in lens.notes]
     size = exact(lens.aperture.value, "system aperture", place)
     lines.append(("aperture", f"{lens.aperture.kind.replace('_', ' ')} {size}"))
     x, y = exact_list(fields.x, "field", place), exact_list(fields.y, "field", place)
@@ -71,7 +71,7 @@ def header(lens: Lens, place: Place, catalogs: Sequence[Path] = ()) -> Metadata:
     lines.append(("primary wavelength", str(lens.primary_wavelength + 1)))
     names = catalogs_needed(lens, catalogs, place.file)
     if names:
-        lines.append(("catalogs", " ".join(names)))
+        lines.append(("catalogs", " ".join(map(texts.word, names))))
     if lens.ray_aiming != "off":
         lines.append(("ray aiming", lens.ray_aiming))
     return lines
@@ -108,8 +108,7 @@ def _row(lens: Lens, number: int, surface: Surface, place: Place) -> dict[str, s
         row |= {f"a{2 * j}": term for j, term in enumerate(found, 1)}
     if surface.apertures:
         row["apertures"] = " + ".join(_aperture(aperture, place) for aperture in surface.apertures)
-    comment = one_line(surface.comment, "the comment", place)
-    return row | {"comment": comment} if comment else row
+    return row | {"comment": texts.written(surface.comment)} if surface.comment else row
 
 
 def _glass(glass: Glass, place: Place) -> str:
@@ -134,7 +133,3 @@ def _aperture(aperture: Aperture, place: Place) -> str:
     if any(aperture.centre):
         words += ["at", *(exact(part, "centre of the aperture", place) for part in aperture.centre)]
     return " ".join(words)
-
-
-def _text(text: str, place: Place) -> str:
-    return one_line(text, "the title or a note", place)

@@ -1,6 +1,7 @@
 """Texts in tables: as they are where that brings them back, else quoted and escaped as in JSON."""
 
 import json
+import re
 
 #: Blanks that no reader takes away inside a text, though Python calls them not printable.
 BLANKS = "\u00a0\u3000"
@@ -9,10 +10,7 @@ BLANKS = "\u00a0\u3000"
 def written(text: str) -> str:
     """A text for a cell or a header line: itself, or in quotes with \\n, \\t, \\" and \\u escapes."""
     plain = text == text.strip() and text and is_printable(text) and text[-1] not in ",;" and not _quoted(text)
-    if plain:
-        return text
-    escaped = json.dumps(text, ensure_ascii=False)
-    return "".join(c if is_printable(c) else json.dumps(c)[1:-1] for c in escaped)
+    return text if plain else _escaped(text)
 
 
 def read(text: str) -> str:
@@ -29,7 +27,22 @@ def read(text: str) -> str:
 
 def is_printable(text: str) -> bool:
     """True for a text without control characters, line separators and characters that no encoding holds."""
-    return text.translate(dict.fromkeys(map(ord, BLANKS), " ")).isprintable()
+    return "\ufffd" not in text and text.translate(dict.fromkeys(map(ord, BLANKS), " ")).isprintable()
+
+
+def words(text: str) -> list[str]:
+    """Words between blanks, commas or semicolons; those in quotes as `written` writes them."""
+    return [read(word) for word in re.findall(r'"(?:[^"\\]|\\.)*"|[^\s,;]+', text)]
+
+
+def word(text: str) -> str:
+    """A text as one of `words`."""
+    plain = words(text) == [text] and is_printable(text) and '"' not in text
+    return text if plain else _escaped(text)
+
+
+def _escaped(text: str) -> str:
+    return "".join(c if is_printable(c) else json.dumps(c)[1:-1] for c in json.dumps(text, ensure_ascii=False))
 
 
 def _quoted(text: str) -> bool:

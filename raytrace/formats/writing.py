@@ -9,6 +9,7 @@ from torch import Tensor
 
 from raytrace.catalog import AmbiguousGlass, UnknownGlass, find_glass
 from raytrace.formats.source import LensFileError, Place
+from raytrace.formats.texts import is_printable
 from raytrace.glass import Glass
 from raytrace.lens import Lens
 from raytrace.surface import Surface
@@ -46,7 +47,7 @@ def thickness(number: Tensor, infinity: str, place: Place) -> str:
 
 def one_line(text: str, what: str, place: Place) -> str:
     """A text without its surrounding blanks. Raises LensFileError if it does not fit on one line of a file."""
-    if not text.isprintable() and not text.replace("\t", " ").isprintable():
+    if not is_printable(text.replace("\t", " ")):
         raise LensFileError(f"{what} holds a line break or a control character, and cannot be written", place)
     return text.strip()
 
