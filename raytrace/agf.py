@@ -12,8 +12,9 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
+from raytrace.dispersion import AGF_FORMULAS, COEFFICIENT_COUNTS
 from raytrace.files import read_bytes, write_atomically
-from raytrace.glass import AGF_FORMULAS, COEFFICIENT_COUNTS, Glass
+from raytrace.glass import Glass
 
 _STATUSES = {0: "standard", 1: "preferred", 2: "obsolete", 3: "special", 4: "melt"}
 _NUMERIC = ("CD", "TD", "ED", "MD", "OD", "LD", "IT")

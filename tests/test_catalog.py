@@ -31,7 +31,8 @@ from raytrace.catalog import (
     shipped_folder,
     write_agf,
 )
-from raytrace.glass import AGF_FORMULAS, constant, index, listing_error, refractive_index
+from raytrace.dispersion import AGF_FORMULAS
+from raytrace.glass import constant, index, listing_error, refractive_index
 
 #: Glasses of which their catalog lists no nd and Vd (infrared materials, and crystals that are opaque at the d line,
 #: were entered as nd = 1, Vd = 0), so that there is nothing to compare with. No listing that exists is inconsistent.

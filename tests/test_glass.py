@@ -12,11 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.autograd import gradcheck, gradgradcheck
 
+from raytrace.dispersion import AGF_FORMULAS, COEFFICIENT_COUNTS, FORMULAS
 from raytrace.glass import (
-    AGF_FORMULAS,
     AIR,
-    COEFFICIENT_COUNTS,
-    FORMULAS,
     LINES,
     MIRROR,
     Glass,

@@ -13,7 +13,8 @@ PACKAGE = Path(__file__).parents[1] / "raytrace"
 FLOORS = {
     # 0: mathematics, knows no optics
     "value": 0,
-    "numerics": 0,
+    "numerics": -1,  # what the others compute with
+    "dispersion": 0,
     "shards": 0,
     "pupil": 0,
     "zernike": 0,

@@ -1,15 +1,18 @@
 """Variables of a lens: which numbers they move, by how much, within what bounds."""
 
 import dataclasses
+import math
 from pathlib import Path
 
 import pytest
 import torch
 
-from raytrace.design.variables import BadVariables, Variables, edge_thickness, parse_bounds, violation
+from raytrace.design.limits import BadLimits, Limits, edge_thickness, limits_of, parse_range, violation
+from raytrace.design.variables import BadVariables, Variables, parse_bounds
 from raytrace.formats import read_lens
+from raytrace.glass import AIR, MIRROR, constant, is_air, model_glass, nd
 from raytrace.lens import with_sensor_distance
-from raytrace.surface import sag
+from raytrace.surface import Surface, sag
 
 LENSES = Path(__file__).parents[1] / "lenses"
 NANOMETRE = 1e-6
@@ -127,19 +130,118 @@ def test_bounds_that_cannot_be_read_are_refused(text, message):
 
 
 def test_a_real_lens_can_be_built_and_a_squeezed_one_cannot():
-    lens = with_sensor_distance(double_gauss(), 57.9)
-    assert float(violation(lens)) == 0
-    surfaces = list(lens.surfaces)
-    surfaces[1] = dataclasses.replace(surfaces[1], thickness=torch.tensor(0.4, dtype=torch.float64))
-    squeezed = dataclasses.replace(lens, surfaces=tuple(surfaces))
+    lens, limits = with_sensor_distance(double_gauss(), 57.9), Limits((1.0, math.inf), (0.05, math.inf), 0.5)
+    assert float(violation(lens, limits)) == 0
+    squeezed = with_thickness(lens, 1, 0.4)
     edge = float(edge_thickness(squeezed.surfaces[1], squeezed.surfaces[2]))
     expected = (1.0 - 0.4) ** 2 + max(0.0, 0.5 - edge) ** 2
-    assert float(violation(squeezed)) == pytest.approx(expected, rel=1e-12)
+    assert float(violation(squeezed, limits)) == pytest.approx(expected, rel=1e-12)
     assert edge < 0.4
     # Air spaces: the two lenses would touch at the centre.
+    assert float(violation(with_thickness(lens, 2, -0.1), limits)) > 0.15**2 - 1e-12
+
+
+def with_thickness(lens, number, thickness):
     surfaces = list(lens.surfaces)
-    surfaces[2] = dataclasses.replace(surfaces[2], thickness=torch.tensor(-0.1, dtype=torch.float64))
-    assert float(violation(dataclasses.replace(lens, surfaces=tuple(surfaces)))) > 0.15**2 - 1e-12
+    surfaces[number] = dataclasses.replace(surfaces[number], thickness=torch.tensor(thickness, dtype=torch.float64))
+    return dataclasses.replace(lens, surfaces=tuple(surfaces))
+
+
+@pytest.mark.parametrize("name", ["phone", "double_gauss"])
+def test_an_element_lacks_thickness_whatever_its_glass_is_called(name):
+    """By the medium's index: a glass of a table has none, air may have one. Each element in turn, 0.01 mm thick."""
+    lens = read_lens(LENSES / f"{name}.zmx")
+    limits = Limits((0.1, math.inf), (0.0, math.inf), 0.0)
+    before = float(violation(lens, limits))
+    elements = [k for k, surface in enumerate(lens.surfaces[1:-1], 1) if float(nd(surface.glass)) > 1.1]
+    assert len(elements) == {"phone": 7, "double_gauss": 6}[name]
+    for k in elements:
+        thin = with_thickness(lens, k, 0.01)
+        assert float(violation(thin, limits)) - before >= 0.09**2 - 1e-12
+        unnamed = [
+            dataclasses.replace(s, glass=dataclasses.replace(s.glass, name="" if k % 2 else "AIR"))
+            for s in thin.surfaces
+        ]
+        assert float(violation(dataclasses.replace(thin, surfaces=tuple(unnamed)), limits)) == float(
+            violation(thin, limits)
+        )
+
+
+def test_air_is_a_fact_of_the_medium():
+    assert is_air(AIR)
+    assert is_air(constant(1.0003, "NITROGEN"))
+    assert is_air(model_glass(1.0, 0.0))
+    assert not is_air(constant(1.5))
+    assert not is_air(constant(1.31, "AIR"))
+    assert not is_air(model_glass(1.5168, 64.2))
+    assert not is_air(MIRROR)
+
+
+def test_glass_behind_a_mirror_is_glass():
+    """A Mangin mirror: the light runs back through 2 mm of glass, a space of the same medium."""
+    glass = constant(1.5)
+    surfaces = [
+        Surface(thickness=torch.tensor(math.inf, dtype=torch.float64)),
+        *(
+            Surface(thickness=torch.tensor(t, dtype=torch.float64), glass=medium)
+            for t, medium in ((2.0, glass), (-2.0, MIRROR), (-50.0, AIR), (0.0, AIR))
+        ),
+    ]
+    lens = dataclasses.replace(double_gauss(), surfaces=tuple(surfaces))
+    assert float(violation(lens, Limits((2.0, 5.0), (1.0, 10.0), 0.0))) == 0
+    # Both ways through the glass lack 1 mm.
+    assert float(violation(lens, Limits((3.0, 5.0), (1.0, 10.0), 0.0))) == pytest.approx(2.0, rel=1e-12)
+    assert float(violation(lens, Limits((0.5, 1.5), (1.0, 10.0), 0.0))) == pytest.approx(0.5, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in LENSES.glob("*.zmx")))
+def test_shipped_lenses_keep_to_the_limits_of_their_size(name):
+    """Real designs from 4 mm to 2.4 m: the smallest cover glass and the largest mirror; two rims that their
+    semi-diameters let overlap by 19 µm."""
+    assert float(violation(read_lens(LENSES / f"{name}.zmx"))) <= (0.02**2 if name == "telephoto" else 0)
+
+
+def test_limits_scale_with_the_lens():
+    lens = double_gauss()
+    small = scaled(lens, 0.1)
+    one, other = limits_of(lens), limits_of(small)
+    assert one.glass[0] == pytest.approx(10 * other.glass[0], rel=1e-12)
+    assert one.glass[0] == pytest.approx(58.45 / 50, rel=1e-3)
+    assert (limits_of(lens, edge=0.3).edge, limits_of(lens, glass=(2.0, 15.0)).glass) == (0.3, (2.0, 15.0))
+    thin = with_thickness(small, 1, 0.01)
+    assert float(violation(thin)) == pytest.approx(1e-2 * float(violation(with_thickness(lens, 1, 0.1))), rel=1e-9)
+
+
+def scaled(lens, factor):
+    surfaces = [
+        dataclasses.replace(
+            s,
+            curvature=None if s.curvature is None else s.curvature / factor,
+            thickness=factor * s.thickness,
+            semi_diameter=factor * s.semi_diameter if s.semi_diameter else s.semi_diameter,
+        )
+        for s in lens.surfaces
+    ]
+    return dataclasses.replace(lens, surfaces=tuple(surfaces))
+
+
+def test_greatest_thicknesses_count_too():
+    lens = double_gauss()
+    limits = limits_of(lens, glass=(1.0, 12.0), air=(0.1, 20.0))
+    # 14 mm of glass behind surface 3; 26.68 mm from element to element across the stop; 58.5 mm to the sensor is free.
+    whole = float(lens.surfaces[5].thickness + lens.surfaces[6].thickness)
+    assert float(violation(lens, limits)) == pytest.approx(2.0**2 + (whole - 20) ** 2, rel=1e-9)
+    own = Variables(lens, "thickness:3", glass_thickness=(1.0, 12.0))
+    own.violation().backward()
+    assert float(own.get_parameter("thickness_3").grad) == pytest.approx(2 * 2.0, rel=1e-9)
+
+
+def test_ranges_are_read():
+    assert parse_range("2:15") == (2.0, 15.0)
+    assert parse_range("0.5") == (0.5, math.inf)
+    for text, message in (("x", "'x': expected the least"), ("15:2", "found 15 and 2"), ("-1:2", "0 ≤ least")):
+        with pytest.raises(BadLimits, match=message):
+            parse_range(text)
 
 
 def test_a_telescope_of_mirrors_can_be_built():

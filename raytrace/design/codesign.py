@@ -235,10 +235,7 @@ def optimise(
     groups += [{"params": optics, "lr": settings.rate_optics}] if optics else []
 
     def loss(step: int, share: Share) -> tuple[Tensor, Record]:
-        error = absolute_error(camera, batches(step, share)).sum() / pixels
-        if share.rank == 0 and optics:  # once: gradients are summed over processes
-            error = error + camera.variables.violation().to(error.dtype)
-        return error, camera.variables.numbers()
+        return absolute_error(camera, batches(step, share)).sum() / pixels, camera.variables.numbers()
 
     yield from train(
         camera,
@@ -248,6 +245,7 @@ def optimise(
         run=run,
         every=every,
         after_step=camera.variables.project,
+        penalty=camera.variables.violation,
     )
 
 

@@ -119,12 +119,14 @@ def train(
     every: int = 100,
     seconds: float = 60.0,
     after_step: Callable[[], None] = lambda: None,
+    penalty: Callable[[], Tensor] | None = None,
 ) -> Iterator[tuple[int, Record]]:
     """Take the steps that are left, one for each item taken from this iterator: (step, what it reports).
 
     loss: (step, share of this process) -> its part of the loss of the batch, to be summed over processes, and numbers
     for the log (of the first process); every, seconds: steps and time between checkpoints, whichever passes first;
-    after_step: a projection, say.
+    after_step: a projection, say; penalty: what is made small beside the loss, the same in all processes. It is added
+    for the gradient alone: the log has it in a column of its own.
     Raises NotFinite at a loss or a gradient that is no number, before it is stepped into.
     """
     prepare()  # numbers must not depend on when somebody else compiles the trace
@@ -134,8 +136,11 @@ def train(
     while step < steps:
         optimizer.zero_grad(set_to_none=True)
         value, record = loss(step, mine)
-        if value.requires_grad:
-            value.backward()
+        added = None if penalty is None else penalty()
+        # Once: gradients are summed over processes.
+        whole = value if added is None or mine.rank else value + added.to(value.dtype)
+        if whole.requires_grad:
+            whole.backward()
         summed = _sum_over_processes(parameters, value.detach())
         if not math.isfinite(summed):
             kept = (
@@ -144,7 +149,7 @@ def train(
             raise NotFinite(f"step {step}: the loss is {summed}, or its gradient is none; {kept}")
         optimizer.step()
         after_step()
-        record = {"loss": summed, **record}
+        record = {"loss": summed} | ({} if added is None else {"penalty": float(added.detach())}) | record
         rows.append((step, record))
         step += 1
         due = step % every == 0 or step == steps or time.monotonic() - kept_at >= seconds

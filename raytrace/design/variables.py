@@ -11,12 +11,10 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
+from raytrace.design.limits import limits_of, violation
 from raytrace.lens import Lens
-from raytrace.surface import Surface, sag
 
 KINDS = ("sensor", "thickness", "curvature", "conic")
-_LEAST_GLASS = 1.0, 0.5  # mm at the centre and at the edge of a lens
-_LEAST_AIR = 0.05, 0.0
 
 
 class BadVariables(ValueError):
@@ -46,13 +44,25 @@ class Variables(nn.Module):
 
     vary: "sensor", and lists like "thickness:5,6,10 curvature:1-4", of the file's surface numbers.
     bounds: by name ("sensor", "curvature_3"), smallest and largest number of the lens; `project` keeps them.
+    glass_thickness, air_thickness: least and greatest in mm at the axis; edge: least of glass at its edge; by default
+    they go with the size of the lens (`limits_of`). `violation` says how far the lens is from them.
     """
 
-    def __init__(self, lens: Lens, vary: str = "sensor", *, bounds: Mapping[str, tuple[float, float]] | None = None):
+    def __init__(
+        self,
+        lens: Lens,
+        vary: str = "sensor",
+        *,
+        bounds: Mapping[str, tuple[float, float]] | None = None,
+        glass_thickness: tuple[float, float] | None = None,
+        air_thickness: tuple[float, float] | None = None,
+        edge: float | None = None,
+    ):
         super().__init__()
         self.lens = lens
         self.variables = parse(lens, vary)
         self.bounds = dict(bounds or {})
+        self.limits = limits_of(lens, glass=glass_thickness, air=air_thickness, edge=edge)
         unknown = set(self.bounds) - {variable.name for variable in self.variables}
         if unknown:
             raise BadVariables(f"bounds for {', '.join(sorted(unknown))}, not among the variables: {vary}")
@@ -86,11 +96,8 @@ class Variables(nn.Module):
                 getattr(self, variable.name).clamp_(min(low, high), max(low, high))
 
     def violation(self) -> Tensor:
-        """How far the lens is from one that can be built: the sum of what thicknesses lack, mm².
-
-        At the centre and at the edge, of glass and of air; 0 for a lens that keeps `_LEAST_GLASS`, `_LEAST_AIR`.
-        """
-        return violation(self())
+        """How far the lens is from its limits, mm² (`limits.violation`)."""
+        return violation(self(), self.limits)
 
 
 def parse(lens: Lens, vary: str) -> tuple[Variable, ...]:
@@ -153,51 +160,3 @@ def _variable(lens: Lens, kind: str, number: int, word: str) -> Variable:
         raise BadVariables(f"{word!r}: surface {number} is flat, and a conic constant changes nothing there")
     start = 0.0 if surface.conic is None else float(surface.conic)
     return Variable(kind, number, start, 8 / (abs(curvature) ** 3 * edge**4))  # z ≈ … + (1 + k) c³ r⁴/8
-
-
-def violation(lens: Lens) -> Tensor:
-    """Σ (what a thickness lacks)² in mm², over the centres and edges of all elements and air spaces; 0 is buildable.
-
-    Elements either side of a stop are also kept from touching beyond its rim.
-    """
-    total, side = torch.zeros_like(lens.surfaces[-2].thickness), 1
-    for before, after in zip(lens.surfaces[1:-1], lens.surfaces[2:], strict=True):
-        side = -side if before.is_mirror else side
-        centre, edge = _LEAST_AIR if _is_air(before) else _LEAST_GLASS
-        lacks = [centre - side * before.thickness]
-        if before.semi_diameter and after.semi_diameter:
-            lacks.append(edge - side * edge_thickness(before, after))
-        for lack in lacks:
-            total = total + lack.clamp_min(0).square()
-    for lack in _beyond_stops(lens):
-        total = total + lack.clamp_min(0).square()
-    return total
-
-
-def _beyond_stops(lens: Lens) -> list[Tensor]:
-    """What air spaces lack at the edge, from element to element, across surfaces with air on both sides."""
-    surfaces, lacks, first = lens.surfaces, [], 1
-    if any(surface.is_mirror for surface in surfaces):
-        return []
-    for number in range(2, len(surfaces) - 1):
-        in_air, stands_in_air = _is_air(surfaces[number - 1]), _is_air(surfaces[number])
-        if not in_air:
-            first = number
-        elif not stands_in_air:
-            before, after = surfaces[first], surfaces[number]
-            if number - first > 1 and _is_air(before) and before.semi_diameter and after.semi_diameter:
-                gap = sum(surface.thickness for surface in surfaces[first:number])
-                whole = edge_thickness(dataclasses.replace(before, thickness=gap), after)
-                lacks.append(_LEAST_AIR[1] - whole)
-            first = number
-    return lacks
-
-
-def edge_thickness(before: Surface, after: Surface) -> Tensor:
-    """Thickness in mm between two surfaces at the smaller of their semi-diameters."""
-    height = before.thickness.new_tensor(min(before.semi_diameter, after.semi_diameter)) ** 2
-    return before.thickness + sag(after, height) - sag(before, height)
-
-
-def _is_air(surface: Surface) -> bool:
-    return surface.is_mirror or surface.glass.name in ("", "AIR")

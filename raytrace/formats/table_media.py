@@ -4,7 +4,8 @@ import numpy as np
 
 from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, Place, number, shown
-from raytrace.glass import AIR, LINES, MODEL_LINES, Glass, constant, model_glass
+from raytrace.dispersion import MODEL_LINES
+from raytrace.glass import AIR, LINES, Glass, constant, model_glass
 
 #: What an empty or undispersed medium's Abbe number is written as.
 NOTHING = ("", "-", "0", "0.0", "∞", "inf", "infinity", "nan", "none")

@@ -11,7 +11,7 @@ from raytrace.formats.writing import (
     catalogs_needed,
     exact,
     exact_list,
-    is_air,
+    is_left_out,
     is_listed,
     listed_name,
     refuse_departure,
@@ -112,7 +112,7 @@ def _row(lens: Lens, number: int, surface: Surface, place: Place) -> dict[str, s
 
 
 def _glass(glass: Glass, place: Place) -> str:
-    if is_air(glass):
+    if is_left_out(glass):
         return ""
     if glass.formula == "mirror":
         return "MIRROR"

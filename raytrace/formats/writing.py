@@ -59,7 +59,7 @@ def refuse_departure(surface: Surface, place: Place) -> None:
         raise LensFileError(f"the surface departs from a conic and even terms ({kind}), which no file holds", place)
 
 
-def is_air(glass: Glass) -> bool:
+def is_left_out(glass: Glass) -> bool:
     """True for the medium that files leave out."""
     return glass.formula == "constant" and glass.name == "" and bool((glass.coefficients == 1).all())
 

@@ -8,7 +8,7 @@ from raytrace.formats.writing import (
     catalogs_needed,
     exact,
     exact_list,
-    is_air,
+    is_left_out,
     listed_name,
     one_line,
     refuse_departure,
@@ -143,7 +143,7 @@ def _coefficients(surface: Surface, place: Place) -> list[str]:
 
 
 def _glass(glass: Glass, place: Place) -> list[str]:
-    if is_air(glass):
+    if is_left_out(glass):
         return []
     if glass.formula == "mirror":
         return ["  GLAS MIRROR 0 0 1.5 40 0 0 0 0 0 0"]

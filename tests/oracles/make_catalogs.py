@@ -25,7 +25,8 @@ from pathlib import Path
 import torch
 
 from raytrace.agf import Catalog, write_agf
-from raytrace.glass import AGF_FORMULAS, COEFFICIENT_COUNTS, LINES, Glass, normal_line_deviation, refractive_index
+from raytrace.dispersion import AGF_FORMULAS, COEFFICIENT_COUNTS
+from raytrace.glass import LINES, Glass, normal_line_deviation, refractive_index
 
 TITLE = "{name}: dispersion coefficients that agree in two or more public sources; each glass names them in its comment"
 
