@@ -6,6 +6,7 @@ each spot's own centroid is a parabola in s, so nothing is retraced:
     s = -Σ W cov(x, m) / Σ W var(m)
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 
 import scipy.optimize
@@ -13,11 +14,19 @@ import torch
 from torch import Tensor
 
 from raytrace.launch import launch
-from raytrace.lens import Lens, with_object_distance
+from raytrace.lens import Lens, with_object_distance, with_sensor_distance
 from raytrace.numerics import safe_divide, safe_sqrt
+from raytrace.paraxial import paraxial_image_distance
+from raytrace.pupil import gauss_rings
 from raytrace.rays import Rays
 from raytrace.spot import EmptySpot, Spot, spot, spot_of_points, where_lit
 from raytrace.trace import media, trace_surfaces
+
+_RINGS = 12  # of the pupil, where focus on the axis is found
+
+
+class NoImage(ValueError):
+    """An object without a real image: there is no place for a sensor."""
 
 
 def image_rays(lens: Lens, pupil: Tensor, *, fields: Tensor | None = None, wavelengths: Tensor | None = None) -> Rays:
@@ -176,6 +185,41 @@ def _bundles(
         share = rays.position.new_full(rays.shape[:-1], distance_weight)
         share = share if field_weights is None else share * field_weights[:, None]
         yield rays, share if wavelength_weights is None else share * wavelength_weights
+
+
+def best_focus(lens: Lens) -> Tensor:
+    """Sensor distance (scalar, mm) of least RMS spot on the axis, over the lens's wavelengths by their weights.
+
+    Raises EmptySpot where no ray arrives.
+    """
+    axis, weights = lens.wavelengths.new_zeros(2, 1), lens.wavelength_weights
+    return focus(lens, *gauss_rings(_RINGS), fields=axis, wavelength_weights=weights, empty="error")
+
+
+def real_image_distance(lens: Lens, object_distances: Tensor) -> Tensor:
+    """Sensor distances (D,) mm of the paraxial images of objects at distances (D,) mm. Raises NoImage for one that is
+    not behind the lens."""
+    images = paraxial_image_distance(lens, object_distances)
+    side = -1 if sum(surface.is_mirror for surface in lens.surfaces) % 2 else 1
+    for distance, image in zip(object_distances.tolist(), images.tolist(), strict=True):
+        if not 0 < side * image < math.inf:
+            place = f"{image:g} mm, on the side the light comes from" if math.isfinite(image) else "infinity"
+            raise NoImage(
+                f"no real image of an object at {distance:g} mm: it lies within the focal length, or the lens diverges "
+                f"(paraxial image at {place})"
+            )
+    return images
+
+
+def focused(lens: Lens, object_distance: float, *, on: str = "paraxial") -> Lens:
+    """The lens with an object at a distance (mm, inf allowed) and the sensor at its image on the axis.
+
+    on: "paraxial", or "rms", the least RMS spot. Raises NoImage where the image is not real.
+    """
+    lens = with_object_distance(lens, object_distance)
+    sensor = real_image_distance(lens, lens.wavelengths.new_tensor([object_distance]))
+    lens = with_sensor_distance(lens, sensor[0].detach())
+    return with_sensor_distance(lens, best_focus(lens).detach()) if on == "rms" else lens
 
 
 def _points_and_slopes(rays: Rays) -> tuple[Tensor, Tensor]:

@@ -11,8 +11,9 @@ import torch
 
 from raytrace.design import optima
 from raytrace.design.claims import claims
-from raytrace.design.codesign import Outcome, Settings, batch, best_focus, camera, lens_at_start
-from raytrace.design.optima import Optimum, closed_form, closed_forms, paraxial_image, scan, write_optima
+from raytrace.design.codesign import Outcome, Settings, batch, camera, lens_at_start
+from raytrace.design.conjugates import paraxial_image
+from raytrace.design.optima import Optimum, closed_form, closed_forms, scan, write_optima
 from raytrace.design.report import CAPTIONS, Report, below_the_mark, markdown
 from raytrace.design.spectral import even_distances, optimise_closed_form, power_spectrum
 from raytrace.design.step_time import StepTime, step_time
@@ -28,6 +29,7 @@ from raytrace.design.study import (
     write_table,
 )
 from raytrace.files import shipped
+from raytrace.focus import best_focus
 from raytrace.formats import read_lens
 from raytrace.lens import with_object_distance, with_sensor_distance
 from raytrace.paraxial import first_order

@@ -7,13 +7,12 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.frame import Tabular, axis, numbered
-from raytrace.focus import focus
+from raytrace.focus import focused
 from raytrace.grid import Grid, grid
-from raytrace.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance, with_wavelengths
+from raytrace.lens import Lens, SystemAperture, with_sensor_distance, with_wavelengths
 from raytrace.numerics import safe_divide, safe_sqrt
-from raytrace.paraxial import first_order, paraxial_image_distance
+from raytrace.paraxial import first_order
 from raytrace.psf import Psf, psf
-from raytrace.pupil import gauss_rings
 from raytrace.trace import media
 from raytrace.value import value
 
@@ -35,7 +34,6 @@ _IDEAL = ("paraxial", "Fourier")  # these place the light of a field where a len
 _CONIC = 0.2  # by how much the conic of the most curved surface grows
 _SLOW = 16.0  # F-number, or the lens's own if it is slower, at which the first dark ring is looked for
 _AIRY_PIXELS = 24  # pixels in the radius of the ideal ring
-_RINGS = 12  # Gauss rings of the least RMS spot
 
 
 @value
@@ -127,16 +125,7 @@ def common_focus(lens: Lens, focus_distance: float, *, wavelength: float | Tenso
     """
     if start not in STARTS:
         raise ValueError(f"start {start!r} is not known; expected {' or '.join(STARTS)}")
-    lens = with_object_distance(with_wavelengths(lens, [float(wavelength)]), focus_distance)
-    sensor = paraxial_image_distance(lens, lens.surfaces[0].thickness)
-    ahead = -1 if sum(surface.is_mirror for surface in lens.surfaces) % 2 else 1
-    if not 0 < ahead * float(sensor) < math.inf:
-        raise ValueError(f"no real image of an object at {focus_distance:g} mm: it lies within the focal length")
-    lens = with_sensor_distance(lens, sensor)
-    if start == "rms":
-        axis = lens.wavelengths.new_zeros(2, 1)
-        lens = with_sensor_distance(lens, focus(lens, *gauss_rings(_RINGS), fields=axis, empty="error"))
-    return lens
+    return focused(with_wavelengths(lens, [float(wavelength)]), focus_distance, on=start)
 
 
 def compare(lens: Lens, object_distances: Tensor) -> Comparison:

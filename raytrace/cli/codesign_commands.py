@@ -19,6 +19,7 @@ from raytrace.cli.codesign_setup import (
 from raytrace.cli.door import CommandError, print_json, say
 from raytrace.design.codesign import STEPS, Outcome
 from raytrace.design.optima import Optimum, closed_form
+from raytrace.design.optima import document as optimum_document
 from raytrace.design.spectral import power_spectrum
 from raytrace.files import write_atomically
 from raytrace.shards import processes
@@ -107,7 +108,7 @@ def _spectral(arguments: argparse.Namespace) -> None:
     settings = settings_without_network(arguments)
     given = experiment(arguments, settings)
     found = closed_form(given.lens, settings, spectrum_of(given))
-    document = plain({"settings": dataclasses.asdict(settings), **given.about, **dataclasses.asdict(found)})
+    document = plain({"settings": dataclasses.asdict(settings), **given.about, **optimum_document(found)})
     if arguments.output:
         path = Path(arguments.output) / "spectral.json"
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -24,7 +24,7 @@ from raytrace.cli.codesign_table import MODELS
 from raytrace.cli.door import CommandError, print_json, say
 from raytrace.design.claims import claims
 from raytrace.design.codesign import STEPS, Outcome, Settings, batch, camera, lens_at_start, outcome
-from raytrace.design.optima import Optimum, closed_forms, scan, write_optima
+from raytrace.design.optima import Optimum, closed_forms, document, scan, write_optima
 from raytrace.design.report import CAPTIONS, Report, below_the_mark, markdown
 from raytrace.design.step_time import StepTime, step_time
 from raytrace.design.study import (
@@ -82,7 +82,7 @@ def compare(arguments: argparse.Namespace) -> None:
 def _recorded_settings(path: Path) -> Settings:
     known = {field.name for field in dataclasses.fields(Settings)}
     found = {key: value for key, value in recorded(path).items() if key in known}
-    return Settings(**{**found, "fields": tuple(found["fields"])})
+    return Settings(**{key: tuple(value) if isinstance(value, list) else value for key, value in found.items()})
 
 
 def _guard(study: Path, given: Experiment) -> None:
@@ -226,7 +226,7 @@ def _document(report: Report) -> dict:
             "missing": [{"model": row, "seed": seed} for row, seed in report.missing],
             "models": [dataclasses.asdict(one) for one in summaries(report.found)],
             "claims": [{**dataclasses.asdict(one), "answer": one.answer} for one in claims(report.found, report.times)],
-            "closed_form": [dataclasses.asdict(one) for one in report.optima],
+            "closed_form": [document(one) for one in report.optima],
             "times": [dataclasses.asdict(one) for one in report.times],
         }
     )

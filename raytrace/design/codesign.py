@@ -14,39 +14,41 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
-import scipy.optimize
 import torch
 from torch import Tensor
 
 from raytrace.design.camera import Camera
+from raytrace.design.conjugates import distance_in_focus, paraxial_image
+from raytrace.design.limits import parse_range
 from raytrace.design.network import RedNet, RedNetShape
-from raytrace.design.spectral import optimise_closed_form, power_spectrum
+from raytrace.design.spectral import optimise_closed_form, out_of_focus, power_spectrum
 from raytrace.design.training import Record, Run, Share, train
 from raytrace.design.variables import Variables, parse_bounds
 from raytrace.files import write_atomically
-from raytrace.focus import focus
+from raytrace.focus import best_focus, focused, real_image_distance
+from raytrace.formats import write_lens
 from raytrace.grid import grid
 from raytrace.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance, with_wavelengths
-from raytrace.paraxial import paraxial_image_distance
 from raytrace.pictures import Pictures, crop, draws
-from raytrace.pupil import gauss_rings
 
 _SAMPLE = 10  # last number of the key of what a sample draws
 _TEST_EPOCH = 2**20  # test samples are those of an epoch that no training reaches
-_RINGS = 12  # of the pupil, where focus is found
 STEPS = ("joint", "refine")
+LENS = "lens.zmx"  # of a run: the lens as it was learned
 _INFINITE = ("focus_paraxial_m", "focus_rms_m")  # of an outcome; null in its file
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """All that decides the result of a run. Lengths in mm but for the wavelength in µm; angles in degrees.
+    """All that decides the result of a run. Lengths in mm but for wavelengths in µm; angles in degrees.
 
     model: PSF model of step 1; vary: variables of the lens; bounds: of some of them, "sensor:57.5,58 thickness_5:8,12".
+    glass_thickness, air_thickness: least, or least and greatest, "2:15"; edge: least of glass at its edge; those that
+    are not given go with the size of the lens (`limits.limits_of`).
     start: "paraxial" (the sensor at the paraxial image of `focus_distance`), "rms" (at its best focus), "spectral"
     (from the paraxial image to the optimum of the closed form), or a sensor distance; f_number: EFL over entrance pupil
-    diameter, None for that of the file; near, far: object distances, drawn evenly; noise: standard deviation in a range
-    of 1.
+    diameter, None for that of the file; wavelengths, the first being the primary one, of which PSFs are sums by
+    wavelength_weights; near, far: object distances, drawn evenly; noise: standard deviation in a range of 1.
     patch: pixels of what is restored; crops: a picture and epoch; precision: of the network, "float32" or "bfloat16"
     (`network.faster_precision` tells which this machine prefers).
     fields: field points in y, samples take them in turn; rate_network, rate_optics: of Adam; tol: of the PSFs; rho: of
@@ -57,10 +59,14 @@ class Settings:
     seed: int = 0
     vary: str = "sensor"
     bounds: str = ""
+    glass_thickness: str = ""
+    air_thickness: str = ""
+    edge: float | None = None
     start: str = "paraxial"
     focus_distance: float = 25e3
     f_number: float | None = None
-    wavelength: float = 0.53
+    wavelengths: tuple[float, ...] = (0.53,)
+    wavelength_weights: tuple[float, ...] = (1.0,)
     near: float = 10e3
     far: float = 50e3
     fields: tuple[float, ...] = (0.0,)
@@ -87,7 +93,9 @@ class Outcome:
 
     l1_joint: on test pictures after step 1, with the PSFs of its own model; l1_drt: after step 2, with DRT PSFs;
     l1_before: between the two, the network of step 1 on DRT PSFs. focus_paraxial_m, focus_rms_m: object distance from
-    vertex 1 in focus, of paraxial rays and of least RMS spot. by_distance: L1 with DRT PSFs after step 2.
+    vertex 1 in focus, of paraxial rays and of least RMS spot. by_distance: L1 with DRT PSFs after step 2. penalty: mm²
+    of what thicknesses lack (`limits.violation`), no part of the losses; no_optimum: why the lens is none of least loss
+    ("" where nothing speaks against it).
     """
 
     model: str
@@ -100,46 +108,43 @@ class Outcome:
     sensor_mm: float
     variables: dict[str, float]
     by_distance: dict[str, float]
+    penalty: float = 0.0
+    no_optimum: str = ""
 
 
 def lens_at_start(lens: Lens, settings: Settings) -> Lens:
-    """The lens at the wavelength and aperture of the experiment, focused as it begins."""
-    lens = with_wavelengths(lens, [settings.wavelength])
+    """The lens at the wavelengths and aperture of the experiment, focused as it begins.
+
+    Raises NoImage where an object at the focus distance, or between near and far, has no real image.
+    """
+    wavelengths, weights = (lens.wavelengths.new_tensor(n) for n in (settings.wavelengths, settings.wavelength_weights))
+    if weights.shape != wavelengths.shape or not bool((weights >= 0).all() and weights.sum() > 0):
+        raise ValueError(f"{len(weights)} weights of {len(wavelengths)} wavelengths; expected one ≥ 0 for each")
+    lens = with_wavelengths(lens, wavelengths, weights)
     if settings.f_number is not None:
-        number = SystemAperture("image_f_number", lens.wavelengths.new_tensor(settings.f_number))
+        number = SystemAperture("image_f_number", wavelengths.new_tensor(settings.f_number))
         lens = dataclasses.replace(lens, aperture=number)
-    lens = with_object_distance(lens, settings.focus_distance)
-    paraxial = paraxial_image_distance(lens, lens.surfaces[0].thickness)
-    if settings.start in ("paraxial", "spectral"):
-        return with_sensor_distance(lens, paraxial.detach())
-    if settings.start == "rms":
-        return with_sensor_distance(lens, best_focus(with_sensor_distance(lens, paraxial)).detach())
+    real_image_distance(lens, wavelengths.new_tensor([settings.near, settings.far]))  # refuses what has none
+    if settings.start in ("paraxial", "rms", "spectral"):
+        return focused(lens, settings.focus_distance, on="rms" if settings.start == "rms" else "paraxial")
     try:
-        return with_sensor_distance(lens, float(settings.start))
+        return with_sensor_distance(with_object_distance(lens, settings.focus_distance), float(settings.start))
     except ValueError as error:
         raise ValueError(
             f"start {settings.start!r}: expected paraxial, rms, spectral or a sensor distance in mm"
         ) from error
 
 
-def best_focus(lens: Lens) -> Tensor:
-    """Sensor distance of least RMS spot on the axis, mm. Raises EmptySpot where no ray arrives."""
-    return focus(lens, *gauss_rings(_RINGS), fields=lens.wavelengths.new_zeros(2, 1), empty="error")
-
-
-@torch.no_grad()
-def distance_in_focus(lens: Lens, image_distance: Callable[[Lens], Tensor]) -> float:
-    """Object distance from vertex 1 in mm whose image, by `image_distance`, is on the sensor; inf beyond 1000 km."""
-
-    def behind(vergence: float) -> float:
-        return float(image_distance(with_object_distance(lens, 1 / vergence)) - lens.surfaces[-2].thickness)
-
-    furthest, nearest = 1e-9, 2e-3
-    if behind(furthest) >= 0:
-        return math.inf
-    if behind(nearest) < 0:
-        raise ValueError(f"the sensor is in focus nearer than {1 / nearest:g} mm: too far behind the lens to be meant")
-    return 1 / scipy.optimize.brentq(behind, furthest, nearest, xtol=1e-14, rtol=1e-12)
+def variables(lens: Lens, settings: Settings) -> Variables:
+    """The variables of an experiment as it begins, with their bounds and the limits of thicknesses."""
+    return Variables(
+        lens_at_start(lens, settings),
+        settings.vary,
+        bounds=parse_bounds(settings.bounds),
+        glass_thickness=parse_range(settings.glass_thickness) if settings.glass_thickness else None,
+        air_thickness=parse_range(settings.air_thickness) if settings.air_thickness else None,
+        edge=settings.edge,
+    )
 
 
 def camera(lens: Lens, settings: Settings) -> Camera:
@@ -149,7 +154,7 @@ def camera(lens: Lens, settings: Settings) -> Camera:
     if settings.precision not in ("float32", "bfloat16"):
         raise ValueError(f"precision {settings.precision!r}: expected float32 or bfloat16")
     return Camera(
-        Variables(lens_at_start(lens, settings), settings.vary, bounds=parse_bounds(settings.bounds)),
+        variables(lens, settings),
         RedNet(RedNetShape(settings.depth, settings.width), seed=settings.seed).to(memory_format=torch.channels_last),
         model=settings.model,
         object_distances=(settings.near, settings.far),
@@ -281,12 +286,14 @@ def run_model(
     *,
     about: dict,
     distances: tuple[float, ...],
+    catalogs: Sequence[str | Path] = (),
     progress: Progress = iter,
 ) -> Iterator[tuple[str, int, Record]]:
     """Both steps of one model and seed, a training step at a time: (step's name, its number, what it reports).
 
     folder: of this run, resumed if begun; about: what else decides the result (lens file, pictures); progress: wraps
-    the batches of every test. The outcome is written to `outcome.json` there at the end, and read by `outcome`.
+    the batches of every test; catalogs: of glass, that the lens was read with. At the end the learned lens is written
+    to `lens.zmx` there, and the outcome to `outcome.json`, read by `outcome`.
     """
     folder = Path(folder)
     if (folder / "outcome.json").exists():
@@ -309,14 +316,17 @@ def run_model(
         l1_joint=l1_joint,
         l1_before=l1_before,
         l1_drt=held_out_error(own, test_pictures, settings, progress=progress),
-        focus_paraxial_m=1e-3 * distance_in_focus(found, _paraxial_image),
+        focus_paraxial_m=1e-3 * distance_in_focus(found, paraxial_image),
         focus_rms_m=1e-3 * distance_in_focus(found, best_focus),
         sensor_mm=float(found.surfaces[-2].thickness),
         variables=own.variables.numbers(),
+        penalty=float(own.variables.violation().detach()),
+        no_optimum=out_of_focus(own),
         by_distance={
             f"{d:g}": held_out_error(own, test_pictures, settings, distance=d, progress=progress) for d in distances
         },
     )
+    write_lens(found, folder / LENS, catalogs=catalogs)
     write_outcome(result, folder)
 
 
@@ -340,9 +350,7 @@ def _steps(own: Camera, pictures: Pictures, settings: Settings, folder: Path, ab
     run = Run(folder / name, {**dataclasses.asdict(settings), **about, "step": name})
     if settings.start == "spectral" and name == STEPS[0] and not run.checkpoint.exists():
         size = settings.patch + settings.size - 1
-        optimise_closed_form(own, power_spectrum(pictures, size, crops=settings.crops, seed=settings.seed))
+        course = optimise_closed_form(own, power_spectrum(pictures, size, crops=settings.crops, seed=settings.seed))
+        if course.no_optimum:
+            raise ValueError(f"start spectral: {course.no_optimum}")
     yield from optimise(own, pictures, settings, run)
-
-
-def _paraxial_image(lens: Lens) -> Tensor:
-    return paraxial_image_distance(lens, lens.surfaces[0].thickness)

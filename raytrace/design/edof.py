@@ -7,6 +7,7 @@ classic Wiener filter of the design depth with the best constant γ, and the bes
 
 import dataclasses
 import math
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
@@ -187,7 +188,11 @@ def best_gamma(H: Tensor, S: Tensor, noise: float, at_design: Tensor) -> float:
         return float(errors(H, S, noise, filter=wiener(at_design, 10**logarithm)).mean())
 
     # Coarse steps first: far from the best γ the error is flat.
-    start = min(np.arange(-6.0, 2.0, 0.5), key=error)
+    places = np.arange(-6.0, 2.0, 0.5)
+    start = min(places, key=error)
+    if start in (places[0], places[-1]):
+        message = f"no optimum of the filter's constant inside 10^{places[0]:g} to 10^{places[-1]:g}"
+        warnings.warn(f"{message}: the error still falls at its end", stacklevel=2)
     return 10 ** float(scipy.optimize.minimize_scalar(error, bounds=(start - 0.5, start + 0.5), method="bounded").x)
 
 
@@ -218,7 +223,7 @@ def best_of_starts(
             found = psf(scene(own(), world), plan=how, memo=memo)
             return expected_error(transfer(found, spectrum.shape[-1]), spectrum, world.noise)
 
-        found = min(minimise(list(own.parameters()), error, steps=steps))
+        found = min(minimise(list(own.parameters()), error, steps=steps).course)
         if found < least:
             best, least = own, found
     return best

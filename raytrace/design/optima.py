@@ -10,12 +10,13 @@ import torch
 from torch import Tensor
 
 from raytrace.design.camera import Camera
-from raytrace.design.codesign import Settings, best_focus, camera, distance_in_focus
+from raytrace.design.codesign import Settings, camera
+from raytrace.design.conjugates import distance_in_focus, paraxial_image
 from raytrace.design.spectral import camera_error, even_distances, optimise_closed_form
 from raytrace.design.study import AFTER_PARAXIAL
 from raytrace.files import write_atomically
+from raytrace.focus import best_focus
 from raytrace.lens import Lens
-from raytrace.paraxial import paraxial_image_distance
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,7 +24,10 @@ class Optimum:
     """The lens of least closed-form error of one model, or of one row of a study.
 
     error: mean square error of a pixel with the model's own PSFs; error_drt: of the same lens with DRT PSFs and the
-    filter that is best for them; course: the error at every evaluation. Focus distances in m as for `Outcome`.
+    filter that is best for them; penalty: mm² of what thicknesses lack (`limits.violation`), no part of the errors;
+    course, penalties: error and penalty at every evaluation. Focus distances in m as for `Outcome`.
+    at_end: variables at an end of their bounds behind which the error still falls; no_optimum: why this lens is none of
+    least error, "" where it is one. lens: as it was found.
     """
 
     model: str
@@ -34,15 +38,20 @@ class Optimum:
     error_drt: float
     variables: dict[str, float]
     course: tuple[float, ...]
+    penalty: float = 0.0
+    penalties: tuple[float, ...] = ()
+    at_end: tuple[str, ...] = ()
+    no_optimum: str = ""
+    lens: Lens | None = None
+
+
+def document(found: Optimum) -> dict:
+    """An optimum for JSON: all but its lens."""
+    return {field.name: getattr(found, field.name) for field in dataclasses.fields(found) if field.name != "lens"}
 
 
 #: Columns of `spectral.csv`.
-COLUMNS = ("model", "sensor_mm", "focus_paraxial_m", "focus_rms_m", "error", "error_drt")
-
-
-def paraxial_image(lens: Lens) -> Tensor:
-    """Sensor distance in mm of the paraxial image of the lens's object."""
-    return paraxial_image_distance(lens, lens.surfaces[0].thickness)
+COLUMNS = ("model", "sensor_mm", "focus_paraxial_m", "focus_rms_m", "error", "error_drt", "penalty", "no_optimum")
 
 
 def closed_form(lens: Lens, settings: Settings, spectrum: Tensor) -> Optimum:
@@ -62,7 +71,12 @@ def closed_form(lens: Lens, settings: Settings, spectrum: Tensor) -> Optimum:
         error=float(error),
         error_drt=float(error_drt),
         variables=own.variables.numbers(),
-        course=tuple(course),
+        course=course.errors,
+        penalty=float(own.variables.violation().detach()),
+        penalties=course.penalties,
+        at_end=course.at_end,
+        no_optimum=course.no_optimum,
+        lens=found,
     )
 
 

@@ -87,7 +87,7 @@ def options(settings: Settings) -> list[str]:
         value = getattr(settings, field.name)
         if field.name in ("model", "seed") or value == getattr(usual, field.name):
             continue
-        option = {"fields": "field"}.get(field.name, field.name).replace("_", "-")
+        option = {"fields": "field", "wavelengths": "wavelength"}.get(field.name, field.name).replace("_", "-")
         shown = " ".join(f"{one:g}" for one in value) if isinstance(value, tuple) else value
         found.append(f"--{option} {shown}")
     return found
@@ -104,13 +104,20 @@ def _experiment(report: Report) -> str:
     where = "the axis" if s.fields == (0.0,) else "the fields " + ", ".join(f"{y:g}" for y in s.fields)
     light = {"window": "the window", "energy": "the light through the pupil"}[s.normalise]
     return (
-        f"{report.lens} at {aperture}, {s.wavelength:g} µm, on {where}; objects at {s.near / 1e3:g} to "
+        f"{report.lens} at {aperture}, {_colours(s)}, on {where}; objects at {s.near / 1e3:g} to "
         f"{s.far / 1e3:g} m, drawn evenly; windows of {s.size} × {s.size} pixels of {1e3 * s.pixel:g} µm, PSFs "
         f"normalised to {light}; noise of standard deviation {s.noise:g} on pictures in [0, 1]. Learned: {s.vary}, "
         f"from {start}. RED-Net of {s.depth} layers of {s.width} maps in {s.precision}, L¹ loss, Adam at "
         f"{s.rate_network:g} (network) and {s.rate_optics:g} (lens), {s.epochs} epochs of each step, batches of "
         f"{s.batch} patches of {s.patch} × {s.patch}. {report.pictures}."
     )
+
+
+def _colours(s: Settings) -> str:
+    listed = ", ".join(f"{one:g}" for one in s.wavelengths)
+    if len(s.wavelengths) == 1:
+        return f"{listed} µm"
+    return f"{listed} µm weighted {', '.join(f'{one:g}' for one in s.wavelength_weights)}"
 
 
 def _progress(report: Report) -> str:

@@ -1,5 +1,6 @@
 """A camera's error in closed form, by the best linear filter of `deconvolve`: deterministic, no network, no noise."""
 
+import dataclasses
 import math
 
 import torch
@@ -8,7 +9,8 @@ from torch import Tensor
 from raytrace.deconvolve import kernel_error
 from raytrace.deconvolve import power_spectrum as periodogram
 from raytrace.design.camera import Camera
-from raytrace.design.descent import minimise
+from raytrace.design.conjugates import sensor_range
+from raytrace.design.descent import Descent, minimise
 from raytrace.pictures import Pictures, crop
 
 #: Length of the first step, mm of thickness or of sag. L-BFGS-B takes 1 of its own units, and a sensor moved by 1 mm
@@ -45,24 +47,69 @@ def even_distances(camera: Camera, count: int = 33) -> Tensor:
     return near + (far - near) * place
 
 
-def optimise_closed_form(camera: Camera, spectrum: Tensor, *, distances: Tensor | None = None) -> list[float]:
-    """Bring the variables of the lens to the least `camera_error`; returns it as it fell, from start to end.
+@dataclasses.dataclass(frozen=True)
+class Course:
+    """How the closed form led a lens: errors and penalties (mm²) at every evaluation, their sum being what falls.
+
+    at_end: names of variables that stand at an end of their bounds behind which it still falls; no_optimum: why the
+    last lens is none of least error, "" where it is one.
+    """
+
+    errors: tuple[float, ...]
+    penalties: tuple[float, ...]
+    at_end: tuple[str, ...]
+    no_optimum: str
+
+
+def optimise_closed_form(camera: Camera, spectrum: Tensor, *, distances: Tensor | None = None) -> Course:
+    """Bring the variables of the lens to the least `camera_error`, with the penalty of a lens beyond its limits.
 
     By L-BFGS-B with exact gradients (scipy), within the bounds of the variables: the first optimum downhill.
     """
     distances = even_distances(camera) if distances is None else distances
-    variables = camera.variables
+    variables, parts = camera.variables, []
 
-    def error() -> Tensor:
-        return camera_error(camera, spectrum, distances) + variables.violation()
+    def whole() -> Tensor:
+        error, penalty = camera_error(camera, spectrum, distances), variables.violation()
+        parts.append((float(error.detach()), float(penalty.detach())))
+        return error + penalty
 
     # Errors are of 1e-3 and variables of millimetres: the default tolerance (2e-9 of 1) would stop too soon.
-    return minimise(
+    found = minimise(
         list(variables.parameters()),
-        error,
+        whole,
         unit=_FIRST_STEP,
         bounds=[_parameter_bounds(variables, variable) for variable in variables.variables],
         tolerance=1e-11,
+    )
+    names = tuple(one.name for one, at_end in zip(variables.variables, found.at_end, strict=True) if at_end)
+    errors, penalties = zip(*parts, strict=True)
+    return Course(errors, penalties, names, _no_optimum(camera, found, names))
+
+
+def _no_optimum(camera: Camera, found: Descent, at_end: tuple[str, ...]) -> str:
+    """Why a descent ended at no optimum; "" where it is one, if only within some of the bounds."""
+    variables = camera.variables
+    if found.is_flat:
+        return "no optimum: where the search began, the loss does not change with the variables"
+    if at_end and ("sensor" in at_end or len(at_end) == len(variables.variables)):
+        ranges = (f"{name} from {low:g} to {high:g}" for name in at_end for low, high in [variables.bounds[name]])
+        return f"no optimum inside {', '.join(ranges)}: the loss still falls at its end"
+    return out_of_focus(camera)
+
+
+def out_of_focus(camera: Camera) -> str:
+    """Why the sensor of a camera is out of focus for all objects of its range; "" where it is not."""
+    lens = camera.variables()
+    width = float(camera.pixels.pitch.detach()) * camera.pixels.rows
+    low, high = sensor_range(lens, camera.range, fields=camera.fields, width=width)
+    sensor = float(lens.surfaces[-2].thickness.detach())
+    if low <= sensor <= high:
+        return ""
+    near, far = camera.range
+    return (
+        f"no optimum inside {low:.7g} to {high:.7g} mm of sensor distance, where an object from {near:g} to {far:g} mm "
+        f"is in focus to the width of the PSF: the loss still falls at its end, and the sensor went to {sensor:.7g} mm"
     )
 
 

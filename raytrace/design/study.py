@@ -147,7 +147,8 @@ def blur_diameters(lens: Lens, distances: Tensor) -> Tensor:
     for distance in distances:
         own = with_object_distance(lens, distance)
         rays = trace(own, launch(own, pupil, fields=axis), own.wavelengths[:, None])
-        found.append(2 * spot(rays, weights).rms_radius[0, 0])
+        share = own.wavelength_weights / own.wavelength_weights.sum()
+        found.append(2 * (share * spot(rays, weights).mean_square_radius[0]).sum().sqrt())
     return torch.stack(found)
 
 

@@ -92,7 +92,7 @@ def polynomials_on_lens(world: World, terms: int = 45) -> PhaseVariables:
 
 def learn(
     variables: PhaseVariables, world: World, S: Tensor, factor: int, *, steps: int = 60, start: Tensor | None = None
-) -> list[float]:
+) -> tuple[float, ...]:
     """Bring variables to the least closed-form error; returns its course. start: changes to begin with."""
     if start is not None:
         with torch.no_grad():
@@ -103,7 +103,7 @@ def learn(
         kernel = psf(scene(variables(), world), plan=how, memo=memo).kernel[0]
         return error_of(coarse(kernel, S.shape[-1], factor), S, world.noise, factor)
 
-    return minimise([variables.change], error, steps=steps)
+    return minimise([variables.change], error, steps=steps).course
 
 
 def learned_lens(
