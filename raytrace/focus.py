@@ -6,7 +6,6 @@ each spot's own centroid is a parabola in s, so nothing is retraced:
     s = -Σ W cov(x, m) / Σ W var(m)
 """
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 
 import scipy.optimize
@@ -201,13 +200,13 @@ def real_image_distance(lens: Lens, object_distances: Tensor) -> Tensor:
     not behind the lens."""
     images = paraxial_image_distance(lens, object_distances)
     side = -1 if sum(surface.is_mirror for surface in lens.surfaces) % 2 else 1
-    for distance, image in zip(object_distances.tolist(), images.tolist(), strict=True):
-        if not 0 < side * image < math.inf:
-            place = f"{image:g} mm, on the side the light comes from" if math.isfinite(image) else "infinity"
-            raise NoImage(
-                f"no real image of an object at {distance:g} mm: it lies within the focal length, or the lens diverges "
-                f"(paraxial image at {place})"
-            )
+    wrong = ~((side * images > 0) & torch.isfinite(images)).detach()
+    if bool(wrong.any()):
+        distance, image = (float(one[wrong][0]) for one in (object_distances.detach(), images.detach()))
+        raise NoImage(
+            f"no real image of an object at {distance:g} mm: it lies within the focal length, or the lens diverges "
+            f"(paraxial image at {image:g} mm)"
+        )
     return images
 
 

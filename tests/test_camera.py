@@ -369,7 +369,7 @@ def test_a_sensor_that_is_in_focus_for_nothing_is_no_optimum():
     assert low < min(images) < max(images) < high
     # By similar triangles: at F/N a blur as wide as the window is N windows away.
     number_of_the_lens = float(first_order(own.variables()).working_f_number)
-    assert high - max(images) == pytest.approx(0.5 * 7 * 0.005 * number_of_the_lens, rel=0.1)
+    assert high - max(images) == pytest.approx(7 * 0.005 * number_of_the_lens, rel=0.1)
 
 
 def test_a_telescope_too_near_its_object_has_no_image_to_be_learned():

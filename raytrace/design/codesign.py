@@ -9,6 +9,7 @@ Every sample is keyed by its number: crop, object distance and noise are the sam
 import dataclasses
 import json
 import math
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -352,5 +353,5 @@ def _steps(own: Camera, pictures: Pictures, settings: Settings, folder: Path, ab
         size = settings.patch + settings.size - 1
         course = optimise_closed_form(own, power_spectrum(pictures, size, crops=settings.crops, seed=settings.seed))
         if course.no_optimum:
-            raise ValueError(f"start spectral: {course.no_optimum}")
+            warnings.warn(f"start spectral: {course.no_optimum}", stacklevel=2)
     yield from optimise(own, pictures, settings, run)
