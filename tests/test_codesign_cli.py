@@ -117,6 +117,66 @@ def test_without_pictures_leaves_are_made(run):
     assert found["focus_paraxial_m"] > 25
 
 
+def test_objects_without_an_image_are_refused(run, pictures):
+    """10 to 50 m lie within the focal length of 57.6 m: no sensor distance is an answer."""
+    code, out, err = run("hubble", "--data", pictures, "--loss", "spectral")
+    assert (code, out) == (1, "")
+    assert "hubble: no real image of an object at 10000 mm: it lies within the focal length" in err
+    assert "give --near, --far and --focus-distance beyond the focal length" in err
+    assert len(err.splitlines()) == 1
+
+
+def test_the_learned_lens_is_a_file_that_traces(run, command, pictures):
+    """Of the closed form and of a run; the file holds the sensor that was said, and its spots are small."""
+    options = ("--data", pictures, *SMALL, "--model", "paraxial", "--wavelength", "0.53", "0.62")
+    code, out, err = run("double_gauss", *options, "--loss", "spectral", "-o", "learned.zmx", "--json")
+    assert code == 0, err
+    found, lens = json.loads(out), read_lens("learned.zmx")
+    assert found["settings"]["wavelengths"] == lens.wavelengths.tolist() == [0.53, 0.62]
+    assert float(lens.surfaces[-2].thickness) == found["sensor_mm"]
+    assert (found["penalty"], found["no_optimum"], found["at_end"]) == (0.0, "", [])
+    code, out, err = command("spot", "learned.zmx", "--json")
+    assert code == 0, err
+    assert "rms" in out
+    code, out, err = run("double_gauss", *options, "-o", "run.zmx", "--json")
+    assert code == 0, err
+    assert float(read_lens("run.zmx").surfaces[-2].thickness) == json.loads(out)["sensor_mm"]
+    assert float(read_lens("run/lens.zmx").surfaces[-2].thickness) == read("run/outcome.json")["sensor_mm"]
+
+
+def test_the_files_own_wavelengths_are_taken_when_asked(run, pictures):
+    options = ("--data", pictures, *SMALL, "--model", "paraxial", "--loss", "spectral", "--json")
+    lens = read_lens(raytrace.files.shipped("lenses") / "cooke_triplet.zmx")
+    code, out, err = run("cooke_triplet", *options, "--file-wavelengths")
+    assert code == 0, err
+    settings = json.loads(out)["settings"]
+    assert sorted(settings["wavelengths"]) == sorted(lens.wavelengths.tolist())
+    assert settings["wavelengths"][0] == float(lens.wavelengths[lens.primary_wavelength])
+    code, _, err = run("cooke_triplet", *options, "--file-wavelengths", "--wavelength", "0.5")
+    assert code == 1
+    assert "leave out --wavelength" in err
+
+
+def test_the_penalty_is_said_beside_the_loss(run, pictures):
+    """Elements thinner than 0.3 mm and thicker than 0.9 mm, of glasses without names; on every row of the log."""
+    options = ("--data", pictures, *SMALL, "--model", "paraxial", "--vary", "sensor", "--json")
+    code, out, err = run("phone", *options, "--glass-thickness", "0.3:0.9", "--edge", "0.1", "-o", "thin")
+    assert code == 0, err
+    found = json.loads(out)
+    surfaces = read_lens("thin/lens.zmx").surfaces
+    glass = [float(surfaces[k].thickness) for k in (2, 4, 6, 8, 10, 12, 14)]
+    expected = sum(max(0, 0.3 - t) ** 2 + max(0, t - 0.9) ** 2 for t in glass)
+    assert found["penalty"] == pytest.approx(expected, rel=1e-3)
+    assert found["limits"]["glass"] == [0.3, 0.9]
+    log = rows("thin/joint/log.csv")
+    assert all(float(row["penalty"]) == pytest.approx(found["penalty"], rel=1e-12) for row in log)
+    code, text, _ = run("phone", *options[:-1], "--glass-thickness", "0.3:0.9", "--edge", "0.1", "-o", "thin")
+    assert f"penalty {found['penalty']:.6g} mm² beside the loss; thicknesses: glass 0.3 to 0.9, its edge 0.1" in text
+    code, _, err = run("phone", *options, "--glass-thickness", "0.9:0.3", "-o", "wrong")
+    assert code == 1
+    assert "'0.9:0.3': expected 0 ≤ least < greatest" in err
+
+
 def test_a_run_begins_where_the_closed_form_ends(run, pictures):
     """One command: the log of the training begins where `--loss spectral` ends."""
     command = ("double_gauss", "--data", pictures, *SMALL, "--model", "paraxial", "--rho", "0.3", "-o", "one")
@@ -126,7 +186,14 @@ def test_a_run_begins_where_the_closed_form_ends(run, pictures):
     assert float(rows("one/joint/log.csv")[0]["sensor"]) == read("one/spectral.json")["sensor_mm"]
     # The sensor's bounds reach both.
     bounded = (*command[:-1], "two", "--bounds", "sensor:57.85,58")
-    assert run(*bounded, "--loss", "spectral")[0] == run(*bounded, "--start", "spectral")[0] == 0
+    code, _, err = run(*bounded, "--loss", "spectral")
+    message = "no optimum inside sensor from 57.85 to 58: the loss still falls at its end"
+    assert (code, err.splitlines()[-1]) == (1, f"raytrace: error: {message}")
+    assert read("two/spectral.json")["no_optimum"] == message
+    assert read("two/spectral.json")["at_end"] == ["sensor"]
+    code, _, err = run(*bounded, "--start", "spectral")
+    assert code == 0, err
+    assert f"start spectral: {message}" in err
     assert read("two/spectral.json")["sensor_mm"] == pytest.approx(57.85, abs=1e-9)
     assert min(float(row["sensor"]) for row in rows("two/joint/log.csv")) >= 57.85 - 1e-9
     assert read("one/spectral.json")["sensor_mm"] < 57.84
@@ -137,7 +204,8 @@ def test_spectral_at_infinity_is_valid_json(run, pictures):
     command = ("double_gauss", "--data", pictures, "--loss", "spectral", "--patch", "16", "--size", "7")
     bounded = (*command, "--model", "paraxial", "--start", "57.1", "--bounds", "sensor:57,57.1", "-o", "closed")
     code, out, err = run(*bounded, "--json")
-    assert code == 0, err
+    assert code == 1
+    assert "error: no optimum inside sensor from 57 to 57.1: the loss still falls at its end" in err
     kept = Path("closed/spectral.json").read_text()
     for document in (json.loads(text, parse_constant=pytest.fail) for text in (out, kept)):
         assert document["focus_paraxial_m"] is document["focus_rms_m"] is None
@@ -162,7 +230,7 @@ def test_spectral_prints_its_course(run, pictures):
     code, out, err = run(*command, "-o", "closed", "--batch", "4")
     assert code == 0, err
     found = read("closed/spectral.json")
-    assert len(re.findall(r"^ +\d+ +0\.\d{8}$", out, re.M)) == len(found["course"])
+    assert len(re.findall(r"^ +\d+ +0\.\d{8} +0$", out, re.M)) == len(found["course"])
     assert f"sensor at {found['sensor_mm']:.4f} mm" in out
     assert f"{found['focus_rms_m']:.2f} m (least RMS spot)" in out
 

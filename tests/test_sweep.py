@@ -103,6 +103,7 @@ def test_rows_are_the_optima_and_none_is_sought_twice(monkeypatch, tmp_path):
         read = list(csv.DictReader(file))
     assert tuple(read[0]) == COLUMNS == (
         "factor", "value", "model", "sensor_mm", "focus_paraxial_m", "focus_rms_m", "error", "error_drt",
+        "penalty", "no_optimum",
     )  # fmt: skip
     assert [float(one["sensor_mm"]) for one in read] == [one.sensor_mm for one in rows]
 

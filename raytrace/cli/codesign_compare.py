@@ -77,6 +77,12 @@ def compare(arguments: argparse.Namespace) -> None:
     else:
         _print(report)
     say(f"written: {docs / 'codesign.md'}")
+    nowhere = [one for one in (*report.optima, *report.found) if one.no_optimum]
+    for one in nowhere:
+        kind = "the closed form" if isinstance(one, Optimum) else f"seed {one.seed}"
+        say(f"warning: {one.model}, {kind}: {one.no_optimum}")
+    if nowhere and len(nowhere) == len(report.optima) + len(report.found):
+        raise CommandError("no model has an optimum; see the warnings, and choose other --near, --far, --bounds")
 
 
 def _recorded_settings(path: Path) -> Settings:

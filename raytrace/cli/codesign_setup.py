@@ -14,10 +14,21 @@ import torch
 from torch import distributed
 from tqdm import tqdm
 
-from raytrace.cli.door import CommandError, field_points, find_lens, number, open_lens, refuse_untraceable, say
+from raytrace.cli.door import (
+    CommandError,
+    catalogs,
+    field_points,
+    find_lens,
+    number,
+    open_lens,
+    refuse_untraceable,
+    say,
+)
 from raytrace.design.codesign import STEPS, Outcome, Settings, camera, lens_at_start, outcome, run_model
 from raytrace.design.network import PRESETS, RedNetShape, faster_precision
 from raytrace.design.training import NotFinite, Record
+from raytrace.focus import NoImage
+from raytrace.formats import FORMATS
 from raytrace.lens import Lens
 from raytrace.paraxial import paraxial_image_distance
 from raytrace.pictures import Pictures, dead_leaves, files, read, split
@@ -29,7 +40,8 @@ _DISTANCES = 9  # at which a finished run is tested
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """A lens, settings and pictures; about: what of them decides the result, for the folders of the runs."""
+    """A lens, settings and pictures; about: what of them decides the result, for the folders of the runs; catalogs: of
+    glass, that the lens was read with."""
 
     lens: Lens
     name: str
@@ -38,6 +50,7 @@ class Experiment:
     test: Pictures
     about: dict[str, str]
     kind: str
+    catalogs: tuple[Path, ...] = ()
 
     @property
     def steps_per_epoch(self) -> int:
@@ -56,15 +69,22 @@ def experiment(arguments: argparse.Namespace, settings: Settings) -> Experiment:
     if settings.near >= settings.far:
         raise CommandError(f"--near {settings.near:g} is not nearer than --far {settings.far:g}")
     field_points(lens, argparse.Namespace(field=[(0.0, y) for y in settings.fields]))
-    camera(lens, settings)  # refuses bad variables, starts and networks
-    refuse_untraceable(lens_at_start(lens, settings), str(path))
+    try:
+        camera(lens, settings)  # refuses bad variables, starts and networks
+    except NoImage as error:
+        message = "give --near, --far and --focus-distance beyond the focal length"
+        raise CommandError(f"{arguments.lens}: {error}; {message}") from error
+    begun = lens_at_start(lens, settings)
+    refuse_untraceable(begun, str(path))
+    FORMATS[".zmx"].write(begun, str(path), catalogs=catalogs(arguments))  # refuses what a learned lens could not keep
     pictures = _pictures(arguments, settings)
     train, test = split(pictures)
     about = {
         "lens": f"{path.stem}, sha256 {hashlib.sha256(path.read_bytes()).hexdigest()[:16]}",
         "pictures": f"{len(pictures)}, blake2 {_digest(pictures)}",
     }
-    return Experiment(lens, path.stem, settings, train, test, about, "pictures" if arguments.data else "dead leaves")
+    kind = "pictures" if arguments.data else "dead leaves"
+    return Experiment(lens, path.stem, settings, train, test, about, kind, catalogs(arguments))
 
 
 def refuse_too_few(given: Experiment) -> None:
@@ -91,14 +111,27 @@ def settings_of(arguments: argparse.Namespace, begun: Path) -> Settings:
         if any(x for x, _ in arguments.field):
             raise CommandError("--field X,Y: co-design takes field points along y, --field Y")
         given["fields"] = tuple(y for _, y in arguments.field)
-    if arguments.wavelength:
-        if len(arguments.wavelength) > 1:
-            raise CommandError("--wavelength: co-design takes one wavelength")
-        given["wavelength"] = arguments.wavelength[0]
+    given |= _light(arguments)
     if arguments.precision == "auto":
         shape = RedNetShape(given["depth"], given["width"])
         given["precision"] = _agreed(lambda: recorded(begun).get("precision") or faster_precision(shape))
     return Settings(**given)
+
+
+def _light(arguments: argparse.Namespace) -> dict[str, tuple[float, ...]]:
+    """Wavelengths and weights by the options: those given, or the file's own, its primary one first."""
+    if not arguments.file_wavelengths:
+        wavelengths = tuple(arguments.wavelength or Settings.wavelengths)
+        weights = tuple(arguments.wavelength_weights or [1.0] * len(wavelengths))
+        return {"wavelengths": wavelengths, "wavelength_weights": weights}
+    if arguments.wavelength or arguments.wavelength_weights:
+        raise CommandError("--file-wavelengths takes the file's own: leave out --wavelength and --wavelength-weights")
+    lens = open_lens(argparse.Namespace(lens=arguments.lens, catalog=arguments.catalog))
+    order = sorted(range(len(lens.wavelengths)), key=lambda k: k != lens.primary_wavelength)
+    return {
+        "wavelengths": tuple(lens.wavelengths[order].tolist()),
+        "wavelength_weights": tuple(lens.wavelength_weights[order].tolist()),
+    }
 
 
 def settings_without_network(arguments: argparse.Namespace) -> Settings:
@@ -157,6 +190,7 @@ def train_run(given: Experiment, settings: Settings, folder: Path, label: str) -
         folder,
         about=given.about,
         distances=given.distances,
+        catalogs=given.catalogs,
         progress=progress.testing,
     )
     try:
@@ -226,10 +260,12 @@ class Progress:
         sys.stderr.flush()
 
     def _lens(self, record: Record) -> str:
+        """Penalty and place of the sensor."""
+        said = f", penalty {record['penalty']:.3g} mm²" if record["penalty"] else ""
         if "sensor" not in record:
-            return ""
-        place = f", sensor {record['sensor']:.4f} mm"
-        return place if self.focus is None else f"{place}, focus {self.focus(record['sensor']):.1f} m"
+            return said
+        said += f", sensor {record['sensor']:.4f} mm"
+        return said if self.focus is None else f"{said}, focus {self.focus(record['sensor']):.1f} m"
 
 
 def conjugates(lens: Lens, settings: Settings) -> tuple[list[float], list[float]]:

@@ -33,6 +33,11 @@ def sweep(arguments: argparse.Namespace) -> None:
     else:
         _print(rows)
     say(f"written: {docs / 'codesign_sweep.md'}")
+    for row in rows:
+        if row.no_optimum:
+            say(f"warning: {row.factor} {row.value}, {row.model}: {row.no_optimum}")
+    if all(row.no_optimum for row in rows):
+        raise CommandError("no case has an optimum; see the warnings, and choose other --near, --far, --bounds")
 
 
 def _write(given: Experiment, rows: Sequence[Row], docs: Path) -> None:

@@ -27,10 +27,11 @@ A run may be stopped at any moment: the same command goes on where it was, and e
 processes share every batch: torchrun --nproc-per-node 2 -m raytrace codesign …"""
 
 _EXAMPLES = """examples:
-  raytrace codesign double_gauss --loss spectral
+  raytrace codesign double_gauss --loss spectral -o learned.zmx
   raytrace codesign double_gauss --model gaussian --data pictures -o run
   raytrace codesign double_gauss --start spectral --bounds sensor:57,58 --data pictures -o begun_in_closed_form
   raytrace codesign lens.zmx --vary sensor thickness:5,6 curvature:1-4 --f-number 4 -o run4
+  raytrace codesign double_gauss --wavelength 0.53 0.48 0.62 --vary thickness:2,9 --air-thickness 0.5:50 -o colours
   raytrace codesign double_gauss --field 0 10 14 --normalise energy --epochs 10 -o fields --json
   raytrace codesign compare double_gauss --data pictures --seeds 0 1 2 -o study --docs docs
   raytrace codesign compare double_gauss --data pictures -o study --docs docs --report-only
@@ -49,7 +50,11 @@ def _add_arguments(parser) -> None:
     )
     catalog(parser)
     json(parser)
-    output_folder(parser, "folder of the run, or of all runs of compare")
+    output_folder(
+        parser,
+        "folder of the run, or of all runs of compare, in each of which lens.zmx is the learned lens; or a lens file "
+        "(.zmx, .csv) for it, the run then being kept in a folder of the same name without suffix",
+    )
     parser.add_argument("--resume", action="store_true", help="only go on with a run that was begun in FOLDER")
     parser.add_argument("--model", choices=MODELS, help="PSF model of step 1 (default gaussian)")
     parser.add_argument(
@@ -90,6 +95,7 @@ def _scene(group) -> None:
         nargs="+",
         help="of variables: sensor:57.5,58 thickness_5:8,12 curvature_3:-0.04,0 (mm, 1/mm)",
     )
+    thickness(group)
     group.add_argument(
         "--start",
         metavar="PLACE",
@@ -99,6 +105,12 @@ def _scene(group) -> None:
     group.add_argument("--focus-distance", metavar="MM", type=positive, help="of --start (default 25000); inf allowed")
     group.add_argument("--f-number", metavar="N", type=positive_finite, help="other than the file's")
     wavelength(group)
+    group.add_argument(
+        "--wavelength-weights", metavar="W", type=positive_finite, nargs="+", help="of --wavelength (default 1 each)"
+    )
+    group.add_argument(
+        "--file-wavelengths", action="store_true", help="the file's wavelengths with their weights (default 0.53 µm)"
+    )
     group.add_argument("--near", metavar="MM", type=positive_finite, help="nearest object (default 10000)")
     group.add_argument("--far", metavar="MM", type=positive_finite, help="furthest object (default 50000)")
     fields(group, default="0; several are taken in turn")
@@ -107,6 +119,27 @@ def _scene(group) -> None:
         "--noise", metavar="S", type=positive_finite, help="standard deviation, of pictures from 0 to 1 (default 0.1)"
     )
     group.add_argument("--tol", metavar="T", type=positive_finite, help="what a PSF may err by (default 0.01)")
+
+
+def thickness(group) -> None:
+    """--glass-thickness, --air-thickness, --edge: what can be built."""
+    group.add_argument(
+        "--glass-thickness",
+        metavar="MIN[:MAX]",
+        help="of elements at the axis in mm: least, or least and greatest (default 1/50 of the largest diameter)",
+    )
+    group.add_argument(
+        "--air-thickness",
+        metavar="MIN[:MAX]",
+        help="of air between elements at the axis (default 1/2000 of the largest diameter); its edges may touch",
+    )
+    group.add_argument(
+        "--edge",
+        metavar="MIN",
+        type=positive_finite,
+        help="least thickness of elements at their edge in mm (default 1/100 of the largest diameter); what lacks is a "
+        "penalty in mm², beside the loss",
+    )
 
 
 def _training(group) -> None:

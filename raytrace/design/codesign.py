@@ -20,6 +20,7 @@ from torch import Tensor
 
 from raytrace.design.camera import Camera
 from raytrace.design.conjugates import distance_in_focus, paraxial_image
+from raytrace.design.descent import NoOptimum
 from raytrace.design.limits import parse_range
 from raytrace.design.network import RedNet, RedNetShape
 from raytrace.design.spectral import optimise_closed_form, out_of_focus, power_spectrum
@@ -353,5 +354,5 @@ def _steps(own: Camera, pictures: Pictures, settings: Settings, folder: Path, ab
         size = settings.patch + settings.size - 1
         course = optimise_closed_form(own, power_spectrum(pictures, size, crops=settings.crops, seed=settings.seed))
         if course.no_optimum:
-            warnings.warn(f"start spectral: {course.no_optimum}", stacklevel=2)
+            warnings.warn(f"start spectral: {course.no_optimum}", NoOptimum, stacklevel=2)
     yield from optimise(own, pictures, settings, run)

@@ -12,6 +12,10 @@ from torch import Tensor
 _MOST = 15_000  # steps
 
 
+class NoOptimum(UserWarning):
+    """A search that ended where the error still falls, and went on with what it had."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Descent:
     """How a descent went.

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from raytrace.deconvolve import blind_error, blind_filter, errors, power_spectrum, psnr, wiener
-from raytrace.design.descent import minimise
+from raytrace.design.descent import NoOptimum, minimise
 from raytrace.grid import grid
 from raytrace.image import transfer_functions
 from raytrace.pictures import Pictures, draws
@@ -192,7 +192,7 @@ def best_gamma(H: Tensor, S: Tensor, noise: float, at_design: Tensor) -> float:
     start = min(places, key=error)
     if start in (places[0], places[-1]):
         message = f"no optimum of the filter's constant inside 10^{places[0]:g} to 10^{places[-1]:g}"
-        warnings.warn(f"{message}: the error still falls at its end", stacklevel=2)
+        warnings.warn(f"{message}: the error still falls at its end", NoOptimum, stacklevel=2)
     return 10 ** float(scipy.optimize.minimize_scalar(error, bounds=(start - 0.5, start + 0.5), method="bounded").x)
 
 

@@ -181,7 +181,7 @@ def _closed_form(report: Report) -> str:
     rows = [
         (
             NAMES.get(one.model, one.model),
-            f"{one.sensor_mm:.4f}",
+            f"{one.sensor_mm:.4f}" + (" (no optimum)" if one.no_optimum else ""),
             _spread(trained[one.model], "sensor_mm", 4) if one.model in trained else "–",
             shown(one.focus_paraxial_m, 1),
             shown(one.focus_rms_m, 1),

@@ -53,7 +53,7 @@ class Case:
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One optimum; errors and focus distances as for `Optimum`."""
+    """One optimum; errors, penalty, focus distances and why it is none as for `Optimum`."""
 
     factor: str
     value: str
@@ -63,6 +63,8 @@ class Row:
     focus_rms_m: float
     error: float
     error_drt: float
+    penalty: float = 0.0
+    no_optimum: str = ""
 
 
 COLUMNS = tuple(field.name for field in dataclasses.fields(Row))
