@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from raytrace.lens import Lens
-from raytrace.numerics import broadcast_shape, safe_divide
+from raytrace.numerics import broadcast_shape, safe_divide, with_batch_axes
 from raytrace.rays import Rays
 from raytrace.trace import media, steps
 
@@ -39,6 +39,7 @@ def aim_at_stop(
     radius: mm, negative where the entrance pupil is an inverted image of the stop; through(pupil, fraction): rays of a
     fraction of the field.
     """
+    pupil = with_batch_axes(pupil, radius.dim())  # an axis of object distances, which pupil points may not have
 
     def missed(aim: Tensor, fraction: float) -> tuple[Tensor, Tensor]:
         position, arrives = at_stop(lens, through(aim, fraction), wavelength)

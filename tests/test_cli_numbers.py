@@ -105,3 +105,9 @@ def test_an_object_na_far_away_is_told_with_what_would_hold_the_beam(run, comman
     assert "nan" not in found.out
     held = run(verb, "na.zmx", *distance, *options, "--epd", 12.5) if verb != "compare" else None
     assert held is None or "lost" not in held.err
+
+
+def test_wavefronts_of_aimed_rays(run):
+    """The retrofocus aims its rays at the stop: points of the pupil meet an axis of object distances there."""
+    (row, *_) = run("wavefront", "retrofocus", "--field", 0, "--size", 8, "--json").document["summary"]
+    assert 0.1 < row["rms"] < 1
