@@ -1,35 +1,81 @@
 """Point spread functions as pictures: one panel a kernel, object distances from left to right."""
 
 import math
-import textwrap
 from collections.abc import Sequence
 
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from raytrace.analysis import Comparison
-from raytrace.plot.style import GREY, INK, array, new_figure, styled
-from raytrace.psf import Psf
+from raytrace.grid import Grid
+from raytrace.plot.style import GREY, INK, array, bar_on_dark, fill, new_figure, number_text, round_length, styled
+from raytrace.psf import CloseUp, Psf
+
+DECADES = 4  # of light on a logarithmic scale
+_MOST_PIXELS = 16  # across a panel, whose edges are drawn
 
 
 @styled
-def psf_grid(found: Psf, object_distances: Sequence[float], labels: Sequence[str], *, title: str = "") -> Figure:
+def psf_grid(
+    found: Psf,
+    object_distances: Sequence[float],
+    labels: Sequence[str],
+    *,
+    close_up: CloseUp | None = None,
+    log: bool = False,
+    title: str = "",
+) -> Figure:
     """Kernels over object distance (columns) and field (rows, named by `labels`), each on its own brightness scale.
 
-    Below each kernel: the energy inside its window (or the energy it was normalised by), and its peak.
+    close_up: draw this light, in its own windows, with the edges of the pixels, instead of the pixels of the kernels.
+    Kernels of each wavelength have a row each, fields outermost. log: four decades of brightness below the peak.
+    Below each: the energy inside the window of the kernel (or the energy it was normalised by), and its peak.
     """
-    energy, kernels = array(found.energy).T, array(found.kernel).swapaxes(0, 1)
+    energy, kernels = _rows(array(found.energy), 0), _rows(array(found.kernel), 2)
     notes = [
         [f"energy {e:.3f}, peak {kernel.max():.3g}" for e, kernel in zip(*row, strict=True)]
         for row in zip(energy, kernels, strict=True)
     ]
-    return _panels(kernels, found, object_distances, labels, notes, title)
+    pitch = float(found.grid.pitch)
+    half = 0.5 * pitch * found.grid.columns
+    if close_up is None:
+        figure, _ = _panels(
+            kernels, [[half] * len(object_distances)] * len(labels), object_distances, labels, notes, log
+        )
+        return _worded(figure, title, [_window(found.grid), _brightness(log)])
+    drawn, each = _rows(array(close_up.light), 2), len(kernels) // close_up.half.shape[1]
+    halves = np.repeat(array(close_up.half).T, each, 0)
+    figure, axes = _panels(drawn, halves, object_distances, labels, notes, log)
+    centre = array(found.grid.centre).reshape(2, *(found.grid.centre.shape[1:] or (1, 1)))
+    offset = np.repeat(np.moveaxis(centre - array(close_up.centre), 2, 0), each, 0)  # field × (x, y) × distance
+    for row, place in zip(axes, offset, strict=True):
+        for d, panel in enumerate(row):
+            _draw_pixels(panel, place[:, d], pitch, found.grid.columns, found.grid.rows)
+    one = (
+        f"window {number_text(2e3 * halves.max(), 3)} µm"
+        if np.ptp(halves) == 0
+        else "windows by the width of the light"
+    )
+    drawn = f"{one}; energy and peak: of the {_window(found.grid)}, outlined where they lie inside"
+    return _worded(figure, title, [drawn, _brightness(log)])
+
+
+def _rows(values: np.ndarray, kept: int) -> np.ndarray:
+    """(D, F, …) or (D, F, W, …), `kept` axes last, as (F or F·W, D, …)."""
+    values = np.moveaxis(values, 0, values.ndim - kept - 1)
+    return values.reshape(-1, *values.shape[values.ndim - kept - 1 :])
 
 
 @styled
-def model_grid(found: Comparison, *, title: str = "") -> Figure:
+def model_grid(found: Comparison, *, log: bool = False, title: str = "") -> Figure:
     """Kernels over object distance (columns) and model (rows, with the number of its rays).
 
     Below each kernel: its energy inside the window, and its relative L1 difference from the last row, the reference.
+    log: four decades of brightness below the peak.
     """
     kernels = [array(one.kernel)[:, 0] for one in found.psfs]
     notes = [
@@ -43,42 +89,89 @@ def model_grid(found: Comparison, *, title: str = "") -> Figure:
         f"{name}\n" + (f"({one.rays} rays)" if one.rays else "")
         for name, one in zip(found.models, found.psfs, strict=True)
     ]
-    remark = f"Δ: relative L¹ difference from {found.models[-1]}"
-    return _panels(kernels, found.psfs[-1], found.object_distances.tolist(), labels, notes, title, remark)
+    grid = found.psfs[-1].grid
+    pitch, distances = float(grid.pitch), found.object_distances.tolist()
+    half = 0.5 * pitch * grid.columns
+    figure, _ = _panels(kernels, [[half] * len(distances)] * len(labels), distances, labels, notes, log)
+    return _worded(
+        figure, title, [_window(grid), _brightness(log), f"Δ: relative L¹ difference from {found.models[-1]}"]
+    )
 
 
-def _panels(kernels, found: Psf, distances, labels, notes, title: str, remark: str = "") -> Figure:
-    """Kernels[row][column] with a note below each, the distances above and the labels on the left."""
+def _panels(kernels, halves, distances, labels, notes, log: bool) -> tuple[Figure, np.ndarray]:
+    """Kernels[row][column] in windows of half widths (mm), a note below each, distances above, labels on the left."""
     rows, columns = len(labels), len(distances)
-    figure = new_figure(max(3.2, 1.55 * columns + 0.5), 1.85 * rows + 0.75)
+    figure = new_figure(max(4.4, 1.75 * columns + 0.7), max(1.85 * rows, 2.6 if rows == 1 else 0) + 0.9)
     axes = figure.subplots(rows, columns, squeeze=False)
-    width = 1000 * float(found.grid.pitch) * found.grid.columns
-    height = 1000 * float(found.grid.pitch) * found.grid.rows
-    extent = (-0.5 * width, 0.5 * width, -0.5 * height, 0.5 * height)
+    alike = len({round(float(half), 12) for row in halves for half in row}) == 1
     for row, label in enumerate(labels):
         for column, distance in enumerate(distances):
-            panel, kernel = axes[row][column], kernels[row][column]
-            panel.imshow(kernel, origin="lower", cmap="magma", vmin=0.0, extent=extent)
-            panel.set_xticks([])
-            panel.set_yticks([])
+            panel, kernel, half = axes[row][column], kernels[row][column], float(halves[row][column])
+            tall = half * kernel.shape[0] / kernel.shape[1]
+            extent = (-half, half, -tall, tall)
+            panel.imshow(
+                kernel, origin="lower", cmap="magma", norm=_norm(kernel, log), extent=extent, interpolation="nearest"
+            )
+            panel.set(xticks=[], yticks=[], xlim=extent[:2], ylim=extent[2:])
             for spine in panel.spines.values():
                 spine.set_visible(True)
                 spine.set_color(GREY)
             panel.set_xlabel(notes[row][column], fontsize=7, color=GREY)
+            if not alike or (row, column) == (0, 0):
+                bar_on_dark(panel, -0.88 * half, -0.86 * tall, round_length(0.5 * half))
             if row == 0:
                 panel.set_title(_distance(distance), color=INK)
             if column == 0:
                 panel.set_ylabel(label)
-    figure.suptitle(_filled(title, figure, 10), fontweight="bold", fontsize=10)
-    pixels = f"{found.grid.columns} × {found.grid.rows} pixels of {1000 * float(found.grid.pitch):g} µm"
-    said = [f"window {width:g} µm, {pixels}; each panel from black (0) to its own peak", remark]
-    figure.supxlabel("\n".join(_filled(line, figure, 7.5) for line in said if line), fontsize=7.5, color=GREY)
+    return figure, axes
+
+
+def _norm(kernel: np.ndarray, log: bool) -> Normalize:
+    """Brightness from 0, or four decades below, to the peak."""
+    peak = float(kernel.max())
+    peak = peak if peak > 0 else 1.0
+    return LogNorm(peak / 10**DECADES, peak, clip=True) if log else Normalize(0.0, peak)
+
+
+def _brightness(log: bool) -> str:
+    return (
+        f"each panel from {10.0**-DECADES:g} of its own peak, logarithmic"
+        if log
+        else "each panel from 0 to its own peak"
+    )
+
+
+def _draw_pixels(panel: Axes, centre: np.ndarray, pitch: float, columns: int, rows: int) -> None:
+    """Outline the window of a kernel about a centre (2,) mm; and its pixels, where a panel holds only a few."""
+    (low, high), (bottom, top) = panel.get_xlim(), panel.get_ylim()
+    corner = centre - 0.5 * pitch * np.array([columns, rows])
+    if pitch * _MOST_PIXELS >= high - low:
+        x, y = (corner[k] + pitch * np.arange(count + 1) for k, count in enumerate((columns, rows)))
+        lines = [[(at, y[0]), (at, y[-1])] for at in x if low < at < high]
+        lines += [[(x[0], at), (x[-1], at)] for at in y if bottom < at < top]
+        panel.add_collection(
+            LineCollection(lines, colors="white", linewidths=0.4, alpha=0.45, gid="pixels"), autolim=False
+        )
+    panel.add_patch(
+        Rectangle(
+            corner, pitch * columns, pitch * rows, fill=False, edgecolor="white", linewidth=0.7, alpha=0.7, gid="window"
+        )
+    )
+    panel.set(xlim=(low, high), ylim=(bottom, top))
+
+
+def _worded(figure: Figure, title: str, said: Sequence[str]) -> Figure:
+    """The title above and one caption below, both in lines that fit."""
+    width = figure.get_figwidth()
+    figure.suptitle(fill(title, width, 10, bold=True), fontweight="bold", fontsize=10)
+    figure.supxlabel(fill("; ".join(said), width, 7.5), fontsize=7.5, color=GREY)
     return figure
 
 
-def _filled(text: str, figure: Figure, size: float) -> str:
-    """A text in lines as wide as the figure; a letter is about 0.62 of its size (points) wide."""
-    return textwrap.fill(text, int(72 * figure.get_figwidth() / (0.62 * size)))
+def _window(grid: Grid) -> str:
+    pitch = 1e3 * float(grid.pitch)
+    window = number_text(pitch * grid.columns, 3)
+    return f"window of {window} µm, {grid.columns} × {grid.rows} pixels of {number_text(pitch, 3)} µm"
 
 
 def _distance(millimetres: float) -> str:

@@ -13,6 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.textpath import TextPath
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
@@ -222,6 +224,38 @@ def scale_bar(axes: Axes, x: float, y: float, length: float, align: str = "cente
         round_text(length), place, (0, 3), textcoords="offset points", ha=align, va="bottom", fontsize=7.5, zorder=6,
         bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.6},
     )  # fmt: skip
+
+
+def bar_on_dark(axes: Axes, x: float, y: float, length: float, words: str = "", *, unit: float = 1.0) -> None:
+    """A white bar of a length in mm from (x, y), on axes of so many mm a unit, its length written above it."""
+    axes.plot([x, x + length / unit], [y, y], color="white", linewidth=1.6, solid_capstyle="butt", zorder=6)
+    axes.annotate(
+        words or round_text(length), (x, y), (0, 3), textcoords="offset points", color="white", fontsize=7, va="bottom",
+        zorder=6,
+    )  # fmt: skip
+
+
+def fill(text: str, width: float, size: float, *, bold: bool = False) -> str:
+    """A text of a size in points in lines no wider than a figure of a width in inches, by the widths of its letters.
+
+    Lines that are there stay; a word wider than the figure is left whole.
+    """
+    font = FontProperties(family=_STYLE["font.family"], size=size, weight="bold" if bold else "normal")
+
+    def length(line: str) -> float:
+        return TextPath((0, 0), line, prop=font).get_extents().width if line.strip() else 0.0
+
+    lines = []
+    for paragraph in text.splitlines():
+        line = ""
+        for word in paragraph.split(" "):
+            longer = f"{line} {word}" if line else word
+            if line and length(longer) > 72 * width - 2 * size:
+                lines.append(line)
+                longer = word
+            line = longer
+        lines.append(line)
+    return "\n".join(lines)
 
 
 def _minus(text: str) -> str:

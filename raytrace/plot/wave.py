@@ -19,6 +19,7 @@ from raytrace.plot.style import (
     GREY,
     INK,
     array,
+    bar_on_dark,
     field_colour,
     new_figure,
     number_text,
@@ -256,10 +257,7 @@ def _bar(panel: Axes, found: WavePsf) -> None:
     pitch, columns = float(found.pitch), found.grid.columns
     length = round_length(0.35 * pitch * columns)
     x, y = 0.06 * columns, 0.08 * found.grid.rows
-    panel.plot([x, x + length / pitch], [y, y], color="white", linewidth=1.6, solid_capstyle="butt")
-    panel.annotate(
-        f"{1e3 * length:g} µm", (x, y), (0, 3), textcoords="offset points", color="white", fontsize=7, va="bottom"
-    )
+    bar_on_dark(panel, x, y, length, unit=pitch)
 
 
 def _depth(distance: float) -> str:

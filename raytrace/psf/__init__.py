@@ -14,6 +14,8 @@ Each gives `kernels(scene, grid, …) -> Kernels`, energy integrated over pixels
 pupil. `ladder.py` drives them to a tolerance, and climbs them for `model="auto"`; `compute.py` is the call.
 """
 
+from raytrace.psf.closeup import CloseUp as CloseUp
+from raytrace.psf.closeup import close_up as close_up
 from raytrace.psf.compute import psf as psf
 from raytrace.psf.ladder import MODELS as MODELS
 from raytrace.psf.ladder import NotConverged as NotConverged

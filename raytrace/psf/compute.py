@@ -57,9 +57,9 @@ def psf(
     fields: (2, F) in the lens's kind of field, its own by default; object_distances: (D,) mm, inf allowed, the lens's
     by default; wavelengths: (W,) µm with wavelength_weights: (W,), the lens's own by default. Kernels are summed over
     the wavelengths; per_wavelength: each has a kernel instead, (D, F, W, rows, columns) of energy 1 for all its light.
-    grid: pixels, by default 21 × 21 of 5 µm; center: what the grid's centre counts from: "axis", "chief" (the chief
-    ray at the primary wavelength) or "centroid" (of the rays). By default "axis" for fields that are given and "chief"
-    for the lens's own.
+    grid: pixels, by default 21 × 21 of 5 µm, its centre (2,) or (2, D, F); center: what the grid's centre counts from:
+    "axis", "chief" (the chief ray at the primary wavelength) or "centroid" (of the rays). By default "axis" for fields
+    that are given and "chief" for the lens's own.
     tol: bound on the estimated error, 0.01 by default; the coarsest order that meets it is returned. rays: instead,
     about that many rays per kernel (`drt`: plain Sobol rays), the error then estimated from half of them.
     order: instead, an order of the model's ladder, as `Psf.order` of an earlier call tells it: for loops, it estimates
@@ -96,14 +96,16 @@ def psf(
     shares = weights / weights.sum()
     kept = None if per_wavelength else shares
 
-    def compute(distances: Tensor) -> Psf:
-        return drive(*_group(lens, fields, distances, wavelengths, shares, base, center, memo), kept)
+    def compute(chosen: Tensor) -> Psf:
+        centre = base.centre[:, chosen] if base.centre.dim() > 1 else base.centre
+        own = dataclasses.replace(base, centre=centre)
+        return drive(*_group(lens, fields, distances[chosen], wavelengths, shares, own, center, memo), kept)
 
     infinite = torch.isinf(distances)
     if bool(infinite.any()) and not bool(infinite.all()):
-        found = _merge(compute(distances[~infinite]), compute(distances[infinite]), infinite)
+        found = _merge(compute(~infinite), compute(infinite), infinite)
     else:
-        found = compute(distances)
+        found = compute(torch.ones_like(infinite))
     # Only traced light can be lost; light beside the window is not.
     if found.rays and not bool((found.energy > 0).any()) and not bool((found.ray_covariance != 0).any()):
         raise EmptyPsf(f"no ray reaches the sensor: {_lost(lens, fields, distances, wavelengths)}")
@@ -200,9 +202,11 @@ def _centre(batch: Scene, lens: Lens, center: str, weights: Tensor) -> Tensor | 
 
 
 def _with_centre(base: Tensor, place: Tensor | None, wavelengths: int) -> Tensor:
-    if place is None:
+    """A base (2,) or (2, D, F), counted from a place, for all wavelengths; a base that is one point stays it."""
+    if place is None and base.dim() == 1:
         return base
-    centre = base.reshape(2, *(1,) * 2) + place if base.dim() == 1 else base + place
+    centre = base if base.dim() > 1 else base.reshape(2, 1, 1)
+    centre = centre if place is None else centre + place
     return centre[..., None].expand(*centre.shape, wavelengths)
 
 
