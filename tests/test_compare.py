@@ -149,7 +149,7 @@ def strict(text: str) -> dict:
 
 
 def test_json_and_figure(capsys, tmp_path, monkeypatch, measured):
-    monkeypatch.setattr(psf_commands, "abilities", lambda lens: measured)  # seconds of work done above
+    monkeypatch.setattr(psf_commands, "abilities", lambda lens, pixels: measured)  # seconds of work done above
     picture = tmp_path / "compare.png"
     words = ["compare", "singlet", "--object-distance", "20000", "inf", "--start", "rms", "--plot", str(picture)]
     assert main([*words, "--json"]) == 0

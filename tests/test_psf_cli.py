@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from raytrace import read_lens
 from raytrace.cli import main
+from raytrace.psf import psf
 
 LENS = str(Path(__file__).parents[1] / "lenses" / "double_gauss.zmx")
 FORM = ["psf", LENS, "--model", "gaussian", "--object-distance", "10000", "30000", "--field", "0", "2"]
@@ -52,7 +54,7 @@ def test_arrays_are_those_of_the_json(tmp_path, capsys):
 
 def test_default_window_is_centred_on_the_axis_with_a_pixel_at_its_centre(tmp_path):
     out = tmp_path / "psf.npz"
-    assert main(["psf", LENS, "--model", "gaussian", "--object-distance", "10000", "-o", str(out)]) == 0
+    assert main(["psf", LENS, "--model", "gaussian", "--object-distance", "10000", "--field", "0", "-o", str(out)]) == 0
     with np.load(out) as arrays:
         kernel = arrays["psf"][0, 0]
         assert kernel.shape == (21, 21)
@@ -124,6 +126,71 @@ def test_rho_scales_the_paraxial_blur(capsys):
     sigmas = []
     for rho in ("0.5", "0.3"):
         assert main(["psf", str(LENS), "--model", "paraxial", "--object-distance", "1e4", "--rho", rho, "--json"]) == 0
-        (found,) = json.loads(capsys.readouterr().out)["results"]
+        found, *_ = json.loads(capsys.readouterr().out)["results"]
         sigmas.append(found["covariance"][0][0] ** 0.5)
     assert sigmas[1] / sigmas[0] == pytest.approx(0.6, rel=1e-12)
+
+
+def test_without_fields_the_command_and_the_library_take_those_of_the_lens(tmp_path, capsys):
+    out = tmp_path / "psf.npz"
+    assert main(["psf", LENS, "--model", "gaussian", "--tol", "0.01", "-o", str(out), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    found = psf(read_lens(LENS), "gaussian", tol=0.01)
+    assert [entry["field"] for entry in document["results"]] == [[0.0, 0.0], [0.0, 10.0], [0.0, 14.0]]
+    with np.load(out) as arrays:
+        np.testing.assert_array_equal(arrays["psf"], found.kernel.numpy())
+        np.testing.assert_array_equal(arrays["centre"], found.grid.centre.numpy())
+
+
+def test_what_is_printed_is_the_width_of_the_kernel_that_is_written(tmp_path, capsys):
+    """The telescope's: diffraction a thousand times wider than its rays, which are named as such."""
+    out = tmp_path / "psf.npz"
+    words = ["psf", "hubble", "--field", "0", "-o", str(out)]
+    assert main([*words, "--json"]) == 0
+    (entry,) = json.loads(capsys.readouterr().out)["results"]
+    with np.load(out) as arrays:
+        kernel, pitch = arrays["psf"][0, 0], float(arrays["pixel_pitch"])
+        np.testing.assert_allclose(arrays["covariance"][0, 0, 0], entry["covariance"][0][0])
+        np.testing.assert_allclose(arrays["ray_covariance"][0, 0, 0], entry["ray_covariance"][0][0])
+    x = pitch * (np.arange(21) - 10)
+    variance = (kernel.sum(0) * x**2).sum() / kernel.sum() - pitch**2 / 12
+    assert entry["covariance"][0][0] == pytest.approx(variance, rel=3e-3)
+    assert entry["ray_covariance"][0][0] < 1e-6 * variance
+    assert main(words) == 0
+    text = capsys.readouterr().out
+    assert f"{1000 * entry['covariance'][0][0] ** 0.5:.4f}" in text
+    assert "rays' σ x" in text
+
+
+def test_wavelengths_are_said_to_be_summed_or_keep_an_axis(tmp_path, capsys):
+    out, words = tmp_path / "psf.npz", ["psf", "telephoto", "--model", "gaussian", "--tol", "1e-5"]
+    words += ["--object-distance", "1e5", "inf"]
+    assert main([*words, "--json", "-o", str(out)]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["wavelengths"] == pytest.approx([0.4861327, 0.5875618, 0.6562725])
+    assert document["wavelength_weights"] == pytest.approx([1 / 3] * 3)
+    assert document["wavelengths_summed"] is True
+    assert len(document["results"]) == 6
+    with np.load(out) as arrays:
+        summed, shares = arrays["psf"], arrays["wavelength_weights"]
+        assert bool(arrays["wavelengths_summed"])
+    assert main([*words, "--per-wavelength", "--json", "-o", str(out)]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["wavelengths_summed"] is False
+    assert [entry["wavelength"] for entry in document["results"]] == document["wavelengths"] * 6
+    assert [entry["object_distance"] for entry in document["results"]] == [1e5] * 9 + [None] * 9
+    with np.load(out) as arrays:
+        assert arrays["psf"].shape == (2, 3, 3, 21, 21)
+        assert not bool(arrays["wavelengths_summed"])
+        np.testing.assert_allclose((shares[:, None, None] * arrays["psf"]).sum(2), summed, atol=1e-4)
+        np.testing.assert_array_equal(arrays["energy"].ravel(), [entry["energy"] for entry in document["results"]])
+    for more, said in (([], "summed over 0.486133, 0.587562, 0.656273 µm"), (["--per-wavelength"], "each of 0.486133")):
+        assert main([*words, *more]) == 0
+        assert said in capsys.readouterr().out
+
+
+def test_kernels_whose_light_is_elsewhere_say_so(capsys):
+    assert main(["psf", LENS, "--model", "gaussian", "--field", "14"]) == 0
+    assert "--center chief" in capsys.readouterr().out
+    assert main(["psf", LENS, "--model", "gaussian", "--field", "14", "--center", "chief"]) == 0
+    assert "--center chief" not in capsys.readouterr().out

@@ -24,6 +24,8 @@ from raytrace.analysis.chief import LateralColour as LateralColour
 from raytrace.analysis.chief import distortion as distortion
 from raytrace.analysis.chief import field_curvature as field_curvature
 from raytrace.analysis.chief import lateral_colour as lateral_colour
+from raytrace.analysis.compare import PIXEL as PIXEL
+from raytrace.analysis.compare import SIZE as SIZE
 from raytrace.analysis.compare import Abilities as Abilities
 from raytrace.analysis.compare import Comparison as Comparison
 from raytrace.analysis.compare import abilities as abilities

@@ -128,10 +128,14 @@ def common_focus(lens: Lens, focus_distance: float, *, wavelength: float | Tenso
     return focused(with_wavelengths(lens, [float(wavelength)]), focus_distance, on=start)
 
 
-def compare(lens: Lens, object_distances: Tensor) -> Comparison:
-    """Kernels of every model on the axis for objects at distances (D,) mm, 21 × 21 pixels of 5 µm; sensor as it is."""
+def compare(lens: Lens, object_distances: Tensor, *, pixels: Grid | None = None) -> Comparison:
+    """Kernels of every model on the axis for objects at distances (D,) mm, sensor as it is.
+
+    pixels: about the axis, by default 21 × 21 of 5 µm.
+    """
+    given = _given(lens, pixels)
     return Comparison(
-        psfs=tuple(_psf(lens, work, object_distances) for work in ROWS.values()),
+        psfs=tuple(_psf(lens, work, object_distances, grid=given) for work in ROWS.values()),
         object_distances=object_distances,
         sensor_distance=lens.surfaces[-2].thickness,
         wavelength=lens.wavelengths[lens.primary_wavelength],
@@ -139,16 +143,20 @@ def compare(lens: Lens, object_distances: Tensor) -> Comparison:
     )
 
 
-def abilities(lens: Lens) -> Abilities:
-    """What each model can represent, measured on a lens of one wavelength at its own object and sensor distance."""
-    changed, upright = _with_conic(lens), _largest_field(lens)
+def abilities(lens: Lens, *, pixels: Grid | None = None) -> Abilities:
+    """What each model can represent, measured on a lens of one wavelength at its own object and sensor distance.
+
+    pixels: about the axis, by default 21 × 21 of 5 µm.
+    """
+    changed, upright, given = _with_conic(lens), _largest_field(lens), _given(lens, pixels)
     rows = []
     for name, work in _CONVERGED.items():
-        focused = _psf(lens, work)
-        away = _psf(lens, work, fields=upright, grid=_about_light(lens, upright, ideal=name in _IDEAL))
+        focused = _psf(lens, work, grid=given)
+        about = _about_light(lens, upright, given, ideal=name in _IDEAL)
+        away = _psf(lens, work, fields=upright, grid=about)
         rows.append(
             {
-                "conic": _relative(_psf(changed, work).kernel, focused.kernel),
+                "conic": _relative(_psf(changed, work, grid=given).kernel, focused.kernel),
                 "anisotropy": _anisotropy(away.ray_covariance[:, 0, 0]),
                 "asymmetry": _relative(away.kernel.flip(-2, -1), away.kernel),
                 "dark_ring": _dark_ring(lens, work),
@@ -161,12 +169,14 @@ def abilities(lens: Lens) -> Abilities:
     return Abilities(**table, models=tuple(ROWS))
 
 
+def _given(lens: Lens, pixels: Grid | None) -> Grid:
+    return grid(lens.wavelengths.new_tensor(PIXEL), SIZE) if pixels is None else pixels
+
+
 def _psf(lens: Lens, work: dict, object_distances: Tensor | None = None, **others) -> Psf:
-    """Kernels as `psf` gives them; on the axis, at the lens's own object distance and pixels unless told otherwise."""
-    like = lens.wavelengths
+    """Kernels as `psf` gives them; on the axis and at the lens's own object distance unless told otherwise."""
     distances = lens.surfaces[0].thickness.reshape(1) if object_distances is None else object_distances
-    given = {"fields": like.new_zeros(2, 1), "grid": grid(like.new_tensor(PIXEL), SIZE), **others}
-    return psf(lens, object_distances=distances, **work, **given)
+    return psf(lens, object_distances=distances, **work, **{"fields": lens.wavelengths.new_zeros(2, 1), **others})
 
 
 def _relative(one: Tensor, other: Tensor) -> Tensor:
@@ -185,9 +195,9 @@ def _largest_field(lens: Lens) -> Tensor:
     return torch.stack([torch.zeros_like(size), size])[:, None]
 
 
-def _about_light(lens: Lens, fields: Tensor, *, ideal: bool) -> Grid:
-    """Pixels about the centroid of the light of a field (2, 1)."""
-    found = _psf(lens, ROWS["paraxial" if ideal else "Gaussian DRT"], fields=fields)
+def _about_light(lens: Lens, fields: Tensor, pixels: Grid, *, ideal: bool) -> Grid:
+    """The pixels about the centroid of the light of a field (2, 1)."""
+    found = _psf(lens, ROWS["paraxial" if ideal else "Gaussian DRT"], fields=fields, grid=pixels)
     return dataclasses.replace(found.grid, centre=found.centroid[:, 0, 0].detach())
 
 

@@ -24,6 +24,7 @@ from raytrace.cli.options import (
     positive_finite,
     ray_aiming,
     sampling,
+    size,
     wavelength,
     window,
 )
@@ -131,18 +132,30 @@ def _psf(parser):
     conditions(parser, several="one row of kernels each")
     fields(parser)
     window(parser, normalise="energy")
-    parser.set_defaults(pixel=0.005, size=21, normalise="energy", rho=0.5)
+    parser.set_defaults(normalise="energy", rho=0.5)
     parser.add_argument(
         "--center",
         choices=("axis", "chief", "centroid"),
-        default="axis",
-        help="what the window is centred on: the optical axis (default), the chief ray or the centroid",
+        help="what the window is centred on: the optical axis (default with --field), the chief ray (default of the "
+        "lens's own fields) or the centroid of the rays",
+    )
+    parser.add_argument(
+        "--per-wavelength", action="store_true", help="a kernel for each wavelength instead of their weighted sum"
     )
     choice = parser.add_mutually_exclusive_group()
     choice.add_argument("--tol", metavar="T", type=positive_finite, help="bound on the estimated error (default 0.01)")
     choice.add_argument("--rays", metavar="N", type=count, help="rays per kernel instead of a tolerance")
-    output(parser, "arrays to write (.npz): psf[distance, field, y, x], pixel_pitch, energy, error, model")
-    plot(parser, "the kernels")
+    output(
+        parser,
+        "arrays to write (.npz): psf[distance, field, y, x], or [distance, field, wavelength, y, x], pixel_pitch, "
+        "energy, error, wavelengths, model",
+    )
+    plot(parser, "the kernels, finely in windows that they fill (with --pixel or --size: the pixels),")
+    _log(parser)
+
+
+def _log(parser):
+    parser.add_argument("--log", action="store_true", help="draw brightness on a logarithmic scale of four decades")
 
 
 def _glass(parser):
@@ -202,7 +215,10 @@ def _compare(parser):
     parser.add_argument(
         "--focus-distance", metavar="MM", type=positive, default=25000.0, help="object in focus (default 25000)"
     )
+    parser.add_argument("--pixel", metavar="MM", type=positive_finite, help="pixel pitch (default 0.005)")
+    size(parser, "the windows (default 21)")
     plot(parser, "the grid of kernels")
+    _log(parser)
 
 
 COMMANDS = (
@@ -307,11 +323,11 @@ COMMANDS = (
         "compare",
         "the PSF models side by side",
         "Compare DRT (256 rays), Gaussian DRT, paraxial, Fourier and wave PSFs on the axis over object distance, with "
-        "one sensor, in a window of 21 pixels of 5 µm, at 0.53 µm unless told otherwise; and show by numbers what each "
+        "one sensor, in windows of 21 pixels of 5 µm, at 0.53 µm unless told otherwise; and show by numbers what each "
         "can represent: change of the kernel when the conic of the most curved surface grows by 0.2; longer over "
-        "shorter σ and asymmetry of the kernel of the largest field; radius of the first dark ring at F/16 over that "
-        "of the Airy disc; how many of the lens's numbers move the kernel; rays traced. For these numbers DRT runs to "
-        "a tolerance: the noise of 256 rays would pass for aberrations.",
+        "shorter σ (of waves: of their rays) and asymmetry of the kernel of the largest field; radius of the first "
+        "dark ring at F/16 over that of the Airy disc; how many of the lens's numbers move the kernel; rays traced. "
+        "For these numbers DRT runs to a tolerance: the noise of 256 rays would pass for aberrations.",
         """examples:
   raytrace compare lenses/double_gauss.zmx --plot compare.png
   raytrace compare double_gauss --start rms --json""",

@@ -6,14 +6,14 @@ import warnings
 import numpy as np
 from torch import Tensor
 
-from raytrace.analysis import Abilities, Comparison, abilities, common_focus
+from raytrace.analysis import PIXEL, SIZE, Abilities, Comparison, abilities, common_focus
 from raytrace.analysis import compare as compare_models
 from raytrace.cli.door import field_points, number, numbers, open_lens, primary, print_json, say
-from raytrace.cli.spots import cell, warn_of_losses
+from raytrace.cli.spots import cell, field_label, warn_of_losses
 from raytrace.files import write_atomically
-from raytrace.grid import grid
+from raytrace.grid import Grid, grid
 from raytrace.lens import FIELD_UNITS, Lens, with_object_distance
-from raytrace.psf import NotConverged, Psf
+from raytrace.psf import NotConverged, Psf, close_up, default_center
 from raytrace.psf import psf as compute
 from raytrace.pupil import gauss_rings
 from raytrace.shards import Share, processes
@@ -27,7 +27,7 @@ def psf(arguments: argparse.Namespace) -> None:
 
 def _psf(arguments: argparse.Namespace, share: Share) -> None:
     lens = open_lens(arguments)
-    fields = field_points(lens, arguments, on_axis=True)
+    fields = field_points(lens, arguments)
     distances = arguments.object_distance or [float(lens.surfaces[0].thickness)]
     rays_are_shared = arguments.model == "gaussian" or (arguments.model == "drt" and arguments.rays)
     if share.processes > 1 and len(distances) * fields.shape[1] * len(lens.wavelengths) == 1 and not rays_are_shared:
@@ -37,31 +37,26 @@ def _psf(arguments: argparse.Namespace, share: Share) -> None:
         arguments.model,
         fields=fields,
         object_distances=lens.wavelengths.new_tensor(distances),
-        grid=grid(lens.wavelengths.new_tensor(arguments.pixel), arguments.size),
-        center=arguments.center,
+        grid=_pixels(lens, arguments),
+        center=arguments.center or default_center(fields if arguments.field else None),
         tol=arguments.tol,
         rays=arguments.rays,
         normalise=arguments.normalise,
+        per_wavelength=arguments.per_wavelength,
         rho=arguments.rho,
         share=share,
     )
     if share.rank:
         return
     _warn(lens, fields, distances, found)
-    labels = [f"{y:g}" if x == 0 else f"{x:g},{y:g}" for x, y in fields.T.tolist()]
     if arguments.output:
         write_atomically(arguments.output, lambda file: save(found, distances, fields, file))
     if arguments.plot:
-        from raytrace import plot
-        from raytrace.plot.style import field_label
-
-        title = f"{lens.name or arguments.lens}: {found.model} PSF"
-        rows = [field_label(lens, field) for field in fields.T.tolist()]
-        plot.save(plot.psf_grid(found, distances, rows, title=title), arguments.plot)
+        _draw(arguments, lens, found, distances, fields)
     if arguments.json:
-        print_json({"model": found.model, "reason": found.reason or None, "results": results(found, distances, fields)})
+        print_json({**_document(found), "results": results(found, distances, fields)})
     else:
-        _print(found, distances, labels, FIELD_UNITS[lens.fields.kind])
+        _print(found, distances, fields, FIELD_UNITS[lens.fields.kind])
     for path in filter(None, (arguments.plot, arguments.output)):
         say(f"written: {path}")
 
@@ -73,29 +68,68 @@ def _warn(lens: Lens, fields: Tensor, distances: list[float], found: Psf) -> Non
         dark = found.ray_centroid[0, d].isnan()
         at = f"object at {distance:g} mm, " if len(distances) > 1 else ""
         trial = with_object_distance(lens, distance)
-        warn_of_losses(trial, fields, points, dark[:, None].expand(-1, len(lens.wavelengths)), at=at)
+        of_each = dark if dark.dim() > 1 else dark[:, None].expand(-1, len(lens.wavelengths))
+        warn_of_losses(trial, fields, points, of_each, at=at)
 
 
-def results(found: Psf, distances: list[float], fields) -> list[dict]:
+def _pixels(lens: Lens, arguments: argparse.Namespace) -> Grid:
+    """The pixels of --pixel and --size, or those by default."""
+    return grid(lens.wavelengths.new_tensor(arguments.pixel or PIXEL), arguments.size or SIZE)
+
+
+def _draw(arguments: argparse.Namespace, lens: Lens, found: Psf, distances: list[float], fields: Tensor) -> None:
+    """The figure: the light itself in windows that it fills, but the pixels where they or their rays were asked for."""
+    from raytrace import plot
+
+    light = None
+    if arguments.pixel is None and arguments.size is None and found.order is not None:
+        places = lens.wavelengths.new_tensor(distances)
+        light = close_up(lens, found, fields=fields, object_distances=places, rho=arguments.rho)
+    rows = [plot.field_label(lens, field) for field in fields.T.tolist()]
+    if not found.wavelengths_summed:
+        rows = [f"{row}\n{1e3 * wavelength:.4g} nm" for row in rows for wavelength in found.wavelengths.tolist()]
+    title = f"{lens.name or arguments.lens}: {found.model} PSF"
+    plot.save(plot.psf_grid(found, distances, rows, close_up=light, log=arguments.log, title=title), arguments.plot)
+
+
+def _document(found: Psf) -> dict:
+    """What `raytrace psf --json` says of all kernels."""
+    return {
+        "model": found.model,
+        "reason": found.reason or None,
+        "wavelengths": numbers(found.wavelengths),
+        "wavelength_weights": numbers(found.wavelength_weights),
+        "wavelengths_summed": found.wavelengths_summed,
+    }
+
+
+def results(found: Psf, distances: list[float], fields: Tensor) -> list[dict]:
     """One entry per kernel, distance-major: what `raytrace psf --json` writes."""
     return [
         {
-            "object_distance": number(distance),
-            "field": numbers(fields[:, f]),
-            "centroid": numbers(found.centroid[:, d, f]),
-            "covariance": [numbers(found.covariance[:2, d, f]), numbers(found.covariance[1:, d, f])],
-            "energy": number(found.energy[d, f]),
-            "error": number(found.error[d, f]),
-            "residual": None if found.residual is None else number(found.residual[d, f]),
+            "object_distance": number(distances[place[0]]),
+            "field": numbers(fields[:, place[1]]),
+            **({} if found.wavelengths_summed else {"wavelength": number(found.wavelengths[place[2]])}),
+            **{key: numbers(getattr(found, key)[:, *place]) for key in ("centroid", "ray_centroid")},
+            **{key: _square(getattr(found, key)[:, *place]) for key in ("covariance", "ray_covariance")},
+            "energy": number(found.energy[place]),
+            "error": number(found.error[place]),
+            "residual": None if found.residual is None else number(found.residual[place]),
             "rays": found.rays,
         }
-        for d, distance in enumerate(distances)
-        for f in range(fields.shape[1])
+        for place in np.ndindex(found.energy.shape)
     ]
 
 
-def save(found: Psf, distances: list[float], fields, file) -> None:
-    """Write the arrays of `-o`: psf[distance, field, y, x] and what belongs to it."""
+def _square(covariance: Tensor) -> list[list]:
+    """[[xx, xy], [xy, yy]]; nulls where there is no light."""
+    return [numbers(covariance[:2]), numbers(covariance[1:])]
+
+
+def save(found: Psf, distances: list[float], fields: Tensor, file) -> None:
+    """Write the arrays of `-o`: psf[distance, field, y, x], or [distance, field, wavelength, y, x], and what belongs to
+    it.
+    """
     np.savez_compressed(
         file,
         psf=found.kernel.detach().numpy(),
@@ -105,33 +139,70 @@ def save(found: Psf, distances: list[float], fields, file) -> None:
         error=found.error.detach().numpy(),
         centroid=found.centroid.detach().numpy(),
         covariance=found.covariance.detach().numpy(),
+        ray_centroid=found.ray_centroid.detach().numpy(),
+        ray_covariance=found.ray_covariance.detach().numpy(),
         object_distance=np.array(distances),
         field=fields.T.numpy(),
+        wavelengths=found.wavelengths.numpy(),
+        wavelength_weights=found.wavelength_weights.numpy(),
+        wavelengths_summed=found.wavelengths_summed,
         model=found.model,
         normalised=found.normalised,
     )
 
 
-def _print(found: Psf, distances: list[float], labels: list[str], unit: str) -> None:
-    print(
-        f"{found.model} PSF, {found.grid.columns} × {found.grid.rows} pixels of {1000 * float(found.grid.pitch):g} µm"
-    )
+def _print(found: Psf, distances: list[float], fields: Tensor, unit: str) -> None:
+    pitch = 1000 * float(found.grid.pitch)
+    print(f"{found.model} PSF, {found.grid.columns} × {found.grid.rows} pixels of {pitch:g} µm, {_colours(found)}")
     if found.reason:
         print(found.reason)
-    print(
-        f"{'object':>12} {'field':>9} {'centroid x':>12} {'centroid y':>12} {'σ x':>9} {'σ y':>9} {'energy':>8} ",
-        end="",
+    waves = found.model in ("fourier", "wave")
+    if waves:
+        print("centroid and σ: of the light inside the window, before pixels; rays' σ: of geometric optics")
+    columns = {
+        "object": "mm",
+        "field": unit,
+        "λ": "µm",
+        "centroid x": "mm",
+        "centroid y": "mm",
+        "σ x": "µm",
+        "σ y": "µm",
+    }
+    columns |= {"rays' σ x": "µm", "rays' σ y": "µm", "energy": "window", "error": "est.", "rays": ""}
+    widths = dict(zip(columns, (12, 9, 9, 12, 12, 9, 9, 9, 9, 8, 9, 7), strict=True))
+    left_out = ({"λ"} if found.wavelengths_summed else set()) | (set() if waves else {"rays' σ x", "rays' σ y"})
+    shown = [name for name in columns if name not in left_out]
+    for words in (shown, (columns[name] for name in shown)):
+        print(" ".join(f"{word:>{widths[name]}}" for name, word in zip(shown, words, strict=True)))
+    for place in np.ndindex(found.energy.shape):
+        at = (slice(None), *place)
+        sigmas = [1000 * m[at][::2].clamp_min(0.0).sqrt() for m in (found.covariance, found.ray_covariance)]
+        cells = {
+            "object": f"{distances[place[0]]:g}",
+            "field": field_label(fields[:, place[1]]),
+            "rays": f"{found.rays}",
+        }
+        cells |= {"λ": "" if found.wavelengths_summed else f"{float(found.wavelengths[place[2]]):g}"}
+        cells |= {
+            f"centroid {a}": cell(value, ".6f") for a, value in zip("xy", found.centroid[at].tolist(), strict=True)
+        }
+        cells |= {f"σ {a}": cell(value, ".4f") for a, value in zip("xy", sigmas[0].tolist(), strict=True)}
+        cells |= {f"rays' σ {a}": cell(value, ".4f") for a, value in zip("xy", sigmas[1].tolist(), strict=True)}
+        cells |= {"energy": f"{float(found.energy[place]):.4f}", "error": cell(float(found.error[place]), ".1e")}
+        print(" ".join(f"{cells[name]:>{widths[name]}}" for name in shown))
+    if bool(((found.energy < 1e-6) & (found.ray_covariance > 0).any(0)).any()):
+        print("kernels of energy 0: their light lies outside the window; --center chief moves it there")
+
+
+def _colours(found: Psf) -> str:
+    """The wavelengths in words, and what was done with them."""
+    named = ", ".join(f"{wavelength:g}" for wavelength in found.wavelengths.tolist())
+    if len(found.wavelengths) == 1:
+        return f"at {named} µm"
+    shares = ":".join(
+        f"{weight:.3g}" for weight in (found.wavelength_weights / found.wavelength_weights.max()).tolist()
     )
-    print(f"{'error':>9} {'rays':>7}")
-    print(f"{'mm':>12} {unit:>9} {'mm':>12} {'mm':>12} {'µm':>9} {'µm':>9} {'window':>8} {'est.':>9} {'':>7}")
-    for d, distance in enumerate(distances):
-        for f, label in enumerate(labels):
-            places = [cell(value, ">12.6f") for value in found.centroid[:, d, f].tolist()]
-            widths = (1000 * found.covariance[::2, d, f].clamp_min(0.0).sqrt()).tolist()
-            print(
-                " ".join([f"{distance:>12g} {label:>9}", *places, *(cell(value, ">9.4f") for value in widths)]),
-                f"{float(found.energy[d, f]):>8.4f} {cell(float(found.error[d, f]), '>9.1e')} {found.rays:>7}",
-            )
+    return f"summed over {named} µm by weights {shares}" if found.wavelengths_summed else f"each of {named} µm"
 
 
 #: Columns of the table of `compare`: attribute, heading.
@@ -153,18 +224,19 @@ def compare(arguments: argparse.Namespace) -> None:
     lens = common_focus(lens, arguments.focus_distance, wavelength=wavelength, start=arguments.start)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotConverged)  # the estimated errors are printed
-        found = compare_models(lens, lens.wavelengths.new_tensor(arguments.object_distance))
-        able = abilities(lens)
+        pixels = _pixels(lens, arguments)
+        found = compare_models(lens, lens.wavelengths.new_tensor(arguments.object_distance), pixels=pixels)
+        able = abilities(lens, pixels=pixels)
     where = f"one sensor at {float(found.sensor_distance):.7f} mm, {float(found.wavelength):g} µm"
     if arguments.plot:
         from raytrace import plot
 
         title = f"{lens.name or arguments.lens}: {where}"
-        plot.save(plot.model_grid(found, title=title), arguments.plot)
+        plot.save(plot.model_grid(found, log=arguments.log, title=title), arguments.plot)
     if arguments.json:
         print_json(_comparison(found, able))
     else:
-        print(f"{where}; fields on the axis")
+        print(f"{where}; on the axis, {pixels.columns} × {pixels.rows} pixels of {1000 * float(pixels.pitch):g} µm")
         _print_comparison(found)
         _print_abilities(able)
     if arguments.plot:
@@ -191,7 +263,8 @@ def _whole(key: str, value) -> float | int | None:
 
 def _print_comparison(found: Comparison) -> None:
     print(
-        f"σ in µm, relative L1 difference from {found.models[-1]}, estimated error of the kernel (Gaussian DRT: of σ)"
+        f"σ in µm (Fourier, wave: of the light inside the window), relative L1 difference from {found.models[-1]}, "
+        "estimated error of the kernel (Gaussian DRT: of σ)"
     )
     distances = (f"{distance / 1000:g} m" for distance in found.object_distances.tolist())
     print(f"{'object at':>14} " + " ".join(f"{distance:>24}" for distance in distances))

@@ -25,4 +25,5 @@ from raytrace.plot.report import focus_report as focus_report
 from raytrace.plot.spots import airy_radius as airy_radius
 from raytrace.plot.spots import spot_diagram as spot_diagram
 from raytrace.plot.style import SUFFIXES as SUFFIXES
+from raytrace.plot.style import field_label as field_label
 from raytrace.plot.style import save as save

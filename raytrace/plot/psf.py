@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 
 from raytrace.analysis import Comparison
 from raytrace.grid import Grid
-from raytrace.plot.style import GREY, INK, array, bar_on_dark, fill, new_figure, number_text, round_length, styled
+from raytrace.plot.style import GREY, INK, array, bar_on_dark, fill, new_figure, round_length, styled
 from raytrace.psf import CloseUp, Psf
 
 DECADES = 4  # of light on a logarithmic scale
@@ -55,11 +55,7 @@ def psf_grid(
     for row, place in zip(axes, offset, strict=True):
         for d, panel in enumerate(row):
             _draw_pixels(panel, place[:, d], pitch, found.grid.columns, found.grid.rows)
-    one = (
-        f"window {number_text(2e3 * halves.max(), 3)} µm"
-        if np.ptp(halves) == 0
-        else "windows by the width of the light"
-    )
+    one = f"window {2e3 * halves.max():.3g} µm" if np.ptp(halves) == 0 else "windows by the width of the light"
     drawn = f"{one}; energy and peak: of the {_window(found.grid)}, outlined where they lie inside"
     return _worded(figure, title, [drawn, _brightness(log)])
 
@@ -99,30 +95,40 @@ def model_grid(found: Comparison, *, log: bool = False, title: str = "") -> Figu
 
 
 def _panels(kernels, halves, distances, labels, notes, log: bool) -> tuple[Figure, np.ndarray]:
-    """Kernels[row][column] in windows of half widths (mm), a note below each, distances above, labels on the left."""
+    """Kernels[row][column] in windows of half widths (mm), a note below each; and the axes (rows, columns) of them.
+
+    Distances stand above and labels on the left; kernels of one distance follow each other in lines of four, each under
+    its label.
+    """
     rows, columns = len(labels), len(distances)
-    figure = new_figure(max(4.4, 1.75 * columns + 0.7), max(1.85 * rows, 2.6 if rows == 1 else 0) + 0.9)
-    axes = figure.subplots(rows, columns, squeeze=False)
+    flows = columns == 1 and rows > 1
+    shape = (-(-rows // 4), min(rows, 4)) if flows else (rows, columns)
+    figure = new_figure(max(4.4, 1.75 * shape[1] + 0.7), (1.85 if max(shape) > 1 else 2.6) * shape[0] + 0.9)
+    grid = figure.subplots(*shape, squeeze=False)
+    axes = grid.reshape(-1, 1)[:rows] if flows else grid
     alike = len({round(float(half), 12) for row in halves for half in row}) == 1
-    for row, label in enumerate(labels):
-        for column, distance in enumerate(distances):
-            panel, kernel, half = axes[row][column], kernels[row][column], float(halves[row][column])
-            tall = half * kernel.shape[0] / kernel.shape[1]
-            extent = (-half, half, -tall, tall)
-            panel.imshow(
-                kernel, origin="lower", cmap="magma", norm=_norm(kernel, log), extent=extent, interpolation="nearest"
-            )
-            panel.set(xticks=[], yticks=[], xlim=extent[:2], ylim=extent[2:])
-            for spine in panel.spines.values():
-                spine.set_visible(True)
-                spine.set_color(GREY)
-            panel.set_xlabel(notes[row][column], fontsize=7, color=GREY)
-            if not alike or (row, column) == (0, 0):
-                bar_on_dark(panel, -0.88 * half, -0.86 * tall, round_length(0.5 * half))
-            if row == 0:
-                panel.set_title(_distance(distance), color=INK)
-            if column == 0:
-                panel.set_ylabel(label)
+    for row, column in np.ndindex(rows, columns):
+        panel, kernel, half = axes[row][column], kernels[row][column], float(halves[row][column])
+        tall = half * kernel.shape[0] / kernel.shape[1]
+        extent = (-half, half, -tall, tall)
+        panel.imshow(
+            kernel, origin="lower", cmap="magma", norm=_norm(kernel, log), extent=extent, interpolation="nearest"
+        )
+        panel.set(xticks=[], yticks=[], xlim=extent[:2], ylim=extent[2:])
+        for spine in panel.spines.values():
+            spine.set_visible(True)
+            spine.set_color(GREY)
+        panel.set_xlabel(notes[row][column], fontsize=7, color=GREY)
+        if not alike or (row, column) == (0, 0):
+            bar_on_dark(panel, -0.88 * half, -0.86 * tall, round_length(0.5 * half))
+        if flows:
+            panel.set_title(labels[row].replace("\n", ", "), color=INK)
+        elif row == 0:
+            panel.set_title(_distance(distances[column]), color=INK)
+        if column == 0:
+            panel.set_ylabel((_distance(distances[0]) if row % 4 == 0 else "") if flows else labels[row])
+    for panel in grid.flat[rows:] if flows else ():
+        panel.axis("off")
     return figure, axes
 
 
@@ -170,8 +176,7 @@ def _worded(figure: Figure, title: str, said: Sequence[str]) -> Figure:
 
 def _window(grid: Grid) -> str:
     pitch = 1e3 * float(grid.pitch)
-    window = number_text(pitch * grid.columns, 3)
-    return f"window of {window} µm, {grid.columns} × {grid.rows} pixels of {number_text(pitch, 3)} µm"
+    return f"window of {pitch * grid.columns:.3g} µm, {grid.columns} × {grid.rows} pixels of {pitch:.3g} µm"
 
 
 def _distance(millimetres: float) -> str:

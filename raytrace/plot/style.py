@@ -240,22 +240,26 @@ def fill(text: str, width: float, size: float, *, bold: bool = False) -> str:
 
     Lines that are there stay; a word wider than the figure is left whole.
     """
-    font = FontProperties(family=_STYLE["font.family"], size=size, weight="bold" if bold else "normal")
-
-    def length(line: str) -> float:
-        return TextPath((0, 0), line, prop=font).get_extents().width if line.strip() else 0.0
-
-    lines = []
+    space = _width(" ", size, bold)
+    room, lines = 72 * width - 2 * size, []
     for paragraph in text.splitlines():
-        line = ""
+        line, length = "", 0.0
         for word in paragraph.split(" "):
-            longer = f"{line} {word}" if line else word
-            if line and length(longer) > 72 * width - 2 * size:
+            own = _width(word, size, bold)
+            if line and length + space + own > room:
                 lines.append(line)
-                longer = word
-            line = longer
+                line, length = "", 0.0
+            line, length = (f"{line} {word}", length + space + own) if line else (word, own)
         lines.append(line)
     return "\n".join(lines)
+
+
+@functools.lru_cache(maxsize=1024)
+def _width(word: str, size: float, bold: bool) -> float:
+    """Points that a word of a size in points takes, from where it begins to where the next letter would."""
+    font = FontProperties(family=_STYLE["font.family"], size=size, weight="bold" if bold else "normal")
+    between, none = (TextPath((0, 0), letters, prop=font).get_extents().width for letters in (f"n{word}n", "nn"))
+    return between - none
 
 
 def _minus(text: str) -> str:

@@ -16,6 +16,7 @@ pupil. `ladder.py` drives them to a tolerance, and climbs them for `model="auto"
 
 from raytrace.psf.closeup import CloseUp as CloseUp
 from raytrace.psf.closeup import close_up as close_up
+from raytrace.psf.compute import default_center as default_center
 from raytrace.psf.compute import psf as psf
 from raytrace.psf.ladder import MODELS as MODELS
 from raytrace.psf.ladder import NotConverged as NotConverged

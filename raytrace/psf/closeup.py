@@ -12,6 +12,7 @@ from raytrace.numerics import safe_sqrt
 from raytrace.paraxial import first_order
 from raytrace.psf.compute import psf
 from raytrace.psf.ladder import NotConverged, Psf
+from raytrace.scene import EmptyPsf
 from raytrace.value import value
 
 _SIGMAS = 3.0  # of the rays, and Airy radii, that half a window holds: a uniform disc reaches 2 σ, a caustic 3
@@ -53,7 +54,10 @@ def close_up(lens: Lens, found: Psf, *, fields: Tensor, object_distances: Tensor
     def light(distances: slice, chosen: slice) -> Tensor:
         grid = Grid(2 * half[distances, chosen].max() / _SAMPLES, _SAMPLES, _SAMPLES, centre[:, distances, chosen])
         where = {"fields": fields[:, chosen], "object_distances": object_distances[distances], "center": "axis"}
-        return psf(lens, found.model, grid=grid, **where, **work).kernel
+        try:
+            return psf(lens, found.model, grid=grid, **where, **work).kernel
+        except EmptyPsf:  # no light: nothing to see
+            return found.kernel.new_zeros(*found.energy[distances, chosen].shape, _SAMPLES, _SAMPLES)
 
     def of_all() -> Tensor:
         if bool((half == half.max()).all()):
@@ -68,7 +72,7 @@ def close_up(lens: Lens, found: Psf, *, fields: Tensor, object_distances: Tensor
 
 def windows(lens: Lens, found: Psf, object_distances: Tensor) -> tuple[Tensor, Tensor]:
     """Half widths (D, F) mm and centres (2, D, F) mm of windows that the kernels fill."""
-    centroid, covariance = found.ray_centroid, found.ray_covariance
+    centroid, covariance = (moment.nan_to_num(0.0) for moment in (found.ray_centroid, found.ray_covariance))
     if not found.wavelengths_summed:
         shares = found.wavelength_weights
         apart = centroid - (shares * centroid).sum(-1, keepdim=True)
@@ -95,7 +99,7 @@ def _affordable(lens: Lens, found: Psf, half: Tensor, object_distances: Tensor) 
         return half
     number = first_order(with_object_distance(lens, object_distances[:, None])).working_f_number.abs()
     cutoff = 1e3 / (found.wavelengths.min() * torch.where(torch.isfinite(number), number, 1.0))
-    blur = 2 * safe_sqrt(torch.maximum(found.ray_covariance[0], found.ray_covariance[2]))
+    blur = 2 * safe_sqrt(torch.maximum(found.ray_covariance[0], found.ray_covariance[2]).nan_to_num(0.0))
     blur = blur if found.wavelengths_summed else blur.amax(-1)
     for _ in range(20):
         points = found.rays * ((blur + 1.4 * half) / (blur + 1.4 * least)) ** 2

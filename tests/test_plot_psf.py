@@ -1,0 +1,162 @@
+"""Figures of kernels: what is drawn is the light of the model, in windows it fills, and every word is on the page."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.text import Text
+
+from raytrace import analysis, plot, read_lens
+from raytrace.cli import main
+from raytrace.grid import grid
+from raytrace.plot.psf import DECADES
+from raytrace.plot.style import fill
+from raytrace.psf import close_up, psf
+
+LENSES = Path(__file__).parents[1] / "lenses"
+
+
+def number(value) -> torch.Tensor:
+    return torch.tensor(value, dtype=torch.float64)
+
+
+def own_fields(lens) -> torch.Tensor:
+    return torch.stack([lens.fields.x, lens.fields.y])
+
+
+def seen(name: str, model: str, **options):
+    """A lens's kernels at infinity with their light, and the fields."""
+    lens = read_lens(LENSES / f"{name}.zmx")
+    fields, distances = options.pop("fields", own_fields(lens)), options.pop("object_distances", number([math.inf]))
+    found = psf(lens, model, fields=fields, object_distances=distances, center="chief", **options)
+    return found, close_up(lens, found, fields=fields, object_distances=distances), fields
+
+
+def outside(figure) -> list[str]:
+    """The words that leave the canvas or lie over each other."""
+    figure.canvas.draw()
+    renderer, page = figure.canvas.get_renderer(), figure.bbox
+    said = [t for t in figure.findobj(Text) if t.get_visible() and t.get_text().strip()]
+    boxes = [(t.get_text(), t.get_window_extent(renderer)) for t in said]
+    boxes = [(words, box) for words, box in boxes if box.width > 0]
+    lost = [w for w, b in boxes if b.x0 < -1 or b.y0 < -1 or b.x1 > page.x1 + 1 or b.y1 > page.y1 + 1]
+    for k, (words, box) in enumerate(boxes):
+        for other, place in boxes[:k]:
+            across = min(box.x1, place.x1) - max(box.x0, place.x0)
+            along = min(box.y1, place.y1) - max(box.y0, place.y0)
+            if across > 2 and along > 2:
+                lost.append(f"{words!r} over {other!r}")
+    return lost
+
+
+@pytest.mark.parametrize(("name", "model"), [("phone", "wave"), ("hubble", "wave"), ("telephoto", "gaussian")])
+def test_the_light_fills_its_window_and_is_that_of_the_kernels(name, model):
+    """The phone's kernel is one pixel of 5 µm: seen closely it is 50 samples wide, of the same energy and centroid."""
+    found, light, _ = seen(name, model, fields=number([[0.0], [0.05]]))
+    samples, half = light.light[0, 0], float(light.half[0, 0])
+    place = (torch.arange(len(samples), dtype=torch.float64) - 0.5 * (len(samples) - 1)) * (2 * half / len(samples))
+    energy = float(samples.sum())
+    assert energy > 0.6
+    sigma = float(((samples.sum(0) * place**2).sum() / energy).sqrt())
+    assert half / 8 < sigma < half / 1.5
+    at = float((samples.sum(1) * place).sum() / energy + light.centre[1, 0, 0])
+    assert at == pytest.approx(float(found.ray_centroid[1, 0, 0]), abs=0.02 * sigma)
+    assert energy == pytest.approx(float(found.energy[0, 0]), abs=0.05)
+
+
+def test_ray_traced_light_fills_its_disc_evenly():
+    """Far out of focus a uniform disc of 2 σ: no pattern of rays, no window that cuts it."""
+    found, light, _ = seen("singlet", "drt", fields=number([[0.0], [0.0]]), object_distances=number([2000.0]))
+    samples = light.light[0, 0]
+    assert float(samples.sum()) == pytest.approx(1, abs=1e-3)
+    assert 2 * float(found.covariance[0, 0, 0].sqrt()) < float(light.half) < 4 * float(found.covariance[0, 0, 0].sqrt())
+
+
+def test_windows_are_alike_unless_the_light_is_not():
+    *_, (found, light, _) = [seen("telephoto", "gaussian")]
+    assert len(set(light.half.flatten().tolist())) == 1
+    distances = number([math.inf, 2000.0])
+    _, light, _ = seen("telephoto", "gaussian", object_distances=distances)
+    assert float(light.half[1, 0]) > 4 * float(light.half[0, 0])
+    axes = plot.psf_grid(found, [math.inf], ["a", "b", "c"]).axes
+    assert {tuple(np.round(panel.get_xlim(), 9)) for panel in axes if panel.images} == {(-0.0525, 0.0525)}
+
+
+@pytest.mark.parametrize("log", [False, True])
+def test_panels_show_the_light_with_the_edges_of_the_pixels(log):
+    found, light, fields = seen("phone", "wave")
+    labels = [f"{y:g}°" for y in fields[1].tolist()]
+    figure = plot.psf_grid(found, [math.inf], labels, close_up=light, log=log, title="Phone camera: wave PSF")
+    panels = [panel for panel in figure.axes if panel.images]
+    assert len(panels) == 4
+    for f, panel in enumerate(panels):
+        (picture,) = panel.images
+        np.testing.assert_allclose(picture.get_array(), light.light[0, f].numpy())
+        assert panel.get_xlim() == pytest.approx((-float(light.half[0, f]), float(light.half[0, f])))
+        assert picture.norm.vmax == pytest.approx(float(light.light[0, f].max()))
+        assert picture.norm.vmin == pytest.approx(picture.norm.vmax / 10**DECADES if log else 0.0)
+        (edges,) = [c for c in panel.collections if c.get_gid() == "pixels"]
+        upright = sorted(line[0, 0] for line in edges.get_segments() if line[0, 0] == line[1, 0])
+        assert np.diff(upright) == pytest.approx(0.005)
+        # The chief ray is the centre of a pixel, half a pixel from its edges.
+        chief = float((found.grid.centre - light.centre)[0, 0, f])
+        assert min(abs(np.array(upright) - chief)) == pytest.approx(0.0025)
+    assert outside(figure) == []
+
+
+def test_kernels_of_each_wavelength_are_rows_fields_outermost():
+    found, light, _ = seen("telephoto", "gaussian", per_wavelength=True, object_distances=number([math.inf, 1e5]))
+    labels = [f"{f} {w}" for f in range(3) for w in range(3)]
+    figure = plot.psf_grid(found, [math.inf, 1e5], labels, close_up=light, title="each")
+    panels = [panel for panel in figure.axes if panel.images]
+    assert len(panels) == 18
+    for row in range(9):
+        for d in range(2):
+            drawn = panels[2 * row + d].images[0].get_array()
+            np.testing.assert_allclose(drawn, light.light[d, row // 3, row % 3].numpy())
+
+
+@pytest.mark.parametrize("count", [1, 3, 12])
+@pytest.mark.parametrize("distances", [(math.inf,), (1e5, math.inf)])
+def test_every_word_is_on_the_page(count, distances):
+    lens = read_lens(LENSES / "telephoto.zmx")
+    fields = torch.stack([torch.zeros(count, dtype=torch.float64), torch.linspace(0, 3, count, dtype=torch.float64)])
+    found = psf(lens, "gaussian", fields=fields, object_distances=number(distances), center="chief")
+    title = "A lens with a name that is much longer than its figure is wide, f = 99.9 mm, F/4: gaussian PSF"
+    figure = plot.psf_grid(found, distances, [f"{y:.3f}°" for y in fields[1].tolist()], title=title)
+    assert outside(figure) == []
+    assert "".join(figure.get_suptitle().split()) == "".join(title.split())
+
+
+def test_lines_are_as_wide_as_the_page():
+    text = "Hubble Space Telescope as designed, f = 57.6 m, F/24: wave PSF " * 3
+    lines = fill(text, 4.0, 10).split("\n")
+    assert len(lines) > 2
+    assert " ".join(lines).split() == text.split()
+    assert fill("short", 4.0, 10) == "short"
+    assert len(fill(text, 8.0, 10).split("\n")) < len(lines)
+
+
+def test_the_pixels_of_a_comparison_are_those_asked_for(tmp_path, capsys):
+    lens = analysis.common_focus(read_lens(LENSES / "singlet.zmx"), 25e3, wavelength=0.53)
+    found = analysis.compare(lens, number([2e4]), pixels=grid(number(0.002), 11))
+    assert all(one.kernel.shape[-2:] == (11, 11) for one in found.psfs)
+    assert all(float(one.grid.pitch) == 0.002 for one in found.psfs)
+    figure = plot.model_grid(found, log=True, title="A title")
+    panels = [panel for panel in figure.axes if panel.images]
+    assert panels[0].get_xlim() == pytest.approx((-0.011, 0.011))
+    assert "11 × 11 pixels of 2 µm" in figure.get_supxlabel()
+    assert outside(figure) == []
+
+
+def test_the_command_draws_the_light_or_the_pixels_asked_for(tmp_path, monkeypatch, capsys):
+    drawn = []
+    monkeypatch.setattr(plot, "save", lambda figure, path: drawn.append(figure))
+    words = ["psf", "phone", "--model", "gaussian", "--plot", str(tmp_path / "a.png")]
+    for more in ([], ["--pixel", "0.001"], ["--size", "31"], ["--per-wavelength"]):
+        assert main([*words, *more]) == 0
+    shapes = [[panel.images[0].get_array().shape for panel in figure.axes if panel.images] for figure in drawn]
+    assert shapes == [[(129, 129)] * 4, [(21, 21)] * 4, [(31, 31)] * 4, [(129, 129)] * 12]
+    assert all(outside(figure) == [] for figure in drawn)
