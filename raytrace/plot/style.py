@@ -14,6 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
+from matplotlib.patheffects import withStroke
 from matplotlib.textpath import TextPath
 from torch import Tensor
 from torch.utils import _pytree as pytree
@@ -228,10 +229,12 @@ def scale_bar(axes: Axes, x: float, y: float, length: float, align: str = "cente
 
 def bar_on_dark(axes: Axes, x: float, y: float, length: float, words: str = "", *, unit: float = 1.0) -> None:
     """A white bar of a length in mm from (x, y), on axes of so many mm a unit, its length written above it."""
-    axes.plot([x, x + length / unit], [y, y], color="white", linewidth=1.6, solid_capstyle="butt", zorder=6)
+    dark = [withStroke(linewidth=1.6, foreground="black")]  # legible on bright kernels too
+    frame = [withStroke(linewidth=3.0, foreground="black")]
+    axes.plot([x, x + length / unit], [y, y], color="white", linewidth=1.6, zorder=6, path_effects=frame)
     axes.annotate(
         words or round_text(length), (x, y), (0, 3), textcoords="offset points", color="white", fontsize=7, va="bottom",
-        zorder=6,
+        zorder=6, path_effects=dark,
     )  # fmt: skip
 
 
