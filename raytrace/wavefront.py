@@ -3,11 +3,13 @@
 A longer path is a positive OPD: light with OPD growing towards +y lands towards +y.
 """
 
+import dataclasses
+
 import torch
 from torch import Tensor
 
 from raytrace import zernike
-from raytrace.numerics import dot, safe_divide, safe_sqrt
+from raytrace.numerics import dot, safe_divide, safe_sqrt, unit
 from raytrace.paraxial import first_order
 from raytrace.rays import Rays
 from raytrace.scene import Scene, beam_share, trace_scene
@@ -28,8 +30,8 @@ class Wavefront:
     valid: (D, F, W, P) bool; usable: also rays that were only vignetted, whose numbers mean something still.
     pupil: (2, P) or (2, D, F, W, P) fractions of the entrance pupil before vignetting factors, Zernike's coordinates.
     weights: of the pupil points, mean over the disc.
-    centre: (3, D, F, W) mm on the sensor, the chief ray's point; radius: (D, F, W) mm of the sphere, from the exit
-        pupil to the image, inf for a telecentric lens and negative for an exit pupil behind the image.
+    centre: (3, D, F, W) mm on the sensor, the chief ray's point; radius: (D, F, W) mm of the sphere, along the chief
+        ray from the plane of the exit pupil to the image, inf for a telecentric lens, negative for a pupil behind it.
     wavelength: (W,) µm; index: (W,) of the image space.
     """
 
@@ -73,31 +75,29 @@ def towards_centre(rays: Rays, centre: Tensor, radius: Tensor) -> Tensor:
     return safe_sqrt(1 - dot(across, across)) * rays.direction - across
 
 
-def wavefront(scene: Scene, pupil: Tensor, weights: Tensor | None = None) -> Wavefront:
+def wavefront(
+    scene: Scene, pupil: Tensor, weights: Tensor | None = None, *, reference: Tensor | None = None
+) -> Wavefront:
     """The wavefront of a scene at pupil points, on the sphere about the chief ray's point of the sensor.
 
     pupil: (2, P), or (2, D, F, W, P) where every kernel has its own points (axes of length 1 broadcast);
     weights: (P,) or (D, F, W, P), shares of the disc's area, equal by default. Every share carries equal light.
+    reference: () µm, the wavelength whose sphere serves all; by default each has that of its own chief ray. The OPD
+    is against the wavelength's own chief ray in either case.
     The chief ray goes through the centre of the (vignetted) pupil, blocked or not; where it cannot be traced, the mean
     of the rays that arrive takes its place.
     """
     weights = torch.full_like(pupil[0], 1.0) / pupil.shape[-1] if weights is None else weights
     with_chief = torch.cat([torch.zeros_like(pupil[..., :1]), pupil], -1)
-    rays = trace_scene(scene, with_chief)
-    usable = rays.valid | (rays.position != 0).any(0) | (rays.direction[:2] != 0).any(0)
-    usable = torch.cat([usable[..., :1] | (with_chief[..., :1] == 0).all(0) & _on_axis(scene), usable[..., 1:]], -1)
-
-    def at_chief(quantity: Tensor) -> Tensor:
-        """The chief ray's value, or the mean where there is no chief ray; keeps the axis of rays."""
-        others = torch.where(rays.valid, quantity, 0.0).sum(-1, keepdim=True)
-        mean = safe_divide(others, rays.valid.sum(-1, keepdim=True).to(quantity.dtype))
-        return torch.where(usable[..., :1], quantity[..., :1], mean)
-
-    centre = at_chief(rays.position)
-    radius = _reference_radius(scene, centre)
+    rays, usable = _on_sensor(scene, with_chief)
+    if reference is None:
+        centre, radius = _reference_sphere(scene, rays, usable)
+    else:
+        alone = dataclasses.replace(scene, wavelengths=reference.reshape(1), memo=None)
+        centre, radius = _reference_sphere(alone, *_on_sensor(alone, with_chief))
     index = media(scene.lens, scene.wavelengths)[-2]
     path = path_to_reference_sphere(rays, centre, radius, index[:, None])
-    opd = torch.where(rays.valid, path - at_chief(path), 0.0)
+    opd = torch.where(rays.valid, path - _at_chief(path, rays.valid, usable), 0.0)
     direction = towards_centre(rays, centre, radius)
     landing = torch.where(usable, rays.position[:2] - centre[:2], 0.0)
     energy = torch.where(rays.valid[..., 1:], weights * beam_share(scene)[..., None], 0.0)
@@ -110,11 +110,40 @@ def wavefront(scene: Scene, pupil: Tensor, weights: Tensor | None = None) -> Wav
         usable=usable[..., 1:],
         pupil=pupil,
         weights=weights,
-        centre=centre[..., 0],
-        radius=radius[..., 0],
+        centre=centre[..., 0].expand(3, *scene.shape),
+        radius=radius[..., 0].expand(scene.shape),
         wavelength=scene.wavelengths,
         index=index,
     )
+
+
+def _on_sensor(scene: Scene, with_chief: Tensor) -> tuple[Rays, Tensor]:
+    """Rays of pupil points, the chief ray first, and which have numbers that mean something."""
+    rays = trace_scene(scene, with_chief)
+    usable = rays.valid | (rays.position != 0).any(0) | (rays.direction[:2] != 0).any(0)
+    # A chief ray along the axis has the numbers of a lost ray, and means them.
+    on_axis = (scene.fields == 0).all(0)[:, None, None] & (with_chief[..., :1] == 0).all(0)
+    return rays, torch.cat([usable[..., :1] | on_axis, usable[..., 1:]], -1)
+
+
+def _at_chief(quantity: Tensor, valid: Tensor, usable: Tensor) -> Tensor:
+    """The chief ray's value, or the mean where there is no chief ray; keeps the axis of rays."""
+    others = torch.where(valid, quantity, 0.0).sum(-1, keepdim=True)
+    mean = safe_divide(others, valid.sum(-1, keepdim=True).to(quantity.dtype))
+    return torch.where(usable[..., :1], quantity[..., :1], mean)
+
+
+def _reference_sphere(scene: Scene, rays: Rays, usable: Tensor) -> tuple[Tensor, Tensor]:
+    """Centre (3, D, F, W, 1) mm, the chief ray's point of the sensor, and signed radius (D, F, W, 1) mm.
+
+    The radius runs along the chief ray from the plane of the paraxial exit pupil; inf for a pupil at infinity.
+    """
+    centre = _at_chief(rays.position, rays.valid, usable)
+    N = unit(_at_chief(rays.direction, rays.valid, usable))[2]
+    pupil = first_order(scene.lens).exit_pupil_position[..., None]
+    finite = torch.isfinite(pupil) & (N != 0)
+    along = (centre[2] - torch.where(finite, pupil, 0.0)) / torch.where(finite, N, 1.0)
+    return centre, torch.where(finite & (along != 0), along, torch.inf)
 
 
 def mean_opd(wavefront: Wavefront, *, empty: str = "nan") -> Tensor:
@@ -164,19 +193,3 @@ def _is_lit(wavefront: Wavefront) -> Tensor:
 
 def _share(wavefront: Wavefront) -> Tensor:
     return safe_divide(wavefront.energy, wavefront.energy.sum(-1, keepdim=True))
-
-
-def _on_axis(scene: Scene) -> Tensor:
-    """(F, 1, 1): a chief ray along the axis has the numbers of a lost ray, and means them."""
-    return (scene.fields == 0).all(0)[:, None, None]
-
-
-def _reference_radius(scene: Scene, centre: Tensor) -> Tensor:
-    """Signed distance (D, F, W, 1) in mm from the centre of the paraxial exit pupil to the image point."""
-    position = first_order(scene.lens).exit_pupil_position
-    # A pupil at infinity has no finite derivative, and the intensity does not depend on the sphere that is chosen.
-    position = position if bool(torch.isfinite(position).all()) else position.detach()
-    side = -1 if sum(surface.is_mirror for surface in scene.lens.surfaces[1:-1]) % 2 else 1
-    depth = (-side * position)[..., None]
-    x, y, z = centre / depth
-    return (depth * torch.sqrt(x * x + y * y + (1 + side * z) ** 2)).expand(*centre.shape[1:])

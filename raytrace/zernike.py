@@ -32,8 +32,14 @@ def ansi(j: int) -> Order:
 
 
 def fringe(j: int) -> Order:
-    """(n, m) of the fringe (University of Arizona) index j = (1 + (n + |m|)/2)² - 2|m| + [m < 0] = 1, 2, …"""
+    """(n, m) of the fringe (University of Arizona) index j = (1 + (n + |m|)/2)² - 2|m| + [m < 0] = 1, 2, …
+
+    But j = 37 is (12, 0), the last of the set of 37 that interferometers and lens programs use: the terms that the rule
+    puts at 37 to 48 follow it, (6, 6) at 38, and from 50 on the rule holds again.
+    """
     _at_least(j, 1, "fringe")
+    if 37 <= j <= 49:
+        j = 49 if j == 37 else j - 1
     d = math.isqrt(j - 1) + 1
     m = (d * d - j + 1) // 2
     return 2 * (d - 1) - m, -m if (d * d - j) % 2 else m

@@ -11,7 +11,9 @@ from problems import MICROMETRE, NANOMETRE, vector
 
 from raytrace import analysis
 from raytrace.cli import main
+from raytrace.files import shipped
 from raytrace.focus import image_rays
+from raytrace.formats import read_lens
 from raytrace.launch import launch
 from raytrace.lens import Lens, with_sensor_distance
 from raytrace.numerics import safe_sqrt
@@ -60,6 +62,42 @@ def test_ray_fan_counts_lateral_colour_and_lands_where_rays_land():
     rays = image_rays(lens, torch.stack([torch.zeros(5).double(), found.pupil]))
     expected = rays.position[1] - rays.position[1, :, :1, 2:3]
     assert torch.allclose(found.tangential, expected, atol=NANOMETRE * 1e-3)
+
+
+def test_opd_fans_on_the_sphere_of_the_primary_wavelength_hold_lateral_colour():
+    """Its centre lies δ from the wavelength's own chief ray's point: the OPD gains the tilt δ·(d - d_chief)."""
+    lens = read_lens(shipped("lenses") / "tessar.zmx")
+    other = next(k for k in range(len(lens.wavelengths)) if k != lens.primary_wavelength)
+    own, primary = (analysis.opd_fan(lens, reference=reference) for reference in ("own", "primary"))
+    assert torch.equal(own.tangential[:, lens.primary_wavelength], primary.tangential[:, lens.primary_wavelength])
+    apart = (primary.tangential - own.tangential)[-1, other] * 1e-3 * lens.wavelengths[other]  # mm
+    rays = image_rays(lens, torch.stack([torch.zeros(41).double(), own.pupil]))
+    chief = rays.position[1, -1, :, 20]
+    shift = chief[other] - chief[lens.primary_wavelength]
+    M = rays.direction[1, -1, other]
+    assert shift.abs() > 1e-4  # mm
+    assert (apart + shift * (M - M[20])).abs().max() <= 1e-3 * apart.abs().max()
+    for fan in (own, primary):
+        assert fan.tangential[:, :, 20].abs().max() <= 1e-12  # waves, at the chief ray
+
+
+def test_fans_of_other_wavelengths_refer_to_the_lens_s_primary_one():
+    lens = problems.double_gauss(wavelengths=(0.5876, 0.45), field=problems.fields("angle", (0.0, 14.0)))
+    for fan in (analysis.ray_fan, analysis.opd_fan):
+        assert torch.equal(fan(lens, wavelengths=lens.wavelengths[1:]).tangential[:, 0], fan(lens).tangential[:, 1])
+
+
+def test_an_unknown_reference_is_refused():
+    with pytest.raises(ValueError, match="reference 'chief': expected one of primary, own"):
+        analysis.opd_fan(perfect(), reference="chief")
+
+
+def test_peak_to_valley_counts_rim_and_centre_whatever_the_map():
+    """Of defocus it is the whole step from the centre to the rim, W = 2√3 c₄."""
+    for size in (8, 127):
+        found = analysis.wavefront_map(perfect(0.1), size=size)
+        expected = 2 * math.sqrt(3) * abs(float(found.coefficients[0, 0, 3]))
+        assert found.peak_to_valley.item() == pytest.approx(expected, rel=1e-4)
 
 
 def test_zernike_coefficients_of_defocus():

@@ -11,7 +11,7 @@ from problems import vector
 from raytrace.lens import with_sensor_distance
 from raytrace.numerics import dot
 from raytrace.pupil import gauss_rings
-from raytrace.scene import scene
+from raytrace.scene import scene, trace_scene
 from raytrace.spot import EmptySpot
 from raytrace.surface import Aperture
 from raytrace.wavefront import mean_opd, peak_to_valley, rms, wavefront, without, zernike_coefficients
@@ -36,6 +36,16 @@ def test_a_perfect_lens_has_no_opd():
     assert front.opd.abs().max() < 1e-11 * WAVE
     assert front.radius[0, 0, 0] > 0
     assert abs(front.energy.sum() - 1) < 1e-14
+
+
+@pytest.mark.parametrize("angle", [0.0, 10.0])
+def test_the_sphere_reaches_from_the_pupil_s_plane_along_the_chief_ray(angle):
+    """The exit pupil is the stop itself, 50 mm before the sensor: R = 50 mm / cos of the chief ray."""
+    lens = problems.lens([problems.surface(0.01, 5.0, 1.5), problems.surface(None, 50.0)], stop=2)
+    s = scene(lens, vector(0.0, angle)[:, None], vector(math.inf), lens.wavelengths)
+    front = wavefront(s, POINTS, WEIGHTS)
+    centre_ray = trace_scene(s, torch.zeros(2, 1, dtype=torch.float64))
+    assert front.radius.item() == pytest.approx(50.0 / centre_ray.direction[2].item(), rel=1e-12)
 
 
 def test_defocus_of_a_perfect_lens():

@@ -4,11 +4,14 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.frame import Tabular, axis, masked
-from raytrace.analysis.setting import primary_number, scene_of
+from raytrace.analysis.setting import scene_of
 from raytrace.lens import Lens
 from raytrace.pupil import fan as pupil_fan
 from raytrace.value import value
 from raytrace.wavefront import Wavefront, wavefront
+
+#: Whose sphere an OPD is measured on.
+REFERENCES = ("primary", "own")
 
 
 @value
@@ -44,26 +47,39 @@ class Fan(Tabular):
 def ray_fan(lens: Lens, *, fields: Tensor | None = None, wavelengths: Tensor | None = None, size: int = 41) -> Fan:
     """Transverse aberrations ε = (x, y) of a ray less the primary wavelength's chief ray on the sensor, mm.
 
-    size: rays across the pupil, odd to have the chief ray among them.
+    size: rays across the pupil, odd to have the chief ray among them. The primary wavelength is the lens's, asked for
+    or not.
     """
-    front = _front(lens, fields, wavelengths, size)
-    reference = front.centre[:2, ..., primary_number(lens, wavelengths), None, None]
-    missed = front.landing + front.centre[:2, ..., None] - reference
-    return _fan(lens, fields, front, missed[1], missed[0], "ray")
+    front = _front(lens, fields, wavelengths, size, "primary")
+    return _fan(lens, fields, front, front.landing[1], front.landing[0], "ray")
 
 
-def opd_fan(lens: Lens, *, fields: Tensor | None = None, wavelengths: Tensor | None = None, size: int = 41) -> Fan:
-    """OPD in waves, each wavelength on the sphere about its own chief ray's point; `size` as for `ray_fan`."""
-    front = _front(lens, fields, wavelengths, size)
+def opd_fan(
+    lens: Lens,
+    *,
+    fields: Tensor | None = None,
+    wavelengths: Tensor | None = None,
+    size: int = 41,
+    reference: str = "primary",
+) -> Fan:
+    """OPD in waves against the chief ray of each wavelength; `size` as for `ray_fan`.
+
+    reference: the sphere, "primary": about the point of the lens's primary wavelength for all, so that lateral colour
+    shows as tilt and axial colour as defocus; "own": about each wavelength's own point, which takes lateral colour out.
+    """
+    front = _front(lens, fields, wavelengths, size, reference)
     waves = front.opd / (1e-3 * front.wavelength[:, None])
     return _fan(lens, fields, front, waves, waves, "opd")
 
 
-def _front(lens: Lens, fields: Tensor | None, wavelengths: Tensor | None, size: int) -> Wavefront:
+def _front(lens: Lens, fields: Tensor | None, wavelengths: Tensor | None, size: int, reference: str) -> Wavefront:
     """The wavefront of both fans, the one along y first."""
+    if reference not in REFERENCES:
+        raise ValueError(f"reference {reference!r}: expected one of {', '.join(REFERENCES)}")
     like = {"dtype": lens.wavelengths.dtype, "device": lens.wavelengths.device}
     points = torch.cat([pupil_fan(size, along, **like)[0] for along in "yx"], 1)
-    return wavefront(scene_of(lens, fields, wavelengths), points)
+    primary = lens.wavelengths[lens.primary_wavelength] if reference == "primary" else None
+    return wavefront(scene_of(lens, fields, wavelengths), points, reference=primary)
 
 
 def _fan(lens, fields, front: Wavefront, along_y: Tensor, along_x: Tensor, quantity: str) -> Fan:

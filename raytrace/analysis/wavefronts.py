@@ -13,6 +13,7 @@ from raytrace.value import value
 from raytrace.wavefront import peak_to_valley, rms, wavefront, zernike_coefficients
 
 _RINGS = 14, 56
+_GRID = 127
 
 
 @value
@@ -21,7 +22,8 @@ class WavefrontMap(Tabular):
 
     opd: (F, W, N, N) waves at pupil points y (rows) and x (columns) of `pupil` (N,), 0 where `valid` is False.
     coefficients: (F, W, J) Noll's Zernike coefficients 1 … J in waves RMS, over the entrance pupil.
-    rms: (F, W) waves about the mean; peak_to_valley: (F, W) waves, over Gauss rings of the pupil.
+    rms: (F, W) waves about the mean; peak_to_valley: (F, W) waves, over a square grid of 127 points across the pupil,
+        centre and ends of its axes among them.
     strehl: (F, W) the largest intensity on the sensor over that without aberrations, defocus counted among them; nan
         where the blur is too large for the sum of waves.
     fields: (2, F); wavelengths: (W,) µm.
@@ -64,7 +66,7 @@ def wavefront_map(
     *,
     fields: Tensor | None = None,
     wavelengths: Tensor | None = None,
-    size: int = 64,
+    size: int = _GRID,
     terms: int = 37,
 ) -> WavefrontMap:
     """OPD over `size` × `size` pupil points, and the Noll coefficients 1 … `terms` of 784 rays.
@@ -73,10 +75,9 @@ def wavefront_map(
     """
     view = scene_of(lens, fields, wavelengths)
     like = {"dtype": lens.wavelengths.dtype, "device": lens.wavelengths.device}
-    line = (2 * torch.arange(size, **like) + 1 - size) / size
-    y, x = torch.meshgrid(line, line, indexing="ij")
-    inside = x * x + y * y <= 1
-    drawn = wavefront(view, torch.stack([x[inside], y[inside]]))
+    line, inside, points = _grid(size, **like)
+    drawn = wavefront(view, points)
+    dense = drawn if size == _GRID else wavefront(view, _grid(_GRID, **like)[2])
     front = wavefront(view, *gauss_rings(*_RINGS, **like))
     wave = 1e-3 * view.wavelengths
     opd = drawn.opd.new_zeros(*drawn.opd.shape[1:3], size, size)
@@ -89,11 +90,19 @@ def wavefront_map(
         pupil=line,
         coefficients=zernike_coefficients(front, terms)[0] / wave[:, None],
         rms=rms(front)[0] / wave,
-        peak_to_valley=peak_to_valley(front)[0] / wave,
+        peak_to_valley=peak_to_valley(dense)[0] / wave,
         strehl=_strehl(view),
         fields=view.fields,
         wavelengths=view.wavelengths,
     )
+
+
+def _grid(size: int, **like) -> tuple[Tensor, Tensor, Tensor]:
+    """A line of `size` points from -1 to 1, which of their pairs (y, x) lie in the pupil, and those (2, P)."""
+    line = torch.linspace(-1.0, 1.0, size, **like)
+    y, x = torch.meshgrid(line, line, indexing="ij")
+    inside = x * x + y * y <= 1
+    return line, inside, torch.stack([x[inside], y[inside]])
 
 
 def _strehl(view: Scene) -> Tensor:

@@ -47,7 +47,7 @@ def fan(arguments: argparse.Namespace) -> None:
 def opd(arguments: argparse.Namespace) -> None:
     """OPD fans."""
     lens, fields = opened(arguments)
-    found = analysis.opd_fan(lens, fields=fields, size=arguments.points)
+    found = analysis.opd_fan(lens, fields=fields, size=arguments.points, reference=arguments.reference)
     report(arguments, lens, found, "fan_plot", every=5, unit="waves")
 
 

@@ -15,9 +15,19 @@ def _fans(parser) -> None:
     points(parser, "rays across the pupil (default 41)", default=41)
 
 
+def _opd(parser) -> None:
+    _fans(parser)
+    parser.add_argument(
+        "--reference",
+        choices=("primary", "own"),
+        default="primary",
+        help="the sphere: about the point of the primary wavelength's chief ray (default), or of each wavelength's own",
+    )
+
+
 def _maps(parser) -> None:
     _analysis(parser, "the maps")
-    size(parser, "a map (default 96)", default=96)
+    size(parser, "a map (default 127)", default=127)
 
 
 def _curves(parser) -> None:
@@ -123,18 +133,19 @@ ANALYSES = (
     (
         "opd",
         "OPD fans",
-        "Optical path difference in waves over the pupil, each wavelength about its own chief ray.",
+        "Optical path difference in waves over the pupil against each wavelength's chief ray, on the reference sphere "
+        "of the primary wavelength.",
         """examples:
   raytrace opd tessar --plot opd.png
-  raytrace opd double_gauss --object-distance 25000 --json""",
-        _fans,
+  raytrace opd double_gauss --object-distance 25000 --reference own --json""",
+        _opd,
         "analysis_commands.opd",
     ),
     (
         "wavefront",
         "wavefront maps, Zernike coefficients, Strehl ratio",
-        "RMS and peak-to-valley OPD in waves and the Strehl ratio; with --json also Noll's Zernike coefficients 1 to "
-        "37 (waves RMS).",
+        "RMS and peak-to-valley OPD in waves (peak to valley over 127 points across the pupil) and the Strehl ratio; "
+        "with --json also Noll's Zernike coefficients 1 to 37 (waves RMS).",
         """examples:
   raytrace wavefront tessar --plot wavefront.png
   raytrace wavefront double_gauss --field 0 --json""",
