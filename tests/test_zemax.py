@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import pytest
 
@@ -354,6 +355,33 @@ def test_report_sorts_every_keyword():
     assert json.loads(json.dumps(report.to_dict()))["keywords"][0]["count"] == 1
     with pytest.raises(LensFileError, match=r"unknown keyword .* \(and 1 more warning\)"):
         read(text, strict=True)
+
+
+@pytest.mark.parametrize(
+    ("operand", "said"),
+    [
+        ("PRES   0   1 0.0 0 0 0 1 1 1.0 0.0 0", r"PRES 0 atm .*configuration 1.*indices are those at 1 atm"),
+        ("TEMP   0   1 40 0 0 0 1 1 1.0 0.0 0", r"TEMP 40 °C .*configuration 1.*indices are those at 20 °C"),
+        ("GLSS   1   1 N-SF6 0 0 0 1 1 0 0.0 0", r"operand GLSS 1 = N-SF6: not followed"),
+        ("PRAM   1   1 -10.0 0 3 0 1 1 1.0 0.0 0", r"operand PRAM 1 = -10: not followed"),
+        ("THIC   1   1 3.5 0 0 0 1 1 1.0 0.0 0", r"operand THIC 1 = 3.5: not followed"),
+    ],
+)
+@pytest.mark.parametrize("count", ["1", "1 1", ""])
+def test_operands_of_a_single_configuration_are_told_by_name_value_and_line(operand, said, count):
+    text = file(tail=f"MNUM {count}\n{operand}")
+    line = text.splitlines().index(operand) + 1
+    assert [warning for warning in read(text)[1].warnings if re.search(rf":{line}.*{said}", warning)]
+    with pytest.raises(LensFileError, match=said):
+        read(text, strict=True)
+
+
+def test_operands_that_change_nothing_are_not_told():
+    quiet = 'MNUM 1\nMOFF 0 1 "" 0\nPRES 0 1 1.0 0 0 0 1 1 1.0 0.0 0\nTEMP 0 1 20 0 0 0 1 1\nTHIC 1 1 4 0 0\nCSUM 5'
+    assert not read(file(tail=quiet))[1].warnings
+    for active in (1, 2):
+        warnings = read(file(tail=f"MNUM 2 {active}\nPRES 0 1 1.0 0 0\nPRES 0 2 0.0 0 0"))[1].warnings
+        assert any("PRES 0 atm (pressure of configuration 2)" in warning for warning in warnings) == (active == 2)
 
 
 def test_multi_configuration_file_says_which_configuration_is_read():

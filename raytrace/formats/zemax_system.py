@@ -1,5 +1,7 @@
 """The system of a .zmx file: unit, aperture, fields, wavelengths, notes, configurations."""
 
+import re
+
 import torch
 from torch import Tensor
 
@@ -209,14 +211,61 @@ def remarks(system: Block, surfaces: list[Block], tail: list[Record], report: Dr
         report.warn("afocal image space (FTYP, seventh value); the image is taken as a plane", field_type.place)
     configurations = system.last("MNUM")
     count = configurations.integer(0, "number of configurations", 1) if configurations else 1
-    if count > 1:
-        _configurations(configurations, count, surfaces, tail, report)
+    if configurations:
+        operands = [other for other in tail if _is_operand(other, configurations)]
+        active = (
+            1 if count == 1 else configurations.integer(1, "active configuration", 0) or _active(surfaces, operands)
+        )
+        if count > 1:
+            _say_which(configurations, count, active, operands, report)
+        else:
+            _only_configuration(operands, surfaces, report)
+        _environment([other for other in operands if not active or int(other.words[1]) == active], report)
 
 
-def _configurations(record: Record, count: int, surfaces: list[Block], tail: list[Record], report: Draft) -> None:
+def _is_operand(record: Record, head: Record) -> bool:
+    """Whether a record after the surfaces is a multi-configuration operand: after MNUM, as `THIC surface number …`."""
+    if record.place.line <= head.place.line or record.keyword == "MOFF" or len(record.words) < 3:
+        return False
+    return all(re.fullmatch(r"-?[0-9]{1,6}", word) for word in record.words[:2])
+
+
+def _environment(operands: list[Record], report: Draft) -> None:
+    """Warn of operands that set a temperature or a pressure, which move every index."""
+    told = {"PRES": ("1", "atm", "pressure"), "TEMP": ("20", "°C", "temperature")}
+    for operand in operands:
+        normal, unit, what = told.get(operand.keyword, (None, "", ""))
+        if normal is None or not is_number(operand.words[2]) or float(operand.words[2]) == float(normal):
+            continue
+        number, value = operand.words[1], float(operand.words[2])
+        message = f"{operand.keyword} {value:g} {unit} ({what} of configuration {number}): not followed; "
+        report.warn(f"{message}indices are those at {normal} {unit}", operand.place)
+
+
+def _only_configuration(operands: list[Record], surfaces: list[Block], report: Draft) -> None:
+    """Warn of operands of a single configuration, but for those that only repeat what the surfaces hold."""
+    for operand in operands:
+        if operand.keyword in ("PRES", "TEMP") or _stored(operand, surfaces):
+            continue
+        surface, _, value = operand.words[:3]
+        value = f"{float(value):g}" if is_number(value) else value
+        report.warn(f"multi-configuration operand {operand.keyword} {surface} = {value}: not followed", operand.place)
+
+
+def _stored(operand: Record, surfaces: list[Block]) -> bool | None:
+    """Whether a surface holds the value of an operand: None for operands other than CRVT and THIC."""
+    keyword = {"CRVT": "CURV", "THIC": "DISZ"}.get(operand.keyword)
+    if keyword is None or not is_number(operand.words[2]):
+        return None
+    surface, value = int(operand.words[0]), float(operand.words[2])
+    stored = surfaces[surface].last(keyword) if 0 <= surface < len(surfaces) else None
+    if not stored or not stored.words or not is_number(stored.words[0]):
+        return None
+    return abs(float(stored.words[0]) - value) <= 1e-9 * abs(value)
+
+
+def _say_which(record: Record, count: int, active: int, operands: list[Record], report: Draft) -> None:
     """The surfaces of a file hold the configuration that was active when it was saved."""
-    operands = [other for other in tail if other.place.line > record.place.line and other.keyword != "MOFF"]
-    active = record.integer(1, "active configuration", 0) or _active(surfaces, operands)
     which = f"configuration {active} of {count}" if active else f"one of {count} configurations"
     varied = ", ".join(sorted({operand.keyword for operand in operands})[:8]) or "nothing"
     message = f"multi-configuration file: {which} read, as stored in its surfaces; they differ in {varied}"
@@ -230,14 +279,10 @@ def _active(surfaces: list[Block], operands: list[Record]) -> int:
     """The configuration whose curvatures and thicknesses are those of the surfaces; 0 if that singles out none."""
     agrees: dict[int, bool] = {}
     for operand in operands:
-        keyword = {"CRVT": "CURV", "THIC": "DISZ"}.get(operand.keyword)
-        if keyword is None or not all(is_number(word) for word in operand.words[:3]) or len(operand.words) < 3:
-            continue
-        surface, configuration, value = (float(word) for word in operand.words[:3])
-        stored = surfaces[int(surface)].last(keyword) if 0 <= surface < len(surfaces) else None
-        if stored and stored.words and is_number(stored.words[0]):
-            same = abs(float(stored.words[0]) - value) <= 1e-9 * abs(value)
-            agrees[int(configuration)] = agrees.get(int(configuration), True) and same
+        same = _stored(operand, surfaces)
+        if same is not None:
+            configuration = int(operand.words[1])
+            agrees[configuration] = agrees.get(configuration, True) and same
     active = [configuration for configuration, same in agrees.items() if same]
     return active[0] if len(active) == 1 else 0
 
