@@ -1,11 +1,13 @@
 """Files damaged by chance, and what a reader owes them: a value or its own one-line error, soon, in little memory."""
 
 import contextlib
+import io
 import re
 import resource
 import signal
 import struct
 import warnings
+import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -33,6 +35,8 @@ class Reader(NamedTuple):
 
 def damaged(content: bytes, other: bytes, source: Random) -> bytes:
     """Bytes flipped, lost, put in or spliced from another file; lines swapped, lost or doubled; numbers replaced."""
+    if content.startswith(b"PK") and source.randrange(2):
+        return _inside(content, source)
     for _ in range(source.choice((1, 1, 1, 2, 4))):
         content = source.choice(_DAMAGES)(content, other, source)
     return content
@@ -81,6 +85,19 @@ def _reordered(content: bytes, other: bytes, source: Random) -> bytes:
     else:
         lines.insert(place, lines[at])
     return b"\n".join(lines)
+
+
+def _inside(content: bytes, source: Random) -> bytes:
+    """An archive with one of its files damaged, and all checksums right."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        parts = {part.filename: archive.read(part) for part in archive.infolist()}
+    name = source.choice(list(parts))
+    parts[name] = damaged(parts[name], source.choice(list(parts.values())), source)
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        for part, inner in parts.items():
+            archive.writestr(zipfile.ZipInfo(part), inner)
+    return stream.getvalue()
 
 
 def resealed(content: bytes) -> bytes:

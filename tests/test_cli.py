@@ -738,7 +738,13 @@ BAD_RAYS = {
     "after a blank line": (RAYS + "0,0,0,0,0,1\n\n0,abc,0,0,0,1\n", "bad.csv:4: column y"),
     "no direction": (RAYS + "0,0,0,0,0,0\n", "bad.csv:2: the direction"),
     "wavelength": ("x,y,z,l,m,n,wavelength\n0,0,0,0,0,1,-0.5\n", "bad.csv:2: wavelength"),
-    "no index": ("x,y,z,l,m,n,wavelength\n0,0,0,0,0,1,1e200\n", "no real refractive index"),
+    "no unit": ("x,y,z,l,m,n,wavelength\n0,0,0,0,0,1,1e200\n", "wavelengths are in µm"),
+    "misspelt": (
+        "x,y,z,l,m,n,wavelenght\n0,0,0,0,0,1,0.5\n",
+        "bad.csv:1: column 'wavelenght' is not known; is 'wavelength'",
+    ),
+    "in nm": ("x,y,z,l,m,n,wavelength_nm\n0,0,0,0,0,1,500\n", "bad.csv:1: column 'wavelength_nm' is not known"),
+    "twice": ("x,X,y,z,l,m,n\n0,0,0,0,0,0,1\n", "bad.csv:1: column 'x' stands twice"),
     "no wavelength": ("x,y,z,l,m,n,wavelength\n0,0,0,0,0,1,\n", "bad.csv:2: column wavelength"),
     "binary": ("\x00\xff\x17" * 300, "bad.csv"),
 }

@@ -3,7 +3,6 @@
 import argparse
 import dataclasses
 import hashlib
-import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -26,7 +25,7 @@ from raytrace.cli.door import (
 )
 from raytrace.design.codesign import STEPS, Outcome, Settings, camera, lens_at_start, outcome, run_model
 from raytrace.design.network import PRESETS, RedNetShape, faster_precision
-from raytrace.design.training import NotFinite, Record
+from raytrace.design.training import NotFinite, Record, read_json
 from raytrace.focus import NoImage
 from raytrace.formats import FORMATS
 from raytrace.lens import Lens
@@ -149,7 +148,7 @@ def _agreed(choose: Callable[[], str]) -> str:
 
 def recorded(path: Path) -> dict:
     """A `settings.json`, empty if there is none."""
-    return json.loads(path.read_text()) if path.exists() else {}
+    return read_json(path) if path.exists() else {}
 
 
 def _pictures(arguments: argparse.Namespace, settings: Settings) -> Pictures:

@@ -1,5 +1,6 @@
 """Tables of rays: read the rays of `raytrace trace --rays`, write what became of them at every surface."""
 
+import difflib
 import json
 import math
 import warnings
@@ -49,19 +50,22 @@ class Fates:
 def read(path: str, lens: Lens) -> tuple[Iterator[Batch], int]:
     """Batches of the rays in a CSV file and their number. Raises CommandError naming file, line and column.
 
-    A ray without a wavelength has the primary one of the lens.
+    A ray without a wavelength has the primary one of the lens. Columns of words and those that `trace` itself writes
+    are left out; any other is an error: a misspelt wavelength must not become the primary one.
     """
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), open(path, "rb") as file:
             warnings.simplefilter("error", pandas.errors.ParserWarning)  # a row longer than the header
-            table = pandas.read_csv(path, skipinitialspace=True, dtype=str, index_col=False, skip_blank_lines=False)
+            table = pandas.read_csv(file, skipinitialspace=True, dtype=str, index_col=False, skip_blank_lines=False)
     except FileNotFoundError:
         raise CommandError(f"{path}: no such file; expected a table of rays with columns {','.join(COLUMNS)}") from None
     except (pandas.errors.ParserError, pandas.errors.ParserWarning) as error:
         raise CommandError(f"{path}: a row has more entries than the header: {_words(error)}") from error
     except (pandas.errors.EmptyDataError, UnicodeDecodeError) as error:
         raise CommandError(f"{path}: not a table of rays: {_words(error)}") from error
-    table.columns = [str(name).strip().lower() for name in table.columns]
+    except OSError as error:
+        raise CommandError(f"{path}: cannot be read: {error.strerror or error}") from error
+    table.columns = [_words(name).lower() for name in table.columns]
     table = table.dropna(how="all")  # blank lines; the index still counts them
     lines = table.index.to_numpy() + 2
     missing = [name for name in COLUMNS if name not in table.columns]
@@ -70,6 +74,9 @@ def read(path: str, lens: Lens) -> tuple[Iterator[Batch], int]:
             f"{path}:1: column {missing[0]!r} is missing; expected a header {','.join(COLUMNS)}[,wavelength], "
             f"found {','.join(table.columns)}"
         )
+    nameless = [k for k, name in enumerate(table.columns) if name.startswith("unnamed:")]
+    empty = [k for k in nameless if k == 0 or table.iloc[:, k].isna().all()]  # a running number, a comma at the end
+    _refuse_columns(table.iloc[:, [k for k in range(table.shape[1]) if k not in empty]], path)
     names = [*COLUMNS, *(["wavelength"] if "wavelength" in table.columns else [])]
     values = np.stack([_floats(table[name]) for name in names], axis=1).reshape(-1, len(names))
     wrong = np.argwhere(~np.isfinite(values))
@@ -97,7 +104,19 @@ def read(path: str, lens: Lens) -> tuple[Iterator[Batch], int]:
     return batches(), len(values)
 
 
-def _words(error: Exception) -> str:
+def _refuse_columns(table: pandas.DataFrame, path: str) -> None:
+    """Raise CommandError for a column that stands twice, and for one of numbers that is not known."""
+    known, names = (*COLUMNS, "wavelength", *OUTPUT), list(table.columns)
+    for k, name in enumerate(names):
+        if name in names[:k]:
+            raise CommandError(f"{path}:1: column {name[:40]!r} stands twice")
+        if name not in known and np.isfinite(_floats(table.iloc[:, k])).any():
+            near = difflib.get_close_matches(name, known, n=1) or ["wavelength"] * name.startswith(("wave", "λ", "lam"))
+            meant = f"is {near[0]!r} meant?" if near else f"expected {','.join(COLUMNS)}[,wavelength]"
+            raise CommandError(f"{path}:1: column {name[:40]!r} is not known; {meant}")
+
+
+def _words(error: object) -> str:
     return " ".join(str(error).split())
 
 

@@ -24,7 +24,7 @@ from raytrace.design.descent import NoOptimum
 from raytrace.design.limits import parse_range
 from raytrace.design.network import RedNet, RedNetShape
 from raytrace.design.spectral import optimise_closed_form, out_of_focus, power_spectrum
-from raytrace.design.training import Record, Run, Share, train
+from raytrace.design.training import DamagedRun, Record, Run, Share, read_json, train
 from raytrace.design.variables import Variables, parse_bounds
 from raytrace.files import write_atomically
 from raytrace.focus import best_focus, focused, real_image_distance
@@ -344,8 +344,12 @@ def outcome(folder: Path) -> Outcome | None:
     path = Path(folder) / "outcome.json"
     if not path.exists():
         return None
-    document = json.loads(path.read_text())
-    return Outcome(**{**document, **{key: math.inf for key in _INFINITE if document[key] is None}})
+    document = read_json(path)
+    document |= {key: math.inf for key in _INFINITE if document.get(key, 0.0) is None}
+    try:
+        return Outcome(**document)
+    except TypeError as error:
+        raise DamagedRun(f"{path}: not what a run found ({error})") from error
 
 
 def _steps(own: Camera, pictures: Pictures, settings: Settings, folder: Path, about: dict, name: str):

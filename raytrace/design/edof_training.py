@@ -21,7 +21,7 @@ from raytrace.deconvolve import blind_filter, towards_measurement
 from raytrace.design.edof import World, best_of_starts, expected_error, mirrored, restored, scene, transfer
 from raytrace.design.network import RedNet, RedNetShape
 from raytrace.design.phase import PhaseVariables, radial_powers
-from raytrace.design.training import Record, Run, Share, train
+from raytrace.design.training import DamagedRun, Record, Run, Share, read_state, train
 from raytrace.files import write_atomically
 from raytrace.glass import index
 from raytrace.pictures import Pictures, crop, draws
@@ -256,10 +256,13 @@ def begin(
     kept = run.folder / "start.pt"
     if kept.exists():
         variables = start(dataclasses.replace(settings, starts=0), world, spectrum)
-        found = torch.load(kept, weights_only=True)
-        variables.start = found["start"]
-        with torch.no_grad():
-            variables.change.copy_(found["change"])
+        found = read_state(kept)
+        try:
+            with torch.no_grad():
+                variables.change.copy_(found["change"])
+            variables.start = found["start"]
+        except (KeyError, RuntimeError, TypeError) as error:
+            raise DamagedRun(f"{kept}: no start of this run; remove it to find it anew") from error
     else:
         variables = start(settings, world, spectrum, progress=progress)
         found = {"start": variables.start, "change": variables.change.detach()}

@@ -9,7 +9,6 @@ the loop: gradients pass them as if they were not there (straight-through).
 """
 
 import dataclasses
-import json
 import math
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -22,7 +21,7 @@ from raytrace.design.edof import World, expected_error, scene, spectrum, transfe
 from raytrace.design.edof import kernels as kernels_of
 from raytrace.design.edof_training import EdofCamera, Settings, begin, learn_element, scheduled
 from raytrace.design.phase import PhaseVariables
-from raytrace.design.training import Record
+from raytrace.design.training import DamagedRun, Record, load_state, read_json
 from raytrace.pictures import Pictures, draws
 from raytrace.wave.element import Element, Pixels, Rings, period
 from raytrace.wave.fabrication import with_tolerance, wrapped
@@ -168,9 +167,12 @@ def read(folder: str | Path, S: Tensor) -> tuple[Element, World]:
     written = Path(folder) / "settings.json"
     if not written.exists():
         raise ValueError(f"{folder}: no settings.json; expected the folder of a run of `raytrace wave edof`")
-    given = json.loads(written.read_text())
-    world = World(**_tuples(given.pop("world")))
-    camera, run = begin(Settings(**_tuples(given)), world, S, folder)
+    given = read_json(written)
+    try:
+        world, settings = World(**_tuples(given.pop("world"))), Settings(**_tuples(given))
+    except (KeyError, TypeError, AttributeError) as error:
+        raise DamagedRun(f"{written}: no settings of `raytrace wave edof` ({error})") from error
+    camera, run = begin(settings, world, S, folder)
     return _ringed(_loaded(camera, run), folder), world
 
 
@@ -178,7 +180,7 @@ def _loaded(camera: EdofCamera, run) -> Element:
     state = run.load()
     if state is None:
         raise ValueError(f"{run.folder}: no checkpoint; let `raytrace wave edof` finish")
-    camera.load_state_dict(state["module"])
+    load_state(camera, state, run.checkpoint)
     with torch.no_grad():
         return camera.variables()[0]
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from raytrace.design.camera import Camera
 from raytrace.design.codesign import STEPS, Outcome, Settings, batch, outcome
 from raytrace.design.codesign import camera as camera_at_start
+from raytrace.design.training import load_state, read_state
 from raytrace.files import write_atomically
 from raytrace.launch import launch
 from raytrace.lens import Lens, with_object_distance
@@ -131,8 +132,8 @@ def losses_by_distance(found: Sequence[Outcome]) -> tuple[list[float], dict[str,
 def trained(lens: Lens, settings: Settings, folder: Path) -> Camera:
     """The camera of a finished run as it ended, with DRT PSFs. settings: those of the run."""
     own = camera_at_start(lens, settings)
-    state = torch.load(Path(folder) / STEPS[1] / "checkpoint.pt", map_location="cpu", weights_only=True)
-    own.load_state_dict(state["module"])
+    kept = Path(folder) / STEPS[1] / "checkpoint.pt"
+    load_state(own, read_state(kept), kept)
     own.variables.requires_grad_(False)
     own.use("drt")
     return own

@@ -13,6 +13,7 @@ import io
 import json
 import math
 import time
+import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
@@ -35,6 +36,46 @@ class OtherSettings(ValueError):
     """A run that is resumed with other settings than it was begun with."""
 
 
+class DamagedRun(ValueError):
+    """A file of a run that cannot be read: what it is, and what to do."""
+
+
+def read_state(path: Path) -> dict:
+    """What `torch.save` wrote, on the processor: tensors and plain values only, nothing is executed.
+
+    The archive is checked before torch reads it: stored bytes as long as announced, with the right checksums.
+    Raises DamagedRun.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if any(part.compress_type or part.file_size > path.stat().st_size for part in archive.infolist()):
+                raise DamagedRun("its entries are longer than the file")
+            wrong = archive.testzip()
+            if wrong:
+                raise DamagedRun(f"{wrong} does not match its checksum")
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(state, dict):
+            raise DamagedRun(f"it holds a {type(state).__name__}")
+    except Exception as error:  # zipfile and torch raise whatever their parsing meets
+        reason = _words(error) or type(error).__name__
+        raise DamagedRun(f"{path}: no checkpoint, or a damaged one ({reason}); remove it to begin anew") from error
+    return state
+
+
+def load_state(module: nn.Module, state: dict, path: Path, optimizer: torch.optim.Optimizer | None = None) -> int:
+    """Bring a module, and an optimiser, to a checkpoint; the step it was made at. Raises DamagedRun."""
+    try:
+        step = state["step"]
+        if not isinstance(step, int) or step < 0:
+            raise TypeError(f"step {step!r}")
+        module.load_state_dict(state["module"])
+        if optimizer is not None:
+            optimizer.load_state_dict(state["optimizer"])
+    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, IndexError) as error:
+        raise DamagedRun(f"{path}: not a checkpoint of this run ({_words(error)}); choose another folder") from error
+    return step
+
+
 class Run:
     """A folder of a training run.
 
@@ -47,7 +88,7 @@ class Run:
         self.folder.mkdir(parents=True, exist_ok=True)
         written = self.folder / "settings.json"
         if written.exists():
-            self._compare(json.loads(written.read_text()))
+            self._compare(read_json(written))
         elif share().rank == 0:
             write_atomically(written, lambda file: file.write(json.dumps(self.settings, indent=1).encode()))
 
@@ -75,23 +116,32 @@ class Run:
         """The last checkpoint, or None; its tensors as they were, on the processor."""
         if not self.checkpoint.exists():
             return None
-        return torch.load(self.checkpoint, map_location="cpu", weights_only=True)
+        return read_state(self.checkpoint)
 
     def rows(self) -> list[dict[str, float]]:
         """The log as numbers, a dict for every step."""
         if not self.log.exists():
             return []
-        with self.log.open(newline="") as file:
-            return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+        header, *rows = self._lines()
+        try:
+            return [{key: float(value) for key, value in zip(header, row, strict=True)} for row in rows]
+        except ValueError as error:
+            raise DamagedRun(f"{self.log}: expected numbers under {','.join(header)} ({_words(error)})") from error
 
     def forget_after(self, step: int) -> None:
         """Drop rows of the log from `step` on: those that a killed run wrote after its last checkpoint."""
         if not self.log.exists():
             return
-        with self.log.open(newline="") as file:
-            header, *rows = list(csv.reader(file)) or [[]]
-        kept = [row for row in rows if len(row) == len(header) and int(row[0]) < step]
+        header, *rows = self._lines()
+        kept = [row for row in rows if len(row) == len(header) and row and row[0].isdecimal() and int(row[0]) < step]
         write_atomically(self.log, lambda file: file.write(_csv([header, *kept]).encode()))
+
+    def _lines(self) -> list[list[str]]:
+        try:
+            with self.log.open(newline="", encoding="utf-8") as file:
+                return list(csv.reader(file)) or [[]]
+        except (ValueError, csv.Error) as error:
+            raise DamagedRun(f"{self.log}: no table of steps ({_words(error)})") from error
 
     def append(self, rows: list[tuple[int, Record]]) -> None:
         if not rows:
@@ -101,6 +151,21 @@ class Run:
         lines = [[step, *(repr(value) for value in record.values())] for step, record in rows]
         with self.log.open("a", newline="") as file:
             file.write(_csv(header + lines))
+
+
+def read_json(path: Path) -> dict:
+    """A document of settings or results. Raises DamagedRun."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise DamagedRun(f"{path}: no JSON ({_words(error)})") from error
+    if not isinstance(found, dict):
+        raise DamagedRun(f"{path}: holds a {type(found).__name__}; expected names and values")
+    return found
+
+
+def _words(error: Exception) -> str:
+    return " ".join(str(error).split())[:120]
 
 
 def _csv(rows: list[list]) -> str:
@@ -164,10 +229,7 @@ def train(
 def _resume(module: nn.Module, optimizer: torch.optim.Optimizer, run: Run) -> int:
     """Bring module and optimiser to the last checkpoint; returns the step to go on with."""
     state = run.load()
-    step = 0 if state is None else state["step"]
-    if state is not None:
-        module.load_state_dict(state["module"])
-        optimizer.load_state_dict(state["optimizer"])
+    step = 0 if state is None else load_state(module, state, run.checkpoint, optimizer)
     if share().rank == 0:
         run.forget_after(step)
     return step

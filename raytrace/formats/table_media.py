@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from raytrace.dispersion import MODEL_LINES
 from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, Place, number, shown
-from raytrace.dispersion import MODEL_LINES
 from raytrace.glass import AIR, LINES, Glass, constant, model_glass
 
 #: What an empty or undispersed medium's Abbe number is written as.
