@@ -357,7 +357,7 @@ COMMANDS = {
     "wavefront": ["--size", "16"],
     "distortion": ["--samples", "3"],
     "curvature": ["--samples", "3"],
-    "lateral": ["--samples", "3"],
+    "lateral": ["--samples", "3", "--wavelength", "0.5876", "0.4861"],
     "illumination": ["--samples", "2"],
     "mtf": ["--geometric", "--frequency", "5", "10"],
     "encircled": ["--geometric", "--radius", "0.05"],

@@ -13,6 +13,8 @@ import pandas
 import pytest
 import torch
 
+from raytrace import plot
+from raytrace.analysis import distortion, opd_fan, ray_fan
 from raytrace.analysis.arrivals import STATUS, arrivals
 from raytrace.cli import build_parser
 from raytrace.cli.door import find_lens
@@ -211,3 +213,94 @@ def test_nothing_near_is_nothing_said():
     assert did_you_mean("--colour", ["--field", "--plot"]) == ""
     assert did_you_mean("Plot", ["plot"]) == "; did you mean plot?"
     assert set(PICTURES) == {".png", ".pdf", ".svg"}
+
+
+@pytest.mark.parametrize("lens", ["phone", "hubble", "telephoto"])
+@pytest.mark.parametrize("analysis", ["mtf", "fan", "opd", "wavefront", "distortion", "encircled", "incidence"])
+def test_a_field_out_of_reach_is_told_with_cause_and_help(command, analysis, lens):
+    field = 5 if lens == "hubble" else 60
+    code, out, err = command(analysis, lens, "--field", field, "--plot", "figure.png")
+    assert (code, out) == (1, "")
+    assert f"{lens}: no ray of field {field} degrees reaches the sensor: all 217 rays lost: " in err
+    assert "at surface" in err or "missed surface" in err
+    assert re.search(r"the lens's own fields go to [\d.]+ degrees, give --field within", err)
+    assert err.count("\n") == 1
+    assert not [*Path().iterdir()]
+
+
+def test_curves_show_the_fields_that_are_in_reach_and_tell_of_the_others(command):
+    code, out, err = command("fan", "tessar", "--field", 0, 80, "--points", 3, "--json")
+    assert code == 0
+    assert "warning: no ray of field 80 degrees reaches the sensor" in err
+    rows = json.loads(out)["results"]
+    assert {row["tangential"] is None for row in rows if row["field_y"] == 80} == {True}
+    assert {row["tangential"] is None for row in rows if row["field_y"] == 0} == {False}
+
+
+FLAT = "# wavelengths: 0.5 0.6\n# fields: angle 0 5\nsurface,radius,thickness,glass,diameter,stop\n"
+FLAT += "0,inf,inf,,,\n1,inf,5,N-BK7,10,1\n2,inf,50,,10,\n3,inf,0,,,\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            "lateral hubble",
+            "lateral colour is a difference of wavelengths, and there is one, 0.6328 µm; give",
+        ),
+        ("distortion hubble --field 0", "all fields are on the axis; give others by --field"),
+        ("lateral tessar --field 0", "all fields are on the axis; give others by --field"),
+        ("curvature tessar --field 0 --plot curvature.png", "all fields are on the axis; give others by --field"),
+        ("curvature flat.csv", "no number of curvature exists for this lens"),
+        (
+            "compare hubble",
+            "within the focal length, or the lens diverges (paraxial image at -1068.25 mm); its focal len",
+        ),
+        ("compare hubble --focus-distance inf", "give --focus-distance and --object-distance beyond, or inf"),
+    ],
+)
+def test_an_analysis_that_shows_nothing_says_so(command, words, message):
+    Path("flat.csv").write_text(FLAT)
+    code, out, err = command(*words.split())
+    assert (code, out) == (1, "")
+    assert message in err
+    assert [path.name for path in Path().iterdir()] == ["flat.csv"]
+
+
+def test_close_rays_of_a_field_in_any_meridian_have_the_foci_of_its_own(command):
+    """A lens of revolution: the sections of a field turn with it."""
+    code, out, err = command("curvature", "tessar", "--field", 9, "9,0", "-9,0", "--json")
+    assert code == 0, err
+    upright, *turned = [[row for row in json.loads(out)["results"] if row["field_x"] == x] for x in (0, 9, -9)]
+    for rows in turned:
+        for name in ("tangential", "sagittal"):
+            assert [row[name] for row in rows] == pytest.approx([row[name] for row in upright], rel=1e-7)
+    assert upright[0]["tangential"] != pytest.approx(upright[0]["sagittal"], rel=0.1)
+
+
+def test_a_thinned_table_says_how_many_points_it_lists(command):
+    for name, points, listed in (("fan", 41, 9), ("opd", 21, 5)):
+        out = command(name, "tessar", "--field", 0, "--wavelength", 0.55, "--points", points)[1]
+        assert out.splitlines()[-1] == f"{listed} of {points} points of each curve; --json lists all"
+        assert len(out.splitlines()) == 2 + listed + 1
+    assert "points of each curve" not in command("fan", "tessar", "--points", 9)[1]
+
+
+PARABOLA = "# wavelengths: 0.5\n# fields: angle 0 1\nsurface,radius,thickness,glass,conic,diameter,stop\n"
+PARABOLA += "0,inf,inf,,,,\n1,-200,-100,MIRROR,-1,20,1\n2,inf,0,,,,\n"
+
+
+def test_axes_do_not_magnify_rounding(tmp_path):
+    """A parabola's image of infinity is perfect: its fans lie on the axis of a scale that means something."""
+    (tmp_path / "parabola.csv").write_text(PARABOLA)
+    lens = read_lens(tmp_path / "parabola.csv")
+    axis = torch.zeros(2, 1, dtype=torch.float64)
+    for found in (ray_fan(lens, fields=axis), opd_fan(lens, fields=axis)):
+        assert float(found.tangential.abs().max()) < 1e-9
+        panels = plot.fan_plot(lens, found).axes
+        assert panels[0].get_ylim()[1] >= 1e-4
+        assert "everywhere" in panels[0].texts[0].get_text()
+    off_axis = ray_fan(lens, fields=axis + 1)
+    assert not plot.fan_plot(lens, off_axis).axes[0].texts
+    alone = distortion(lens, fields=axis + 1)
+    assert plot.distortion_curves(lens, alone).axes[0].lines[0].get_marker() == "o"  # one field: a line is not seen

@@ -101,22 +101,33 @@ def field_curvature(
 ) -> FieldCurvature:
     """Tangential and sagittal foci of close rays, s = -(∂x/∂p)/(∂m/∂p) with m = (L, M)/N, as Coddington's equations.
 
-    fields: (2, F) along y, by default `size` from the axis to the lens's largest. Raises ValueError for fields off the
-    y axis, whose principal sections are turned.
+    fields: (2, F), by default `size` from the axis to the lens's largest. Tangential is the plane through the axis and
+    the field point, sagittal the one across it. Close rays that leave the lens parallel have no focus: invalid.
     """
     lens = unvignetted(lens)
     fields = field_range(lens, size) if fields is None else fields
-    if bool((fields[0] != 0).any()):
-        raise ValueError("field curvature is drawn for fields along y; found a field with x other than 0")
     wavelengths = wavelengths_of(lens, wavelengths)
-    step = fields.new_tensor([[0.0, 0.0, 1.0, -1.0], [1.0, -1.0, 0.0, 0.0]]) * _NEAR_CHIEF
-    rays = image_rays(lens, step, fields=fields, wavelengths=wavelengths)
-    slope = safe_divide(rays.direction[:2], rays.direction[2].expand_as(rays.direction[:2]))
-    (x, y), (m_x, m_y) = rays.position[:2], slope
-    tangential = -safe_divide(y[..., 0] - y[..., 1], m_y[..., 0] - m_y[..., 1])
-    sagittal = -safe_divide(x[..., 2] - x[..., 3], m_x[..., 2] - m_x[..., 3])
-    valid = (rays.valid | _kept(rays.direction)).all(-1)
+    along = torch.where((fields == 0).all(0), fields.new_tensor([[0.0], [1.0]]), _meridian(fields))
+    alike = bool((along == along[:, :1]).all())
+    groups = [(fields, along[:, :1])] if alike else zip(fields.split(1, 1), along.split(1, 1), strict=True)
+    each = [_close_foci(lens, group, wavelengths, meridian) for group, meridian in groups]
+    tangential, sagittal, valid = (torch.cat(found) for found in zip(*each, strict=True))
     return FieldCurvature(tangential, sagittal, fields, wavelengths, valid)
+
+
+def _close_foci(lens: Lens, fields: Tensor, wavelengths: Tensor, along: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Tangential and sagittal foci (F, W) of fields (2, F) in one meridian (2, 1), and whether they exist."""
+    across = torch.stack([along[1], -along[0]])
+    pupil = torch.cat([along, -along, across, -across], 1) * _NEAR_CHIEF
+    rays = image_rays(lens, pupil, fields=fields, wavelengths=wavelengths)
+    slope = safe_divide(rays.direction[:2], rays.direction[2].expand_as(rays.direction[:2]))
+    foci, valid = [], (rays.valid | _kept(rays.direction)).all(-1)
+    for section, pair in ((along, slice(0, 2)), (across, slice(2, 4))):
+        place, tilt = (dot_2(part[..., pair], section[:, :, None, None]) for part in (rays.position[:2], slope))
+        opening = tilt[..., 0] - tilt[..., 1]
+        foci.append(-safe_divide(place[..., 0] - place[..., 1], opening))
+        valid = valid & (opening.abs() > 8 * torch.finfo(opening.dtype).eps)
+    return *foci, valid
 
 
 def lateral_colour(

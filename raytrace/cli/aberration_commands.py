@@ -3,7 +3,7 @@
 import argparse
 
 from raytrace import analysis
-from raytrace.cli.analysis_commands import DENSE, draw, print_table, report, rows
+from raytrace.cli.analysis_commands import DENSE, draw, opened, print_table, report, rows
 from raytrace.cli.door import field_points, open_lens, print_json
 from raytrace.cli.spots import field_label
 from raytrace.lens import FIELD_UNITS
@@ -70,8 +70,7 @@ def grid(arguments: argparse.Namespace) -> None:
 
 def incidence(arguments: argparse.Namespace) -> None:
     """Angles of incidence on the sensor, or with --surfaces on every surface."""
-    lens = open_lens(arguments)
-    fields = field_points(lens, arguments) if arguments.field else None
+    lens, fields = opened(arguments) if arguments.field else (open_lens(arguments), None)
     wavelengths = lens.wavelengths if arguments.wavelength else None
     found = analysis.incidence(lens, fields=fields, wavelengths=wavelengths, size=arguments.samples)
     if arguments.json:

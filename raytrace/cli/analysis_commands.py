@@ -9,6 +9,7 @@ from torch import Tensor
 from raytrace import analysis
 from raytrace.analysis.frame import Tabular, flat
 from raytrace.cli.door import CommandError, field_points, number, open_lens, print_json, say
+from raytrace.cli.reach import check_reach, refuse_empty
 from raytrace.lens import FIELD_UNITS, Lens
 from raytrace.numerics import broadcast_shape
 
@@ -22,7 +23,7 @@ DENSE = 65  # fields of a curve over the field, when it is drawn
 
 def mtf(arguments: argparse.Namespace) -> None:
     """Modulation through frequency or through focus."""
-    lens, fields = opened(arguments)
+    lens, fields = opened(arguments, every=True)
     kind = "geometric" if arguments.geometric else "diffraction"
     frequencies = None if arguments.frequency is None else lens.wavelengths.new_tensor(arguments.frequency)
     if arguments.through_focus is None:
@@ -53,7 +54,7 @@ def opd(arguments: argparse.Namespace) -> None:
 
 def wavefront(arguments: argparse.Namespace) -> None:
     """Wavefront maps; the text is RMS, peak to valley and the Strehl ratio, the JSON also the coefficients."""
-    lens, fields = opened(arguments)
+    lens, fields = opened(arguments, every=True)
     found = analysis.wavefront_map(lens, fields=fields, size=arguments.size)
     report(arguments, lens, found, "wavefront_maps", summary=found.summary(), unit="waves")
 
@@ -80,24 +81,26 @@ def illumination(arguments: argparse.Namespace) -> None:
 
 def encircled(arguments: argparse.Namespace) -> None:
     """Encircled energy."""
-    lens, fields = opened(arguments)
+    lens, fields = opened(arguments, every=True)
     kind = "geometric" if arguments.geometric else "diffraction"
     radii = None if arguments.radius is None else lens.wavelengths.new_tensor(arguments.radius)
     found = analysis.encircled_energy(lens, radii, kind=kind, fields=fields)
     report(arguments, lens, found, "encircled_curves", every=5)
 
 
-def opened(arguments: argparse.Namespace) -> tuple[Lens, Tensor]:
-    """The lens, and the fields of --field, else the lens's own."""
+def opened(arguments: argparse.Namespace, *, every: bool = False) -> tuple[Lens, Tensor]:
+    """The lens, and the fields of --field, else the lens's own; rays must reach the sensor from one, or from every."""
     lens = open_lens(arguments)
-    return lens, field_points(lens, arguments)
+    fields = field_points(lens, arguments)
+    check_reach(arguments, lens, fields, every=every)
+    return lens, fields
 
 
 def over_field(arguments: argparse.Namespace, analyse: Callable, figure: str) -> None:
     """Report an analysis at the fields of --field, else at --samples fields; its figure is drawn through many."""
-    lens = open_lens(arguments)
-    fields = field_points(lens, arguments) if arguments.field else None
+    lens, fields = opened(arguments) if arguments.field else (open_lens(arguments), None)
     found = analyse(lens, fields=fields, size=arguments.samples)
+    refuse_empty(arguments, lens, found)
     dense = analyse(lens, fields=fields, size=DENSE) if arguments.plot else None
     report(arguments, lens, found, figure, unit="mm", dense=dense)
 
@@ -151,6 +154,8 @@ def print_table(columns: dict[str, Tensor], field_unit: str, every: int, unit: s
     for row in zip(*table.values(), strict=True):
         cells = (_cell(factor[name] * float(value)) for name, value in zip(table, row, strict=True))
         print("  ".join(f"{cell:>{width}}" for cell, width in zip(cells, widths.values(), strict=True)))
+    if thin > 1:
+        print(f"{len(range(0, length, thin))} of {length} points of each curve; --json lists all")
 
 
 def _cell(value: float) -> str:

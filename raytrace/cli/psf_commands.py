@@ -8,11 +8,13 @@ from torch import Tensor
 
 from raytrace.analysis import PIXEL, SIZE, Abilities, Comparison, abilities, common_focus
 from raytrace.analysis import compare as compare_models
-from raytrace.cli.door import field_points, number, numbers, open_lens, primary, print_json, say
+from raytrace.cli.door import CommandError, field_points, number, numbers, open_lens, primary, print_json, say
 from raytrace.cli.spots import cell, field_label, warn_of_losses
 from raytrace.files import write_atomically
+from raytrace.focus import NoImage, real_image_distance
 from raytrace.grid import Grid, grid
 from raytrace.lens import FIELD_UNITS, Lens, with_object_distance
+from raytrace.paraxial import first_order
 from raytrace.psf import NotConverged, Psf, close_up, default_center
 from raytrace.psf import psf as compute
 from raytrace.pupil import gauss_rings
@@ -221,11 +223,19 @@ def compare(arguments: argparse.Namespace) -> None:
     """The models side by side over object distance, and what each of them can represent, in numbers."""
     lens = open_lens(arguments)
     wavelength = primary(lens) if arguments.wavelength else 0.53
-    lens = common_focus(lens, arguments.focus_distance, wavelength=wavelength, start=arguments.start)
+    distances = lens.wavelengths.new_tensor(arguments.object_distance)
+    try:
+        lens = common_focus(lens, arguments.focus_distance, wavelength=wavelength, start=arguments.start)
+        real_image_distance(lens, distances)
+    except NoImage as error:
+        raise CommandError(
+            f"{arguments.lens}: {error}; its focal length is {_focal_length(lens):.6g} mm, give --focus-distance and "
+            "--object-distance beyond, or inf"
+        ) from error
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotConverged)  # the estimated errors are printed
         pixels = _pixels(lens, arguments)
-        found = compare_models(lens, lens.wavelengths.new_tensor(arguments.object_distance), pixels=pixels)
+        found = compare_models(lens, distances, pixels=pixels)
         able = abilities(lens, pixels=pixels)
     where = f"one sensor at {float(found.sensor_distance):.7f} mm, {float(found.wavelength):g} µm"
     if arguments.plot:
@@ -241,6 +251,10 @@ def compare(arguments: argparse.Namespace) -> None:
         _print_abilities(able)
     if arguments.plot:
         say(f"written: {arguments.plot}")
+
+
+def _focal_length(lens: Lens) -> float:
+    return float(first_order(lens).effective_focal_length)
 
 
 def _comparison(found: Comparison, able: Abilities) -> dict:

@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 
 from raytrace.analysis import GridDistortion, Incidence, LongitudinalAberration, Seidel
 from raytrace.lens import Lens
-from raytrace.plot.panels import DASHES, chart, legend_below, titled, wavelength_label
+from raytrace.plot.panels import DASHES, chart, drawn_at_least, legend_below, titled, wavelength_label
 from raytrace.plot.style import (
     FAINT,
     GREY,
@@ -70,8 +70,7 @@ def longitudinal_curves(lens: Lens, found: LongitudinalAberration) -> Figure:
         panel.plot(shown[w], array(found.pupil), label=wavelength_label(found, w), **style)
     panel.axvline(0, color=GREY, linewidth=0.6)
     panel.set_ylim(0, 1)
-    if np.nanmax(np.abs(shown), initial=0.0) < 1e-9:
-        panel.set_xlim(-1, 1)
+    drawn_at_least([panel], 1e-6, "x")
     legend_below(figure, panel, 3)
     return titled(figure, lens, "longitudinal aberration")
 

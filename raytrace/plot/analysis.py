@@ -19,7 +19,9 @@ from raytrace.analysis import (
 from raytrace.lens import Lens
 from raytrace.plot.panels import (
     DASHES,
+    FEW,
     chart,
+    drawn_at_least,
     field_axis,
     field_labels,
     field_name,
@@ -71,6 +73,7 @@ def fan_plot(lens: Lens, found: Fan) -> Figure:
         panel.set_xlim(-1, 1)
         panel.set_xlabel("pupil coordinate")
     figure.supylabel("transverse aberration (µm)" if ray else "OPD (waves)", fontsize=8.5)
+    drawn_at_least(axes.flat, 1e-3 if ray else 1e-4, "y")
     legend_below(figure, axes[0][0], len(colours))
     return titled(figure, lens, "ray fans" if ray else "OPD fans")
 
@@ -82,7 +85,7 @@ def wavefront_maps(lens: Lens, found: WavefrontMap) -> Figure:
     figure = new_figure(max(4.2, 1.9 * count + 1.4), 2.05 * len(labels) + 0.6)
     axes = figure.subplots(len(labels), count, squeeze=False)
     opd = np.where(array(found.valid).astype(bool), array(found.opd), np.nan)
-    largest = max(float(np.nanmax(np.abs(opd), initial=0.0)), 1e-6)
+    largest = max(float(np.nanmax(np.abs(opd), initial=0.0)), 1e-4)
     for row, label in enumerate(labels):
         for w in range(count):
             panel = axes[row][w]
@@ -158,6 +161,7 @@ def distortion_curves(lens: Lens, found: Distortion) -> Figure:
     for panel, (name, values) in zip(figure.subplots(1, len(curves), squeeze=False)[0], curves, strict=True):
         over_field(panel, lens, found, 100 * array(values), array(found.valid), dashes=DASHES)
         panel.set_xlabel(f"{name} distortion (%)")
+        drawn_at_least([panel], 1e-6, "x")
     legend_below(figure, panel, len(found.wavelengths))
     return titled(figure, lens, "distortion")
 
@@ -169,6 +173,7 @@ def curvature_curves(lens: Lens, found: FieldCurvature) -> Figure:
     valid = array(found.valid)
     over_field(panel, lens, found, array(found.tangential), valid, suffix=" T", dashes=("solid",))
     over_field(panel, lens, found, array(found.sagittal), valid, suffix=" S", dashes=(_SAGITTAL,))
+    drawn_at_least([panel], 1e-6, "x")
     legend_below(figure, panel, 2 if len(found.wavelengths) < 3 else 3)
     return titled(figure, lens, "field curvature")
 
@@ -177,9 +182,12 @@ def curvature_curves(lens: Lens, found: FieldCurvature) -> Figure:
 def lateral_curves(lens: Lens, found: LateralColour) -> Figure:
     """Chief rays' heights less the primary wavelength's over the field, beside the Airy radius of that one in grey."""
     figure, panel = chart(4.6, 4.4, "lateral colour (µm)", "")
-    airy = 1.22e3 / float(cutoff(lens, lens.wavelengths[lens.primary_wavelength]))
-    panel.axvspan(-airy, airy, color=FAINT, alpha=0.35, linewidth=0, label="Airy radius")
+    if (resolved := float(cutoff(lens, lens.wavelengths[lens.primary_wavelength]))) > 0:
+        airy = 1.22e3 / resolved
+        panel.axvspan(-airy, airy, color=FAINT, alpha=0.35, linewidth=0, label="Airy radius")
     over_field(panel, lens, found, 1e3 * array(found.shift), array(found.valid), dashes=DASHES)
+    if not panel.patches:
+        drawn_at_least([panel], 1e-3, "x")
     legend_below(figure, panel, 4)
     return titled(figure, lens, "lateral colour")
 
@@ -189,14 +197,14 @@ def illumination_curve(lens: Lens, found: RelativeIllumination) -> Figure:
     """Relative illumination over the field, beside cos⁴θ where fields are angles."""
     figure, panel = chart(5.4, 3.6, field_name(lens), "relative illumination")
     field = field_axis(found)
-    line = {"linewidth": 1.5} if len(field) > 5 else {"linestyle": "none", "marker": "o", "markersize": 3.5}
+    line = {"linewidth": 1.5} if len(field) > FEW else {"linestyle": "none", "marker": "o", "markersize": 3.5}
     panel.plot(
         field, array(found.illumination), color=field_colour(0), clip_on=False, zorder=3, label="this lens", **line
     )
     if lens.fields.kind == "angle":
         fine = np.linspace(0, field.max(), 100)
         panel.plot(fine, np.cos(np.deg2rad(fine)) ** 4, color=GREY, linewidth=1.0, linestyle=":", label="cos⁴θ")
-    panel.set_xlim(0, max(field.max(), 1e-9))
+    panel.set_xlim(0, field.max() or 1.0)
     panel.set_ylim(0, 1.05 * max(1.0, float(found.illumination.max())))
     legend_below(figure, panel, 2)
     return titled(figure, lens, "relative illumination")

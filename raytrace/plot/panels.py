@@ -1,6 +1,6 @@
 """What figures of curves share: ruled panels, titles and legends, curves of each wavelength over the field."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,20 +12,37 @@ from raytrace.plot.style import GREY, array, field_label, field_title, new_figur
 #: Dashes of wavelengths, in order, for readers who do not tell their colours apart.
 DASHES = ("solid", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)))
 
+#: So many fields are drawn as points, for a line of one would not be seen.
+FEW = 5
+
 
 def over_field(panel: Axes, lens: Lens, found, values: np.ndarray, valid: np.ndarray, *, dashes, suffix="") -> None:
     """Curves (F, W) drawn upwards over the field, as lens designers do; dashes: one after another by wavelength."""
     ruled(panel)
     field, shown = field_axis(found), np.where(valid.astype(bool), values, np.nan)
+    order = np.argsort(field, kind="stable")
+    field, shown = field[order], shown[order]
     for w, colour in enumerate(wavelength_colours(found.wavelengths.tolist())):
         style = {"color": colour, "linewidth": 1.4, "linestyle": dashes[w % len(dashes)]}
+        style |= {"marker": "o", "markersize": 3.5} if len(field) <= FEW else {}
         panel.plot(shown[:, w], field, label=wavelength_label(found, w) + suffix, **style)
     panel.axvline(0, color=GREY, linewidth=0.6)
-    panel.set_ylim(0, max(field.max(), 1e-9))
+    panel.set_ylim(0, field.max() or 1.0)
     panel.set_ylabel(field_name(lens))
-    widest = np.nanmax(np.abs(shown), initial=0.0)
-    if widest < 1e-9:
-        panel.set_xlim(-1, 1)
+
+
+def drawn_at_least(axes: Iterable[Axes], floor: float, along: str) -> None:
+    """Keep axes of one scale from magnifying rounding: where no curve passes the floor, they end there and say so."""
+    panels = list(axes)
+    curves = [line for panel in panels for line in panel.lines if not line.get_label().startswith("_")]  # no rulers
+    drawn = [getattr(line, f"get_{along}data")() for line in curves]
+    if max(np.nanmax(np.abs(np.asarray(values, dtype=float)), initial=0.0) for values in drawn) >= floor:
+        return
+    for panel in panels:
+        getattr(panel, f"set_{along}lim")(-floor, floor)
+        panel.text(
+            0.5, 0.96, f"below {floor:g} everywhere", transform=panel.transAxes, ha="center", va="top", color=GREY
+        )
 
 
 def field_axis(found) -> np.ndarray:
