@@ -12,11 +12,14 @@ import pytest
 import torch
 
 from raytrace.cli import wave_table
+from raytrace.glass import index
 from raytrace.grid import grid
+from raytrace.plot.wave import height_figure
 from raytrace.wave.aim import aim
 from raytrace.wave.baselines import BASELINES, baseline
 from raytrace.wave.exchange import write_heights
 from raytrace.wave.fabrication import as_rings
+from raytrace.wave.label import read_label, write_element
 from raytrace.wave.plan import ENGINES
 from raytrace.wave.psf import psf
 from raytrace.wave.scene import WaveScene
@@ -90,6 +93,53 @@ def test_an_element_of_a_file_is_the_element_that_was_written(run, tmp_path):
     assert whole["results"][0]["peak"] != pytest.approx(named["results"][0]["peak"], rel=1e-4)
 
 
+def test_heights_keep_the_material_that_they_were_learned_for(run, tmp_path):
+    """Rings of fused silica: without an option the kernel is theirs, not that of PMMA."""
+    (lens,) = baseline("fresnel", aim(radius=0.5))
+    element = as_rings(lens, 0.002)
+    write_element(element, tmp_path / "rings.npy", design_wavelength=0.55)
+    found = read_label(tmp_path / "rings.npy")
+    wavelengths = torch.tensor([0.46, 0.55, 0.64], dtype=torch.float64)
+    assert torch.equal(index(found.glass, wavelengths), index(element.glass, wavelengths))
+    assert (found.design_wavelength, found.pitch, found.aperture) == (0.55, 0.002, 1.0)
+    arguments = ("psf", "--element", "rings.npy", "--aperture", "1", *SMALL, "--json")
+    peaks = {}
+    for glass in ((), ("--glass", "F_SILICA"), ("--glass", "PMMA")):
+        code, out, err = run(*arguments, *glass)
+        assert code == 0, err
+        peaks[glass] = json.loads(out)["results"][0]["peak"]
+    assert peaks[()] == peaks["--glass", "F_SILICA"]
+    assert peaks[()] > 1.01 * peaks["--glass", "PMMA"]
+    # A bare file says nothing, and is not guessed at; a damaged label is no crash.
+    (tmp_path / "rings.npy.json").write_text('{"material": "F_SILICA", "formula": "sellmeier_1"}')
+    code, _, err = run(*arguments)
+    assert code == 1
+    assert "rings.npy.json: is no label of a height map (KeyError: 'coefficients'); remove it" in err
+    (tmp_path / "rings.npy.json").unlink()
+    code, _, err = run(*arguments)
+    assert code == 1
+    assert "rings.npy: does not say its material (there is no rings.npy.json beside it); give --glass NAME" in err
+    np.save(tmp_path / "bare.npy", element.profile.heights.numpy())
+    code, _, err = run("psf", "--element", "bare.npy", "--aperture", "1", *SMALL)
+    assert code == 1
+    assert "pitch" in err
+
+
+def test_heights_of_all_parts_are_drawn():
+    """The round lens and the cubic plate over it: two maps, the second odd in x and y."""
+    elements = baseline("cubic-refractive", aim(radius=0.5))
+    figure = height_figure(elements, title="cubic-refractive")
+    maps = [axes.images[0].get_array() for axes in figure.axes if axes.images]
+    assert len(maps) == len(elements) == 2
+    round_part, plate = (np.ma.filled(one, np.nan) for one in maps)
+    inside = ~np.isnan(plate)
+    assert np.allclose(round_part[inside], round_part[::-1, ::-1][inside], atol=1e-9)
+    assert np.allclose(plate[inside], -plate[::-1, ::-1][inside], atol=1e-9)
+    assert np.nanmax(np.abs(plate)) > 1
+    titles = [axes.get_title() for axes in figure.axes if axes.images]
+    assert titles == ["smooth, round; PMMA", "smooth, free form; PMMA"]
+
+
 def test_exact_spheres_and_paraboloids_differ(run):
     peaks = [
         json.loads(run("psf", "--element", "ideal", *SMALL, "--json", *more)[1])["results"][0]["peak"]
@@ -154,6 +204,7 @@ def test_focus_prints_what_became_of_the_plate(run, tmp_path):
     assert document["seconds"] > 0
     assert 0.85 < document["flat_pixels_best"] < 0.9
     assert np.load(tmp_path / "lens.npy").shape == (128, 128)
+    assert json.loads((tmp_path / "lens.npy.json").read_text())["material"] == "F_SILICA"
     assert (tmp_path / "focus.png").read_bytes()[:4] == b"\x89PNG"
 
 

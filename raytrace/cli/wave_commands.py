@@ -19,9 +19,10 @@ from raytrace.grid import Grid, centres
 from raytrace.plot import wave as figures
 from raytrace.plot.style import object_text
 from raytrace.wave.caustic import caustic
-from raytrace.wave.exchange import FORMATS, write_heights
+from raytrace.wave.exchange import FORMATS
+from raytrace.wave.label import write_element
 from raytrace.wave.psf import WavePsf
-from raytrace.wave.scene import WaveScene, is_smooth
+from raytrace.wave.scene import WaveScene
 
 _PLANES = 121  # of a caustic
 _SHOWN = (0, 5, 10, 20, 40, 80, 160)  # steps of learning that the figure shows
@@ -47,9 +48,7 @@ def psf(arguments: argparse.Namespace) -> None:
 
 
 def _heights(arguments: argparse.Namespace, seen: WaveScene, found: WavePsf):
-    """Of the element of most detail: one that is wrapped or sampled, else the first."""
-    part = next((element for element in seen.elements if not is_smooth(element)), seen.elements[0])
-    return figures.height_figure(part, title=_title(arguments))
+    return figures.height_figure(seen.elements, title=_title(arguments))
 
 
 def _caustic(arguments: argparse.Namespace, seen: WaveScene, found: WavePsf):
@@ -179,7 +178,7 @@ def focus(arguments: argparse.Namespace) -> None:
     seconds, busy = time.perf_counter() - began, time.process_time() - busy
     torch.set_num_threads(threads)
     if arguments.output:
-        write_heights(found.element.profile, arguments.output)
+        write_element(found.element, arguments.output, design_wavelength=setting.wavelength)
     if arguments.plot:
         plot.save(figures.focus_figure(found, title=_goal(found)), arguments.plot)
     if arguments.json:

@@ -26,8 +26,8 @@ from raytrace.pictures import NoPictures, Pictures, dead_leaves, files, read, sp
 from raytrace.plot import edof as drawn
 from raytrace.plot.style import save
 from raytrace.wave.element import Element
-from raytrace.wave.exchange import write_heights
 from raytrace.wave.fabrication import as_made, as_pixels
+from raytrace.wave.label import write_element
 
 _WIDE = 512  # pixels of a period that is restored
 _LEAVES = 40  # pictures of dead leaves
@@ -50,8 +50,8 @@ def edof(arguments: argparse.Namespace) -> None:
     known = {"settings": settings, "world": world}
     document = plain({name: dataclasses.asdict(one) for name, one in known.items()} | dataclasses.asdict(own))
     write_atomically(folder / "outcome.json", lambda file: file.write(json.dumps(document, indent=1).encode()))
-    profile = as_made(elements[0]).profile if settings.kind == "rings" else as_pixels(elements[0], world.pixel).profile
-    write_heights(profile, folder / "heights.npy")
+    made = as_made(elements[0]) if settings.kind == "rings" else as_pixels(elements[0], world.pixel)
+    write_element(made, folder / "heights.npy", design_wavelength=world.wavelengths[len(world.wavelengths) // 2])
     if arguments.plot:
         save(drawn.element_figure(elements, found, own, world), arguments.plot)
     if arguments.json:

@@ -8,10 +8,9 @@ from pathlib import Path
 
 from torch import Tensor
 
-from raytrace.catalog import find_glass
 from raytrace.cli.door import CommandError, print_json
 from raytrace.cli.progress import progress
-from raytrace.cli.wave_setup import height_map
+from raytrace.cli.wave_setup import height_map, material
 from raytrace.cli.wave_superres import folders, page, pictures, write_csv
 from raytrace.design.edof import World, periodic, spectrum
 from raytrace.design.edof_training import Settings
@@ -85,8 +84,13 @@ def _element(arguments, given: str, train: Pictures, S: Tensor) -> tuple[str, El
         return given, element, world
     if given != "learned" and Path(given).suffix.lower() in FORMATS and not Path(given).is_dir():
         span = tuple(arguments.span) if arguments.span else None
-        glass = find_glass(arguments.glass)
-        made_of = height_map(given, aperture=arguments.aperture, glass=glass, pitch=arguments.pitch, span=span)
+        made_of = height_map(
+            given,
+            aperture=arguments.aperture,
+            glass=lambda: material(given, arguments.glass),
+            pitch=arguments.pitch,
+            span=span,
+        )
         return Path(given).name, made_of, dataclasses.replace(world, radius=0.5 * arguments.aperture)
     if given != "learned" and not Path(given).is_dir():
         raise CommandError(

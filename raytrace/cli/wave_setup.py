@@ -4,7 +4,7 @@ import argparse
 import dataclasses
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -24,6 +24,7 @@ from raytrace.wave.baselines import BASELINES, baseline
 from raytrace.wave.element import Element, Rings
 from raytrace.wave.exchange import FORMATS, read_heights
 from raytrace.wave.fabrication import wrapped
+from raytrace.wave.label import label_of, read_label
 from raytrace.wave.plan import Plan, plan
 from raytrace.wave.psf import WavePsf, psf
 from raytrace.wave.scene import WaveScene
@@ -72,21 +73,37 @@ def _named(arguments: argparse.Namespace) -> tuple[Element, ...]:
 
 def _from_file(arguments: argparse.Namespace) -> Element:
     """A height map in the aperture; wrapped where a design wavelength or steps are given."""
-    glass, span = _glass(arguments), tuple(arguments.span) if arguments.span else None
-    element = height_map(arguments.element, aperture=arguments.aperture, glass=glass, pitch=arguments.pitch, span=span)
-    if arguments.design_wavelength or arguments.levels:
-        element = wrapped(element, arguments.design_wavelength or _WAVELENGTH, levels=arguments.levels or 0)
-    return element
+    element = height_map(
+        arguments.element,
+        aperture=arguments.aperture,
+        glass=lambda: _glass(arguments),
+        pitch=arguments.pitch,
+        span=tuple(arguments.span) if arguments.span else None,
+    )
+    if not (arguments.design_wavelength or arguments.levels):
+        return element
+    label = read_label(arguments.element)
+    design = arguments.design_wavelength or (label and label.design_wavelength)
+    if not design:
+        raise CommandError(f"{arguments.element}: does not say what it was made for; give --design-wavelength UM")
+    return wrapped(element, design, levels=arguments.levels or 0)
 
 
 def height_map(
-    path: str, *, aperture: float, glass: Glass, pitch: float | None = None, span: tuple[float, float] | None = None
+    path: str,
+    *,
+    aperture: float,
+    glass: Callable[[], Glass],
+    pitch: float | None = None,
+    span: tuple[float, float] | None = None,
 ) -> Element:
-    """The element of a file of heights in an aperture of so many mm; pitch, span: of a file that does not say them.
+    """The element of a file of heights in an aperture of so many mm.
 
+    glass: asked for once the heights are read; pitch, span: of a file that does not say them, nor its label.
     Raises CommandError where the heights do not fill the aperture, and what `read_heights` raises.
     """
-    profile = read_heights(path, pitch=pitch, span=span)
+    label = read_label(path)
+    profile = read_heights(path, pitch=pitch or (label and label.pitch), span=span)
     profile = dataclasses.replace(profile, heights=profile.heights.double(), pitch=profile.pitch.double())
     counts = (2 * len(profile.heights),) if isinstance(profile, Rings) else profile.heights.shape
     across = min(counts) * float(profile.pitch)
@@ -96,12 +113,13 @@ def height_map(
             f"{path}: the heights are {across:.6g} mm across, less than the aperture of {aperture:g} mm; "
             f"give --aperture {across:.6g}"
         )
-    return Element(profile, torch.tensor(0.5 * aperture, dtype=torch.float64), glass)
+    return Element(profile, torch.tensor(0.5 * aperture, dtype=torch.float64), glass())
 
 
 def _glass(arguments: argparse.Namespace) -> Glass:
+    """The material of a height map: of --index, or as `material` finds it."""
     if arguments.index is None:
-        return find_glass(arguments.glass or "PMMA", user=catalogs(arguments))
+        return material(arguments.element, arguments.glass, user=catalogs(arguments))
     if arguments.glass:
         raise CommandError("--glass and --index both name the material: give one of them")
     try:
@@ -110,9 +128,22 @@ def _glass(arguments: argparse.Namespace) -> Glass:
         raise CommandError(f"--index: {error}") from error
 
 
+def material(path: str, name: str | None, *, user: Sequence[Path] = ()) -> Glass:
+    """The glass of a name, else that of the label beside a height map. Raises CommandError where neither says it."""
+    if name:
+        return find_glass(name, user=tuple(user))
+    label = read_label(path)
+    if label is None:
+        raise CommandError(
+            f"{path}: does not say its material (there is no {label_of(path).name} beside it); give --glass NAME, as "
+            "PMMA, or --index N for each --wavelength where the command has it"
+        )
+    return label.glass
+
+
 def check_colours(parts: Sequence[Element], wavelengths: Sequence[float]) -> None:
     """Raises CommandError for a wavelength (µm) outside what a material is known for: thin elements live by n - 1."""
-    for glass in {element.glass.name: element.glass for element in parts}.values():
+    for glass in {id(element.glass.coefficients): element.glass for element in parts}.values():
         check_unit(torch.tensor(wavelengths), [glass])
         if glass.formula == "constant":
             continue
@@ -120,7 +151,9 @@ def check_colours(parts: Sequence[Element], wavelengths: Sequence[float]) -> Non
         outside = [wavelength for wavelength in wavelengths if not low <= wavelength <= high]
         if outside:
             listed = ", ".join(f"{wavelength:g}" for wavelength in outside)
-            raise CommandError(f"{glass.name} is known from {low:g} to {high:g} µm, not at {listed} µm")
+            raise CommandError(
+                f"{glass.name or 'the material'} is known from {low:g} to {high:g} µm, not at {listed} µm"
+            )
         check_wavelengths(glass, wavelengths)
 
 

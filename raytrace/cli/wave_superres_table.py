@@ -103,7 +103,7 @@ def _quantise(parser: argparse.ArgumentParser) -> None:
         ".tif, .dat, .grd; fine maps of pixels take minutes, rings seconds",
     )
     files = parser.add_argument_group("height maps")
-    files.add_argument("--glass", metavar="NAME", default="F_SILICA", help="material (default F_SILICA)")
+    files.add_argument("--glass", metavar="NAME", help="material (default: that of its FILE.json)")
     files.add_argument(
         "--aperture", metavar="MM", type=positive_finite, default=5.0, help="diameter, sensor at 35.5 mm (default 5)"
     )

@@ -89,7 +89,7 @@ def element(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--levels", metavar="N", type=count, help="steps of a wave's height, of wrapped elements (default any height)"
     )
-    group.add_argument("--glass", metavar="NAME", help="material of a file's element (default PMMA)")
+    group.add_argument("--glass", metavar="NAME", help="material of a file's element (default: that of its FILE.json)")
     group.add_argument(
         "--index",
         metavar="N",

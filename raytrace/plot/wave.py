@@ -27,8 +27,9 @@ from raytrace.plot.style import (
     styled,
     wavelength_colours,
 )
-from raytrace.wave.element import Element, Pixels, Rings, height
+from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike, height
 from raytrace.wave.psf import WavePsf
+from raytrace.wave.scene import is_smooth
 
 _GAMMA = 0.4  # of brightness in kernels: a haze of a hundredth of the peak is still seen
 _DECADES = 4.0  # of light in a caustic
@@ -83,26 +84,50 @@ def psf_figure(found: WavePsf, *, title: str = "") -> Figure:
 
 
 @styled
-def height_figure(element: Element, *, title: str = "") -> Figure:
-    """The height of an element as it is made: the disc, its profile along x, and the profile at the rim."""
+def height_figure(elements: Sequence[Element], *, title: str = "") -> Figure:
+    """The heights of elements in contact as they are made, a row for each: the disc, the profile along x, and the rim
+    of one that has steps."""
+    figure = new_figure(7.6, 3.1 * len(elements))
+    grid = figure.add_gridspec(2 * len(elements), 2, width_ratios=(1.15, 1.6))
+    for row, element in enumerate(elements):
+        above, below = 2 * row, 2 * row + 1
+        disc = figure.add_subplot(grid[above : below + 1, 0])
+        _disc(disc, element)
+        disc.set_title(_kind(element), fontsize=8.5)
+        R = float(element.radius)
+        if is_smooth(element):
+            whole = figure.add_subplot(grid[above : below + 1, 1])
+            _profile(whole, element, -R, R)
+            whole.set_xlabel("x, mm")
+            continue
+        whole, rim = figure.add_subplot(grid[above, 1]), figure.add_subplot(grid[below, 1])
+        _profile(whole, element, -R, R)
+        feature = float(element.profile.pitch) if isinstance(element.profile, Rings | Pixels) else R / 500
+        _profile(rim, element, R - min(0.3 * R, 40 * feature), R)
+        rim.set_xlabel("x, mm  (above: the whole diameter; here: the rim)")
+    figure.suptitle(title, fontweight="bold", fontsize=10)
+    return figure
+
+
+def _disc(axes: Axes, element: Element) -> None:
+    """Height over the aperture as a map."""
     R = float(element.radius)
-    figure = new_figure(7.6, 3.1)
-    grid = figure.add_gridspec(2, 2, width_ratios=(1.15, 1.6))
-    disc, whole, rim = (figure.add_subplot(grid[place]) for place in (np.s_[:, 0], np.s_[0, 1], np.s_[1, 1]))
     line = torch.linspace(-R, R, _ACROSS, dtype=element.radius.dtype)
     with torch.no_grad():
         heights = 1e3 * array(height(element, line.expand(_ACROSS, -1), line[:, None].expand(-1, _ACROSS)))
     x = array(line)
     heights[np.hypot(x, x[:, None]) > R] = np.nan
-    shown = disc.imshow(heights, origin="lower", extent=(-R, R, -R, R), cmap="cividis", interpolation="nearest")
-    disc.set(xlabel="x, mm", ylabel="y, mm")
-    figure.colorbar(shown, ax=disc, label="height, µm", shrink=0.85)
-    _profile(whole, element, -R, R)
-    feature = float(element.profile.pitch) if isinstance(element.profile, Rings | Pixels) else R / 500
-    _profile(rim, element, R - min(0.3 * R, 40 * feature), R)
-    rim.set_xlabel("x, mm  (above: the whole diameter; here: the rim)")
-    figure.suptitle(title, fontweight="bold", fontsize=10)
-    return figure
+    shown = axes.imshow(heights, origin="lower", extent=(-R, R, -R, R), cmap="cividis", interpolation="nearest")
+    axes.set(xlabel="x, mm", ylabel="y, mm")
+    axes.figure.colorbar(shown, ax=axes, label="height, µm", shrink=0.85)
+
+
+def _kind(element: Element) -> str:
+    """What a height is, and of what."""
+    profile = element.profile
+    kind = {Pixels: "pixels", Rings: "rings", EvenPowers: "smooth, round", Zernike: "smooth, free form"}[type(profile)]
+    kind = f"{kind}, wrapped" if element.period is not None else kind
+    return f"{kind}; {element.glass.name}" if element.glass.name else kind
 
 
 @styled
