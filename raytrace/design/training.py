@@ -94,7 +94,7 @@ class Run:
 
     def _compare(self, before: dict) -> None:
         differ = [
-            f"{key} was {before.get(key)!r}, now {self.settings.get(key)!r}"
+            f"{_words(key)} was {before.get(key)!r}, now {self.settings.get(key)!r}"
             for key in sorted({*before, *self.settings})
             if before.get(key) != self.settings.get(key)
         ]
@@ -126,7 +126,7 @@ class Run:
         try:
             return [{key: float(value) for key, value in zip(header, row, strict=True)} for row in rows]
         except ValueError as error:
-            raise DamagedRun(f"{self.log}: expected numbers under {','.join(header)} ({_words(error)})") from error
+            raise DamagedRun(f"{self.log}: expected numbers under {_words(','.join(header))} ({_words(error)})") from error
 
     def forget_after(self, step: int) -> None:
         """Drop rows of the log from `step` on: those that a killed run wrote after its last checkpoint."""
@@ -164,7 +164,7 @@ def read_json(path: Path) -> dict:
     return found
 
 
-def _words(error: Exception) -> str:
+def _words(error: object) -> str:
     return " ".join(str(error).split())[:120]
 
 

@@ -226,6 +226,9 @@ def _read_csv(content: bytes, file: str, known: Known) -> Map:
         found = lines[0][:60]
         raise HeightMapError(f"begins with {found!r}; expected the header x_mm,y_mm,sag_mm or r_mm,sag_mm", file, 1)
     table = _numbers(lines[1:], file, first=2, counts=(len(head),), separator=",")
+    if not np.isfinite(table[:, :-1]).all():
+        row = int(np.flatnonzero(~np.isfinite(table[:, :-1]).all(1))[0])
+        raise HeightMapError(f"reads {lines[row + 1][:60]!r}; expected finite places", file, row + 2)
     if len(head) == 2:
         pitch = 2 * float(table[0, 0])
         _expect(table[:, 0], (np.arange(len(table)) + 0.5) * pitch, pitch, "r", file, np.arange(len(table)) + 2)
