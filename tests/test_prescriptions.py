@@ -268,6 +268,9 @@ def test_numbers_as_people_write_them():
     assert radius_of("1,234.5") == pytest.approx(1234.5)
     assert radius_of("1,234", "-40.5") == pytest.approx(1234)
     assert radius_of("1,234", "-40,5", index="1,5") == pytest.approx(1.234)
+    assert read("No;R;d;nd\nstop;50;4;1,516\n2;-50;40;\nimage;;;\n")[0].surfaces[1].glass.coefficients.tolist() == [
+        1.516
+    ]
     assert radius_of('"1,234.5"', separator=",") == pytest.approx(1234.5)
     with pytest.raises(LensFileError, match=r"radius is '1,234': a decimal comma or thousands\? Write 1\.234 or 1234"):
         radius_of("1,234", index="2")

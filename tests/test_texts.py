@@ -32,7 +32,7 @@ def texts_of(lens) -> tuple:
     return lens.name, lens.notes, tuple(surface.comment for surface in lens.surfaces)
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(name=NASTY, note=NASTY, comment=NASTY)
 @example("# a", "#", "# 1")
 @example("title: x", "note: aperture: EPD 3", "stop")
@@ -50,7 +50,7 @@ def test_any_text_comes_back_from_a_table(suffix, tmp_path_factory, name, note, 
         assert texts_of(read_lens(path)) == texts_of(lens)
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(name=NASTY, note=NASTY, comment=NASTY)
 @example(" a", "b ", "\tc")
 @example("Notes...", "Notes...", "x" * 500)
@@ -73,7 +73,7 @@ def test_a_warning_names_the_text_that_a_zmx_file_loses(tmp_path):
         write_lens(with_texts("a", "b", " x "), tmp_path / "lens.zmx")
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(name=NASTY, note=NASTY, comment=NASTY)
 def test_any_text_comes_back_from_pandas(name, note, comment):
     lens = with_texts(name, note, comment)

@@ -126,7 +126,9 @@ class Run:
         try:
             return [{key: float(value) for key, value in zip(header, row, strict=True)} for row in rows]
         except ValueError as error:
-            raise DamagedRun(f"{self.log}: expected numbers under {_words(','.join(header))} ({_words(error)})") from error
+            raise DamagedRun(
+                f"{self.log}: expected numbers under {_words(','.join(header))} ({_words(error)})"
+            ) from error
 
     def forget_after(self, step: int) -> None:
         """Drop rows of the log from `step` on: those that a killed run wrote after its last checkpoint."""

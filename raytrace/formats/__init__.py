@@ -96,6 +96,8 @@ def _changed_texts(lens: Lens, content: bytes, form: Format, path: Path, catalog
         message = f"the file would not be read again: {found}"
         raise LensFileError(message, Place(str(path), None, error.surface)) from error
     pairs = [("the title", lens.name, again.name), ("a note", lens.notes, again.notes)]
+    lost = [name for name in lens.catalogs if name not in again.catalogs]
+    pairs += [(f"the catalog {name}", name, "") for name in lost]
     comments = zip(lens.surfaces, again.surfaces, strict=True)
     pairs += [(f"the comment of surface {k}", a.comment, b.comment) for k, (a, b) in enumerate(comments)]
     return [f"{what} ({shown(str(before))})" for what, before, after in pairs if before != after]
