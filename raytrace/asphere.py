@@ -23,11 +23,18 @@ Extra = tuple[Callable[[Tensor, Tensor], Sequence[Tensor]], Tensor]
 
 
 def sag_and_derivatives(
-    u: Tensor, curvature: Tensor | None, conic: Tensor | None, coefficients: Tensor | None, highest: int = 2
+    u: Tensor,
+    curvature: Tensor | None,
+    conic: Tensor | None,
+    coefficients: Tensor | None,
+    highest: int = 2,
+    *,
+    along: Tensor | float = 1.0,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """S(u), dS/du, d²S/du² with u = r² (...) in mm²; derivatives above the `highest` asked for stay 0.
+    """S(u), dS/du, d²S/du² v² with u = r² (...) in mm²; derivatives above the `highest` asked for stay 0.
 
-    Beyond the edge of a closed conic its radicand is held at 0+.
+    along: v, by whose square the second derivative comes multiplied: c³ alone leaves the range of numbers before any
+    length or curvature does. Beyond the edge of a closed conic its radicand is held at 0+.
 
     S = c u/(1+w) + Σ_j a_j u^j,  w = √(1 - (1+k) c² u);  dS = c/2w + …;  d²S = (1+k) c³/4w³ + …
     """
@@ -35,13 +42,14 @@ def sag_and_derivatives(
     if curvature is not None:
         c = curvature
         shape = 1.0 if conic is None else 1 + conic
-        radicand = 1 - shape * c * c * u
+        radicand = 1 - shape * (c * (c * u))  # also its derivatives stay in range: neither c² nor r² c̄
         w = torch.sqrt(torch.where(radicand > 0, radicand, torch.finfo(u.dtype).tiny))
         S = c * u / (1 + w)
         if highest > 0:
             dS = 0.5 * c / w
         if highest > 1:
-            d2S = (0.25 * shape * c**3) / (w * w * w)
+            tilt = c * along / w
+            d2S = 0.25 * shape * c / w * tilt * tilt
     if coefficients is not None:
         S = S + u * polynomial(coefficients, u)
         if highest > 0:
@@ -50,7 +58,7 @@ def sag_and_derivatives(
             first = order * coefficients
             dS = dS + polynomial(first, u)
             if highest > 1:
-                d2S = d2S + polynomial(((order - 1) * first)[1:], u)
+                d2S = d2S + polynomial(((order - 1) * first)[1:], u) * along * along
     return S, dS, d2S
 
 
@@ -180,7 +188,7 @@ def _residual(p, d, c, k, a, t, extra=None):
     radial = x * d[0] + y * d[1]
     scale = z.abs() + (c * u).abs() + u * polynomial(a.abs(), u) + p[2].abs() + (t * d[2]).abs()
     scale = scale + 2 * dS.abs() * (u + radial.abs() * t.abs())
-    inside_domain = 1 - (1 + k) * c * c * u > 0
+    inside_domain = 1 - (1 + k) * (c * (c * u)) > 0
     F, dF = z - S, d[2] - 2 * dS * radial
     if extra is not None:
         (D, D_x, D_y), bound = extra[0](x, y), extra[1]
@@ -209,7 +217,7 @@ def _newton(p, d, c, k, a, t, extra=None):
 
 def _bracketed(p, d, c, k, a, rim, extra=None):
     """First crossing in the direction of propagation on the stretch of ray inside rim and sag range (1-D batch)."""
-    big = torch.finfo(p.dtype).max ** 0.25
+    big = torch.finfo(p.dtype).max ** 0.48  # its square is a number
     L, M, N = d
     closed = (1 + k) * c * c
     edge = torch.where(closed > 0, torch.rsqrt(torch.where(closed > 0, closed, 1.0)), big)

@@ -18,7 +18,8 @@ from raytrace.asphere import aligned, asphere_root, sag_and_derivatives, search
 from raytrace.departure import Departure, covers, numbers, sag_of, size_of
 from raytrace.glass import AIR, Glass
 from raytrace.numerics import broadcast_shape, differentiating, dot
-from raytrace.value import value
+from raytrace.roots import conic_root, double, doubles, foot_of, way_of
+from raytrace.value import to, value
 
 
 @value
@@ -113,12 +114,15 @@ class Meeting(NamedTuple):
     cosine: (...) n·d with the normal n of `normal`, n_z > 0 at the vertex; finite where a ray misses.
     met: (...) bool, whether there is a crossing.
     normal: that of `normal` and its squared length where they are known already, else None.
+    exact: of rays in float32 the hit and the direction in float64, each a triple, from which it is decided whether
+        light passes: within 1e-7 of the critical angle rounding would. None of rays in float64.
     """
 
     hit: tuple[Tensor, Tensor, Tensor]
     cosine: Tensor
     met: Tensor
     normal: tuple | None = None
+    exact: tuple[Sequence[Tensor], Sequence[Tensor]] | None = None
 
 
 def meet(surface: Surface, position: Sequence[Tensor], direction: Sequence[Tensor]) -> Meeting:
@@ -143,14 +147,15 @@ def normal(surface: Surface, hit: Sequence[Tensor]) -> tuple[tuple[Tensor, Tenso
     if surface.departure is not None:
         return _tilted_normal(surface, sag_of(numbers(surface.departure), x, y, highest=1), x, y)
     if surface.coefficients is not None:
-        radius_squared = x * x + y * y
-        slope = 2 * sag_and_derivatives(radius_squared, surface.curvature, surface.conic, surface.coefficients, 1)[1]
-        return (-slope * x, -slope * y, torch.ones_like(x)), 1 + slope * slope * radius_squared
+        slope = 2 * sag_and_derivatives(x * x + y * y, surface.curvature, surface.conic, surface.coefficients, 1)[1]
+        n_x, n_y = -slope * x, -slope * y
+        return (n_x, n_y, torch.ones_like(x)), 1 + n_x * n_x + n_y * n_y
     c = surface.curvature
     if surface.conic is None:
         return (-c * x, -c * y, 1 - c * z), 1.0
+    # In this order no product of a backward derivative leaves the range of numbers: c² c̄ and r² c̄ would.
     k = surface.conic
-    return (-c * x, -c * y, 1 - (1 + k) * c * z), 1 - k * c * c * (x * x + y * y)
+    return (-c * x, -c * y, 1 - (1 + k) * c * z), 1 - k * (c * (c * (x * x + y * y)))
 
 
 def inside(surface: Surface, hit: Tensor) -> Tensor | None:
@@ -182,7 +187,8 @@ def _meet_plane(position, direction) -> Meeting:
     N = torch.where(met, N, 1.0)
     t = z / N
     hit = torch.addcmul(x, t, L, value=-1), torch.addcmul(y, t, M, value=-1), z.new_zeros(())
-    return Meeting(hit, N, met)
+    exact = None if N.dtype == torch.float64 else (doubles(hit), doubles(direction))
+    return Meeting(hit, N, met, exact=exact)
 
 
 def _meet_conic(surface: Surface, position, direction) -> Meeting:
@@ -192,8 +198,10 @@ def _meet_conic(surface: Surface, position, direction) -> Meeting:
     """
     c = surface.curvature
     shape = None if surface.conic is None else 1 + surface.conic
-    foot = _foot(position, direction)
-    t, met = conic_root([a.detach() for a in foot], [a.detach() for a in direction], c.detach(), _detach(shape))
+    foot, slide = foot_of(position, direction)
+    way = way_of(position, direction, foot, slide)
+    root, met = conic_root(way.foot, way.direction, double(c), double(shape))
+    t, exact = way.back(root, met)
     L, M, N = direction
     N = torch.where(met, N, 1.0)
     x, y, z = (torch.addcmul(torch.where(met, p, 0.0), t, d) for p, d in zip(foot, (L, M, N), strict=True))
@@ -201,113 +209,87 @@ def _meet_conic(surface: Surface, position, direction) -> Meeting:
     dF = c * torch.addcmul(x * L + y * M, shaped, N) - N
     polish = t.dtype == torch.float64
     if not (polish or differentiating()):
-        return Meeting((x, y, z), -dF, met)
+        return Meeting((x, y, z), -dF, met, exact=exact)
+    shaped = z if shape is None else shape * z
     F = (0.5 * c) * torch.addcmul(x * x + y * y, shaped, z) - z
     d2F = c if shape is None else c * torch.addcmul(L * L + M * M, shape * N, N)
     step = _step(F, dF, d2F, polish)
     hit = tuple(torch.addcmul(a, step, d, value=-1) for a, d in zip((x, y, z), (L, M, N), strict=True))
-    return Meeting(hit, d2F * step - dF, met)
+    return Meeting(hit, d2F * step - dF, met, exact=exact)
 
 
-def _foot(position, direction) -> list[Tensor]:
-    """Foot of the perpendicular from the vertex to the ray.
-
-    From there a far origin costs no digits (Feder 1951, Spencer & Murty 1962); the slide stays in the graph.
-    """
-    slide = -dot(position, direction)
-    return [torch.addcmul(p, slide, d) for p, d in zip(position, direction, strict=True)]
-
-
-def conic_root(foot, direction, c: Tensor, shape: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Path t (...) from the foot of the perpendicular to the conic of shape 1+k, 0 if there is none; and whether met.
-
-        A t² - 2 G t + F = 0,  A = c (L² + M² + (1+k) N²),  G = N - c k p_z N - c (p·d),
-        F = c (p_x² + p_y² + (1+k) p_z²) - 2 p_z
-
-    in the algebraic form that does not cancel (Kahan 2004), regular at c = 0 and at k = -1. For a sphere (shape None)
-    A = c and G = N, and G never cancels against the root. Worked in float64 also for float32 rays: within 1e-7 of the
-    edge of a surface rounding would decide between a hit and a miss.
-    """
-    dtype = direction[0].dtype
-    if dtype != torch.float64:
-        foot, direction, c = [a.double() for a in foot], [a.double() for a in direction], c.double()
-        shape = None if shape is None else shape.double()
-    L, M, N = direction
-    x, y, z = foot
-    if shape is None:
-        F = torch.sub(c * torch.addcmul(x * x + y * y, z, z), z, alpha=2)
-        discriminant = torch.addcmul(N * N, c, F, value=-1)
-        t = F / (N + torch.copysign(torch.sqrt(discriminant.clamp_min(0.0)), N))
-        met = (discriminant > 0) & ((c * torch.addcmul(z, t, N)).abs() < 1)
-        return torch.where(met, t, 0.0).to(dtype), met
-    shaped = shape * N
-    A = c * torch.addcmul(L * L + M * M, shaped, N)
-    G = torch.addcmul(N, c, torch.addcmul(x * L + y * M, shaped, z), value=-1)
-    F = torch.sub(c * torch.addcmul(x * x + y * y, shape * z, z), z, alpha=2)
-    discriminant = torch.addcmul(G * G, A, F, value=-1)
-    root = torch.copysign(torch.sqrt(discriminant.clamp_min(0.0)), N)
-    same_sign = torch.where(N < 0, -G, G) >= 0
-    t = torch.where(same_sign, F, G - root) / torch.where(same_sign, G + root, A)
-    met = (discriminant > 0) & ((shape * c) * torch.addcmul(z, t, N) < 1) & (t.abs() < float("inf"))
-    return torch.where(met, t, 0.0).to(dtype), met
+def in_double(surface: Surface) -> Surface:
+    """The surface with the numbers of its shape in float64 and outside the graph."""
+    return dataclasses.replace(
+        surface,
+        curvature=double(surface.curvature),
+        conic=double(surface.conic),
+        coefficients=double(surface.coefficients),
+        departure=None if surface.departure is None else to(surface.departure, dtype=torch.float64),
+    )
 
 
 def _meet_asphere(surface: Surface, position, direction) -> Meeting:
     """F(t) = z - sag(x² + y²) = 0 along the ray; the root itself is found outside the graph."""
     c, k, a = surface.curvature, surface.conic, surface.coefficients
-    zero = a.new_zeros(())
+    zero = a.new_zeros((), dtype=torch.float64)
     rim = float("inf") if surface.semi_diameter is None else surface.semi_diameter
-    foot = _foot(position, direction)
-    t, met = asphere_root(
-        torch.stack(torch.broadcast_tensors(*(p.detach() for p in foot))),
-        torch.stack(torch.broadcast_tensors(*(d.detach() for d in direction))),
-        zero if c is None else c.detach(),
-        zero if k is None else k.detach(),
-        a.detach(),
+    foot, slide = foot_of(position, direction)
+    way = way_of(position, direction, foot, slide)
+    root, met = asphere_root(
+        torch.stack(torch.broadcast_tensors(*way.foot)),
+        torch.stack(torch.broadcast_tensors(*way.direction)),
+        zero if c is None else double(c),
+        zero if k is None else double(k),
+        double(a),
         rim,
     )
+    t, exact = way.back(root, met)
     L, M, N = (torch.where(met, d, at) for d, at in zip(direction, (0.0, 0.0, 1.0), strict=True))
     foot = [torch.where(met, p, 0.0) for p in foot]
     x, y, z = (torch.addcmul(p, t, d) for p, d in zip(foot, (L, M, N), strict=True))
-    S, dS, d2S = sag_and_derivatives(x * x + y * y, c, k, a)
     radial = x * L + y * M
+    S, dS, d2S = sag_and_derivatives(x * x + y * y, c, k, a, along=radial)
     dF = N - 2 * dS * radial
-    d2F = -(4 * d2S * radial * radial + 2 * dS * (L * L + M * M))
+    d2F = -(4 * d2S + 2 * dS * (L * L + M * M))
     step = _step(z - S, dF, d2F, t.dtype == torch.float64)
     hit = tuple(torch.addcmul(a, step, d, value=-1) for a, d in zip((x, y, z), (L, M, N), strict=True))
     n, norm_squared = normal(surface, hit)
-    return Meeting(hit, dot(n, (L, M, N)), met, (n, norm_squared))
+    return Meeting(hit, dot(n, (L, M, N)), met, (n, norm_squared), exact)
 
 
 def _meet_departure(surface: Surface, position, direction) -> Meeting:
     """As `_meet_asphere`, with F(t) = z - S(x² + y²) - D(x, y)."""
     c, k, a = surface.curvature, surface.conic, surface.coefficients
     shape, scale = departure = numbers(surface.departure)
-    zero, rim = shape.new_zeros(()), float("inf") if surface.semi_diameter is None else surface.semi_diameter
-    foot = _foot(position, direction)
-    t, met = torch.ops.raytrace.departure_root(
-        torch.stack(torch.broadcast_tensors(*(p.detach() for p in foot))),
-        torch.stack(torch.broadcast_tensors(*(d.detach() for d in direction))),
-        zero if c is None else c.detach(),
-        zero if k is None else k.detach(),
-        zero[None] if a is None else a.detach(),
-        shape.detach(),
-        scale.detach(),
+    zero = shape.new_zeros((), dtype=torch.float64)
+    rim = float("inf") if surface.semi_diameter is None else surface.semi_diameter
+    foot, slide = foot_of(position, direction)
+    way = way_of(position, direction, foot, slide)
+    root, met = torch.ops.raytrace.departure_root(
+        torch.stack(torch.broadcast_tensors(*way.foot)),
+        torch.stack(torch.broadcast_tensors(*way.direction)),
+        zero if c is None else double(c),
+        zero if k is None else double(k),
+        zero[None] if a is None else double(a),
+        double(shape),
+        double(scale),
         rim,
     )
+    t, exact = way.back(root, met)
     L, M, N = (torch.where(met, d, at) for d, at in zip(direction, (0.0, 0.0, 1.0), strict=True))
     foot = [torch.where(met, p, 0.0) for p in foot]
     x, y, z = (torch.addcmul(p, t, d) for p, d in zip(foot, (L, M, N), strict=True))
-    S, dS, d2S = sag_and_derivatives(x * x + y * y, c, k, a)
-    D = sag_of(departure, x, y)
     radial = x * L + y * M
+    S, dS, d2S = sag_and_derivatives(x * x + y * y, c, k, a, along=radial)
+    D = sag_of(departure, x, y)
     dF = N - 2 * dS * radial - (D.x * L + D.y * M)
-    d2F = -(4 * d2S * radial * radial + 2 * dS * (L * L + M * M))
+    d2F = -(4 * d2S + 2 * dS * (L * L + M * M))
     d2F = d2F - (D.xx * L * L + 2 * D.xy * L * M + D.yy * M * M)
     step = _step(z - S - D.z, dF, d2F, t.dtype == torch.float64)
     hit = tuple(torch.addcmul(a, step, d, value=-1) for a, d in zip((x, y, z), (L, M, N), strict=True))
     n, norm_squared = _tilted_normal(surface, sag_of(departure, *hit[:2], highest=1), *hit[:2])
-    return Meeting(hit, dot(n, (L, M, N)), met, (n, norm_squared))
+    return Meeting(hit, dot(n, (L, M, N)), met, (n, norm_squared), exact)
 
 
 def _tilted_normal(surface: Surface, D, x: Tensor, y: Tensor):
@@ -372,7 +354,3 @@ def _step(F: Tensor, dF: Tensor, d2F: Tensor, polish: bool) -> Tensor:
     step = (F - F.detach()) / dF
     step = torch.addcmul(step, (0.5 * d2F / dF).detach() * step, step)
     return step + (F / dF).detach() if polish else step
-
-
-def _detach(x: Tensor | None) -> Tensor | None:
-    return None if x is None else x.detach()

@@ -19,7 +19,7 @@ from raytrace.fused.structure import is_expressible
 from raytrace.lens import Lens
 from raytrace.numerics import dot, unit, with_batch_axes
 from raytrace.rays import Rays
-from raytrace.surface import Surface, inside, meet, normal
+from raytrace.surface import Surface, in_double, inside, meet, normal
 from raytrace.value import value
 
 
@@ -38,19 +38,23 @@ class Crossing:
     clipped: Tensor
 
 
-def refract(direction, normal, cosine, norm_squared, n1: Tensor, n2: Tensor):
+def refract(direction, normal, cosine, norm_squared, n1: Tensor, n2: Tensor, b_squared: Tensor | None = None):
     """Snell's law n1 sin θ1 = n2 sin θ2 as a vector, and whether light passes (False: total internal reflection).
 
         d' = (n1/n2) d + sign(n·d) D/(a + b)/n2 n,   D = (n2 - n1)(n2 + n1),   a = n1 |n·d|,   b = √(a² + D |n|²)
 
     direction: unit, by components; normal: by components, of squared length norm_squared; cosine: n·d.
+    b_squared: b² in float64 where it is known better than by these numbers; it then decides.
     No 1 - cos² anywhere: equal indices return d exactly, and grazing rays keep their digits. The squared length of
     d' is then brought to 1 within rounding, by a factor that is 1 identically and so is not differentiated.
     """
     a = n1 * cosine
     D = (n2 - n1) * (n2 + n1)
-    b_squared = torch.addcmul(D * norm_squared, a, a)
-    passes = b_squared > 0
+    exact, b_squared = b_squared, torch.addcmul(D * norm_squared, a, a)
+    passes = (b_squared if exact is None else exact) > 0
+    if exact is not None:
+        smallest = torch.finfo(b_squared.dtype).tiny
+        b_squared = exact.to(b_squared.dtype).clamp_min(smallest) + (b_squared - b_squared.detach())
     b = torch.sqrt(torch.where(passes, b_squared, 1.0))
     # An index of 0 is a medium without a real index: nothing passes into it.
     n2 = torch.where(n2 > 0, n2, 1.0)
@@ -58,6 +62,15 @@ def refract(direction, normal, cosine, norm_squared, n1: Tensor, n2: Tensor):
     ratio = n1 / n2
     refracted = [torch.addcmul(ratio * d, along_normal, n) for d, n in zip(direction, normal, strict=True)]
     return _renormalise(refracted), passes
+
+
+def _snell_discriminant(surface: Surface, hit, direction, n1: Tensor, n2: Tensor) -> Tensor:
+    """b² of `refract` in float64, outside the graph."""
+    with torch.no_grad():
+        n, norm_squared = normal(in_double(surface), hit)
+        n1, n2 = n1.double(), n2.double()
+        a = n1 * dot(n, direction)
+        return torch.addcmul((n2 - n1) * (n2 + n1) * torch.as_tensor(norm_squared), a, a).detach()
 
 
 def reflect(direction, normal, cosine, norm_squared):
@@ -114,7 +127,7 @@ def _cross(surface: Surface, rays: _Ray, gap: Tensor | None, side: int, n1: Tens
     direction = rays.direction
     x, y, z = rays.position
     arrival = rays.position if gap is None else (x, y, z - gap)
-    hit, cosine, met, known = meet(surface, arrival, direction)
+    hit, cosine, met, known, exact = meet(surface, arrival, direction)
     opl = rays.opl
     if opl is not None:
         opl = opl + n1 * _reduced_path(rays.position, hit, direction, gap, side)
@@ -124,7 +137,8 @@ def _cross(surface: Surface, rays: _Ray, gap: Tensor | None, side: int, n1: Tens
         if surface.is_mirror:
             direction = reflect(direction, n, cosine, norm_squared)
         else:
-            direction, passes = refract(direction, n, cosine, norm_squared, n1, n2)
+            sure = None if exact is None else _snell_discriminant(surface, *exact, n1, n2)
+            direction, passes = refract(direction, n, cosine, norm_squared, n1, n2, sure)
     survives = met if passes is None else met & passes
     clear = inside(surface, hit)
     valid = rays.valid & survives

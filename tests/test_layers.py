@@ -27,6 +27,7 @@ FLOORS = {
     "glass": 1,
     "rays": 1,
     "asphere": 1,
+    "roots": 1,
     "departure": 1,
     # 2
     "agf": 2,
@@ -206,7 +207,19 @@ def test_importing_the_package_loads_no(library):
 
 #: What may not stand in a physics file, and why (docstrings and comments are not code and are not read).
 FORBIDDEN_CALLS = {"item": "synchronises with the host", "numpy": "leaves the graph", "set_default_dtype": "global"}
-PHYSICS = ["numerics", "surface", "asphere", "trace", "paraxial", "aiming", "launch", "spot", "focus", "wavefront"]
+PHYSICS = [
+    "numerics",
+    "roots",
+    "surface",
+    "asphere",
+    "trace",
+    "paraxial",
+    "aiming",
+    "launch",
+    "spot",
+    "focus",
+    "wavefront",
+]
 
 
 @pytest.mark.parametrize("name", PHYSICS)

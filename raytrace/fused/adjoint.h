@@ -125,10 +125,11 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
       }
     } else if (kind == kAsphere) {
       gdS = T(-2) * (hx * gnx + hy * gny) + T(8) * dS * u * gw;
-      T gu = gdS * d2S + T(4) * dS * dS * gw;
-      gX += T(2) * (hx * gu - dS * gnx), gY += T(2) * (hy * gu - dS * gny);
       T radicand = T(1) - shape * c * c * u;
       over_w = T(1) / root(radicand > 0 ? radicand : T(1));
+      T steep = c * over_w;
+      T gu = gdS * d2S + T(0.25) * shape * steep * gdS * steep * steep + T(4) * dS * dS * gw;
+      gX += T(2) * (hx * gu - dS * gnx), gY += T(2) * (hy * gu - dS * gny);
       conic_sag = c * u * over_w / (over_w + T(1));
       T third = over_w * over_w * over_w;
       sum_c += T(0.5) * gdS * third;

@@ -80,6 +80,10 @@ inline double root(double v) { return __builtin_sqrt(v); }
 // surface.py takes in float64.
 template <typename T>
 constexpr T kGrazing = sizeof(T) == 4 ? T(0.1) : T(1e-3);
+// b² of Snell's law (trace.py) up to which a loop leaves a ray to `careful`: there rounding to float32 would decide
+// whether light passes.
+template <typename T>
+constexpr T kCritical = sizeof(T) == 4 ? T(1e-4) : T(0);
 // |1 - n_z| at which a hit is near the edge of the vertex sheet.
 template <typename T>
 constexpr T kEdge = sizeof(T) == 4 ? T(0.99) : T(0.999999);

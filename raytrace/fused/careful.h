@@ -1,4 +1,5 @@
-// One ray at one surface in the arithmetic of raytrace/surface.py and asphere.py, with every case they know.
+// One ray at one surface in the arithmetic of raytrace/surface.py and asphere.py, with every case they know; in float64
+// also for float32 rays, for what becomes of a ray must not be decided by rounding.
 #pragma once
 #include "loops.h"
 
@@ -51,7 +52,7 @@ struct AsphereSearch {
   bool bracketed(double& found_at) const {
     const int samples = 96, bisections = 64;
     const double infinity = std::numeric_limits<double>::infinity();
-    const double big = std::pow(std::numeric_limits<double>::max(), 0.25);
+    const double big = std::pow(std::numeric_limits<double>::max(), 0.48);  // its square is a number
     double closed = (1 + s.k) * s.c * s.c, edge = closed > 0 ? 1 / std::sqrt(closed) : big;
     double reach = 4 * (std::sqrt(x * x + y * y) + std::fabs(z));
     double radius = edge < big ? std::fmin(edge, s.rim) : s.rim;
@@ -107,99 +108,93 @@ struct AsphereSearch {
   }
 };
 
-template <typename T>
-Surface<double> in_double(const Surface<T>& s) {
+inline const Surface<double>& in_double(const Surface<double>& s) { return s; }
+inline Surface<double> in_double(const Surface<float>& s) {
   Surface<double> d{};
   d.at = s.at, d.gap = s.gap, d.c = s.c, d.k = s.k, d.n1 = s.n1, d.n2 = s.n2, d.rim = s.rim;
   for (int j = 0; j < kTerms; j++) d.a[j] = s.a[j];
   return d;
 }
 
-// Path from the foot of the perpendicular, taken in float64 for either type; whether there is a crossing.
-template <typename T>
-bool crossing(const Surface<T>& s, T px, T py, T pz, T dx, T dy, T dz, T& path) {
-  double x = px, y = py, z = pz, L = dx, M = dy, N = dz, t = 0;
-  bool met;
-  if (s.at->kind == kAsphere) {
-    const Surface<double> d = in_double(s);
-    met = AsphereSearch{d, s.at->terms, x, y, z, L, M, N}(t);
-  } else {
-    double c = s.c, shape = T(1) + s.k;
-    double A = c * (L * L + M * M + shape * N * N);
-    double G = s.at->kind == kSphere ? N : N - c * (x * L + y * M + shape * z * N);
-    double F = c * (x * x + y * y + shape * z * z) - 2 * z;
-    double discriminant = G * G - A * F, r = signed_as(std::sqrt(std::fmax(discriminant, 0.0)), N);
-    bool same_sign = (N < 0 ? -G : G) >= 0;
-    t = same_sign ? F / (G + r) : (G - r) / A;
-    double height = shape * c * (z + t * N);
-    met = discriminant > 0 && height < 1 && std::fabs(t) < std::numeric_limits<double>::infinity();
-    if (s.at->kind == kSphere) met = met && height > -1;
-  }
-  path = met ? T(t) : T(0);
-  return met;
+// A ray before a surface in the frame of the one before it; then behind it.
+struct Ray { double x, y, z, L, M, N, path; };
+
+// Path from the foot of the perpendicular; whether there is a crossing.
+inline bool crossing(const Surface<double>& s, double x, double y, double z, double L, double M, double N, double& t) {
+  if (s.at->kind == kAsphere) return AsphereSearch{s, s.at->terms, x, y, z, L, M, N}(t);
+  double c = s.c, shape = 1 + s.k;
+  double A = c * (L * L + M * M + shape * N * N);
+  double G = s.at->kind == kSphere ? N : N - c * (x * L + y * M + shape * z * N);
+  double F = c * (x * x + y * y + shape * z * z) - 2 * z;
+  double discriminant = G * G - A * F, r = signed_as(std::sqrt(std::fmax(discriminant, 0.0)), N);
+  bool same_sign = (N < 0 ? -G : G) >= 0;
+  t = same_sign ? F / (G + r) : (G - r) / A;
+  double height = shape * c * (z + t * N);
+  bool met = discriminant > 0 && height < 1 && std::fabs(t) < std::numeric_limits<double>::infinity();
+  return met && (s.at->kind != kSphere || height > -1);
 }
 
-// Carries ray i of a block over a gap and through a surface. A ray that is lost becomes the axial ray.
-template <typename T, bool path>
-void cross_carefully(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int i, const Surface<T>& s) {
-  T x = from.x[i], y = from.y[i], z = from.z[i], L = from.L[i], M = from.M[i], N = from.N[i];
-  T ahead = z - s.gap, hx, hy, hz, nx = 0, ny = 0, nz = 1, w = 1, cosine = N;
-  bool met;
+// Carries a ray over a gap and through a surface, in float64 for rays of either type; false if it is lost there.
+// farthest: a path whose square is the largest number of the type.
+inline bool carry(Ray& ray, const Surface<double>& s, double farthest, bool with_path) {
+  const double x = ray.x, y = ray.y, z = ray.z, L = ray.L, M = ray.M, N = ray.N, ahead = z - s.gap, shape = 1 + s.k;
+  double hx, hy, hz, nx = 0, ny = 0, nz = 1, w = 1, cosine = N;
   if (s.at->kind == kPlane) {
-    T t = ahead / N;
-    met = t * t < std::numeric_limits<T>::infinity();
+    double t = ahead / N;
+    if (!(std::fabs(t) < farthest)) return false;
     hx = x - t * L, hy = y - t * M, hz = 0;
   } else {
-    T slide = -(x * L + y * M + ahead * N), t;
-    T px = x + slide * L, py = y + slide * M, pz = ahead + slide * N;
-    met = crossing(s, px, py, pz, L, M, N, t);
+    const bool asphere = s.at->kind == kAsphere;
+    double slide = -(x * L + y * M + ahead * N), t = 0, S, dS = 0, d2S, F, dF;
+    double px = x + slide * L, py = y + slide * M, pz = ahead + slide * N;
+    if (!crossing(s, px, py, pz, L, M, N, t)) return false;
     hx = px + t * L, hy = py + t * M, hz = pz + t * N;
-    T S, dS = 0, d2S, shape = T(1) + s.k;
-    bool asphere = s.at->kind == kAsphere;
-    if (sizeof(T) == 8 && met) {  // polished; a root in float64 is exact in float32
-      T F, dF;
-      if (asphere) {
-        sag<T, false>(s, s.at->terms, hx * hx + hy * hy, S, dS, d2S);
-        F = hz - S, dF = N - 2 * dS * (hx * L + hy * M);
-      } else {
-        F = T(0.5) * s.c * (hx * hx + hy * hy + shape * hz * hz) - hz;
-        dF = s.c * (hx * L + hy * M + shape * hz * N) - N;
-      }
-      T step = F / dF;
-      hx -= step * L, hy -= step * M, hz -= step * N;
-    }
     if (asphere) {
-      sag<T, false>(s, s.at->terms, hx * hx + hy * hy, S, dS, d2S);
+      sag<double, false>(s, s.at->terms, hx * hx + hy * hy, S, dS, d2S);
+      F = hz - S, dF = N - 2 * dS * (hx * L + hy * M);
+    } else {
+      F = 0.5 * s.c * (hx * hx + hy * hy + shape * hz * hz) - hz;
+      dF = s.c * (hx * L + hy * M + shape * hz * N) - N;
+    }
+    double step = F / dF;  // polished
+    hx -= step * L, hy -= step * M, hz -= step * N;
+    if (asphere) {
+      sag<double, false>(s, s.at->terms, hx * hx + hy * hy, S, dS, d2S);
       nx = -2 * dS * hx, ny = -2 * dS * hy, w = 1 + 4 * dS * dS * (hx * hx + hy * hy);
     } else {
       nx = -s.c * hx, ny = -s.c * hy, nz = 1 - shape * s.c * hz, w = 1 - s.k * s.c * s.c * (hx * hx + hy * hy);
     }
     cosine = nx * L + ny * M + nz * N;
   }
-  T l = L, m = M, o = N;
-  bool survives = met;
-  if (met && s.at->bend == kRefract) {
-    Surface<T> usable = s;
-    usable.n2 = s.n2 > 0 ? s.n2 : T(1);  // an index of 0 is none: the discriminant, with n2 = 0, says so
-    T D = (s.n2 - s.n1) * (s.n2 + s.n1), a = s.n1 * cosine, b_squared = D * w + a * a;
-    survives = b_squared > 0;
-    T along = survives ? D / usable.n2 / (a + signed_as(root(b_squared), a)) : T(0), mu = s.n1 / usable.n2;
+  double l = L, m = M, o = N;
+  if (s.at->bend == kRefract) {
+    // An index of 0 is none: the discriminant, with n2 = 0, says so.
+    double D = (s.n2 - s.n1) * (s.n2 + s.n1), a = s.n1 * cosine, b_squared = D * w + a * a, n2 = s.n2 > 0 ? s.n2 : 1;
+    if (!(b_squared > 0)) return false;
+    double along = D / n2 / (a + signed_as(std::sqrt(b_squared), a)), mu = s.n1 / n2;
     l = mu * L + along * nx, m = mu * M + along * ny, o = mu * N + along * nz;
-  } else if (met && s.at->bend == kReflect) {
-    T twice = 2 * cosine / w;
+  } else if (s.at->bend == kReflect) {
+    double twice = 2 * cosine / w;
     l = L - twice * nx, m = M - twice * ny, o = N - twice * nz;
   }
-  if (survives && s.at->bend != kNone) {
-    T factor = T(1.5) - T(0.5) * (l * l + m * m + o * o);
-    l *= factor, m *= factor, o *= factor;
+  double factor = s.at->bend == kNone ? 1 : 1.5 - 0.5 * (l * l + m * m + o * o);
+  if (with_path)
+    ray.path += s.n1 * reduced_path(hx, hy, hz, x, y, z, L, M, N, s.gap, s.at->gap >= 0, double(s.at->side));
+  ray.x = hx, ray.y = hy, ray.z = hz, ray.L = l * factor, ray.M = m * factor, ray.N = o * factor;
+  return true;
+}
+
+// Ray i of a block. A ray that is lost becomes the axial ray.
+template <typename T, bool path>
+void cross_carefully(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int i, const Surface<T>& s) {
+  Ray ray{from.x[i], from.y[i], from.z[i], from.L[i], from.M[i], from.N[i], path ? from.path[i] : T(0)};
+  if (!carry(ray, in_double(s), std::sqrt(double(std::numeric_limits<T>::max())), path)) {
+    ray = {0, 0, 0, 0, 0, 1, 0};
+    notes.valid[i] = 0, notes.lost[i] = notes.surface, notes.any_lost = true;
   }
-  if (path) {
-    T longer = reduced_path(hx, hy, hz, x, y, z, L, M, N, s.gap, s.at->gap >= 0, T(s.at->side));
-    to.path[i] = survives ? from.path[i] + s.n1 * longer : T(0);
-  }
-  to.x[i] = survives ? hx : T(0), to.y[i] = survives ? hy : T(0), to.z[i] = survives ? hz : T(0);
-  to.L[i] = survives ? l : T(0), to.M[i] = survives ? m : T(0), to.N[i] = survives ? o : T(1);
-  if (!survives) notes.valid[i] = 0, notes.lost[i] = notes.surface, notes.any_lost = true;
+  if (path) to.path[i] = T(ray.path);
+  to.x[i] = T(ray.x), to.y[i] = T(ray.y), to.z[i] = T(ray.z);
+  to.L[i] = T(ray.L), to.M[i] = T(ray.M), to.N[i] = T(ray.N);
 }
 
 }  // namespace raytrace

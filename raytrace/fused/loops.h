@@ -11,14 +11,14 @@ struct Law {
   explicit Law(const Surface<T>& s)
       : mu(s.n1 / s.n2), D((s.n2 - s.n1) * (s.n2 + s.n1)), over_n2(T(1) / s.n2), n1(s.n1) {}
 
-  // Turns (L, M, N); false where no light passes.
+  // Turns (L, M, N); false where no light passes, or float32 cannot tell.
   inline bool operator()(T& L, T& M, T& N, T nx, T ny, T nz, T cosine, T norm_squared) const {
     bool passes = true;
     T along, keep;
     if (bend == kRefract) {
       T a = n1 * cosine;
       T b_squared = a * a + D * norm_squared;
-      passes = b_squared > 0;
+      passes = b_squared > kCritical<T>;
       T b = signed_as(root(passes ? b_squared : T(1)), a);
       along = D * over_n2 / (a + b);
       keep = mu;
@@ -44,7 +44,8 @@ inline T reduced_path(T hx, T hy, T hz, T x, T y, T z, T L, T M, T N, T gap, boo
   return path + gap * lag;
 }
 
-// S(u), its slope and, if asked for, its curvature at u = r²; `inside`: the radicand of the conic is above 0.
+// S(u), its slope and, if asked for, what the polynomial adds to its second derivative at u = r² (the conic's holds c³,
+// which may leave the range of numbers: see the adjoint); returns whether the radicand of the conic is above 0.
 template <typename T, bool second>
 inline bool sag(const Surface<T>& s, int terms, T u, T& S, T& dS, T& d2S) {
   T shape = T(1) + s.k, radicand = T(1) - shape * s.c * s.c * u;
@@ -59,7 +60,7 @@ inline bool sag(const Surface<T>& s, int terms, T u, T& S, T& dS, T& d2S) {
   // Σ a_j u^(j+1) = u p, so its derivatives are p + u p' and 2 p' + u p''; d2p carries p''/2.
   S = s.c * u / (T(1) + w) + u * p;
   dS = T(0.5) * s.c * over_w + p + u * dp;
-  if (second) d2S = T(0.25) * shape * s.c * s.c * s.c * over_w * over_w * over_w + 2 * dp + 2 * u * d2p;
+  if (second) d2S = 2 * dp + 2 * u * d2p;
   return inside;
 }
 

@@ -43,7 +43,7 @@ void push(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, int n, const Surfa
     T u = hx * hx + hy * hy;
 
     // The normal, its squared length, and what the numbers of the surface do to F at the hit.
-    T nx = 0, ny = 0, nz = 1, w = 1, S, dS = 0, d2S = 0, moved = 0, slope = 0;
+    T nx = 0, ny = 0, nz = 1, w = 1, S, dS = 0, d2S = 0, moved = 0, slope = 0, steep = 0;
     if (kind == kSphere || kind == kConic) {
       nx = -c * hx, ny = -c * hy, nz = T(1) - shape * c * hz;
       if (kind == kConic) w = T(1) - k * c * c * u;
@@ -52,10 +52,11 @@ void push(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, int n, const Surfa
       sag<T, true>(s, terms, u, S, dS, d2S);
       nx = T(-2) * dS * hx, ny = T(-2) * dS * hy, w = T(1) + T(4) * dS * dS * u;
       T radicand = T(1) - shape * c * c * u, over_w = T(1) / root(radicand > 0 ? radicand : T(1));
+      steep = c * over_w;
       T conic_sag = c * u * over_w / (over_w + T(1)), third = over_w * over_w * over_w, p = 0, q = 0;
       for (int j = terms - 1; j >= 0; j--) p = p * u + change.a[j], q = q * u + T(j + 1) * change.a[j];
       moved = -(dc * u * over_w * over_w / (over_w + T(1)) + T(0.5) * dk * c * conic_sag * conic_sag * over_w + u * p);
-      slope = T(0.5) * dc * third + T(0.25) * dk * c * c * c * u * third + q;
+      slope = T(0.5) * dc * third + T(0.25) * dk * c * (c * c * u) * third + q;
     }
     T cosine = nx * L + ny * M + nz * N;
 
@@ -83,12 +84,13 @@ void push(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, int n, const Surfa
     T dnx = 0, dny = 0, dnz = 0, dw = 0;
     if (kind == kSphere || kind == kConic) {
       dnx = -c * px - dc * hx, dny = -c * py - dc * hy, dnz = -shape * (c * pz + dc * hz) - dk * c * hz;
-      if (kind == kConic) dw = -c * (c * u * dk + T(2) * k * (u * dc + c * (hx * px + hy * py)));
+      if (kind == kConic) dw = -c * (c * u * dk + T(2) * k * (u * dc + hx * (c * px) + hy * (c * py)));
     } else if (kind == kAsphere) {
-      T du = T(2) * (hx * px + hy * py);
-      slope += d2S * du;
+      // No product of two lengths, as hx px, stands alone: it leaves the range of numbers before its factors do.
+      slope += T(2) * (d2S * hx * px + d2S * hy * py);
+      slope += T(0.5) * shape * steep * (steep * hx * (steep * px) + steep * hy * (steep * py));
       dnx = T(-2) * (slope * hx + dS * px), dny = T(-2) * (slope * hy + dS * py);
-      dw = T(8) * dS * u * slope + T(4) * dS * dS * du;
+      dw = T(8) * (dS * u * slope + dS * hx * (dS * px) + dS * hy * (dS * py));
     }
 
     // Behind the surface.
