@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.glass import Glass, check_wavelengths
+from raytrace.glass import Glass, check_wavelengths, refractive_index
 from raytrace.surface import Surface
 from raytrace.value import value
 
@@ -131,6 +131,12 @@ def largest_field(lens: Lens) -> Tensor:
     return torch.stack([torch.zeros_like(largest), largest])[:, None]
 
 
+def name_of_field(field: Tensor) -> str:
+    """A field point (2,) in words: its y alone on the axis of x."""
+    x, y = field.tolist()
+    return f"{y:g}" if x == 0 else f"{x:g},{y:g}"
+
+
 def check_media(lens: Lens, wavelengths: Tensor, *, where: str = "") -> None:
     """Refuse wavelengths (W,) µm at which a glass of the lens has no index; warn of glasses used outside their range.
 
@@ -196,5 +202,17 @@ def check(lens: Lens) -> None:
         raise ValueError("object space is telecentric but the object is at infinity: give an object distance")
     if at_infinity and lens.aperture.kind in ("object_na", "object_cone_angle"):
         raise ValueError(f"aperture {lens.aperture.kind} needs an object at a finite distance")
+    _check_cone(lens)
     if lens.fields.kind == "angle" and bool((torch.hypot(lens.fields.x, lens.fields.y) >= 90).any()):
         raise ValueError("field angles reach 90 degrees: rays start from the plane of the entrance pupil")
+
+
+def _check_cone(lens: Lens) -> None:
+    """Refuse a cone of light at the object that reaches a right angle with the axis."""
+    kind, number = lens.aperture.kind, float(lens.aperture.value)
+    if kind == "object_cone_angle" and number >= 90:
+        raise ValueError(f"aperture object_cone_angle {number:g} degrees: expected less than 90")
+    if kind == "object_na":
+        index = float(refractive_index(lens.surfaces[0].glass, lens.wavelengths[lens.primary_wavelength]))
+        if number >= index:
+            raise ValueError(f"aperture object_na {number:g}: expected less than the index {index:g} before surface 1")

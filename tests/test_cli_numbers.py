@@ -111,3 +111,71 @@ def test_wavefronts_of_aimed_rays(run):
     """The retrofocus aims its rays at the stop: points of the pupil meet an axis of object distances there."""
     (row, *_) = run("wavefront", "retrofocus", "--field", 0, "--size", 8, "--json").document["summary"]
     assert 0.1 < row["rms"] < 1
+
+
+def singlet(name: str, *changes: tuple[str, str]) -> str:
+    """The shipped singlet with some of its lines changed, as a file in the current folder."""
+    text = (LENSES / "singlet.zmx").read_text(encoding="utf-8")
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new, 1)
+    Path(f"{name}.zmx").write_text(text, encoding="utf-8")
+    return f"{name}.zmx"
+
+
+PLATE = ("CURV -0.01934984520123839", "CURV 0")
+NARROW = "the beam of field 10.5 has no width: its vignetting factors leave nothing of the pupil"
+AFOCAL = "the Fourier model has no pupil here"
+BLOCKED = ("DIAM 14.79 1 0 0 1", "OBSC 0 60 0\n  DIAM 14.79 1 0 0 1")
+LOST = "field 0 degrees, 0.486133 µm has no {}: all 144 rays lost: vignetted at surface 2; leave the field out"
+
+
+@pytest.mark.parametrize(
+    ("command", "change", "message"),
+    [
+        ("mtf --frequency 5", ("VCYN 0 0 0", "VCYN 0 1 1"), NARROW),
+        ("encircled", ("VCXN 0 0 0", "VCXN 0 1 1"), NARROW),
+        ("psf --model fourier", ("DISZ 100.0", "DISZ 0"), AFOCAL),
+        ("psf --model fourier", PLATE, AFOCAL),
+        ("mtf --frequency 5", BLOCKED, LOST.format("wave on the sensor")),
+        ("mtf --frequency 5 --geometric", BLOCKED, LOST.format("MTF")),
+        ("encircled --geometric", BLOCKED, LOST.format("encircled energy")),
+        ("spot", ("ENPD 12.5", "OBNA 1.5 0"), "aperture object_na needs an object at a finite distance"),
+        ("focus --criterion mean", BLOCKED, "no ray reaches the image"),
+    ],
+)
+def test_what_has_no_number_is_one_line_that_names_the_cause(run, command, change, message):
+    verb, *options = command.split()
+    found = run(verb, singlet("nasty", change), *options)
+    assert found.code == 1
+    assert found.out == ""
+    assert message in found.err.splitlines()[-1]
+    assert "defect" not in found.err
+
+
+def test_a_cone_at_a_right_angle_is_refused(run):
+    lens = singlet("wide", ("ENPD 12.5", "OBNA 1 0"), ("DISZ INFINITY", "DISZ 200"))
+    assert "aperture object_na 1: expected less than the index 1 before surface 1" in run("info", lens).err
+
+
+def test_focus_by_the_mean_distance_on_a_clipped_image(run):
+    """20 µm of image, 2 mm out of focus: wherever the sensor goes, the rays that reached it go with it."""
+    lens = singlet("clipped", ("DISZ 100.0", "DISZ 98"))
+    text = Path(lens).read_text(encoding="utf-8").rstrip("\n")
+    Path(lens).write_text(text + "\n  CLAP 0 0.02 0\n", encoding="utf-8")
+    found = run("focus", lens, "--criterion", "mean", "--json")
+    assert "of the rays are lost" in found.err
+    # Only rays near the axis are left, and they meet at the paraxial focus that the file's source publishes, 100 mm.
+    assert found.document["sensor_after"] == pytest.approx(100, abs=0.05)
+
+
+def test_info_says_infinite_or_nothing_where_there_is_no_number(run):
+    text = run("info", singlet("plate", PLATE)).out
+    assert "nan" not in text
+    assert "-inf" not in text
+    for quantity in ("effective focal length", "F/#", "paraxial image distance"):
+        line = next(line for line in text.splitlines() if line.strip().startswith(quantity))
+        assert line.removeprefix(f"  {quantity}").split()[0] == "infinite"
+    touching = run("info", singlet("touching", ("DISZ INFINITY", "DISZ 0"))).out
+    (line,) = (line for line in touching.splitlines() if "magnification" in line)
+    assert line.split() == ["magnification", "-"]

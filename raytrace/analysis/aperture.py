@@ -6,10 +6,12 @@ import torch
 from torch import Tensor
 
 from raytrace import zernike
+from raytrace.analysis.setting import refuse_dark
+from raytrace.lens import name_of_field
 from raytrace.numerics import safe_divide, safe_sqrt
 from raytrace.psf.dft import phasor
 from raytrace.pupil import gauss_rings
-from raytrace.scene import Scene
+from raytrace.scene import Scene, beam_share
 from raytrace.value import value
 from raytrace.wavefront import wavefront
 
@@ -46,10 +48,14 @@ def exit_pupil(scene: Scene, *, size: int | None = None) -> ExitPupil:
     like = {"dtype": scene.wavelengths.dtype, "device": scene.wavelengths.device}
     points, weights = gauss_rings(*_PROBE, **like)
     probe = wavefront(scene, points, weights)
-    if not bool((probe.usable.sum(-1) >= 2 * _TERMS).all()):
-        raise ValueError("too few rays of a field reach the sensor for a wavefront: check the field and the apertures")
+    enough = (probe.usable.sum(-1) >= 2 * _TERMS) & probe.valid.any(-1)
+    refuse_dark(scene.lens, scene.fields, scene.wavelengths, enough[0], "wave on the sensor")
     waves_per = 1e3 * probe.index / probe.wavelength  # n/λ, 1/mm
     middle, half = _box(probe.direction[:2].detach(), probe.usable)
+    narrow = (beam_share(scene)[0, :, 0] == 0) | (half == 0).any(0).any(-1)[0]
+    if bool(narrow.any()):
+        name = name_of_field(scene.fields[:, int(narrow.to(torch.int8).argmax())])
+        raise ValueError(f"the beam of field {name} has no width: its vignetting factors leave nothing of the pupil")
     if size is None:
         blur = torch.where(probe.usable, torch.linalg.vector_norm(probe.landing, dim=0), 0.0).amax(-1)
         needed = 4 * float((blur * half.amax(0) * waves_per).max().detach())

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from raytrace.analysis.aperture import ExitPupil, exit_pupil
 from raytrace.analysis.frame import Tabular, axis
-from raytrace.analysis.setting import scene_of, wavelength_weights, wavelengths_of
+from raytrace.analysis.setting import refuse_dark, scene_of, wavelength_weights, wavelengths_of
 from raytrace.focus import image_rays
 from raytrace.lens import Lens
 from raytrace.numerics import safe_divide, safe_sqrt
@@ -81,8 +81,8 @@ def _rays(lens: Lens, fields: Tensor | None, wavelengths: Tensor | None) -> tupl
     energy = torch.where(rays.valid, wavelength_weights(lens, wavelengths)[:, None] / _RAYS, 0.0).flatten(1)
     hits = torch.where(rays.valid, rays.position[:2], 0.0).flatten(2)
     total = energy.sum(-1)
-    if not bool((total > 0).all()):
-        raise ValueError("no ray of a field reaches the sensor: it has no encircled energy")
+    given = scene_of(lens, fields, wavelengths)
+    refuse_dark(lens, given.fields, given.wavelengths, (total > 0)[:, None], "encircled energy")
     energy = energy / total[:, None]
     centroid = (energy * hits).sum(-1)
     x, y = torch.where(energy > 0, hits - centroid[..., None], 0.0)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from raytrace.analysis.aperture import MARGIN, exit_pupil
 from raytrace.analysis.frame import Tabular, axis
-from raytrace.analysis.setting import primary_number, scene_of, wavelength_weights, wavelengths_of
+from raytrace.analysis.setting import primary_number, refuse_dark, scene_of, wavelength_weights, wavelengths_of
 from raytrace.focus import image_rays
 from raytrace.lens import Lens, with_sensor_distance
 from raytrace.numerics import safe_divide, safe_sqrt
@@ -207,8 +207,8 @@ def _geometric(lens: Lens, frequencies: Tensor, fields, wavelengths) -> tuple[Te
     rays = image_rays(lens, points, fields=fields, wavelengths=wavelengths)
     energy = torch.where(rays.valid, rule, 0.0)
     light = energy.sum(-1)
-    if not bool((light > 0).all()):
-        raise ValueError("no ray of a field reaches the sensor: it has no MTF")
+    given = scene_of(lens, fields, wavelengths)
+    refuse_dark(lens, given.fields, given.wavelengths, light > 0, "MTF")
     hits = torch.where(rays.valid, rays.position[:2], 0.0)
     mean = (energy * hits).sum(-1) / light
     weights = wavelength_weights(lens, wavelengths) * light

@@ -6,10 +6,13 @@ import torch
 from torch import Tensor
 
 from raytrace.launch import is_at_infinity, object_field
-from raytrace.lens import Lens, check_media, largest_field, with_field_kind
+from raytrace.lens import FIELD_UNITS, Lens, check_media, largest_field, name_of_field, with_field_kind
+from raytrace.losses import losses
 from raytrace.paraxial import first_order
+from raytrace.pupil import gauss_rings
 from raytrace.scene import Scene
 from raytrace.scene import scene as make_scene
+from raytrace.spot import EmptySpot
 
 
 def scene_of(lens: Lens, fields: Tensor | None, wavelengths: Tensor | None) -> Scene:
@@ -42,6 +45,20 @@ def field_range(lens: Lens, size: int) -> Tensor:
     largest = largest_field(lens)[1, 0]
     y = largest * torch.linspace(0.0, 1.0, size, dtype=largest.dtype, device=largest.device)
     return torch.stack([torch.zeros_like(y), y])
+
+
+def refuse_dark(lens: Lens, fields: Tensor, wavelengths: Tensor, lit: Tensor, what: str) -> None:
+    """Raise EmptySpot that names the first field (2, F) and wavelength (W,) µm without light, and where its rays end.
+
+    lit: (F, W); what: is not defined there.
+    """
+    if bool(lit.all()):
+        return
+    f, w = torch.nonzero(~lit)[0].tolist()
+    found = losses(lens, gauss_rings(6)[0].to(fields), fields=fields[:, f : f + 1], wavelengths=wavelengths[w : w + 1])
+    lost = found.words(0, 0) if int(found.arrived) == 0 else "too few rays reach the sensor"
+    where = f"field {name_of_field(fields[:, f])} {FIELD_UNITS[lens.fields.kind]}, {float(wavelengths[w]):g} µm"
+    raise EmptySpot(f"{where} has no {what}: {lost}; leave the field out")
 
 
 def unvignetted(lens: Lens) -> Lens:

@@ -5,8 +5,7 @@ import argparse
 from raytrace import analysis
 from raytrace.cli.analysis_commands import DENSE, draw, opened, print_table, report, rows
 from raytrace.cli.door import field_points, open_lens, print_json
-from raytrace.cli.spots import field_label
-from raytrace.lens import FIELD_UNITS
+from raytrace.lens import FIELD_UNITS, name_of_field
 
 
 def seidel(arguments: argparse.Namespace) -> None:
@@ -21,7 +20,7 @@ def seidel(arguments: argparse.Namespace) -> None:
         unit = FIELD_UNITS[lens.fields.kind]
         for number, field in enumerate(found.fields.unbind(1)):
             invariant = f"optical invariant {abs(float(found.invariant[number])):.6g} mm"
-            print(f"field {field_label(field)} {unit}, {invariant}, aberrations in {found.unit}")
+            print(f"field {name_of_field(field)} {unit}, {invariant}, aberrations in {found.unit}")
             _print_surfaces(found, number)
     draw(arguments, lens, found, "seidel_bars")
 

@@ -18,11 +18,11 @@ from raytrace.cli.door import (
     print_json,
     say,
 )
-from raytrace.cli.spots import field_label, pupil_points, warn_of_losses
+from raytrace.cli.spots import pupil_points, warn_of_losses
 from raytrace.focus import focus as best_focus
 from raytrace.focus import focus_of_mean_radius, image_rays, mean_rms_radius
 from raytrace.formats import read_lens, write_lens
-from raytrace.lens import FIELD_UNITS, Lens, with_object_distance, with_sensor_distance
+from raytrace.lens import FIELD_UNITS, Lens, name_of_field, with_object_distance, with_sensor_distance
 from raytrace.paraxial import first_order, paraxial_image_distance
 
 
@@ -127,7 +127,7 @@ def _print_focus(lens, arguments, distances, fields, wavelengths, paraxial, resu
     print(f"  entrance pupil {float(data.entrance_pupil_diameter):.5g} mm across, {place:.5g} mm from surface 1")
     shown = ", ".join("infinity" if d == float("inf") else f"{d:g} mm" for d in distances)
     unit = FIELD_UNITS[lens.fields.kind]
-    at = ", ".join(field_label(field) for field in fields.unbind(1))
+    at = ", ".join(name_of_field(field) for field in fields.unbind(1))
     colours = ", ".join(f"{w:g}" for w in wavelengths.tolist())
     print(f"  object at {shown}; field {at} {unit}; {colours} µm; criterion {arguments.criterion}\n")
     rows = [("before", result["sensor_before"]), ("after", result["sensor_after"])]

@@ -1,6 +1,7 @@
 """`raytrace info`, `check`, `convert` and `layout`."""
 
 import argparse
+import math
 import warnings
 from pathlib import Path
 
@@ -90,7 +91,7 @@ def info_text(lens: Lens, title: str) -> str:
     data = first_order(lens)
     lines = [f"{title}: {lens.name}" if lens.name else title, ""]
     for words, name, unit in FIRST_ORDER_LINES:
-        lines.append(f"  {words:<24} {float(getattr(data, name)) + 0.0:>16.9g}  {unit}".rstrip())
+        lines.append(f"  {words:<24} {_quantity(float(getattr(data, name))):>16}  {unit}".rstrip())
     unit = FIELD_UNITS[lens.fields.kind]
     points = ", ".join(f"({x:g}, {y:g})" for x, y in zip(lens.fields.x.tolist(), lens.fields.y.tolist(), strict=True))
     shown = [
@@ -113,6 +114,13 @@ def info_text(lens: Lens, title: str) -> str:
             f"{float(indices[k]):>9.6f} {size:>10}  {_remarks(lens, k)}".rstrip()
         )
     return "\n".join(lines)
+
+
+def _quantity(value: float) -> str:
+    """A number, "infinite", which has no sign, or - for one that does not exist."""
+    if math.isnan(value):
+        return "-"
+    return "infinite" if math.isinf(value) else f"{value + 0.0:.9g}"
 
 
 def _remarks(lens: Lens, k: int) -> str:

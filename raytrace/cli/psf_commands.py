@@ -9,11 +9,11 @@ from torch import Tensor
 from raytrace.analysis import PIXEL, SIZE, Abilities, Comparison, abilities, common_focus
 from raytrace.analysis import compare as compare_models
 from raytrace.cli.door import CommandError, field_points, number, numbers, open_lens, primary, print_json, say
-from raytrace.cli.spots import cell, field_label, warn_of_losses
+from raytrace.cli.spots import cell, warn_of_losses
 from raytrace.files import write_atomically
 from raytrace.focus import NoImage, real_image_distance
 from raytrace.grid import Grid, grid
-from raytrace.lens import FIELD_UNITS, Lens, with_object_distance
+from raytrace.lens import FIELD_UNITS, Lens, name_of_field, with_object_distance
 from raytrace.paraxial import first_order
 from raytrace.psf import NotConverged, Psf, close_up, default_center
 from raytrace.psf import psf as compute
@@ -87,7 +87,7 @@ def _draw(arguments: argparse.Namespace, lens: Lens, found: Psf, distances: list
     if arguments.pixel is None and arguments.size is None and found.order is not None:
         places = lens.wavelengths.new_tensor(distances)
         light = close_up(lens, found, fields=fields, object_distances=places, rho=arguments.rho)
-    rows = [plot.field_label(lens, field) for field in fields.T.tolist()]
+    rows = [plot.name_of_field(lens, field) for field in fields.T.tolist()]
     if not found.wavelengths_summed:
         rows = [f"{row}\n{1e3 * wavelength:.4g} nm" for row in rows for wavelength in found.wavelengths.tolist()]
     title = f"{lens.name or arguments.lens}: {found.model} PSF"
@@ -181,7 +181,7 @@ def _print(found: Psf, distances: list[float], fields: Tensor, unit: str) -> Non
         sigmas = [1000 * m[at][::2].clamp_min(0.0).sqrt() for m in (found.covariance, found.ray_covariance)]
         cells = {
             "object": f"{distances[place[0]]:g}",
-            "field": field_label(fields[:, place[1]]),
+            "field": name_of_field(fields[:, place[1]]),
             "rays": f"{found.rays}",
         }
         cells |= {"λ": "" if found.wavelengths_summed else f"{float(found.wavelengths[place[2]]):g}"}

@@ -9,9 +9,9 @@ from raytrace.analysis import Arrivals, arrivals
 from raytrace.analysis.arrivals import STATUS
 from raytrace.cli.door import field_points, open_lens, print_json, ray_aiming, refuse_suffix, say
 from raytrace.cli.progress import progress
-from raytrace.cli.spots import field_label, pupil_points, spot_cells, spot_entry, warn_of_losses
+from raytrace.cli.spots import pupil_points, spot_cells, spot_entry, warn_of_losses
 from raytrace.files import write_atomically
-from raytrace.lens import FIELD_UNITS, Lens
+from raytrace.lens import FIELD_UNITS, Lens, name_of_field
 from raytrace.spot import Spot, spot_of_points
 from raytrace.spot import spot as spot_of
 
@@ -56,7 +56,7 @@ def spot(arguments: argparse.Namespace) -> None:
     for f in range(fields.shape[1]):
         for w, wavelength in enumerate(lens.wavelengths.tolist()):
             lost = points.shape[1] - int(spots.rays[f, w])
-            print(f"{field_label(fields[:, f]):>10} {wavelength:>11g} {spot_cells(spots, (f, w))} {lost:>7}")
+            print(f"{name_of_field(fields[:, f]):>10} {wavelength:>11g} {spot_cells(spots, (f, w))} {lost:>7}")
         if len(lens.wavelengths) > 1:
             print(f"{'':>10} {'all':>11} {spot_cells(polychromatic(lens, spots, weights, f), ())}")
 

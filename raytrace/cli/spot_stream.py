@@ -7,8 +7,8 @@ from torch import Tensor
 from raytrace import pupil
 from raytrace.cli.door import CommandError, field_points, number, open_lens, print_json, ray_aiming
 from raytrace.cli.progress import progress
-from raytrace.cli.spots import field_label, spot_cells, spot_entry, warn_of_losses
-from raytrace.lens import FIELD_UNITS, Lens
+from raytrace.cli.spots import spot_cells, spot_entry, warn_of_losses
+from raytrace.lens import FIELD_UNITS, Lens, name_of_field
 from raytrace.streaming import MAX_BYTES, StreamedSpot, stream_spots
 
 _TRIED = 4096  # rays that tell where all are lost
@@ -74,7 +74,7 @@ def _print(lens: Lens, fields: Tensor, each: StreamedSpot, whole: StreamedSpot) 
     )
     print(f"{unit:>10} {'µm':>11} {'mm':>13} {'mm':>13} {'µm':>10} {'µm':>10} {'lost':>11}")
     for f in range(fields.shape[1]):
-        label = field_label(fields[:, f])
+        label = name_of_field(fields[:, f])
         for w, wavelength in enumerate(lens.wavelengths.tolist()):
             print(
                 f"{label:>10} {wavelength:>11g} {spot_cells(each, (f, w))} {each.launched - int(each.rays[f, w]):>11}"

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from raytrace import pupil
 from raytrace.cli.door import CommandError, number, numbers, say
-from raytrace.lens import FIELD_UNITS, Lens
+from raytrace.lens import FIELD_UNITS, Lens, name_of_field
 from raytrace.losses import beam_hint, losses
 from raytrace.spot import Spot
 from raytrace.streaming import StreamedSpot
@@ -85,12 +85,6 @@ def warn_of_losses(
                 said.setdefault(found.words(place, w), []).append(f"{wavelength:g}")
         for words, colours in said.items():
             unit = FIELD_UNITS[lens.fields.kind]
-            say(f"warning: {at}field {field_label(fields[:, f])} {unit}, {', '.join(colours)} µm: {words}")
+            say(f"warning: {at}field {name_of_field(fields[:, f])} {unit}, {', '.join(colours)} µm: {words}")
     if hint := beam_hint(lens):
         say(f"warning: {hint}; see --f-number and --entrance-pupil-diameter")
-
-
-def field_label(field: Tensor) -> str:
-    """A field point in words: its y alone on the axis of x."""
-    x, y = field.tolist()
-    return f"{y:g}" if x == 0 else f"{x:g},{y:g}"

@@ -70,6 +70,7 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0, zernike: Tensor | None 
     single = grid.pitch.dtype != torch.float64 or scene.wavelengths.dtype != torch.float64
     scene, window = (to(each, dtype=torch.float64) if single else each for each in (scene, grid))
     lens = paraxial(scene)
+    _refuse_without_pupil(lens)
     waves = None if zernike is None else _aberrations(scene, zernike.to(torch.float64))
     shift, blur = _moments(lens, waves)
     if waves is None and symmetry(scene) == "round" and is_centred(window):
@@ -79,6 +80,16 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0, zernike: Tensor | None 
     limit = {"ray_centroid": lens.chief + shift, "ray_covariance": blur}
     found = Kernels(kernel, grid, lens.chief + centroid, covariance, rays=0, **limit)
     return dataclasses.replace(to(found, dtype=grid.pitch.dtype), grid=grid) if single else found
+
+
+def _refuse_without_pupil(lens: Paraxial) -> None:
+    """Raise ValueError where the phase of the pupil is no number."""
+    numbers = torch.stack([lens.defocus.detach(), lens.frequency.detach()])
+    if not bool(torch.isfinite(numbers).all()) or not bool((numbers[1] != 0).all()):
+        raise ValueError(
+            "the Fourier model has no pupil here: the lens is afocal, or the sensor or the object stands in a "
+            "principal plane; move them, or use a ray model"
+        )
 
 
 def _kernels(lens: Paraxial, window: Grid, waves: Tensor | None, order: int) -> tuple[Tensor, Tensor, Tensor]:
