@@ -19,6 +19,7 @@ from raytrace.lens import Lens, with_sensor_distance
 from raytrace.numerics import safe_sqrt
 from raytrace.paraxial import first_order
 from raytrace.pupil import gauss_rings
+from raytrace.spot import EmptySpot
 from raytrace.trace import trace
 
 WAVELENGTH = 0.55e-3  # mm
@@ -383,3 +384,17 @@ def test_commands_write_strict_json_and_a_figure(command, capsys, tmp_path):
 def test_through_focus_needs_one_frequency(capsys):
     assert main(["mtf", "double_gauss", "--through-focus", "0.1"]) == 1
     assert "--frequency" in capsys.readouterr().err
+
+
+# no light
+
+
+@pytest.mark.parametrize("kind", ["diffraction", "geometric"])
+@pytest.mark.parametrize("analyse", [analysis.mtf, analysis.encircled_energy])
+def test_a_field_without_light_is_named_with_where_its_rays_end(analyse, kind):
+    lens = read_lens(shipped("lenses") / "cooke_triplet.zmx")
+    fields = vector(0.0, 0.0, 0.0, 80.0).reshape(2, 2)
+    argument = vector(10.0) if analyse is analysis.mtf else vector(0.01)
+    lost = r"field 80 degrees, 0\.486133 µm has no .*: all 144 rays lost: missed surface 2; leave the field out"
+    with pytest.raises(EmptySpot, match=lost):
+        analyse(lens, argument, kind=kind, fields=fields)

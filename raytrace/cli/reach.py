@@ -9,8 +9,7 @@ from torch import Tensor
 from raytrace.analysis import Distortion, FieldCurvature, LateralColour, RelativeIllumination
 from raytrace.analysis.frame import Tabular, flat
 from raytrace.cli.door import CommandError, primary, say
-from raytrace.cli.spots import field_label
-from raytrace.lens import FIELD_UNITS, Lens
+from raytrace.lens import FIELD_UNITS, Lens, name_of_field
 from raytrace.losses import beam_hint, losses
 from raytrace.pupil import hexapolar
 
@@ -31,7 +30,8 @@ def check_reach(arguments: argparse.Namespace, lens: Lens, fields: Tensor, *, ev
     if not dark:
         return
     unit = FIELD_UNITS[lens.fields.kind]
-    told = [f"no ray of field {field_label(fields[:, f])} {unit} reaches the sensor: {found.words(f, 0)}" for f in dark]
+    named = ((f, f"{name_of_field(fields[:, f])} {unit}") for f in dark)
+    told = [f"no ray of field {field} reaches the sensor: {found.words(f, 0)}" for f, field in named]
     if every or len(dark) == fields.shape[1]:
         raise CommandError(f"{arguments.lens}: {told[0]}; {_help(arguments, lens)}")
     for words in told:
