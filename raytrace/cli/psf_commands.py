@@ -87,7 +87,7 @@ def _draw(arguments: argparse.Namespace, lens: Lens, found: Psf, distances: list
     if arguments.pixel is None and arguments.size is None and found.order is not None:
         places = lens.wavelengths.new_tensor(distances)
         light = close_up(lens, found, fields=fields, object_distances=places, rho=arguments.rho)
-    rows = [plot.name_of_field(lens, field) for field in fields.T.tolist()]
+    rows = [plot.field_label(lens, field) for field in fields.T.tolist()]
     if not found.wavelengths_summed:
         rows = [f"{row}\n{1e3 * wavelength:.4g} nm" for row in rows for wavelength in found.wavelengths.tolist()]
     title = f"{lens.name or arguments.lens}: {found.model} PSF"
