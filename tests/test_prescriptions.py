@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from raytrace.formats import LensFileError, table
+from raytrace.formats.source import Place, decode
 from raytrace.formats.table_columns import meaning
 from raytrace.glass import LINES, abbe_number, nd, refractive_index
 from raytrace.paraxial import first_order
@@ -307,6 +308,13 @@ def test_a_radius_of_zero_on_a_lens_is_said():
     rows = "No,R,d,nd\n1,0,4,1.5\n2,50,3,\nstop,0,3,\n3,-50,4,1.5\n4,0.0,40,\nimage,0,,\n"
     _, report = read(rows)
     assert report.warnings == ("lens.csv:5: radius 0 of surface 1, 5 is taken as a plane; write inf if it is one",)
+
+
+def test_a_table_in_a_national_encoding_is_asked_for_in_utf_8():
+    content = NOCTILUX.encode("shift-jis", "replace")
+    with pytest.raises(LensFileError, match="in Shift-JIS or GBK. Save it as UTF-8"):
+        read(decode(content, Place("lens.csv")))
+    assert abs(focal_length(read(decode(NOCTILUX.encode("utf-16"), Place("lens.csv")))[0]) - 52) < 0.05
 
 
 def test_an_object_without_a_distance_is_far_away():

@@ -17,7 +17,7 @@ from torch import Tensor
 from raytrace.design.camera import Camera
 from raytrace.design.codesign import STEPS, Outcome, Settings, batch, outcome
 from raytrace.design.codesign import camera as camera_at_start
-from raytrace.design.training import load_state, read_state
+from raytrace.design.training import load_state, read_log, read_state
 from raytrace.files import write_atomically
 from raytrace.launch import launch
 from raytrace.lens import Lens, with_object_distance
@@ -104,9 +104,8 @@ def course(study: Path, model: str, seed: int, step: str = STEPS[0]) -> dict[str
     path = run_folder(study, model, seed) / step / "log.csv"
     if not path.exists():
         return {}
-    with path.open(newline="") as file:
-        read = list(csv.DictReader(file))
-    return {key: [float(row[key]) for row in read] for key in (read[0] if read else ())}
+    rows = read_log(path)
+    return {key: [row[key] for row in rows] for key in (rows[0] if rows else ())}
 
 
 def courses(study: Path, found: Sequence[Outcome], column: str, step: str = STEPS[0]) -> dict[str, list[list[float]]]:

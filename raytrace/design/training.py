@@ -120,30 +120,15 @@ class Run:
 
     def rows(self) -> list[dict[str, float]]:
         """The log as numbers, a dict for every step."""
-        if not self.log.exists():
-            return []
-        header, *rows = self._lines()
-        try:
-            return [{key: float(value) for key, value in zip(header, row, strict=True)} for row in rows]
-        except ValueError as error:
-            raise DamagedRun(
-                f"{self.log}: expected numbers under {_words(','.join(header))} ({_words(error)})"
-            ) from error
+        return read_log(self.log) if self.log.exists() else []
 
     def forget_after(self, step: int) -> None:
         """Drop rows of the log from `step` on: those that a killed run wrote after its last checkpoint."""
         if not self.log.exists():
             return
-        header, *rows = self._lines()
+        header, *rows = _lines(self.log)
         kept = [row for row in rows if len(row) == len(header) and row and row[0].isdecimal() and int(row[0]) < step]
         write_atomically(self.log, lambda file: file.write(_csv([header, *kept]).encode()))
-
-    def _lines(self) -> list[list[str]]:
-        try:
-            with self.log.open(newline="", encoding="utf-8") as file:
-                return list(csv.reader(file)) or [[]]
-        except (ValueError, csv.Error) as error:
-            raise DamagedRun(f"{self.log}: no table of steps ({_words(error)})") from error
 
     def append(self, rows: list[tuple[int, Record]]) -> None:
         if not rows:
@@ -153,6 +138,24 @@ class Run:
         lines = [[step, *(repr(value) for value in record.values())] for step, record in rows]
         with self.log.open("a", newline="") as file:
             file.write(_csv(header + lines))
+
+
+def read_log(path: Path) -> list[dict[str, float]]:
+    """A log as numbers, a dict for every step. Raises DamagedRun."""
+    header, *rows = _lines(path)
+    try:
+        return [{key: float(value) for key, value in zip(header, row, strict=True)} for row in rows]
+    except ValueError as error:
+        found = f"expected numbers under {_words(','.join(header))} ({_words(error)})"
+        raise DamagedRun(f"{path}: {found}") from error
+
+
+def _lines(path: Path) -> list[list[str]]:
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return list(csv.reader(file)) or [[]]
+    except (ValueError, csv.Error) as error:
+        raise DamagedRun(f"{path}: no table of steps ({_words(error)})") from error
 
 
 def read_json(path: Path) -> dict:

@@ -56,7 +56,10 @@ def parse(text: str, file: str, report: Draft) -> Table:
             else:
                 add_row(table, split(line, place), place)
     if split is None:
-        raise LensFileError("no line of headings; expected one naming thickness and curvature or radius", table.place)
+        hint = "; in Shift-JIS or GBK? Save it as UTF-8" if re.search("[\x80-\x9f]", text) else ""
+        raise LensFileError(
+            f"no line of headings; expected one naming thickness and curvature or radius{hint}", table.place
+        )
     return table
 
 
