@@ -46,7 +46,7 @@ def aim_at_stop(
         return torch.stack([at / radius - to for at, to in zip(position, pupil, strict=True)]), arrives
 
     aim, found = _root(missed, pupil, origin=lambda start: start)
-    return torch.where(found, aim, pupil), found
+    return torch.stack([torch.where(found, at, to) for at, to in zip(aim, pupil, strict=True)]), found
 
 
 def aim_at_image(

@@ -322,6 +322,20 @@ def test_batches_broadcast_and_equal_single_rays():
     assert torch.equal(one.direction, whole.direction[:, 2, 1, 5])
 
 
+@pytest.mark.parametrize("kind", ["object_height", "real_image_height"])
+def test_object_distances_in_a_batch_are_aimed_as_alone(kind):
+    """Two distances (D, 1, 1, 1) before fields, wavelengths and pupil points whose own axes are fewer."""
+    base = double_gauss(field=fields(kind, (0.0, 9.0)), wavelengths=(0.45, 0.53, 0.65), ray_aiming="real")
+    distances = vector(300.0, 500.0)
+    field = torch.stack([base.fields.x, base.fields.y])[:, :, None, None]
+    both = with_object_distance(base, distances[:, None, None, None])
+    rays = rays_of_field(both, field, POINTS, wavelength=base.wavelengths[:, None])
+    assert rays.valid.all()
+    for k, distance in enumerate(distances):
+        alone = launch(with_object_distance(base, distance), POINTS)
+        assert (rays.position[:, k] - alone.position).abs().max() <= 1e-12  # mm
+
+
 def test_aiming_does_not_depend_on_neighbours():
     system = double_gauss()
     whole = launch(system, POINTS, ray_aiming="real")
