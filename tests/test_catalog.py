@@ -404,6 +404,19 @@ def test_what_is_left_aside_is_said(tmp_path):
         assert read_agf(path).glasses["ONE"].nd_listed == 1.5168
 
 
+def test_the_edition_of_a_glass_is_told(tmp_path):
+    """By the sources of a shipped glass, by the comment of a user's one; and where a newer edition is in use."""
+    assert re.match(r"date not stated; \d+ sources agree: .*SCHOTT", catalogs.edition(find_glass("N-BK7"))[0])
+    for (catalog, name), (newer, _) in catalogs.OLDER_EDITIONS.items():
+        told = catalogs.edition(find_glass(name, catalogs=[catalog]))
+        assert newer in told[-1]
+    assert len(catalogs.edition(find_glass("H-K9L"))) == 1
+    own = tmp_path / "OWN.AGF"
+    own.write_text("NM MINE 1 517642 1.5 60 0 1\nGC melt of March\nCD 2.25 0 0 0 0 0 0 0 0 0\nLD 0.4 0.7\n")
+    assert catalogs.edition(find_glass("MINE", user=[own])) == ("OWN: melt of March",)
+    assert catalogs.edition(catalogs.Glass("", "constant", torch.ones(1))) == ()
+
+
 def test_a_range_of_zeros_is_no_range():
     assert parse_agf(SMALL.replace("LD 0.4 0.7", "LD 0 0"), "x.agf").glasses["Two"].wavelength_range is None
 

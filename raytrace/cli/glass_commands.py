@@ -5,7 +5,7 @@ import re
 
 import torch
 
-from raytrace.catalog import find_glass
+from raytrace.catalog import edition, find_glass
 from raytrace.cli.door import catalogs, number, print_json
 from raytrace.glass import LINES, abbe_number, check_wavelengths, mil_glass, nd, refractive_index
 from raytrace.lens import check_unit
@@ -25,6 +25,7 @@ def glass(arguments: argparse.Namespace) -> None:
             {
                 "name": found.name,
                 "catalog": found.catalog or None,
+                "edition": list(edition(found)),
                 "formula": found.formula,
                 "coefficients": found.coefficients.tolist(),
                 "wavelength_range": list(found.wavelength_range) if found.wavelength_range else None,
@@ -41,5 +42,7 @@ def glass(arguments: argparse.Namespace) -> None:
     print(f"  Vd       {float(abbe_number(found)):.4f}")
     print(f"  formula  {found.formula}")
     print(f"  range    {span[0]:g} to {span[1]:g} µm" if span else "  range    not listed")
+    for sentence in edition(found):
+        print(f"  edition  {sentence}")
     for wavelength, index in zip(asked, indices, strict=True):
         print(f"  n({wavelength:g} µm) = {index:.10f}")
