@@ -312,7 +312,7 @@ def test_a_radius_of_zero_on_a_lens_is_said():
 
 def test_a_table_in_a_national_encoding_is_asked_for_in_utf_8():
     content = NOCTILUX.encode("shift-jis", "replace")
-    with pytest.raises(LensFileError, match="in Shift-JIS or GBK. Save it as UTF-8"):
+    with pytest.raises(LensFileError, match=r"in Shift-JIS or GBK\? Save it as UTF-8"):
         read(decode(content, Place("lens.csv")))
     assert abs(focal_length(read(decode(NOCTILUX.encode("utf-16"), Place("lens.csv")))[0]) - 52) < 0.05
 
