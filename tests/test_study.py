@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from raytrace.design import optima
-from raytrace.design.claims import claims
+from raytrace.design.claims import claims, is_of_paper
 from raytrace.design.codesign import Outcome, Settings, batch, camera, lens_at_start
 from raytrace.design.conjugates import paraxial_image
 from raytrace.design.optima import Optimum, closed_form, closed_forms, scan, write_optima
@@ -302,6 +302,9 @@ def test_the_page_names_settings_that_are_not_usual():
     assert f"![{CAPTIONS['loss.png']}](codesign/loss.png)" in page
     assert below_the_mark(page) == "By hand."
     assert "codesign_sweep.md" not in page
+    assert "## The paper's claims" in page
+    other = markdown(dataclasses.replace(report, of_paper=False))
+    assert "paper" not in other
     assert "[codesign_sweep.md](codesign_sweep.md)" in markdown(dataclasses.replace(report, sweep=True))
     begun = dataclasses.replace(report.settings, start="spectral", rho=0.3, bounds="sensor:57,58")
     page_of_begun = markdown(dataclasses.replace(report, settings=begun))
@@ -323,3 +326,9 @@ def test_marks_of_the_focus_axis_are_round_and_apart():
     assert all(20 <= z <= 100 for z in marks)
     places = [images[distances.index(z)] for z in marks]
     assert min(a - b for a, b in itertools.pairwise(places)) > (high - low) / 12
+
+
+def test_only_the_papers_lens_has_its_claims():
+    paths = sorted(shipped("lenses").glob("*.zmx"))
+    assert [path.stem for path in paths if is_of_paper(read_lens(path))] == ["double_gauss"]
+    assert is_of_paper(with_sensor_distance(read_lens(shipped("lenses") / "double_gauss.zmx"), 57.0))

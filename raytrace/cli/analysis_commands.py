@@ -19,6 +19,7 @@ _UNITS = {
     "upper": "°",
 }  # fmt: skip
 DENSE = 65  # fields of a curve over the field, when it is drawn
+FINE = 321  # frequencies or radii of a curve, when it is drawn
 
 
 def mtf(arguments: argparse.Namespace) -> None:
@@ -28,7 +29,9 @@ def mtf(arguments: argparse.Namespace) -> None:
     frequencies = None if arguments.frequency is None else lens.wavelengths.new_tensor(arguments.frequency)
     if arguments.through_focus is None:
         found = analysis.mtf(lens, frequencies, kind=kind, fields=fields)
-        report(arguments, lens, found, "mtf_curves", every=5)
+        fine = analysis.mtf(lens, _fine(found.frequencies), kind=kind, fields=fields) if arguments.plot else None
+        asked = None if frequencies is None else found
+        report(arguments, lens, found, "mtf_curves", every=5, dense=fine, asked=asked)
         return
     if frequencies is None or len(frequencies) != 1:
         raise CommandError("--through-focus needs one spatial frequency: add --frequency F")
@@ -85,7 +88,13 @@ def encircled(arguments: argparse.Namespace) -> None:
     kind = "geometric" if arguments.geometric else "diffraction"
     radii = None if arguments.radius is None else lens.wavelengths.new_tensor(arguments.radius)
     found = analysis.encircled_energy(lens, radii, kind=kind, fields=fields)
-    report(arguments, lens, found, "encircled_curves", every=5)
+    fine = analysis.encircled_energy(lens, _fine(found.radii), kind=kind, fields=fields) if arguments.plot else None
+    report(arguments, lens, found, "encircled_curves", every=5, dense=fine, asked=None if radii is None else found)
+
+
+def _fine(places: Tensor) -> Tensor:
+    """Frequencies or radii from 0 to the last of these, close enough for a smooth curve."""
+    return places.max() * torch.linspace(0, 1, FINE, dtype=places.dtype)
 
 
 def opened(arguments: argparse.Namespace, *, every: bool = False) -> tuple[Lens, Tensor]:
@@ -101,8 +110,20 @@ def over_field(arguments: argparse.Namespace, analyse: Callable, figure: str) ->
     lens, fields = opened(arguments) if arguments.field else (open_lens(arguments), None)
     found = analyse(lens, fields=fields, size=arguments.samples)
     refuse_empty(arguments, lens, found)
-    dense = analyse(lens, fields=fields, size=DENSE) if arguments.plot else None
-    report(arguments, lens, found, figure, unit="mm", dense=dense)
+    line = None if fields is None else _line(fields)
+    dense = analyse(lens, fields=line, size=DENSE) if arguments.plot else None
+    marks = {} if figure != "illumination_curve" or fields is None else {"asked": found}
+    report(arguments, lens, found, figure, unit="mm", dense=dense, **marks)
+
+
+def _line(fields: Tensor) -> Tensor:
+    """Many fields (2, F) from the axis to the largest of these, if they lie on one line to it; else these."""
+    size = torch.hypot(*fields)
+    largest = fields[:, size.argmax()]
+    along = (fields * largest[:, None]).sum(0) / size.max()
+    if not size.max() > 0 or bool((along < (1 - 1e-9) * size).any()):
+        return fields
+    return largest[:, None] * torch.linspace(0, 1, DENSE, dtype=fields.dtype)
 
 
 def report(
@@ -115,6 +136,7 @@ def report(
     unit: str = "",
     summary: dict[str, Tensor] | None = None,
     dense: Tabular | None = None,
+    **options,
 ) -> None:
     """Print the result as JSON, or every so many-th row of its table; save the figure of it, or of the dense one."""
     if arguments.json:
@@ -122,7 +144,7 @@ def report(
         print_json(document if summary is None else {**document, "summary": rows(summary)})
     else:
         print_table(summary or found.columns(), FIELD_UNITS[lens.fields.kind], every if summary is None else 1, unit)
-    draw(arguments, lens, found if dense is None else dense, figure)
+    draw(arguments, lens, found if dense is None else dense, figure, **options)
 
 
 def draw(arguments, lens: Lens, found: Tabular, figure: str, **options) -> None:

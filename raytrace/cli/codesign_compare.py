@@ -22,7 +22,7 @@ from raytrace.cli.codesign_setup import (
 )
 from raytrace.cli.codesign_table import MODELS
 from raytrace.cli.door import CommandError, print_json, say
-from raytrace.design.claims import claims
+from raytrace.design.claims import Claim, claims, is_of_paper
 from raytrace.design.codesign import STEPS, Outcome, Settings, batch, camera, lens_at_start, outcome
 from raytrace.design.optima import Optimum, closed_forms, document, scan, write_optima
 from raytrace.design.report import CAPTIONS, Report, below_the_mark, markdown
@@ -143,6 +143,7 @@ def _report(given: Experiment, study: Path, models: Sequence[str], seeds: Sequen
         figures=tuple(name for name in CAPTIONS if name in drawn),
         machine=machine(),
         sweep=(docs / "codesign_sweep.md").exists(),
+        of_paper=is_of_paper(given.lens),
     )
     _write(report, drawn, docs)
     return report
@@ -231,11 +232,16 @@ def _document(report: Report) -> dict:
             "rows": rows(report.found),
             "missing": [{"model": row, "seed": seed} for row, seed in report.missing],
             "models": [dataclasses.asdict(one) for one in summaries(report.found)],
-            "claims": [{**dataclasses.asdict(one), "answer": one.answer} for one in claims(report.found, report.times)],
+            "claims": [{**dataclasses.asdict(one), "answer": one.answer} for one in _claims(report)],
             "closed_form": [document(one) for one in report.optima],
             "times": [dataclasses.asdict(one) for one in report.times],
         }
     )
+
+
+def _claims(report: Report) -> list[Claim]:
+    """Those of the paper, if the lens is its."""
+    return claims(report.found, report.times) if report.of_paper else []
 
 
 def _print(report: Report) -> None:
@@ -247,7 +253,7 @@ def _print(report: Report) -> None:
             f"{NAMES[one.model]:>26} {one.seeds:>5} {mean['l1_joint']:>10.5f} {mean['l1_drt']:>10.5f} "
             f"{mean['focus_paraxial_m']:>10.2f} {mean['focus_rms_m']:>10.2f} {mean['sensor_mm']:>10.4f}"
         )
-    for claim in claims(report.found, report.times):
+    for claim in _claims(report):
         print(f"{claim.answer:>11}: {claim.text}; {claim.figures}")
     if report.missing:
         print(f"not finished: {', '.join(f'{row} {seed}' for row, seed in report.missing)}")

@@ -8,6 +8,7 @@ from pathlib import Path
 from raytrace.cli.codesign_commands import spectrum_of
 from raytrace.cli.codesign_setup import Experiment, bar, experiment, plain, settings_without_network
 from raytrace.cli.door import CommandError, print_json, say
+from raytrace.design.claims import is_of_paper
 from raytrace.design.report import below_the_mark
 from raytrace.design.sweep import Row, readings, write_sweep
 from raytrace.design.sweep import sweep as sweep_all
@@ -31,7 +32,7 @@ def sweep(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print_json(_document(given, rows))
     else:
-        _print(rows)
+        _print(rows, of_paper=is_of_paper(given.lens))
     say(f"written: {docs / 'codesign_sweep.md'}")
     for row in rows:
         if row.no_optimum:
@@ -44,10 +45,11 @@ def _write(given: Experiment, rows: Sequence[Row], docs: Path) -> None:
     folder, path = docs / "codesign", docs / "codesign_sweep.md"
     folder.mkdir(parents=True, exist_ok=True)
     write_sweep(rows, folder / "sweep.csv")
-    save(sweep_figure(readings(rows)), folder / "sweep.png")
+    of_paper = is_of_paper(given.lens)
+    save(sweep_figure(readings(rows), of_paper=of_paper), folder / "sweep.png")
     kept = below_the_mark(path.read_text(encoding="utf-8")) if path.exists() else ""
     pictures = f"the spectrum of {len(given.train)} {given.kind}"
-    text = page(rows, given.settings, lens=given.name, pictures=pictures, kept=kept)
+    text = page(rows, given.settings, lens=given.name, pictures=pictures, kept=kept, of_paper=of_paper)
     write_atomically(path, lambda file: file.write(text.encode()))
 
 
@@ -63,7 +65,7 @@ def _document(given: Experiment, rows: Sequence[Row]) -> dict:
     )
 
 
-def _print(rows: Sequence[Row]) -> None:
+def _print(rows: Sequence[Row], *, of_paper: bool) -> None:
     print(
         f"{'factor':>12} {'value':<42} {'model':<9} {'sensor mm':>10} {'paraxial m':>11} {'RMS m':>8} {'error DRT':>11}"
     )
@@ -73,7 +75,10 @@ def _print(rows: Sequence[Row]) -> None:
             f"{row.focus_rms_m:>8.2f} {row.error_drt:>11.8f}"
         )
     for one in answers(readings(rows)):
+        closest = (
+            f"; closest to the paper {one.pair[0]:.1f} and {one.pair[1]:.1f} m ({one.closest})" if of_paper else ""
+        )
         print(
-            f"{one.definition}: Gaussian DRT focused nearer than paraxial in {one.nearer} of {one.readings} readings; "
-            f"closest to the paper {one.pair[0]:.1f} and {one.pair[1]:.1f} m ({one.closest})"
+            f"{one.definition}: Gaussian DRT focused nearer than paraxial in {one.nearer} of {one.readings} readings"
+            f"{closest}"
         )

@@ -8,6 +8,10 @@ from collections.abc import Callable, Mapping, Sequence
 from raytrace.design.codesign import Outcome
 from raytrace.design.step_time import StepTime
 from raytrace.design.study import NAMES, Summary, losses_by_distance, summaries
+from raytrace.lens import Lens
+
+#: Curvature radii in mm of the paper's lens (Table 3), to five digits; the plane ones and the stop left out.
+_RADII = (54.153, 152.522, 35.9506, 22.2699, -25.685, -36.9802, 196.417, -67.1476)
 
 SIMPLE = ("paraxial", "fourier")
 OURS = "gaussian"
@@ -25,6 +29,12 @@ class Claim:
     @property
     def answer(self) -> str:
         return {True: "yes", False: "no", None: "not run yet"}[self.holds]
+
+
+def is_of_paper(lens: Lens) -> bool:
+    """Whether a lens is that of the paper, whatever its sensor distance and aperture: no other has its claims."""
+    bent = [1 / float(s.curvature) for s in lens.surfaces if s.curvature is not None and float(s.curvature) != 0]
+    return len(bent) == len(_RADII) and all(math.isclose(a, b, rel_tol=1e-4) for a, b in zip(bent, _RADII, strict=True))
 
 
 def claims(found: Sequence[Outcome], times: Sequence[StepTime]) -> list[Claim]:

@@ -32,7 +32,7 @@ class Report:
     """All that a page says.
 
     missing: (row, seed) of runs that are not finished; figures: file names that exist; sweep: whether there is a page
-    of one beside this.
+    of one beside this; of_paper: whether the lens is the paper's, whose numbers then stand beside the found ones.
     """
 
     lens: str
@@ -45,6 +45,7 @@ class Report:
     figures: tuple[str, ...]
     machine: Mapping[str, str | int]
     sweep: bool = False
+    of_paper: bool = True
 
 
 def markdown(report: Report, *, folder: str = "codesign", kept: str = "") -> str:
@@ -55,9 +56,8 @@ def markdown(report: Report, *, folder: str = "codesign", kept: str = "") -> str
         _experiment(report),
         _progress(report),
         "## Loss and focus",
-        _table(report.found),
-        "## The paper's claims",
-        _claims(report),
+        _table(report.found, of_paper=report.of_paper),
+        *(["## The paper's claims", _claims(report)] if report.of_paper else []),
         *(f"![{CAPTIONS[name]}]({folder}/{name})\n\n*{CAPTIONS[name]}*" for name in report.figures),
         "## The closed form beside training",
         _closed_form(report),
@@ -130,12 +130,12 @@ def _progress(report: Report) -> str:
     )
 
 
-def _table(found: Sequence[Outcome]) -> str:
+def _table(found: Sequence[Outcome], *, of_paper: bool) -> str:
     if not found:
         return "No run is finished yet."
     header = (
         "model", "seeds", "L¹, step 1", "L¹, step 2 (DRT)", "change", "focus, paraxial (m)", "focus, RMS (m)",
-        "sensor (mm)", "paper: L¹, step 1", "paper: step 2", "paper: focus (m)",
+        "sensor (mm)", *(("paper: L¹, step 1", "paper: step 2", "paper: focus (m)") if of_paper else ()),
     )  # fmt: skip
     rows = []
     for one in summaries(found):
@@ -149,14 +149,14 @@ def _table(found: Sequence[Outcome]) -> str:
                 _spread(one, "focus_paraxial_m", 1),
                 _spread(one, "focus_rms_m", 1),
                 _spread(one, "sensor_mm", 4),
-                *_paper(one.model),
+                *(_paper(one.model) if of_paper else ()),
             )
         )
     return (
         f"{table(header, rows)}\n\nMean ± standard deviation over seeds, of test pictures; every model of a seed sees "
         "the same crops, distances and noise. Focus is the object distance from vertex 1 whose image is on the sensor: "
-        "the paraxial one, or that of least RMS spot; the paper does not say which is its own. Rows one by one: "
-        "[table2.csv](codesign/table2.csv)."
+        f"the paraxial one, or that of least RMS spot{'; the paper does not say which is its own' if of_paper else ''}."
+        " Rows one by one: [table2.csv](codesign/table2.csv)."
     )
 
 

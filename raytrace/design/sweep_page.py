@@ -67,13 +67,31 @@ def _answer(definition: str, focus: Callable[[Row], float], found: Sequence[Read
 
 
 def page(
-    rows: Sequence[Row], settings: Settings, *, lens: str, pictures: str, folder: str = "codesign", kept: str = ""
+    rows: Sequence[Row],
+    settings: Settings,
+    *,
+    lens: str,
+    pictures: str,
+    folder: str = "codesign",
+    kept: str = "",
+    of_paper: bool = True,
 ) -> str:
-    """The sweep as a page of Markdown. folder: of table and figure, as the page calls it; kept: text below `KEPT`."""
+    """The sweep as a page of Markdown. folder: of table and figure, as the page calls it; kept: text below `KEPT`.
+
+    of_paper: whether the lens is the paper's, so that the found numbers stand beside its and answer its claims.
+    """
     found = readings(rows)
     alone = [one for one in found if one.factor != COMBINED]
     together = [one for one in found if one.factor == COMBINED]
     command = " ".join([f"raytrace codesign sweep {lens} --data DIR --docs docs", *options(settings)])
+    verdict = ["## Is the lens of Gaussian DRT focused nearer, at 27.3 m beside 33.9 m?", _verdict(found)]
+    lines = "; thin lines: the numbers of the paper" if of_paper else ""
+    consequences = [
+        "## What follows for the paper's claims",
+        _claims(distinct(found)),
+        "A loss here is of the mean square error with DRT PSFs, beside the least of the four lenses, behind linear "
+        "filters; the paper's are of the mean absolute error behind networks.",
+    ]
     parts = [
         "# Co-design: where the closed form puts the lens, by what the paper leaves open",
         f"    {command}",
@@ -81,14 +99,10 @@ def page(
         "does not know the object distance errs least. Each factor is varied alone (ρ is of the paraxial model only), "
         f"then {_words(TOGETHER)} together. All rows: [sweep.csv]({folder}/sweep.csv). The experiment is that of "
         "[codesign.md](codesign.md).",
-        "## Is the lens of Gaussian DRT focused nearer, at 27.3 m beside 33.9 m?",
-        _verdict(found),
+        *(verdict if of_paper else []),
         f"![Focus distance by factor, model and definition.]({folder}/sweep.png)",
-        "*Focus distance of the optimum by factor, model and definition; thin lines: the numbers of the paper.*",
-        "## What follows for the paper's claims",
-        _claims(distinct(found)),
-        "A loss here is of the mean square error with DRT PSFs, beside the least of the four lenses, behind linear "
-        "filters; the paper's are of the mean absolute error behind networks.",
+        f"*Focus distance of the optimum by factor, model and definition{lines}.*",
+        *(consequences if of_paper else []),
         "## Focus of the optimum",
         _focus_table(alone),
         "Object distances in m: paraxial conjugate / least RMS spot of the sensor. Shift: of Gaussian DRT's sensor "

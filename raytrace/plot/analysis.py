@@ -1,7 +1,9 @@
 """Figures of the analyses: fans, wavefronts, MTF, encircled energy, and curves over the field."""
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import Colormap, ListedColormap, Normalize
 from matplotlib.figure import Figure
 
 from raytrace.analysis import (
@@ -26,6 +28,7 @@ from raytrace.plot.panels import (
     field_labels,
     field_name,
     legend_below,
+    nothing,
     over_field,
     ruled,
     titled,
@@ -37,6 +40,7 @@ from raytrace.plot.style import (
     INK,
     array,
     field_colour,
+    field_colours,
     new_figure,
     number_text,
     styled,
@@ -80,47 +84,69 @@ def fan_plot(lens: Lens, found: Fan) -> Figure:
 
 @styled
 def wavefront_maps(lens: Lens, found: WavefrontMap) -> Figure:
-    """A panel for each field (rows) and wavelength (columns), one scale for all, RMS, P-V and Strehl below."""
+    """A panel for each field (rows) and wavelength (columns), one scale for all, RMS, P-V and Strehl below.
+
+    Maps of a single wavelength follow each other in lines of four. 0 is white, and the scale ends where the maps end.
+    """
     labels, count = field_labels(lens, found.fields), len(found.wavelengths)
-    figure = new_figure(max(4.2, 1.9 * count + 1.4), 2.05 * len(labels) + 0.6)
-    axes = figure.subplots(len(labels), count, squeeze=False)
+    flows = count == 1
+    shape = (-(-len(labels) // 4), min(len(labels), 4)) if flows else (len(labels), count)
+    side = 2.9 if shape == (1, 1) else 1.9
+    figure = new_figure(side * shape[1] + 1.3, (side + 0.6) * shape[0] + (0.75 if shape[0] > 1 else 0.95))
+    grid = figure.subplots(*shape, squeeze=False)
+    axes = grid.reshape(-1, 1) if flows else grid
     opd = np.where(array(found.valid).astype(bool), array(found.opd), np.nan)
-    largest = max(float(np.nanmax(np.abs(opd), initial=0.0)), 1e-4)
-    for row, label in enumerate(labels):
-        for w in range(count):
-            panel = axes[row][w]
-            drawn = panel.imshow(
-                opd[row, w], origin="lower", cmap="RdBu_r", vmin=-largest, vmax=largest, extent=(-1, 1, -1, 1)
-            )
-            panel.set_xticks([])
-            panel.set_yticks([])
-            for spine in panel.spines.values():
-                spine.set_visible(False)
-            rms, valley, strehl = (
-                number_text(float(v[row, w]), 3) for v in (found.rms, found.peak_to_valley, found.strehl)
-            )
-            panel.set_xlabel(f"RMS {rms}, P–V {valley}\nStrehl {strehl}", fontsize=7.5, color=GREY)
-            if row == 0:
-                panel.set_title(wavelength_label(found, w), color=INK)
-            if w == 0:
-                panel.set_ylabel(label)
-    bar = figure.colorbar(drawn, ax=axes, shrink=0.8, aspect=30, pad=0.02)
+    colours, scale = _diverging(opd)
+    for row, w in np.ndindex(len(labels), count):
+        panel = axes[row][w]
+        drawn = panel.imshow(opd[row, w], origin="lower", cmap=colours, norm=scale, extent=(-1, 1, -1, 1))
+        panel.set(xticks=[], yticks=[])
+        for spine in panel.spines.values():
+            spine.set_visible(False)
+        rms, valley, strehl = (
+            number_text(float(v[row, w]), 3) for v in (found.rms, found.peak_to_valley, found.strehl)
+        )
+        panel.set_xlabel(f"RMS {rms}, P–V {valley}\nStrehl {strehl}", fontsize=7.5, color=GREY)
+        if flows:
+            panel.set_title(labels[row], color=INK)
+        elif row == 0:
+            panel.set_title(wavelength_label(found, w), color=INK)
+        if w == 0 and not flows:
+            panel.set_ylabel(labels[row])
+    for panel in axes.ravel()[len(labels) * count :]:
+        panel.axis("off")
+    bar = figure.colorbar(drawn, ax=grid, shrink=0.8, aspect=30, pad=0.02)
     bar.set_label("OPD (waves)")
     bar.outline.set_visible(False)
-    return titled(figure, lens, "wavefront")
+    return titled(figure, lens, f"wavefront, {wavelength_label(found, 0)}" if flows else "wavefront")
+
+
+def _diverging(values: np.ndarray) -> tuple[Colormap, Normalize]:
+    """Blue below 0, white at 0, red above, equally deep on either side; from the least to the largest of the values."""
+    low, high = min(float(np.nanmin(values, initial=0.0)), 0.0), max(float(np.nanmax(values, initial=0.0)), 0.0)
+    largest = max(-low, high, 1e-4)
+    low, high = (low, high) if high - low > 1e-4 else (-largest, largest)
+    shades = matplotlib.colormaps["RdBu_r"](0.5 + 0.5 * np.linspace(low, high, 256) / largest)
+    return ListedColormap(shades), Normalize(low, high)
 
 
 @styled
-def mtf_curves(lens: Lens, found: Mtf) -> Figure:
-    """Modulation over spatial frequency: tangential solid, sagittal dashed, the diffraction limit grey."""
+def mtf_curves(lens: Lens, found: Mtf, *, asked: Mtf | None = None) -> Figure:
+    """Modulation over spatial frequency: tangential solid, sagittal dashed, the diffraction limit grey.
+
+    asked: frequencies of their own, marked on the curves.
+    """
     figure, panel = chart(6.4, 4.0, "spatial frequency (cycles/mm)", "modulation")
     frequency = array(found.frequencies)
+    _pairs(panel, lens, found, frequency, array(found.tangential), array(found.sagittal))
+    for f, colour in enumerate(field_colours(found.fields.shape[1]) if asked is not None else []):
+        for values in (asked.tangential, asked.sagittal):
+            _marks(panel, array(asked.frequencies), array(values[f]), colour)
     if found.limit is not None:
         panel.plot(frequency, array(found.limit), color=GREY, linewidth=1.0, linestyle=":", label="diffraction limit")
-    _pairs(panel, lens, found, frequency, array(found.tangential), array(found.sagittal))
     panel.set_xlim(0, frequency.max())
     panel.set_ylim(0, 1.0)
-    legend_below(figure, panel, 4)
+    legend_below(figure, panel, 6)
     return titled(figure, lens, f"{found.kind} MTF")
 
 
@@ -134,17 +160,19 @@ def mtf_through_focus_curves(lens: Lens, found: ThroughFocusMtf) -> Figure:
     panel.axvline(float(lens.surfaces[-2].thickness), color=GREY, linewidth=0.8)
     panel.set_xlim(distance.min(), distance.max())
     panel.set_ylim(0, 1.0)
-    legend_below(figure, panel, 4)
+    legend_below(figure, panel, 6)
     return titled(figure, lens, f"{found.kind} MTF through focus")
 
 
 @styled
-def encircled_curves(lens: Lens, found: EncircledEnergy) -> Figure:
-    """Share of the light over the radius about the centroid."""
+def encircled_curves(lens: Lens, found: EncircledEnergy, *, asked: EncircledEnergy | None = None) -> Figure:
+    """Share of the light over the radius about the centroid. asked: radii of their own, marked on the curves."""
     figure, panel = chart(6.0, 3.8, "radius from the centroid (µm)", "encircled energy")
-    radii = 1e3 * array(found.radii)
-    for f, label in enumerate(field_labels(lens, found.fields)):
-        panel.plot(radii, array(found.share[f]), color=field_colour(f), linewidth=1.5, label=label)
+    radii, labels = 1e3 * array(found.radii), field_labels(lens, found.fields)
+    for f, (label, colour) in enumerate(zip(labels, field_colours(len(labels)), strict=True)):
+        panel.plot(radii, array(found.share[f]), color=colour, linewidth=1.5, label=label)
+        if asked is not None:
+            _marks(panel, 1e3 * array(asked.radii), array(asked.share[f]), colour)
     panel.axhline(0.8, color=GREY, linewidth=0.7, linestyle=":")
     panel.set_xlim(0, radii.max())
     panel.set_ylim(0, 1.02)
@@ -182,6 +210,10 @@ def curvature_curves(lens: Lens, found: FieldCurvature) -> Figure:
 def lateral_curves(lens: Lens, found: LateralColour) -> Figure:
     """Chief rays' heights less the primary wavelength's over the field, beside the Airy radius of that one in grey."""
     figure, panel = chart(4.6, 4.4, "lateral colour (µm)", "")
+    if len(found.wavelengths) == 1:
+        panel.set_ylabel(field_name(lens))
+        nothing(panel, "one wavelength:\nno lateral colour")
+        return titled(figure, lens, "lateral colour")
     if (resolved := float(cutoff(lens, lens.wavelengths[lens.primary_wavelength]))) > 0:
         airy = 1.22e3 / resolved
         panel.axvspan(-airy, airy, color=FAINT, alpha=0.35, linewidth=0, label="Airy radius")
@@ -193,24 +225,33 @@ def lateral_curves(lens: Lens, found: LateralColour) -> Figure:
 
 
 @styled
-def illumination_curve(lens: Lens, found: RelativeIllumination) -> Figure:
-    """Relative illumination over the field, beside cos⁴θ where fields are angles."""
+def illumination_curve(lens: Lens, found: RelativeIllumination, *, asked: RelativeIllumination | None = None) -> Figure:
+    """Relative illumination over the field, beside cos⁴θ where fields are angles; asked: fields marked on the line."""
     figure, panel = chart(5.4, 3.6, field_name(lens), "relative illumination")
-    field = field_axis(found)
-    line = {"linewidth": 1.5} if len(field) > FEW else {"linestyle": "none", "marker": "o", "markersize": 3.5}
-    panel.plot(
-        field, array(found.illumination), color=field_colour(0), clip_on=False, zorder=3, label="this lens", **line
-    )
+    order = np.argsort(field_axis(found), kind="stable")
+    field, values = field_axis(found)[order], array(found.illumination)[order]
+    look = {"marker": "o", "markersize": 3.5} if len(field) <= FEW else {}
+    panel.plot(field, values, color=field_colour(0), linewidth=1.5, clip_on=False, zorder=3, label="this lens", **look)
+    if asked is not None:
+        _marks(panel, field_axis(asked), array(asked.illumination), field_colour(0))
     if lens.fields.kind == "angle":
         fine = np.linspace(0, field.max(), 100)
         panel.plot(fine, np.cos(np.deg2rad(fine)) ** 4, color=GREY, linewidth=1.0, linestyle=":", label="cos⁴θ")
     panel.set_xlim(0, field.max() or 1.0)
-    panel.set_ylim(0, 1.05 * max(1.0, float(found.illumination.max())))
+    panel.set_ylim(0, 1.05 * max(1.0, values.max()))
     legend_below(figure, panel, 2)
     return titled(figure, lens, "relative illumination")
 
 
 def _pairs(panel: Axes, lens: Lens, found, x: np.ndarray, tangential: np.ndarray, sagittal: np.ndarray) -> None:
-    for f, label in enumerate(field_labels(lens, found.fields)):
-        panel.plot(x, tangential[f], color=field_colour(f), linewidth=1.5, label=f"{label} T")
-        panel.plot(x, sagittal[f], color=field_colour(f), linewidth=1.5, linestyle=_SAGITTAL, label=f"{label} S")
+    """Curves of fields in their colours, tangential solid, sagittal dashed, and what the legend says of both."""
+    labels = field_labels(lens, found.fields)
+    for f, (label, colour) in enumerate(zip(labels, field_colours(len(labels)), strict=True)):
+        panel.plot(x, tangential[f], color=colour, linewidth=1.5, label=label)
+        panel.plot(x, sagittal[f], color=colour, linewidth=1.5, linestyle=_SAGITTAL)
+    for name, dash in (("tangential", "solid"), ("sagittal", _SAGITTAL)):
+        panel.plot([], [], color=INK, linewidth=1.2, linestyle=dash, label=name)
+
+
+def _marks(panel: Axes, x: np.ndarray, y: np.ndarray, colour) -> None:
+    panel.plot(x, y, "o", color=colour, markersize=3.5, clip_on=False, zorder=4)

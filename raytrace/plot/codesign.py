@@ -160,11 +160,14 @@ def scan_figure(
 
 
 @styled
-def sweep_figure(found: Sequence[Reading]) -> Figure:
+def sweep_figure(found: Sequence[Reading], *, of_paper: bool = True) -> Figure:
     """Focus of the closed form's optima: a column of panels for each factor, a row for each definition of focus.
+
+    of_paper: whether the lens is the paper's, whose numbers are lines then.
 
     Distances stand as they do behind the lens, evenly in 1/z, so that infinity has a place.
     """
+    papers = PAPER if of_paper else {}
     groups = {factor: [one for one in found if one.factor == factor.name] for factor in FACTORS}
     groups = {factor: own for factor, own in groups.items() if own}
     figure = new_figure(9.6, 5.0)
@@ -176,7 +179,7 @@ def sweep_figure(found: Sequence[Reading]) -> Figure:
             for model in factor.models:
                 values = [-1 / getattr(one.of[model], column) for one in own]
                 panel.plot(values, marker="o", markersize=3.5, **_look(model))
-            for model, (*_, paper) in PAPER.items():
+            for model, (*_, paper) in papers.items():
                 panel.axhline(-1 / paper, color=_look(model)["color"], linewidth=0.6, alpha=0.7, zorder=0)
             panel.set_xticks(range(len(own)), [_sweep_tick(factor, one.value) for one in own])
             panel.set_xlim(-0.5, len(own) - 0.5)
@@ -184,7 +187,7 @@ def sweep_figure(found: Sequence[Reading]) -> Figure:
             panel.spines["left"].set_visible(panel is panels[0])
         panels[0].set_ylabel(f"object in focus,\n{label}")
         _distance_ticks(panels[0])
-        for model, (*_, paper) in PAPER.items():
+        for model, (*_, paper) in papers.items():
             # Right of the last panel, in the colour of its line.
             panels[-1].annotate(
                 f"{paper:g}", (1, -1 / paper), (3, _LIFT.get(model, 0)), ("axes fraction", "data"), "offset points",
@@ -192,7 +195,8 @@ def sweep_figure(found: Sequence[Reading]) -> Figure:
             )  # fmt: skip
     for panel, factor in zip(axes[0], groups, strict=True):
         panel.set_title(_TITLES[factor.name])
-    _legend(figure, axes[0][0], [Line2D([], [], color=GREY, linewidth=0.6, label="the paper's")])
+    lines = [Line2D([], [], color=GREY, linewidth=0.6, label="the paper's")] if of_paper else []
+    _legend(figure, axes[0][0], lines)
     return figure
 
 

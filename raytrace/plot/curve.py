@@ -1,7 +1,6 @@
 """Through-focus curve: RMS spot radius against sensor distance, without tracing a ray twice."""
 
 import math
-import textwrap
 from typing import NamedTuple
 
 import numpy as np
@@ -70,7 +69,7 @@ def through_focus_curve(
     bundle = focus_rays(lens, fields=fields, by=by, **rule)
     if by == "field":
         labels = [style.field_label(lens, field) for field in style.array(fields).T]
-        colours, title = [style.field_colour(f) for f in range(len(labels))], style.field_title(lens)
+        colours, title = style.field_colours(len(labels)), style.field_title(lens)
     else:
         values = style.array(lens.wavelengths if wavelengths is None else wavelengths)
         labels = [f"{wavelength:.4g} µm" for wavelength in values]
@@ -83,7 +82,7 @@ def through_focus_curve(
     draw_curves(axes, bundle, sensor, span, labels=labels, colours=colours)
     draw_marks(axes, marks)
     axes.set_title(
-        "\n".join(textwrap.wrap(lens.name, 70)) or "Lens", fontsize=11, fontweight="bold", pad=20, loc="left"
+        style.fill(lens.name, 6.3, 11, bold=True) or "Lens", fontsize=11, fontweight="bold", pad=20, loc="left"
     )
     axes.annotate(
         style.first_order_text(lens, first_order(lens)),
@@ -142,7 +141,7 @@ def draw_curves(
     axes: Axes, bundle: FocusRays, sensor: float, span: tuple[float, float], *, labels, colours=None
 ) -> None:
     """One line for each batch of rays, a dot at its minimum; labels carry the place and the radius of the minimum."""
-    colours = [style.field_colour(c) for c in range(len(labels))] if colours is None else colours
+    colours = style.field_colours(len(labels)) if colours is None else colours
     shifts = np.linspace(span[0], span[1], _SAMPLES) - sensor
     radii, best = 1e3 * bundle.radii(shifts), bundle.best
     least = 1e3 * np.diagonal(bundle.radii(best))

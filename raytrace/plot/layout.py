@@ -1,7 +1,6 @@
 """Layout: the cross section of a lens in the y-z plane with the rays of its fields."""
 
 import math
-import textwrap
 
 import numpy as np
 import torch
@@ -49,15 +48,16 @@ def layout(
     shape = (y1 - y0) / (z1 - z0)
     width = min(max(6.0 / shape, 5.5), 8.0)
     figure.set_size_inches(width, min(max(0.98 * width * shape, 1.2), 6.0) + 1.1)
-    figure.suptitle("\n".join(textwrap.wrap(lens.name, int(11 * width))) or "Lens", fontsize=11, fontweight="bold")
+    figure.suptitle(style.fill(lens.name, width, 11, bold=True) or "Lens", fontsize=11, fontweight="bold")
     axes.set_title(style.first_order_text(lens, first_order(lens)), fontsize=8.5, color=style.GREY, pad=4)
     labels = [
         style.field_label(lens, field) for field in zip(*style.array(style.lens_fields(lens, fields)), strict=True)
     ]
-    handles = [Line2D([], [], color=style.field_colour(f), label=label) for f, label in enumerate(labels)]
+    colours = style.field_colours(len(labels))
+    handles = [Line2D([], [], color=colour, label=label) for colour, label in zip(colours, labels, strict=True)]
     figure.legend(
         handles=[Line2D([], [], linestyle="", label=style.field_title(lens)), *handles],
-        loc="outside lower center", ncols=len(handles) + 1, handlelength=1.4, columnspacing=1.6,
+        loc="outside lower center", ncols=min(len(handles) + 1, int(1.5 * width)), handlelength=1.4, columnspacing=1.6,
     )  # fmt: skip
     return figure
 
@@ -90,7 +90,7 @@ def draw_layout(
         _draw_mirrors(axes, lens, z, radii, paths)
         _draw_apertures(axes, lens, z, radii)
         _draw_stop(axes, lens, z, radii)
-        _draw_rays(axes, paths, colours or [style.field_colour(f) for f in range(len(paths))])
+        _draw_rays(axes, paths, colours or style.field_colours(len(paths)))
         half = _draw_sensor(axes, lens, z, radii, paths)
         if near:
             _draw_object(axes, lens, z, paths)

@@ -7,7 +7,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from raytrace.lens import Lens
-from raytrace.plot.style import GREY, array, field_label, field_title, new_figure, number_text, wavelength_colours
+from raytrace.plot.style import (
+    GREY,
+    array,
+    field_label,
+    field_title,
+    fill,
+    new_figure,
+    number_text,
+    wavelength_colours,
+)
 
 #: Dashes of wavelengths, in order, for readers who do not tell their colours apart.
 DASHES = ("solid", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)))
@@ -43,6 +52,12 @@ def drawn_at_least(axes: Iterable[Axes], floor: float, along: str) -> None:
         panel.text(
             0.5, 0.96, f"below {floor:g} everywhere", transform=panel.transAxes, ha="center", va="top", color=GREY
         )
+
+
+def nothing(panel: Axes, words: str) -> None:
+    """Say in an empty panel why it is empty, instead of axes that measure nothing."""
+    panel.set(xlim=(-1, 1), ylim=(0, 1), xticks=[], yticks=[])
+    panel.text(0.5, 0.5, words, transform=panel.transAxes, ha="center", va="center", color=GREY, zorder=5)
 
 
 def field_axis(found) -> np.ndarray:
@@ -82,5 +97,6 @@ def legend_below(figure: Figure, panel: Axes, columns: int) -> None:
 
 
 def titled(figure: Figure, lens: Lens, what: str) -> Figure:
-    figure.suptitle(f"{lens.name}\n{what}" if lens.name else what.capitalize(), fontweight="bold", fontsize=10)
+    words = f"{lens.name}\n{what}" if lens.name else what.capitalize()
+    figure.suptitle(fill(words, figure.get_figwidth(), 10, bold=True), fontweight="bold", fontsize=10)
     return figure

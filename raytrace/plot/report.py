@@ -1,6 +1,5 @@
 """Focus report: one page that shows what moving the sensor did."""
 
-import textwrap
 from collections.abc import Sequence
 from numbers import Number
 
@@ -58,7 +57,8 @@ def focus_report(
 
     columns = max(len(labels), 1)
     figure = style.new_figure(10.0 if columns > 3 else 9.0, 8.4)
-    figure.suptitle("\n".join(textwrap.wrap(lens.name, 90)) or "Lens", fontsize=12, fontweight="bold")
+    name = style.fill(lens.name, figure.get_figwidth(), 12, bold=True) or "Lens"
+    figure.suptitle(name, fontsize=12, fontweight="bold")
     top, bottom = figure.subfigures(2, 1, height_ratios=(1.0, 1.0), hspace=0.02)
     wide = min(1.0 + 0.32 * (columns - 1), 1.6)
     left, right = bottom.subfigures(1, 2, width_ratios=(1.25, wide), wspace=0.02)
@@ -108,9 +108,9 @@ def _draw_focus(axes: Axes, before: Lens, after: Lens, distances: list[float], l
         text = f"{name}: {place:.4f} mm{radius}"
         axes.axvline(place, color=style.GREY, linewidth=1.0, linestyle=_DASHES[name], label=text, zorder=2)
     if "paraxial focus" not in marks:
-        each = len(labels) // len(distances)
+        each, colours = len(labels) // len(distances), style.field_colours(len(labels))
         for number, place in enumerate(paraxial):
-            axes.plot(place, 0, "^", color=style.field_colour(number * each), markersize=5, clip_on=False, zorder=5,
+            axes.plot(place, 0, "^", color=colours[number * each], markersize=5, clip_on=False, zorder=5,
                       label="paraxial foci" if number == 0 else None)  # fmt: skip
     axes.set_title("RMS spot radius through focus", fontweight="bold", pad=8)
 
@@ -136,13 +136,17 @@ def _draw_spots(page, before: Lens, after: Lens, distances: list[float], labels:
                 panel.set_ylabel(f"Spots {when}" if column == 0 else "", fontweight="bold")
                 if row == 0:
                     label = labels[column] if len(distances) == 1 else f"object at {labels[column]}"
-                    panel.set_title(label.replace(", ", "\n", 1), color=style.field_colour(column), fontsize=8.5)
+                    panel.set_title(
+                        label.replace(", ", "\n", 1), color=style.field_colours(len(labels))[column], fontsize=8.5
+                    )
             size = panel_size([float(whole.geometric_radius[f])], airy)
             if bool(whole.rms_radius[f].isfinite()) and half > _MAGNIFY * size:
                 inset = panel.inset_axes((0.985 - _INSET, 0.985 - _INSET, _INSET, _INSET), zorder=8)
                 draw_dots(inset, whole, dots, f, half=size, **look)
                 inset.set_facecolor("#fbfbfb")
                 inset.set_xlabel(f"{style.number_text(_INSET * half / size, 2)}×", fontsize=7, labelpad=1)
-    page.legend(handles=wavelength_handles(wavelengths, airy), loc="outside lower center", ncols=2, handletextpad=0.3)
-    if count < len(labels):
-        page.supxlabel(f"the first {count} of {len(labels)} spots", fontsize=8, color=style.GREY)
+    words = f"the first {count} of {len(labels)} spots" if count < len(labels) else None
+    page.legend(
+        handles=wavelength_handles(wavelengths, airy), loc="outside lower center", ncols=2, handletextpad=0.3,
+        title=words, title_fontproperties={"size": 8},
+    )  # fmt: skip

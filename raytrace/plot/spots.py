@@ -1,7 +1,6 @@
 """Spot diagram: where the rays of each field meet the sensor, beside the Airy disc."""
 
 import math
-import textwrap
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,10 +13,13 @@ from torch import Tensor
 
 from raytrace.focus import image_rays
 from raytrace.lens import Lens, with_object_distance
+from raytrace.numerics import safe_divide
 from raytrace.paraxial import first_order
 from raytrace.plot import style
-from raytrace.pupil import gauss_rings, hexapolar
+from raytrace.pupil import gauss_rings, hexapolar, with_rim
 from raytrace.spot import Spot, spot_of_points
+
+_DOT_RINGS = 12  # 469 dots of a wavelength
 
 
 def airy_radius(lens: Lens) -> Tensor:
@@ -35,12 +37,14 @@ def field_spots(
 ) -> tuple[Spot, Spot]:
     """Polychromatic spots (F,), and the spots (F, W) of the rays that are drawn as dots.
 
-    The RMS radius is that of the rule `pupil` (points, weights), by default Gaussian quadrature. The dots, a hexapolar
-    grid up to the rim of the pupil, have no weight in it but count for the geometric radius.
+    The RMS radius is that of the rule `pupil` (points, weights), by default Gaussian quadrature. The dots have no
+    weight in it but count for the geometric radius, as do points on the rim of the pupil. They are those of
+    `even_hexapolar`: each stands for the same area of the pupil, so that light is where dots are.
     """
     dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
     points, weights = gauss_rings(dtype=dtype, device=device) if pupil is None else pupil
-    dots = hexapolar(8, dtype=dtype, device=device)[0]
+    points, weights = with_rim(points, weights)
+    dots = even_hexapolar(_DOT_RINGS, dtype=dtype, device=device)
     shares = shares_of(lens, wavelengths, wavelength_weights)
     with torch.no_grad():
         rays = image_rays(lens, torch.cat([points, dots], dim=1), fields=fields, wavelengths=wavelengths)
@@ -49,6 +53,17 @@ def field_spots(
         whole = spot_of_points(hits.flatten(2), valid.flatten(1), (shares[:, None] * weights).flatten())
         drawn = points.shape[1]
         return whole, spot_of_points(hits[..., drawn:], valid[..., drawn:])
+
+
+def even_hexapolar(rings: int, **like) -> Tensor:
+    """Points (2, 1 + 3·rings·(rings + 1)) of equal areas of the pupil: the centre, and 6, 12, … on circles.
+
+    The first j rings and the centre fill the radius √((1 + 3j(j + 1))/N) of N points in all; each ring halves its area.
+    """
+    points = hexapolar(rings, **like)[0]
+    ring = torch.round(torch.hypot(*points) * rings)
+    radius = torch.sqrt((1 + 3 * ring * ring) / points.shape[1])
+    return torch.where(ring > 0, points * safe_divide(radius, torch.hypot(*points)), 0.0)
 
 
 def shares_of(lens: Lens, wavelengths: Tensor | None, weights: Tensor | None) -> Tensor:
@@ -87,7 +102,7 @@ def spot_diagram(
     columns = min(fields.shape[1], 4 if fields.shape[1] % 3 or fields.shape[1] == 12 else 3)
     rows = math.ceil(fields.shape[1] / columns)
     width = max(2.25 * columns, 5.6)
-    figure = style.new_figure(width, (width / columns if columns > 1 else 3.4) * 1.12 * rows + 1.05)
+    figure = style.new_figure(width, ((width / columns if columns > 1 else 3.4) + 0.55) * rows + 1.05)
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for f, panel in enumerate(axes):
         if f >= fields.shape[1]:
@@ -95,7 +110,7 @@ def spot_diagram(
             continue
         draw_spot(panel, whole, dots, f, wavelengths=wavelengths, airy=airy, half=half)
         panel.set_title(f"{style.field_title(lens)} {style.field_label(lens, fields[:, f])}")
-    name = "\n".join(textwrap.wrap(lens.name, int(11 * width))) or "Lens"
+    name = style.fill(lens.name, width, 11, bold=True) or "Lens"
     figure.suptitle(name, fontsize=11, fontweight="bold")
     legend = figure.legend(
         handles=wavelength_handles(wavelengths, airy),

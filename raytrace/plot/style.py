@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_rgb
+from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.patheffects import withStroke
@@ -120,6 +120,13 @@ def lens_fields(lens: Lens, fields: Tensor | None) -> Tensor:
 
 def field_colour(number: int) -> str:
     return FIELD_COLOURS[number % len(FIELD_COLOURS)]
+
+
+def field_colours(count: int) -> list[str]:
+    """A colour for each of so many fields; where there are too many to name, from dark to bright in their order."""
+    if count <= len(FIELD_COLOURS):
+        return [field_colour(f) for f in range(count)]
+    return [to_hex(matplotlib.colormaps["viridis"](0.92 * f / (count - 1))) for f in range(count)]
 
 
 def field_label(lens: Lens, field: Sequence[float]) -> str:
