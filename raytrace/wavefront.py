@@ -17,6 +17,8 @@ from raytrace.spot import where_lit
 from raytrace.trace import media
 from raytrace.value import value
 
+_WORST_CONDITION = 1e4  # of a fit of Zernike polynomials: beyond, its coefficients say nothing of the pupil
+
 
 @value
 class Wavefront:
@@ -166,12 +168,17 @@ def peak_to_valley(wavefront: Wavefront, *, empty: str = "nan") -> Tensor:
     return where_lit(lit, torch.where(lit, highest - lowest, 0.0), empty=empty)[0]
 
 
-def zernike_coefficients(wavefront: Wavefront, count: int = 37) -> Tensor:
+def zernike_coefficients(wavefront: Wavefront, count: int = 37, *, empty: str = "nan") -> Tensor:
     """Noll coefficients 1 … count (D, F, W, count) in mm RMS, fitted to the rays that arrive.
 
-    Raises ValueError where fewer rays than coefficients arrive.
+    empty: what they are where the light fills too little of the entrance pupil to tell them apart (a fit would enlarge
+    the least deviation ten thousand times, as in the middle 0.55 of the radius), see `spot`.
     """
-    return zernike.fit(wavefront.opd, _noll_basis(wavefront, count), wavefront.energy)
+    basis, energy = _noll_basis(wavefront, count), wavefront.energy
+    clear = zernike.condition(basis, energy.detach()) < _WORST_CONDITION
+    energy = torch.where(clear[..., None], energy, wavefront.weights)
+    found = zernike.fit(torch.where(clear[..., None], wavefront.opd, 0.0), basis, energy)
+    return where_lit(clear[..., None], found, empty=empty)[0]
 
 
 def without(wavefront: Wavefront, count: int) -> Tensor:

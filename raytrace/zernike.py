@@ -99,6 +99,17 @@ def fit(values: Tensor, basis: Tensor, weights: Tensor | None = None) -> Tensor:
     return torch.linalg.solve_triangular(r, right, upper=True)[..., 0]
 
 
+def condition(basis: Tensor, weights: Tensor) -> Tensor:
+    """By how much a fit may enlarge what its values err by (...): 1 on the whole disc, inf for too few points.
+
+    The largest over the smallest singular value of the weighted basis (J, P); weights: (..., P), not negative.
+    """
+    root = torch.sqrt(weights)
+    values = torch.linalg.svdvals(torch.linalg.qr(root[..., None] * basis.T, mode="r").R)
+    found = values[..., 0] / values[..., -1].clamp_min(torch.finfo(values.dtype).tiny)
+    return torch.where((weights > 0).sum(-1) < len(basis), torch.inf, found)
+
+
 def _jacobi(known: dict[int, list[Tensor]], m: int, k: int, t: Tensor) -> None:
     """Extend known[m] up to P_k^(0, m)(t)."""
     found = known.setdefault(m, [torch.ones_like(t)])

@@ -180,3 +180,12 @@ def test_info_says_infinite_or_nothing_where_there_is_no_number(run):
     touching = run("info", singlet("touching", ("DISZ INFINITY", "DISZ 0"))).out
     (line,) = (line for line in touching.splitlines() if "magnification" in line)
     assert line.split() == ["magnification", "-"]
+
+
+def test_a_cone_that_hardly_anything_passes_gives_no_absurd_numbers(run):
+    found = run("wavefront", "double_gauss", "--f-number", 0.5, "--field", 0, "--size", 8, "--json")
+    assert "field 0 degrees: the light fills too little of the entrance pupil for Zernike coefficients" in found.err
+    assert {row["coefficient"] for row in found.document["results"]} == {None}
+    assert found.document["summary"][0]["rms"] > 1
+    lost = run("illumination", "double_gauss", "--f-number", 0.1, "--samples", 3)
+    assert "nothing to show" in lost.err  # nor a solid angle of 1e13 sr

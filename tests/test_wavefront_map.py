@@ -181,3 +181,18 @@ def test_gradients_with_a_vignetted_ray():
 
     start = [torch.tensor(t, dtype=torch.float64, requires_grad=True) for t in (0.02, 66.0)]
     assert torch.autograd.gradcheck(statistics, start, eps=1e-6, atol=1e-7)
+
+
+def test_light_through_a_small_part_of_the_pupil_tells_no_coefficients():
+    """Not numbers of 1e14 waves; the RMS, which needs no polynomials, stays."""
+    lens = problems.double_gauss(aperture=("image_f_number", 0.5))
+    fast, slow = (
+        wavefront(scene(x, vector(0.0, 0.0)[:, None], vector(25e3), x.wavelengths), *gauss_rings(14, 56))
+        for x in (lens, problems.double_gauss())
+    )
+    assert fast.valid.sum() > 37
+    assert zernike_coefficients(fast).isnan().all()
+    assert rms(fast).isfinite()
+    assert zernike_coefficients(slow).isfinite().all()
+    with pytest.raises(EmptySpot):
+        zernike_coefficients(fast, empty="error")

@@ -97,3 +97,15 @@ def test_fit_finds_the_coefficients_whatever_is_cut_out_of_the_disc():
 def test_wrong_orders_are_refused():
     with pytest.raises(ValueError, match="n = 2, m = 1"):
         zernike.polynomials([(2, 1)], torch.zeros(1), torch.zeros(1))
+
+
+def test_condition_is_one_on_the_whole_disc_and_grows_as_light_fills_less_of_it():
+    points, weights = gauss_rings(14, 56)
+    basis = zernike.polynomials([zernike.noll(j) for j in range(1, 38)], *points)
+    radius = torch.linalg.vector_norm(points, dim=0)
+    parts = torch.stack([weights * (radius < r) for r in (1.0, 0.9, 0.7, 0.5, 0.05)])
+    found = zernike.condition(basis, parts)
+    assert found[0].item() == pytest.approx(1, rel=1e-12)
+    assert (found.diff()[:3] > 0).all()
+    assert found[2].item() == pytest.approx(torch.linalg.cond(parts[2].sqrt()[:, None] * basis.T).item(), rel=1e-6)
+    assert found[-1].isinf()

@@ -15,6 +15,7 @@ from raytrace.value import value
 from raytrace.wavefront import wavefront
 
 _RINGS = 24, 96
+_WORST_CONDITION = 1e8  # of the fit of that map
 _TERMS = 45  # Zernike terms (to degree 8) of the map from the pupil to directions
 
 
@@ -52,12 +53,15 @@ def relative_illumination(
     view = scene_of(lens, torch.cat([torch.zeros_like(fields[:, :1]), fields], 1), wavelengths)
     front = wavefront(view, points, weights)
     orders = [zernike.noll(j) for j in range(1, _TERMS + 1)]
-    enough = front.usable.sum(-1, keepdim=True) >= 2 * _TERMS
+    basis = zernike.polynomials(orders, *points)
+    # Where light comes through a small part of the pupil alone, the slopes of the map are not known from it.
+    enough = (zernike.condition(basis, front.usable * weights) < _WORST_CONDITION)[..., None]
     directions = torch.where(front.usable & enough, front.direction[:2], 0.0)
     share = torch.where(front.usable | ~enough, weights, 0.0)
-    fitted = zernike.fit(directions, zernike.polynomials(orders, *points), share)
+    fitted = zernike.fit(directions, basis, share)
     (L_x, M_x), (L_y, M_y) = (fitted @ slope for slope in zernike.gradients(orders, *points))
     jacobian = (L_x * M_y - L_y * M_x).abs()
     angle = math.pi * torch.where(front.valid & enough, weights * jacobian, 0.0).sum(-1)[0]
+    angle = torch.where(enough[0, ..., 0] | ~front.valid[0].any(-1), angle, torch.nan)
     solid = (angle * wavelength_weights(lens, wavelengths)).sum(-1)
     return RelativeIllumination(safe_divide(solid[1:], solid[:1].expand_as(solid[1:])), solid[1:], fields)

@@ -71,7 +71,8 @@ def wavefront_map(
 ) -> WavefrontMap:
     """OPD over `size` × `size` pupil points, and the Noll coefficients 1 … `terms` of 784 rays.
 
-    Raises ValueError where fewer rays than coefficients arrive.
+    What a field does not have is nan: everything where no ray arrives, the coefficients where the light fills too
+    little of the pupil.
     """
     view = scene_of(lens, fields, wavelengths)
     like = {"dtype": lens.wavelengths.dtype, "device": lens.wavelengths.device}

@@ -10,7 +10,7 @@ from raytrace import analysis
 from raytrace.analysis.frame import Tabular, flat
 from raytrace.cli.door import CommandError, field_points, number, open_lens, print_json, say
 from raytrace.cli.reach import check_reach, refuse_empty
-from raytrace.lens import FIELD_UNITS, Lens
+from raytrace.lens import FIELD_UNITS, Lens, name_of_field
 from raytrace.numerics import broadcast_shape
 
 _UNITS = {
@@ -59,6 +59,10 @@ def wavefront(arguments: argparse.Namespace) -> None:
     """Wavefront maps; the text is RMS, peak to valley and the Strehl ratio, the JSON also the coefficients."""
     lens, fields = opened(arguments, every=True)
     found = analysis.wavefront_map(lens, fields=fields, size=arguments.size)
+    unknown = found.coefficients[..., 0].isnan() & found.rms.isfinite()
+    for f in torch.nonzero(unknown.any(1))[:, 0].tolist():
+        field = f"field {name_of_field(found.fields[:, f])} {FIELD_UNITS[lens.fields.kind]}"
+        say(f"warning: {field}: the light fills too little of the entrance pupil for Zernike coefficients")
     report(arguments, lens, found, "wavefront_maps", summary=found.summary(), unit="waves")
 
 
