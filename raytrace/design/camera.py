@@ -104,8 +104,8 @@ class Camera(nn.Module):
             return self.pixels
         primary = lens.wavelengths[lens.primary_wavelength][None]
         rays = trace_scene(scene(lens, fields, distances, primary, self._memo), fields.new_zeros(2, 1))
-        chief = rays.position[:2, ..., 0].expand(2, len(distances), fields.shape[1], len(lens.wavelengths))
-        return dataclasses.replace(self.pixels, centre=self.pixels.centre[:, None, None, None] + chief)
+        chief = rays.position[:2, ..., 0, 0].expand(2, len(distances), fields.shape[1])
+        return dataclasses.replace(self.pixels, centre=self.pixels.centre[:, None, None] + chief)
 
     def image(self, picture: Tensor, object_distances: Tensor, field: int = 0) -> Tensor:
         """What falls on the sensor, without noise: (B, H - margin, W - margin)."""
