@@ -193,6 +193,10 @@ def test_rays_of_a_table_keep_their_form(command):
         ("spot double_gauss --plto spot.png", 2, "unknown option --plto; did you mean --plot?"),
         ("wave psf --elment=cubic", 2, "unknown option --elment; did you mean --element?"),
         ("wave psf --element cubc", 1, "did you mean cubic?"),
+        ("wave table --rows frsnel", 1, "did you mean fresnel?"),
+        ("wave quantise --element frsnel", 1, "did you mean fresnel?"),
+        ("codesign compar double_gauss", 1, "did you mean compare?"),
+        ("codesign double_gauss --field 5,5 --loss spectral", 1, "co-design takes field points along y"),
         ("psf double_gauss -o psf.png", 2, "'psf.png' is a picture: figures are saved by --plot"),
         ("mtf tessar --plot mtf.npz", 2, "'mtf.npz' is no picture (.png, .pdf, .svg)"),
         ("spot double_gauss --field 1,2,3", 2, "'1,2,3' is not a field point, Y or X,Y"),
@@ -207,6 +211,7 @@ def test_errors_say_what_may_have_been_meant(command, words, code, message):
     assert (found, out) == (code, "")
     assert message in err
     assert err.count("\n") == 1
+    assert [path.name for path in Path().iterdir()] == ["mine.zmx"]
 
 
 def test_nothing_near_is_nothing_said():

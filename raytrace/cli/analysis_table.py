@@ -112,7 +112,8 @@ ANALYSES = (
     (
         "mtf",
         "modulation transfer function",
-        "Tangential and sagittal MTF of each field, all wavelengths by their weights, through frequency or focus.",
+        "Tangential (of patterns that vary along y) and sagittal (along x) MTF of each field, all wavelengths by their "
+        "weights, through frequency or focus.",
         """examples:
   raytrace mtf double_gauss --object-distance 25000 --plot mtf.png
   raytrace mtf tessar --frequency 10 20 40 --geometric --json

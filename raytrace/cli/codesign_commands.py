@@ -17,6 +17,7 @@ from raytrace.cli.codesign_setup import (
     train_run,
 )
 from raytrace.cli.door import CommandError, print_json, say
+from raytrace.cli.options import did_you_mean
 from raytrace.design.codesign import LENS, STEPS, Outcome, variables
 from raytrace.design.limits import Limits
 from raytrace.design.optima import Optimum, closed_form
@@ -48,7 +49,9 @@ def codesign(arguments: argparse.Namespace) -> None:
     *before, arguments.lens = arguments.words
     form = before[0] if before else ""
     if len(before) > 1 or form not in _FORMS:
-        raise CommandError(f"{' '.join(arguments.words)}: expected LENS, compare LENS or sweep LENS")
+        raise CommandError(
+            f"{' '.join(arguments.words)}: expected LENS, compare LENS or sweep LENS{did_you_mean(form, _FORMS)}"
+        )
     for name, forms in _BELONG.items():
         if form not in forms and getattr(arguments, name) not in (None, False):
             raise CommandError(

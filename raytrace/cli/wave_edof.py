@@ -12,6 +12,7 @@ import torch
 
 from raytrace.cli.codesign_setup import plain
 from raytrace.cli.door import CommandError, print_json, say
+from raytrace.cli.options import did_you_mean
 from raytrace.cli.progress import progress
 from raytrace.cli.wave_edof_table import STARTS, STEPS
 from raytrace.design.edof import Quality, World, kernels, periodic, quality, spectrum
@@ -66,7 +67,8 @@ def table(arguments: argparse.Namespace) -> None:
     for option, given in (("rows", arguments.rows), ("also", arguments.also)):
         unknown = sorted(set(given or ()) - set(NAMES))
         if unknown:
-            raise CommandError(f"--{option} {' '.join(unknown)}: expected {', '.join(NAMES)}")
+            meant = did_you_mean(unknown[0], NAMES)
+            raise CommandError(f"--{option} {' '.join(unknown)}: expected {', '.join(NAMES)}{meant}")
     rows = [*(arguments.rows or (name for name, *_ in ROWS)), *(arguments.also or ())]
     world = World()
     contents, train = _contents(arguments)

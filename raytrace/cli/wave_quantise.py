@@ -9,6 +9,7 @@ from pathlib import Path
 from torch import Tensor
 
 from raytrace.cli.door import CommandError, print_json
+from raytrace.cli.options import did_you_mean
 from raytrace.cli.progress import progress
 from raytrace.cli.wave_setup import height_map, material
 from raytrace.cli.wave_superres import folders, page, pictures, write_csv
@@ -94,7 +95,8 @@ def _element(arguments, given: str, train: Pictures, S: Tensor) -> tuple[str, El
         return Path(given).name, made_of, dataclasses.replace(world, radius=0.5 * arguments.aperture)
     if given != "learned" and not Path(given).is_dir():
         raise CommandError(
-            f"--element {given}: expected fresnel, learned, the folder of a run, or a height map ({', '.join(FORMATS)})"
+            f"--element {given}: expected fresnel, learned, the folder of a run, or a height map "
+            f"({', '.join(FORMATS)}){did_you_mean(given, ('fresnel', 'learned'))}"
         )
     try:
         return (Path(given).name, *read(given, S)) if given != "learned" else _learned(arguments, world, train, S)
