@@ -20,7 +20,7 @@ from raytrace.wave.baselines import BASELINES, baseline
 from raytrace.wave.exchange import write_heights
 from raytrace.wave.fabrication import as_rings
 from raytrace.wave.label import read_label, write_element
-from raytrace.wave.plan import ENGINES
+from raytrace.wave.plan import ENGINES, plan
 from raytrace.wave.psf import psf
 from raytrace.wave.scene import WaveScene
 
@@ -123,6 +123,40 @@ def test_heights_keep_the_material_that_they_were_learned_for(run, tmp_path):
     code, _, err = run("psf", "--element", "bare.npy", "--aperture", "1", *SMALL)
     assert code == 1
     assert "pitch" in err
+
+
+def test_what_is_dear_is_said_or_refused(run):
+    """The cubic element at its full size: seconds where it was minutes; what no memory is left for is refused."""
+    words = ("psf", "--element", "cubic", "--depth", "1000", "--wavelength", "0.55")
+    code, out, err = run(*words, "--max-bytes", "10MB")
+    assert (code, out) == (1, "")
+    assert "GB a kernel, more than 0.01 GB; take fewer by --samples or --tol, a smaller window by --size" in err
+    parts = baseline("cubic", aim())
+    double = {"dtype": torch.float64}
+    seen = WaveScene(
+        parts,
+        torch.tensor(35.5, **double),
+        torch.tensor([500.0, 1000.0, math.inf], **double),
+        torch.tensor([0.46, 0.55, 0.64], **double),
+        grid(torch.tensor(0.00369, **double), 128),
+    )
+    chosen = plan(seen)
+    assert chosen.error < 1e-3
+    assert chosen.flops < 5e10
+    assert chosen.memory < 3e9
+
+
+def test_a_focusing_lens_of_other_measures(run, tmp_path):
+    """Half as wide, at another distance and wavelength, its features given."""
+    words = ("--aperture", "0.5", "--sensor", "12", "--wavelength", "0.64", "--feature", "0.01", "--size", "33")
+    code, out, err = run("focus", "--steps", "2", "--json", "-o", "lens.npy", *words)
+    assert code == 0, err
+    assert np.load(tmp_path / "lens.npy").shape == (50, 50)
+    label = read_label(tmp_path / "lens.npy")
+    assert (label.design_wavelength, label.pitch, label.aperture) == (0.64, 0.01, 0.5)
+    code, _, err = run("focus", "--wavelength", "0.5", "0.6")
+    assert code == 1
+    assert "a lens is learned at one wavelength" in err
 
 
 def test_heights_of_all_parts_are_drawn():

@@ -11,7 +11,7 @@ from problems import scalar
 from test_wave_propagation import PLASTIC, R, lens, relative, scene
 
 from raytrace.psf.dft import integrate, phasor, sub_pixels
-from raytrace.wave import radial
+from raytrace.wave import mixed, radial
 from raytrace.wave.aim import aim
 from raytrace.wave.baselines import baseline
 from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike
@@ -106,16 +106,17 @@ def limit(name: str) -> torch.Tensor:
 
 def polar_sum(s, nodes: int = 6, arms: int = 512) -> torch.Tensor:
     """The diffraction integral over Gauss radii between all steps and even angles: exact at rings, any angle."""
-    r, weight = radial._rule(radial.edges(s), nodes)
+    r, weight = radial.rule(radial.edges(s), nodes)
     angle = (torch.arange(arms, dtype=r.dtype) + 0.5) * (2 * math.pi / arms)
     x, y = ((r[:, None] * turn(angle)).flatten() for turn in (torch.cos, torch.sin))
     u, v, share = sub_pixels(s.grid, 4)
     wavelength = millimetres(s)[0]
     area = (weight[:, None] * (2 * math.pi / arms)).expand(-1, arms).flatten()
-    field = phasor(residual(s, x, y)[0, 0] / wavelength) * area
-    focal = s.sensor_distance * wavelength
-    along_x, along_y = (phasor(-place[:, None] * at / focal) for place, at in ((u, x), (v, y)))
-    U = (along_y * field) @ along_x.T / (focal * math.sqrt(math.pi) * aperture(s))
+    t, light = (one[:, None].expand(-1, arms) for one in radial.slope(s, r))
+    field = phasor(residual(s, x, y)[0, 0] / wavelength) * area * light.flatten()
+    tx, ty = ((t * turn(angle)).flatten() for turn in (torch.cos, torch.sin))
+    along_x, along_y = (phasor(-place[:, None] * at / wavelength) for place, at in ((u, tx), (v, ty)))
+    U = (along_y * field) @ along_x.T / (wavelength * math.sqrt(math.pi) * aperture(s))
     return integrate(U.real**2 + U.imag**2, share, s.grid.pitch)[None, None]
 
 
@@ -158,3 +159,44 @@ def test_width_and_steps_of_a_ring():
     assert float(spread(s).steps) == pytest.approx(4.0)
     flat = dataclasses.replace(s, elements=(lens(focus=500.0),), depths=scalar(1000.0)[None])
     assert float(spread(flat).width) == pytest.approx(R * 35.5e-3, rel=0.02)
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_a_kinoform_under_a_cubic_plate_is_computed_without_cutting_its_rings(exact):
+    """Beside the sum over every ring and angle, to half of what is predicted."""
+    elements = baseline("cubic", aim(radius=0.2, exact=exact))
+    seen = scene(*elements, depths=(500.0,), wavelengths=BLUE, size=8, exact=exact)
+    found = psf(seen)
+    assert found.plan.cells == "mixed"
+    assert found.error < 1e-3
+    assert relative(found.kernel, polar_sum(seen, nodes=4, arms=768)) < 0.5 * found.error
+
+
+def test_a_mixed_scene_does_not_depend_on_its_band():
+    """Twice the band of the round part, cells and radii with it: the same kernel to a tenth of what is predicted."""
+    seen = scene(*baseline("cubic", aim(radius=0.2)), depths=(1000.0,), wavelengths=GREEN, size=8)
+    chosen = plan(seen)
+    wider = dataclasses.replace(chosen, band=tuple(2 * end for end in chosen.band), samples=2 * chosen.samples, inner=8)
+    wider = dataclasses.replace(wider, extent=mixed.extent_of(seen, wider.band))
+    assert relative(psf(seen, plan=chosen).kernel, psf(seen, plan=wider).kernel) < chosen.error
+
+
+def test_heights_of_mixed_scenes_have_derivatives():
+    """Against differences of the peak pixel by one ring and by the strength of the plate."""
+    lens, plate = baseline("cubic", aim(radius=0.1))
+    base = scene(lens, plate, depths=(1000.0,), wavelengths=GREEN, size=4)
+    chosen = plan(base)
+
+    def peak(shift):
+        heights = lens.profile.heights.clone()
+        heights[30] = heights[30] + shift[0]
+        one = dataclasses.replace(lens, profile=Rings(heights, lens.profile.pitch))
+        other = dataclasses.replace(plate, profile=Zernike(plate.profile.coefficients * (1 + shift[1])))
+        return psf(dataclasses.replace(base, elements=(one, other)), plan=chosen).kernel[0, 0, 1, 2]
+
+    zero = torch.zeros(2, dtype=torch.float64)
+    slope = torch.func.grad(peak)(zero)
+    for k, step in enumerate((1e-7, 1e-4)):
+        aside = torch.zeros(2, dtype=torch.float64)
+        aside[k] = step
+        assert float(slope[k]) == pytest.approx(float(peak(aside) - peak(-aside)) / (2 * step), rel=1e-4)

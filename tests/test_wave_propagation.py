@@ -54,8 +54,8 @@ def along_x(s, x, samples=256):
     t = sums.x[0] / torch.sqrt(r2 * s.exact + s.sensor_distance**2)
     unfolded = dataclasses.replace(
         sums,
-        along_x=pupil._waves(x, t, wavelength),
-        along_y=pupil._waves(torch.zeros(1, dtype=x.dtype), t, wavelength),
+        along_x=pupil.waves_at(x, t, wavelength),
+        along_y=pupil.waves_at(torch.zeros(1, dtype=x.dtype), t, wavelength),
         folded=False,
     )
     return pupil.intensity(s, unfolded)[..., 0, :]

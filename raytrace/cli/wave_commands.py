@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from raytrace import plot
-from raytrace.cli.door import number, print_json, refuse_suffix, say
+from raytrace.cli.door import CommandError, number, print_json, refuse_suffix, say
 from raytrace.cli.progress import progress
 from raytrace.cli.wave_setup import elements, kernels, scene
 from raytrace.design.focusing import Learned, Setting, learn_to_focus
@@ -34,7 +34,13 @@ def psf(arguments: argparse.Namespace) -> None:
     drawn = {draw: path for name, draw in _FIGURES.items() if (path := getattr(arguments, name))}
     parts = elements(arguments)
     seen = scene(arguments, parts)
-    found = kernels(seen, engine=arguments.engine, samples=arguments.samples, tol=arguments.tol)
+    found = kernels(
+        seen,
+        engine=arguments.engine,
+        samples=arguments.samples,
+        tol=arguments.tol,
+        max_bytes=arguments.max_bytes,
+    )
     if arguments.output:
         write_atomically(arguments.output, lambda file: save(found, arguments.element, file))
     for draw, path in drawn.items():
@@ -161,9 +167,7 @@ def _print(found: WavePsf, arguments: argparse.Namespace) -> None:
 def focus(arguments: argparse.Namespace) -> None:
     """A flat plate learns to be a lens: print, draw, save."""
     refuse_suffix("-o", arguments.output, tuple(FORMATS))
-    setting = Setting(
-        method=arguments.method, samples=arguments.samples, seed=arguments.seed, collimator=arguments.collimator
-    )
+    setting = _setting(arguments)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # arrays are small: a second thread would only wait
     torch.optim.SGD([torch.zeros(1)], 1.0)  # torch loads its compiler with the first optimiser: no part of learning
@@ -187,6 +191,27 @@ def focus(arguments: argparse.Namespace) -> None:
         _print_course(found, seconds)
     for path in filter(None, (arguments.output, arguments.plot)):
         say(f"written: {path}")
+
+
+def _setting(arguments: argparse.Namespace) -> Setting:
+    """What `wave focus` learns."""
+    if len(arguments.wavelength) > 1:
+        raise CommandError("--wavelength: a lens is learned at one wavelength")
+    if arguments.feature and arguments.feature > 0.5 * arguments.aperture:
+        raise CommandError(
+            f"--feature {arguments.feature:g}: wider than half of the aperture of {arguments.aperture:g} mm"
+        )
+    return Setting(
+        diameter=arguments.aperture,
+        distance=arguments.sensor,
+        wavelength=arguments.wavelength[0],
+        samples=round(arguments.aperture / arguments.feature) if arguments.feature else arguments.samples,
+        pixel=arguments.pixel,
+        size=arguments.size,
+        method=arguments.method,
+        seed=arguments.seed,
+        collimator=arguments.collimator,
+    )
 
 
 def _course(found: Learned) -> dict:

@@ -38,7 +38,7 @@ LEAVES = {"sharp leaves": 2.5, "smooth leaves": 8.0}
 
 def edof(arguments: argparse.Namespace) -> None:
     """Learn one element, or go on with it; then say what it is worth."""
-    world, settings = World(), _settings(arguments)
+    world, settings = _world(arguments), _settings(arguments)
     train, test = _pictures(arguments)
     folder = Path(arguments.output)
     camera = _learn(settings, world, train, folder, f"{settings.kind}, seed {settings.seed}")
@@ -83,8 +83,26 @@ def table(arguments: argparse.Namespace) -> None:
         _print_table(found)
 
 
+def _world(arguments: argparse.Namespace) -> World:
+    if arguments.size % 2 == 0:
+        raise CommandError(f"--size {arguments.size}: a window needs a pixel at its middle; take an odd number")
+    return World(
+        radius=0.5 * arguments.aperture,
+        sensor_distance=arguments.sensor,
+        depths=tuple(arguments.depth),
+        design=arguments.focus,
+        wavelengths=tuple(arguments.wavelength),
+        pixel=arguments.pixel,
+        size=arguments.size,
+        noise=World.noise if arguments.noise is None else arguments.noise,
+        exact=arguments.exact,
+    )
+
+
 def _settings(arguments: argparse.Namespace) -> Settings:
     kind = arguments.element
+    if arguments.feature and kind != "rings":
+        raise CommandError(f"--feature {arguments.feature:g}: a {kind} element has no rings; take --element rings")
     if arguments.tolerance and kind != "rings":
         raise CommandError(f"--tolerance {arguments.tolerance:g}: a {kind} element has no rings; take --element rings")
     return Settings(
@@ -100,6 +118,8 @@ def _settings(arguments: argparse.Namespace) -> Settings:
         steps=arguments.steps,
         starts=arguments.starts,
         tolerance=1e-6 * (arguments.tolerance or 0.0),
+        pitch=arguments.feature or Settings.pitch,
+        noise=(arguments.noise, arguments.noise) if arguments.noise else Settings.noise,
         seed=arguments.seed,
     )
 

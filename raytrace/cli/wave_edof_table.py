@@ -2,15 +2,18 @@
 
 import argparse
 
-from raytrace.cli.options import count, file_name, json, output_folder, plot, positive_finite, seed_number
+from raytrace.cli.options import count, file_name, json, output_folder, plot, positive, positive_finite, seed_number
+from raytrace.cli.wave_options import camera, feature, light, pixels
 
 KINDS = ("rings", "smooth", "zernike")
 STEPS, STARTS = 120, 4
+_DEPTHS = (500.0, 2000 / 3, 1000.0, 2000.0, float("inf"))
 
 _EDOF_DESCRIPTION = """\
-Learn a phase element that shows scenes from 0.5 m to infinity, in three colours, behind one linear filter: 5 mm
-aperture, sensor at 35.5 mm. rings: free heights of 2 µm rings of fused silica; smooth: seven polynomials of the radius
-in PMMA; zernike: Noll's polynomials on a PMMA lens, without symmetry.
+Learn a phase element that shows scenes at all depths and in all colours behind one linear filter; by default from 0.5 m
+to infinity, with a 5 mm aperture and the sensor at 35.5 mm. rings: free heights of rings of fused silica, 2 µm wide or
+as --feature says; smooth: seven polynomials of the radius in PMMA; zernike: Noll's polynomials on a PMMA lens, without
+symmetry.
 
 --loss spectral is the expected error of the best blind filter in closed form: deterministic, no pictures drawn.
 --loss images draws pictures, depths and noise as the original did, with the filter in the loop. Both begin from the
@@ -59,6 +62,21 @@ def _edof(parser: argparse.ArgumentParser) -> None:
         metavar="NM",
         type=positive_finite,
         help="rings err in height by up to so many nm, drawn anew at every step (default 0)",
+    )
+    camera(parser)
+    light(parser, depths=_DEPTHS)
+    pixels(parser, across=255)
+    world = parser.add_argument_group("element and noise")
+    feature(world, "0.002 for rings")
+    world.add_argument(
+        "--focus",
+        metavar="MM",
+        type=positive,
+        default=1000.0,
+        help="depth that a filter is made for (default 1000)",
+    )
+    world.add_argument(
+        "--noise", metavar="S", type=positive_finite, help="standard deviation, of pictures from 0 to 1 (default 0.01)"
     )
     group = parser.add_argument_group("learning")
     group.add_argument("--loss", choices=("spectral", "images"), default="spectral", help="default spectral")

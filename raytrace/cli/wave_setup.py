@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from raytrace.catalog import find_glass
-from raytrace.cli.door import CommandError, catalogs
+from raytrace.cli.door import CommandError, catalogs, say
 from raytrace.cli.options import did_you_mean
 from raytrace.cli.progress import progress
 from raytrace.glass import Glass, check_wavelengths
@@ -33,7 +33,8 @@ from raytrace.wave.scene import WaveScene
 STEPPED = ("fresnel", "multifocal", "cubic", "achromat", "hybrid")
 _WAVELENGTH = 0.55
 _PIECE = 1e9  # bytes: what would take more is computed kernel by kernel
-_MOST = 0.9  # of the machine's memory
+_FEW = 3.0  # s: what takes more is said
+_RATE = 1.5e9  # operations of a plan in a second of one core, to a factor of three
 
 
 def aim(arguments: argparse.Namespace) -> Aim:
@@ -171,22 +172,35 @@ def scene(arguments: argparse.Namespace, parts: Sequence[Element]) -> WaveScene:
 
 
 @torch.no_grad()
-def kernels(found: WaveScene, *, engine: str, samples: int | None, tol: float) -> WavePsf:
-    """PSFs of a scene; where all at once would take too much memory, one after the other, with a bar.
+def kernels(found: WaveScene, *, engine: str, samples: int | None, tol: float, max_bytes: int | None = None) -> WavePsf:
+    """PSFs of a scene; where all at once would take too much memory, one after the other. What takes more than a few
+    seconds is said before it begins.
 
-    Raises CommandError where one alone is more than the machine has.
+    Raises CommandError where one kernel alone would take more than max_bytes (half of what is free).
     """
     chosen = plan(found, engine=engine, samples=samples, tol=tol)
     count = len(found.depths) * len(found.wavelengths)
-    available = _MOST * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    if chosen.memory / count > available:
+    limit = free_memory() / 2 if max_bytes is None else max_bytes
+    whole = chosen.memory < min(_PIECE, limit)
+    needed = chosen.memory if whole else chosen.memory / count
+    if needed > limit:
         raise CommandError(
-            f"{chosen.samples} samples take {chosen.memory / count / 1e9:.0f} GB a kernel, more than this machine has; "
-            "take fewer by --samples or --tol, or a smaller window"
+            f"{chosen.samples} samples take {needed / 1e9:.2g} GB a kernel, more than {limit / 1e9:.2g} GB; take fewer "
+            "by --samples or --tol, a smaller window by --size, or allow more by --max-bytes"
         )
-    if chosen.memory < _PIECE:
-        return psf(found, plan=chosen)
-    return _one_by_one(found, chosen)
+    seconds = chosen.flops / _RATE
+    if seconds > _FEW:
+        say(f"{count} kernels, {chosen.samples} samples: about {seconds:.0f} s and {needed / 1e9:.2g} GB")
+    return psf(found, plan=chosen) if whole else _one_by_one(found, chosen)
+
+
+def free_memory() -> float:
+    """Bytes that are free, as far as the system says."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        return 1024.0 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
+    except (OSError, StopIteration):
+        return 0.5 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def _one_by_one(found: WaveScene, chosen: Plan) -> WavePsf:

@@ -137,7 +137,7 @@ def _table_rows(block: _Block) -> list[tuple[str, str, str, str, str]]:
         for row in found:
             closed = "–" if row.closed is None else f"{row.closed:.2f}"
             rows.append((scene, row.name, closed, f"{row.psnr:.2f}", f"{row.psnr - found[0].psnr:+.2f}"))
-        rows.append((scene, "no one equation beats", f"{bound:.2f}", "–", "–"))
+        rows.append((scene, "upper bound of one image", f"{bound:.2f}", "–", "–"))
     return rows
 
 
@@ -228,7 +228,7 @@ def _superres_page(arguments, blocks: Sequence[_Block], kind: str, noises: list[
 _SUPERRES_TEXT = """## What it shows
 
 * **A scene that fills the sensor**: every frequency of the image is one equation for s² aliases. No kernel can do
-  better, in closed form, than to show the strongest alias and to lose the others (*no one equation beats*): what is
+  better, in closed form, than to show the strongest alias and to lose the others (*upper bound of one image*): what is
   learned is a better low pass than the lens, no more. Restored test pictures may lie above the bound, because they have
   another spectrum than the pictures the filter was made for. Showing such a scene at three places does not help:
   the copies add up to one image, one equation.

@@ -6,34 +6,19 @@ SUBCOMMANDS holds (name, summary, description, examples, add_arguments, "module.
 import argparse
 
 from raytrace.cli.options import (
-    catalog,
     count,
     file_name,
     json,
     output,
     picture_file,
     plot,
-    positive,
-    positive_finite,
     seed_number,
-    size,
 )
 from raytrace.cli.wave_edof_table import EDOF
+from raytrace.cli.wave_options import ELEMENTS as ELEMENTS
+from raytrace.cli.wave_options import ENGINES as ENGINES
+from raytrace.cli.wave_options import camera, element, engine, feature, light, max_bytes, pixels
 from raytrace.cli.wave_superres_table import SUPERRES
-
-#: The names that `--element` takes beside files: those of wave.baselines.
-ELEMENTS = (
-    "ideal",
-    "singlet",
-    "fresnel",
-    "multifocal",
-    "multifocal-refractive",
-    "cubic",
-    "cubic-refractive",
-    "achromat",
-    "hybrid",
-)
-ENGINES = ("auto", "pupil", "radial", "fresnel", "angular_spectrum")
 
 _DESCRIPTION = """\
 Waves behind a thin phase element: point spread functions over depth and colour, and elements that are learned from
@@ -43,116 +28,6 @@ _EXAMPLES = """examples:
   raytrace wave psf --element singlet --focus 1000 --depth 500 1000 inf -o psf.npz --plot psf.png
   raytrace wave psf --element fresnel --wavelength 0.46 0.55 0.64 --json
   raytrace wave focus --json"""
-
-
-# -- arguments that subcommands share ----------------------------------------------------------------------------------
-
-
-def camera(parser: argparse.ArgumentParser, *, exact: bool = True) -> None:
-    """--aperture, --sensor, --exact: what every wave camera has."""
-    group = parser.add_argument_group("camera")
-    group.add_argument(
-        "--aperture", metavar="MM", type=positive_finite, default=5.0, help="diameter of the aperture (default 5)"
-    )
-    group.add_argument(
-        "--sensor", metavar="MM", type=positive_finite, default=35.5, help="from element to sensor (default 35.5)"
-    )
-    if exact:
-        group.add_argument(
-            "--exact", action="store_true", help="true spheres instead of Fresnel's paraboloids, in design and PSF"
-        )
-
-
-def element(parser: argparse.ArgumentParser) -> None:
-    """--element and what makes one: focus, design wavelength, levels; glass, pitch and span of a file."""
-    group = parser.add_argument_group("element")
-    group.add_argument(
-        "--element",
-        metavar="NAME|FILE",
-        type=file_name,
-        default="singlet",
-        help=f"{', '.join(ELEMENTS)} (default singlet), or a height map: .npy, .csv, .png, .tif, .dat, .grd",
-    )
-    group.add_argument(
-        "--focus",
-        metavar="MM",
-        type=positive,
-        default=1000.0,
-        help="object distance that a named element is made for; inf allowed (default 1000)",
-    )
-    group.add_argument(
-        "--design-wavelength",
-        metavar="UM",
-        type=positive_finite,
-        help="that it is made for, and wrapped at (default 0.55); a file's heights are wrapped only if this is given",
-    )
-    group.add_argument(
-        "--levels", metavar="N", type=count, help="steps of a wave's height, of wrapped elements (default any height)"
-    )
-    group.add_argument("--glass", metavar="NAME", help="material of a file's element (default: that of its FILE.json)")
-    group.add_argument(
-        "--index",
-        metavar="N",
-        type=positive_finite,
-        nargs="+",
-        help="refractive index of a file's element at each --wavelength, instead of --glass",
-    )
-    group.add_argument("--pitch", metavar="MM", type=positive_finite, help="of a file that does not say it")
-    group.add_argument(
-        "--span", metavar="MM", type=float, nargs=2, help="heights of black and white of a picture that does not say"
-    )
-    catalog(group)
-
-
-def light(parser: argparse.ArgumentParser, *, depths: tuple[float, ...] = (500.0, 1000.0, float("inf"))) -> None:
-    """--depth, --wavelength: the point sources."""
-    group = parser.add_argument_group("light")
-    listed = " ".join(f"{depth:g}" for depth in depths)
-    group.add_argument(
-        "--depth",
-        metavar="MM",
-        type=positive,
-        nargs="+",
-        default=list(depths),
-        help=f"distances of points on the axis; inf allowed (default {listed})",
-    )
-    group.add_argument(
-        "--wavelength",
-        metavar="UM",
-        type=positive_finite,
-        nargs="+",
-        default=[0.46, 0.55, 0.64],
-        help="in µm (default 0.46 0.55 0.64)",
-    )
-
-
-def pixels(parser: argparse.ArgumentParser, *, across: int = 128) -> None:
-    """--pixel, --size: the window of the PSF."""
-    group = parser.add_argument_group("window")
-    group.add_argument(
-        "--pixel", metavar="MM", type=positive_finite, default=0.00369, help="pixel pitch (default 0.00369)"
-    )
-    size(group, f"the window, centred on the axis (default {across})", default=across)
-
-
-def engine(parser: argparse.ArgumentParser) -> None:
-    """--engine, --samples, --tol: how PSFs are computed."""
-    group = parser.add_argument_group("sampling")
-    group.add_argument(
-        "--engine",
-        choices=ENGINES,
-        default="auto",
-        help="auto (default): radial for round elements, else pupil; fresnel and angular_spectrum are references",
-    )
-    group.add_argument(
-        "--samples",
-        metavar="N",
-        type=count,
-        help="across the aperture (radial: between steps of the element) instead of as many as --tol needs",
-    )
-    group.add_argument(
-        "--tol", metavar="T", type=positive_finite, default=1e-3, help="predicted relative L2 error (default 1e-3)"
-    )
 
 
 # -- the subcommands ---------------------------------------------------------------------------------------------------
@@ -171,6 +46,7 @@ def _psf(parser: argparse.ArgumentParser) -> None:
     light(parser)
     pixels(parser)
     engine(parser)
+    max_bytes(parser)
     json(parser)
     output(
         parser,
@@ -186,6 +62,10 @@ def _focus(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--collimator", action="store_true", help="the other way round: a point at the front focus, a plane wave out"
     )
+    camera(parser, exact=False, across=1.0, sensor=25.0)
+    light(parser, depths=(), wavelengths=(0.55,))
+    pixels(parser, across=65, pitch=0.004)
+    feature(parser, "the aperture over --samples")
     parser.add_argument("--method", choices=("sgd", "adam"), default="sgd", help="SGD with momentum (default), or Adam")
     parser.add_argument("--steps", metavar="N", type=count, default=300, help="at most (default 300)")
     parser.add_argument(
@@ -219,16 +99,17 @@ _PSF_EXAMPLES = """examples:
   raytrace wave psf --element ideal --depth 500 --engine fresnel --samples 2500 --json"""
 
 _FOCUS_DESCRIPTION = """\
-Learn a lens from pictures: a flat plate of free heights, 1 mm wide, 25 mm before a sensor, at 0.55 µm, is told nothing
-but to make the images of dead leaves equal to the leaves. `peak_ratio` is the peak of its PSF over that of the ideal
-continuous lens, both over the light through the aperture; seconds on one core.
+Learn a lens from pictures: a flat plate of free heights is told nothing but to make the images of dead leaves far away
+equal to the leaves. It is --aperture wide, --sensor before the sensor, for one --wavelength. `peak_ratio` is the peak
+of its PSF over that of the ideal continuous lens, both over the light through the aperture; seconds on one core.
 
---collimator learns the element that turns a point 25 mm before it into a plane wave: the peak of its far field, and the
-RMS phase that is left, in waves."""
+--collimator learns the element that turns a point as far before it as --sensor into a plane wave: the peak of its far
+field, and the RMS phase that is left, in waves."""
 
 _FOCUS_EXAMPLES = """examples:
   raytrace wave focus --json
   raytrace wave focus --method adam --plot focus.png -o lens.npy
+  raytrace wave focus --aperture 0.5 --sensor 10 --wavelength 0.64 --samples 64
   raytrace wave focus --collimator --steps 200"""
 
 SUBCOMMANDS = (

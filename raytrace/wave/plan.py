@@ -12,7 +12,7 @@ where that is above 1e-4. Stray light, spread evenly with a density ε per mm²,
 
 import math
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -21,6 +21,7 @@ from raytrace.psf.ladder import NotConverged
 from raytrace.psf.radial import is_centred, reach
 from raytrace.wave import propagate, radial
 from raytrace.wave.element import Pixels, Rings
+from raytrace.wave.mixed import deflection, extent_of, is_mixed, radii_of_band, round_part
 from raytrace.wave.pupil import cells_across
 from raytrace.wave.scene import WaveScene, aperture, check, is_round, is_smooth, millimetres
 from raytrace.wave.spread import blur, blur_of_pixels, is_free, slopes, spread
@@ -38,10 +39,11 @@ class Plan:
     """How to compute the PSFs of a scene.
 
     engine: one of ENGINES; samples: cells or samples across the aperture (`radial`: Gauss radii between steps);
-    nodes: per pixel and axis (`radial`: of its rule); cells: "smooth", "sampled" or "flat", what stands in a cell of
-    the pupil; extent: of the cells over the diameter; inner: Gauss nodes in a flat cell, parts: cells
-    along a flat pixel; pad, band_limit: of the
-    transfer functions. error: predicted, relative L2 of the worst kernel; flops, memory (bytes): predicted.
+    nodes: per pixel and axis (`radial`: of its rule); cells: "smooth", "sampled", "flat" or "mixed" (`wave.mixed`):
+    what stands in a cell of the pupil; extent: of the cells over the diameter; inner: Gauss nodes in a flat cell, or
+    radii between steps; parts: cells along a flat pixel; pad, band_limit: of the transfer functions; band: mm on the
+    sensor over which the round part fades out (mixed). error: predicted, relative L2 of the worst kernel; flops, memory
+    (bytes): predicted.
     """
 
     engine: str
@@ -56,6 +58,7 @@ class Plan:
     parts: int = 1
     pad: float = 1.0
     band_limit: bool = True
+    band: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -167,6 +170,8 @@ def _setting(scene: WaveScene) -> _Setting:
 
 
 def _pupil(scene: WaveScene, s: _Setting, samples: int | None, nodes: int, tol: float) -> Plan:
+    if samples is None and is_mixed(scene):
+        return _mixed(scene, s, nodes, tol)
     least = s.diameter * (s.reach + s.blur) / (s.shortest * s.distance)
     if samples is not None and samples < least and not _only_pixels(scene):
         raise AliasedSampling(
@@ -201,6 +206,27 @@ def _pupil(scene: WaveScene, s: _Setting, samples: int | None, nodes: int, tol: 
     flops = 2 * D * W * (K * cells**2 + K**2 * cells + 30 * cells**2) * (1 if kind != "flat" else 4)
     memory = s.bytes * (D * W * (6 * cells**2 + 4 * K * cells + 8 * K**2) + 4 * W * K * cells)
     return Plan("pupil", samples, nodes, error, flops, memory, cells=kind, extent=extent, inner=inner, parts=parts)
+
+
+def _mixed(scene: WaveScene, s: _Setting, nodes: int, tol: float) -> Plan:
+    """Smooth cells behind a round part that is known within a band: what the free part takes into the window's corner,
+    and 25 Airy radii beyond, where light diffracted at the rim has faded."""
+    longest = float(millimetres(scene).detach().max())
+    aside, beyond = deflection(scene, 1.0), 25 * longest * s.distance / s.diameter
+    near = math.sqrt(2) * s.reach + aside + beyond
+    band = near, 1.4 * near
+    extent = extent_of(scene, band)
+    period = band[1] + deflection(scene, extent) + beyond + s.reach
+    samples = _even(extent * s.diameter * period / (s.shortest * s.distance))
+    half, turned = _half_phases(round_part(scene), replace(s, reach=band[1] / math.sqrt(2)))
+    inner = _count(half, 0.1 * tol)
+    error = _node_error(s, nodes) + _radius_error(turned, inner) + 3e-4
+    D, W = s.kernels
+    K, J, n = s.size * nodes, inner * (len(radial.edges(round_part(scene))) - 1), radii_of_band(scene, band)
+    T = 20 * n
+    flops = W * n * (J + T) * (60 + 4 * D) + D * W * (K * samples**2 + K**2 * samples + 150 * samples**2)
+    memory = s.bytes * (W * n * (J + T) + (2 * W + 8) * samples**2 * 4 + D * W * 8 * K**2)
+    return Plan("pupil", samples, nodes, error, flops, memory, cells="mixed", extent=extent, inner=inner, band=band)
 
 
 def _radial(scene: WaveScene, s: _Setting, samples: int | None, nodes: int | None, tol: float) -> Plan:

@@ -5,8 +5,9 @@ from torch import Tensor
 from raytrace.grid import Grid
 from raytrace.psf.dft import integrate
 from raytrace.value import value
+from raytrace.wave import mixed, propagate, pupil, radial
 from raytrace.wave import plan as planning
-from raytrace.wave import propagate, pupil, radial
+from raytrace.wave.mixed import MixedSums
 from raytrace.wave.plan import Plan
 from raytrace.wave.pupil import PupilSums
 from raytrace.wave.radial import RadialSums
@@ -75,10 +76,12 @@ def psf(
     return WavePsf(_kernels(scene, plan, memo), scene.depths, scene.wavelengths, scene.grid, plan)
 
 
-def prepare(scene: WaveScene, plan: Plan) -> RadialSums | PupilSums:
+def prepare(scene: WaveScene, plan: Plan) -> RadialSums | PupilSums | MixedSums:
     """What the heights do not change, of the engines that have it."""
     if plan.engine == "radial":
         return radial.prepare(scene, plan.samples, radial.order_of(scene, plan.nodes))
+    if plan.cells == "mixed":
+        return mixed.prepare(scene, plan.samples, plan.nodes, extent=plan.extent, radii=plan.inner, band=plan.band)
     if plan.cells == "flat":
         return pupil.prepare_pixels(scene, plan.nodes, plan.inner, parts=plan.parts)
     return pupil.prepare(scene, plan.samples, plan.nodes, extent=plan.extent)
@@ -98,4 +101,5 @@ def _kernels(scene: WaveScene, plan: Plan, memo: Memo | None) -> Tensor:
     sums = prepare(scene, plan) if memo is None else memo.find(scene, plan, prepare)
     if plan.engine == "radial":
         return radial.kernels(scene, sums)
-    return integrate(pupil.intensity(scene, sums), sums.pixel, scene.grid.pitch)
+    light = (mixed if plan.cells == "mixed" else pupil).intensity(scene, sums)
+    return integrate(light, sums.pixel, scene.grid.pitch)

@@ -60,7 +60,7 @@ def prepare(scene: WaveScene, samples: int, nodes: int, *, extent: float = 1.0) 
     t = edge * R.new_tensor((2 * np.arange(len(cells)) + 1) / len(cells) - 1) * extent
     u, v, pixel = sub_pixels(scene.grid, nodes)
     folded = is_centred(scene.grid)
-    along_x, along_y = ((_halves if folded else _waves)(s, t, wavelength) for s in (u, v))
+    along_x, along_y = ((halves if folded else waves_at)(s, t, wavelength) for s in (u, v))
     t2 = t * t + (t * t)[:, None]
     stretch = 1 / torch.sqrt(1 - torch.clamp(t2, max=0.99)) if scene.exact else torch.ones_like(t2)
     x, y = z * t * stretch, z * t[:, None] * stretch
@@ -92,11 +92,18 @@ def intensity(scene: WaveScene, sums: PupilSums) -> Tensor:
         waves = path(scene.elements, sums.x, sums.y, scene.wavelengths)
     else:
         waves = residual(scene, sums.x, sums.y, sums.sphere)
-    U = phasor(waves / millimetres(scene)[:, None, None])
+    return light_of(scene, sums, sums.weight * phasor(waves / millimetres(scene)[:, None, None]))
+
+
+def light_of(scene: WaveScene, sums, U: Tensor) -> Tensor:
+    """|U|² (..., W, Y, X) at the nodes of the pixels, of light through cells (..., W, N, N).
+
+    sums: their matrices `along_x`, `along_y`, and whether they are `folded`, as of `PupilSums`.
+    """
     if sums.folded:
         nodes = tuple(n * len(sums.pixel) for n in scene.grid.shape)
-        return _folded_intensity(sums, torch.stack([sums.weight * U.real, sums.weight * U.imag]), nodes)
-    U = sums.along_y @ (sums.weight * U) @ sums.along_x.mT
+        return _folded_intensity(sums, torch.stack([U.real, U.imag]), nodes)
+    U = sums.along_y @ U @ sums.along_x.mT
     return U.real**2 + U.imag**2
 
 
@@ -145,14 +152,14 @@ def _cell_areas(x: Tensor, y: Tensor) -> Tensor:
     return quadrant.diff(dim=0).diff(dim=1).clamp(min=0.0)
 
 
-def _waves(u: Tensor, t: Tensor, wavelength: Tensor) -> Tensor:
+def waves_at(u: Tensor, t: Tensor, wavelength: Tensor) -> Tensor:
     """exp(-2πi u t/λ): (W, U, N)."""
     return phasor(-u[:, None] * t / wavelength[:, None, None])
 
 
-def _halves(u: Tensor, t: Tensor, wavelength: Tensor) -> Tensor:
+def halves(u: Tensor, t: Tensor, wavelength: Tensor) -> Tensor:
     """cos and sin of 2π u t/λ at the upper halves of symmetric points: (2, W, ⌈U/2⌉, ⌈N/2⌉)."""
-    wave = _waves(u[len(u) // 2 :], t[len(t) // 2 :], wavelength)
+    wave = waves_at(u[len(u) // 2 :], t[len(t) // 2 :], wavelength)
     cosine = wave.real
     if len(t) % 2:  # the point in the middle is its own image
         cosine = torch.cat([0.5 * cosine[..., :1], cosine[..., 1:]], -1)

@@ -40,7 +40,7 @@ class RadialSums:
 def prepare(scene: WaveScene, nodes: int, order: int) -> RadialSums:
     """Constants for `nodes` Gauss radii between steps, and an order of the radii on the sensor (`radii_of_waves`)."""
     R, wavelength = aperture(scene), millimetres(scene)[:, None, None]
-    r, weight = _rule(edges(scene), nodes)
+    r, weight = rule(edges(scene), nodes)
     t, light = slope(scene, r)
     rho, to_pixels = radii_of_waves(scene.grid, cutoff(scene), order)
     scale = 2 * math.sqrt(math.pi) / (R * wavelength)
@@ -65,7 +65,7 @@ def intensity(scene: WaveScene, sums: RadialSums) -> Tensor:
 
 def field(scene: WaveScene, rho: Tensor, nodes: int) -> Tensor:
     """U (D, W, K) at radii rho (K,) mm on the sensor, |U|² per mm² as `intensity`."""
-    r, weight = _rule(edges(scene), nodes)
+    r, weight = rule(edges(scene), nodes)
     t, light = slope(scene, r)
     wavelength = millimetres(scene)
     waves = path(scene.elements, r, torch.zeros_like(r), scene.wavelengths) + spheres(scene, r * r)[:, None]
@@ -124,7 +124,7 @@ def _jumps(element: Element, radius: Tensor) -> Tensor:
     return torch.sqrt(r[at] ** 2 + share * (r[at + 1] ** 2 - r[at] ** 2))
 
 
-def _rule(edges: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
+def rule(edges: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
     """Radii (J,) mm and weights (J,) mm² of ∫ f r dr: Gauss nodes in r² between each pair of edges."""
     place, share = (edges.new_tensor(a) / 2 for a in np.polynomial.legendre.leggauss(nodes))
     s = edges * edges
