@@ -149,7 +149,7 @@ def test_what_is_dear_is_said_or_refused(run):
 def test_a_focusing_lens_of_other_measures(run, tmp_path):
     """Half as wide, at another distance and wavelength, its features given."""
     words = ("--aperture", "0.5", "--sensor", "12", "--wavelength", "0.64", "--feature", "0.01", "--size", "33")
-    code, out, err = run("focus", "--steps", "2", "--json", "-o", "lens.npy", *words)
+    code, _, err = run("focus", "--steps", "2", "--json", "-o", "lens.npy", *words)
     assert code == 0, err
     assert np.load(tmp_path / "lens.npy").shape == (50, 50)
     label = read_label(tmp_path / "lens.npy")

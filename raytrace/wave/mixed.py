@@ -113,7 +113,7 @@ def prepare(
     axis = (torch.arange(cells, dtype=R.dtype, device=R.device) - 0.5 * (cells - 1)) * dt
     t2 = axis * axis + (axis * axis)[:, None]
     step = float(millimetres(scene).detach().min()) / (_POINTS * band[1])
-    table = step * torch.arange(math.ceil(float(edge) * extent * math.sqrt(2) / step) + 4, dtype=R.dtype)
+    table = step * torch.arange(math.ceil(float(edge) * extent * math.sqrt(2) / step) + 4).to(R)
     back = 2 * math.pi / wavelength**2 * part * bessel_j0(2 * math.pi * table[:, None] * rho / wavelength)
     u, v, pixel = sub_pixels(scene.grid, nodes)
     folded = is_centred(scene.grid)
