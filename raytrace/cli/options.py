@@ -195,8 +195,8 @@ def fields(parser: argparse.ArgumentParser, *, default: str = "") -> None:
         metavar="F",
         type=field_point,
         nargs="+",
-        help="field points, Y or X,Y, in the file's own kind of field (degrees or mm), never an index; vignetting factors "
-        "are interpolated between the file's own fields" + (f" (default {default})" if default else ""),
+        help="field points, Y or X,Y, in the file's own kind of field (degrees or mm), never an index; vignetting "
+        "factors are interpolated between the file's own fields" + (f" (default {default})" if default else ""),
     )
 
 
