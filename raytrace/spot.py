@@ -12,7 +12,7 @@ from raytrace.value import value
 class Spot:
     """Statistics over the last axis of a batch of rays; entries (...), mm.
 
-    centroid: (2, ...); rms_radius and geometric_radius (the largest distance) are about the centroid.
+    centroid: (2, ...); rms_radius and geometric_radius (the largest distance) are about it, or about another point.
     mean_square_radius: mm², smooth where the RMS is 0: minimise this one.
     points: (2, ..., P) and valid: (..., P) what was averaged; rays: how many were valid.
 
@@ -34,16 +34,21 @@ class EmptySpot(ValueError):
     """No ray of a spot arrives: it has no centroid and no radius."""
 
 
-def spot(rays: Rays, weights: Tensor | None = None, *, empty: str = "nan") -> Spot:
+def spot(rays: Rays, weights: Tensor | None = None, *, about: Tensor | None = None, empty: str = "nan") -> Spot:
     """Spot of rays (3, ..., P) over their last axis, invalid ones left out; weights: (P,) or (..., P), 1 by default.
 
+    about: (2, ...) mm, from where radii count, the centroid by default. Equally weighted hexapolar rays about the
+    primary wavelength's chief ray are the default of OpticStudio; by the area that a ray stands for, about the
+    centroid, a spot has the moments of the light.
     empty: what a spot without rays is: "nan", or "error", which raises EmptySpot and looks at the numbers to do so.
     """
-    return spot_of_points(rays.position[:2], rays.valid, weights, empty=empty)
+    return spot_of_points(rays.position[:2], rays.valid, weights, about=about, empty=empty)
 
 
-def spot_of_points(points: Tensor, valid: Tensor, weights: Tensor | None = None, *, empty: str = "nan") -> Spot:
-    """Spot of points (2, ..., P) mm; `empty` as for `spot`.
+def spot_of_points(
+    points: Tensor, valid: Tensor, weights: Tensor | None = None, *, about: Tensor | None = None, empty: str = "nan"
+) -> Spot:
+    """Spot of points (2, ..., P) mm; `about` and `empty` as for `spot`.
 
     One point is subtracted before the mean is formed, so that a spot of 1 pm 1 m off the axis keeps its digits; a spot
     of one ray has radius 0 and gradient 0.
@@ -56,7 +61,8 @@ def spot_of_points(points: Tensor, valid: Tensor, weights: Tensor | None = None,
     reference = torch.where(first, points, 0.0).sum(-1, keepdim=True)
     offset = torch.where(valid, points - reference, 0.0)
     mean = (share * offset).sum(-1, keepdim=True)
-    centred = torch.where(valid, offset - mean, 0.0)
+    centre = mean if about is None else about[..., None] - reference
+    centred = torch.where(valid, offset - centre, 0.0)
     mean_square = (share * (centred[0] ** 2 + centred[1] ** 2)).sum(-1)
     # The radii are formed in units of a power of two near the largest coordinate: squares of 1e-200 or 1e200 are none.
     scale = _power_of_two(centred)

@@ -53,6 +53,7 @@ FLOORS = {
     "losses": 7,
     "reuse": 7,
     # 8
+    "f_number": 8,
     "scene": 8,
     "streaming": 8,
     # 9
@@ -218,6 +219,7 @@ PHYSICS = [
     "launch",
     "spot",
     "focus",
+    "f_number",
     "wavefront",
 ]
 

@@ -1,6 +1,7 @@
 """First order: the limit of real rays, the identities of Gaussian optics, conjugates, mirrors and pupils."""
 
 import dataclasses
+import json
 import math
 from fractions import Fraction
 from pathlib import Path
@@ -9,7 +10,9 @@ import pytest
 import torch
 from problems import aspheric_singlet, double_gauss, fields, lens, scalar, surface, vector
 
-from raytrace.formats import read_lens
+from raytrace.cli import main
+from raytrace.f_number import real_working_f_number
+from raytrace.formats import read_lens, write_lens
 from raytrace.glass import MIRROR
 from raytrace.lens import with_object_distance
 from raytrace.paraxial import first_order, paraxial_image_distance, signed, system_matrix
@@ -259,3 +262,32 @@ def test_a_lens_telecentric_in_object_space_keeps_its_cone():
     assert data.object_na.item() == pytest.approx(0.1, rel=1e-12)
     assert data.optical_invariant.item() == pytest.approx(3.0 * 0.1 / math.sqrt(0.99), rel=1e-12)
     assert bool(torch.isfinite(data.working_f_number))
+
+
+def test_the_real_working_f_number_is_of_the_sine_of_the_real_ray():
+    """A paraboloid of focal length f: sin θ = h/(f + h²/4f) of the ray at height h; nan for a lens that loses it."""
+    f, h = 100.0, 60.0
+    mirror = lens([surface(-1 / (2 * f), -f, MIRROR, conic=-1.0)], aperture=("entrance_pupil_diameter", 2 * h))
+    sine = h / (f + h * h / (4 * f))  # the focus is f + h²/4f away from where the ray meets the mirror
+    assert real_working_f_number(mirror).item() == pytest.approx(1 / (2 * sine), rel=1e-12)
+    assert first_order(mirror).working_f_number.item() == pytest.approx(f / (2 * h), rel=1e-12)
+    immersed = lens([surface(0.05, 60.0, 1.5)], aperture=("entrance_pupil_diameter", 1e-3))
+    assert real_working_f_number(immersed).item() == pytest.approx(
+        first_order(immersed).working_f_number.item(), rel=1e-6
+    )
+    assert bool(
+        real_working_f_number(lens([surface(0.2, 10.0, 1.5)], aperture=("entrance_pupil_diameter", 12.0))).isnan()
+    )
+
+
+def test_info_prints_what_does_not_exist_as_a_dash(capsys, tmp_path):
+    afocal = lens([surface(None, 5.0, 1.5), surface(None, 20.0)], field=fields("angle", (3.0,)))
+    write_lens(afocal, tmp_path / "plate.csv")
+    assert main(["info", str(tmp_path / "plate.csv")]) == 0
+    text = capsys.readouterr().out
+    assert "nan" not in text
+    assert "optical invariant" in text
+    assert main(["info", str(tmp_path / "plate.csv"), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["optical_invariant"] == pytest.approx(5.0 * math.tan(math.radians(3.0)))
+    assert document["real_working_f_number"] is None

@@ -1,5 +1,6 @@
 """Spot: the statistics of points, exact where the textbook formulas cancel, and never NaN."""
 
+import json
 import math
 
 import numpy as np
@@ -7,6 +8,12 @@ import pytest
 import torch
 from test_hardcases import of_kind
 
+from raytrace import pupil
+from raytrace.analysis import chief_reference
+from raytrace.cli import main
+from raytrace.files import shipped
+from raytrace.focus import image_rays
+from raytrace.formats import read_lens
 from raytrace.rays import Rays
 from raytrace.spot import EmptySpot, spot, spot_of_points
 
@@ -180,3 +187,37 @@ def test_spot_of_rays_ignores_lost_ones():
     found = spot(Rays(position, direction, torch.tensor([True, True, False])))
     assert found.centroid.tolist() == [0.5, 0.0]
     assert found.rms_radius == found.geometric_radius == 0.5
+
+
+def test_radii_about_another_point_follow_the_theorem_of_parallel_axes():
+    """Mean square about a point = about the centroid + distance², and the largest radius is counted from there."""
+    generator = np.random.default_rng(2)
+    points, weights = tensor(generator.normal(size=(2, 3, 40))), tensor(generator.random(40))
+    valid = torch.as_tensor(generator.random((3, 40)) < 0.8)
+    about = tensor([[0.3], [-1.0]]).requires_grad_()
+    own, other = (spot_of_points(points, valid, weights, about=at) for at in (None, about))
+    torch.testing.assert_close(other.centroid, own.centroid)
+    apart = ((own.centroid - about) ** 2).sum(0)
+    torch.testing.assert_close(other.mean_square_radius, own.mean_square_radius + apart)
+    torch.testing.assert_close(other.rms_radius**2, other.mean_square_radius)
+    far = torch.where(valid, torch.hypot(*(points - about[..., None])), 0.0).amax(-1)
+    torch.testing.assert_close(other.geometric_radius, far)
+    gradient = torch.autograd.grad(other.mean_square_radius.sum(), about)[0]
+    torch.testing.assert_close(gradient, (2 * (about - own.centroid)).sum(1, keepdim=True))
+
+
+def test_the_command_takes_equal_weights_about_the_chief_ray(capsys):
+    """`--weights equal --reference chief`: as the library has it, and not what the defaults give."""
+    hexapolar = ["spot", "cooke_triplet", "--sampling", "hexapolar", "--rings", "6", "--json"]
+    found = []
+    for options in ([], ["--weights", "equal", "--reference", "chief"]):
+        assert main([*hexapolar, *options]) == 0
+        found.append(json.loads(capsys.readouterr().out))
+    lens = read_lens(shipped("lenses") / "cooke_triplet.zmx")
+    fields = torch.stack([lens.fields.x, lens.fields.y])
+    expected = spot(image_rays(lens, pupil.hexapolar(6)[0]), about=chief_reference(lens, fields))
+    radii = tensor([entry["rms_radius"] for entry in found[1]["results"]]).reshape(3, 3)
+    torch.testing.assert_close(radii, expected.rms_radius, rtol=1e-12, atol=0)
+    assert found[0]["reference"] == "centroid"
+    assert all(a["rms_radius"] != b["rms_radius"] for a, b in zip(*(d["results"] for d in found), strict=True))
+    assert main([*hexapolar, "--rays", "1000", "--reference", "chief"]) == 1

@@ -151,6 +151,12 @@ def chief_points(lens: Lens, fields: Tensor, wavelengths: Tensor) -> tuple[Tenso
     return rays.position[:2, ..., 0], (rays.valid | _kept(rays.direction))[..., 0] | on_axis
 
 
+def chief_reference(lens: Lens, fields: Tensor) -> Tensor:
+    """Where the primary wavelength's chief rays of fields (2, F) meet the sensor, (2, F, 1) mm; nan where none does."""
+    points, valid = chief_points(lens, fields, lens.wavelengths[lens.primary_wavelength][None])
+    return torch.where(valid, points, torch.nan)
+
+
 def _height(lens: Lens, fields: Tensor, wavelengths: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
     """Heights (F, W) of chief rays in the meridians of `along` (2, F), and whether they arrive or are but vignetted."""
     points, valid = chief_points(lens, fields, wavelengths)

@@ -83,6 +83,19 @@ def _spot(parser):
     parser.add_argument(
         "--max-bytes", metavar="BYTES", type=memory, help="memory that --rays may take, as 200MB (default 256MB)"
     )
+    parser.add_argument(
+        "--reference",
+        choices=("centroid", "chief"),
+        default="centroid",
+        help="radii about the centroid (default), or about the chief ray of the primary wavelength",
+    )
+    parser.add_argument(
+        "--weights",
+        choices=("area", "equal"),
+        default="area",
+        help="rays count by their share of the pupil's area (default) or all alike; OpticStudio's spots are "
+        "--sampling hexapolar --rings 6 --weights equal --reference chief",
+    )
     ray_aiming(parser)
     output(parser, "table of the rays to write (.csv): field, wavelength, pupil point, x, y, weight, status")
     plot(parser, "the spot diagram")

@@ -18,24 +18,28 @@ from raytrace.cli.door import (
     refuse_untraceable,
     say,
 )
+from raytrace.f_number import real_working_f_number
 from raytrace.formats import LensFileWarning, read_lens_with_report, write_lens
 from raytrace.lens import FIELD_UNITS, Lens, check_media
 from raytrace.paraxial import first_order, vertex_curvature
 from raytrace.trace import media
 
-#: Lines of `raytrace info`: words, entry of FirstOrder, unit.
+#: Lines of `raytrace info`: words, entry of FirstOrder (and the real working F/#), unit.
 FIRST_ORDER_LINES = (
     ("effective focal length", "effective_focal_length", "mm"),
     ("back focal distance", "back_focal_distance", "mm, from the last surface before the image"),
     ("front focal distance", "front_focal_distance", "mm, from surface 1"),
     ("F/#", "f_number", "focal length / entrance pupil diameter"),
     ("working F/#", "working_f_number", "1/(2 n' u')"),
+    ("real working F/#", "real_working_f_number", "1/(2 n' sin θ') of the real marginal ray"),
     ("entrance pupil position", "entrance_pupil_position", "mm, from surface 1"),
     ("entrance pupil diameter", "entrance_pupil_diameter", "mm"),
     ("exit pupil position", "exit_pupil_position", "mm, from the image"),
     ("exit pupil diameter", "exit_pupil_diameter", "mm"),
     ("paraxial image distance", "paraxial_image_distance", "mm, from the last surface before the image"),
     ("magnification", "magnification", ""),
+    ("angular magnification", "angular_magnification", "u'/u of the chief ray"),
+    ("optical invariant", "optical_invariant", "mm, of the largest field"),
     ("object NA", "object_na", ""),
     ("image NA", "image_na", ""),
     ("Petzval radius", "petzval_radius", "mm"),
@@ -53,11 +57,10 @@ def info(arguments: argparse.Namespace) -> None:
 
 def info_document(lens: Lens) -> dict:
     """What `raytrace info --json` writes."""
-    data = first_order(lens)
     indices = media(lens, lens.wavelengths)
     return {
         "name": lens.name,
-        **{name: number(getattr(data, name)) for _, name, _ in FIRST_ORDER_LINES},
+        **{name: number(figure) for (_, name, _), figure in zip(FIRST_ORDER_LINES, _figures(lens), strict=True)},
         "wavelengths": numbers(lens.wavelengths),
         "wavelength_weights": numbers(lens.wavelength_weights),
         "primary_wavelength": lens.primary_wavelength,
@@ -88,10 +91,9 @@ def info_document(lens: Lens) -> dict:
 
 def info_text(lens: Lens, title: str) -> str:
     """What `raytrace info` prints."""
-    data = first_order(lens)
     lines = [f"{title}: {lens.name}" if lens.name else title, ""]
-    for words, name, unit in FIRST_ORDER_LINES:
-        lines.append(f"  {words:<24} {_quantity(float(getattr(data, name))):>16}  {unit}".rstrip())
+    for (words, _, unit), figure in zip(FIRST_ORDER_LINES, _figures(lens), strict=True):
+        lines.append(f"  {words:<24} {_quantity(figure):>16}  {unit}".rstrip())
     unit = FIELD_UNITS[lens.fields.kind]
     points = ", ".join(f"({x:g}, {y:g})" for x, y in zip(lens.fields.x.tolist(), lens.fields.y.tolist(), strict=True))
     shown = [
@@ -121,6 +123,12 @@ def _quantity(value: float) -> str:
     if math.isnan(value):
         return "-"
     return "infinite" if math.isinf(value) else f"{value + 0.0:.9g}"
+
+
+def _figures(lens: Lens) -> list[float]:
+    """The numbers of FIRST_ORDER_LINES; nan or infinite where a quantity does not exist."""
+    data, real = first_order(lens), real_working_f_number(lens)
+    return [float(getattr(data, name, real)) for _, name, _ in FIRST_ORDER_LINES]
 
 
 def _remarks(lens: Lens, k: int) -> str:

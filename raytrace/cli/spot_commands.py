@@ -1,11 +1,13 @@
 """`raytrace spot`."""
 
 import argparse
+import dataclasses
 
+import torch
 from torch import Tensor
 
 from raytrace import pupil
-from raytrace.analysis import Arrivals, arrivals
+from raytrace.analysis import Arrivals, arrivals, chief_reference
 from raytrace.analysis.arrivals import STATUS
 from raytrace.cli.door import field_points, open_lens, print_json, ray_aiming, refuse_suffix, say
 from raytrace.cli.progress import progress
@@ -25,8 +27,11 @@ def spot(arguments: argparse.Namespace) -> None:
     refuse_suffix("-o", arguments.output, (".csv", ""))
     lens = open_lens(arguments)
     fields = field_points(lens, arguments)
-    # The rim carries no weight: it shows in the geometric radius, which Gaussian nodes inside the pupil miss.
-    points, weights = pupil.with_rim(*pupil_points(arguments))
+    points, weights = pupil_points(arguments)
+    if arguments.weights == "equal":
+        weights = torch.full_like(weights, 1 / len(weights))
+    else:  # the rim carries no weight: it shows in the geometric radius, which Gaussian nodes inside the pupil miss
+        points, weights = pupil.with_rim(points, weights)
     found = arrivals(
         lens,
         points,
@@ -37,18 +42,25 @@ def spot(arguments: argparse.Namespace) -> None:
     )
     if unaimed := int((found.status == STATUS.index("unaimed")).sum()):
         say(f"warning: {unaimed} of {found.status.numel()} rays found no way to their point of the stop")
-    spots = spot_of(found.rays, weights)
+    about = None
+    if arguments.reference == "chief":
+        aiming = ray_aiming(arguments) or lens.ray_aiming
+        about = chief_reference(dataclasses.replace(lens, ray_aiming=aiming), fields)
+    spots = spot_of(found.rays, weights, about=about)
     warn_of_losses(lens, fields, points, spots.rms_radius.isnan(), aiming=ray_aiming(arguments))
     if arguments.plot:
         from raytrace import plot
 
-        plot.save(plot.spot_diagram(lens, fields=fields, pupil=(points, weights)), arguments.plot)
+        figure = plot.spot_diagram(lens, fields=fields, pupil=(points, weights), reference=arguments.reference)
+        plot.save(figure, arguments.plot)
         say(f"spot diagram written to {arguments.plot}")
     if arguments.output:
         write_atomically(arguments.output, lambda file: found.to_frame().to_csv(file, index=False))
         say(f"rays written to {arguments.output}")
     if arguments.json:
-        print_json(_spot_document(lens, found, spots))
+        print_json(
+            {**_spot_document(lens, found, spots), "reference": arguments.reference, "weights": arguments.weights}
+        )
         return
     unit = FIELD_UNITS[lens.fields.kind]
     print(f"{'field':>10} {'wavelength':>11} {'centroid x':>13} {'centroid y':>13} {'RMS':>10} {'GEO':>10} {'rays':>7}")
@@ -58,14 +70,15 @@ def spot(arguments: argparse.Namespace) -> None:
             lost = points.shape[1] - int(spots.rays[f, w])
             print(f"{name_of_field(fields[:, f]):>10} {wavelength:>11g} {spot_cells(spots, (f, w))} {lost:>7}")
         if len(lens.wavelengths) > 1:
-            print(f"{'':>10} {'all':>11} {spot_cells(polychromatic(lens, spots, weights, f), ())}")
+            print(f"{'':>10} {'all':>11} {spot_cells(polychromatic(lens, spots, weights, f, about), ())}")
 
 
-def polychromatic(lens: Lens, spots: Spot, weights: Tensor, field: int) -> Spot:
-    """The spot of one field over all wavelengths, by their weights."""
+def polychromatic(lens: Lens, spots: Spot, weights: Tensor, field: int, about: Tensor | None = None) -> Spot:
+    """The spot of one field over all wavelengths, by their weights; about: (2, F, 1) mm or the centroid."""
     wavelength_weights = lens.wavelength_weights / lens.wavelength_weights.sum()
     joint = (wavelength_weights[:, None] * weights).flatten()
-    return spot_of_points(spots.points[:, field].flatten(1), spots.valid[field].flatten(), joint)
+    about = None if about is None else about[:, field, 0]
+    return spot_of_points(spots.points[:, field].flatten(1), spots.valid[field].flatten(), joint, about=about)
 
 
 def _spot_document(lens: Lens, found: Arrivals, spots: Spot) -> dict:

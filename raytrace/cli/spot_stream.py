@@ -42,6 +42,8 @@ def spot(arguments: argparse.Namespace) -> None:
 
 
 def _check(arguments: argparse.Namespace) -> None:
+    if arguments.reference != "centroid" or arguments.weights != "area":
+        raise CommandError("--rays gives radii about the centroid by area: leave --reference and --weights out")
     if arguments.rays is None:
         raise CommandError("--max-bytes belongs to --rays: without it all rays are kept")
     for name in ("rings", "points"):

@@ -1,5 +1,6 @@
 """Spot diagram: where the rays of each field meet the sensor, beside the Airy disc."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -11,6 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from torch import Tensor
 
+from raytrace.analysis import chief_reference
 from raytrace.focus import image_rays
 from raytrace.lens import Lens, with_object_distance
 from raytrace.numerics import safe_divide
@@ -34,12 +36,14 @@ def field_spots(
     wavelengths: Tensor | None = None,
     wavelength_weights: Tensor | None = None,
     pupil: tuple[Tensor, Tensor] | None = None,
+    about: Tensor | None = None,
 ) -> tuple[Spot, Spot]:
     """Polychromatic spots (F,), and the spots (F, W) of the rays that are drawn as dots.
 
     The RMS radius is that of the rule `pupil` (points, weights), by default Gaussian quadrature. The dots have no
     weight in it but count for the geometric radius, as do points on the rim of the pupil. They are those of
-    `even_hexapolar`: each stands for the same area of the pupil, so that light is where dots are.
+    `even_hexapolar`: each stands for the same area of the pupil, so that light is where dots are. about: (2, F) mm,
+    from where radii count, the centroid by default.
     """
     dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
     points, weights = gauss_rings(dtype=dtype, device=device) if pupil is None else pupil
@@ -50,7 +54,7 @@ def field_spots(
         rays = image_rays(lens, torch.cat([points, dots], dim=1), fields=fields, wavelengths=wavelengths)
         weights = torch.cat([weights, torch.zeros_like(dots[0])])
         hits, valid = rays.position[:2], rays.valid
-        whole = spot_of_points(hits.flatten(2), valid.flatten(1), (shares[:, None] * weights).flatten())
+        whole = spot_of_points(hits.flatten(2), valid.flatten(1), (shares[:, None] * weights).flatten(), about=about)
         drawn = points.shape[1]
         return whole, spot_of_points(hits[..., drawn:], valid[..., drawn:])
 
@@ -82,20 +86,25 @@ def spot_diagram(
     wavelength_weights: Tensor | None = None,
     pupil: tuple[Tensor, Tensor] | None = None,
     object_distance: Tensor | float | None = None,
+    reference: str = "centroid",
 ) -> Figure:
     """Spot diagram: one panel a field, one colour and marker a wavelength, the Airy disc at the primary wavelength.
 
-    All panels have the same scale, are centred on the centroid over all wavelengths, and print the RMS and the
-    geometric radius about it. fields: (2, F) in the lens's own kind of field; wavelengths: (W,) µm; both by default
-    those of the lens. wavelength_weights: (W,), by default the lens's, equal for wavelengths that are given.
-    pupil: points (2, P) and weights (P,) that make the RMS radius; object_distance: mm from surface 1, inf allowed.
+    All panels have the same scale, are centred on the centroid over all wavelengths or, as `reference` says, on the
+    "chief" ray of the primary one, and print the RMS and the geometric radius about it. fields: (2, F) in the lens's
+    own kind of field; wavelengths: (W,) µm; both by default those of the lens. wavelength_weights: (W,), by default the
+    lens's, equal for wavelengths that are given. pupil: points (2, P) and weights (P,) that make the RMS radius;
+    object_distance: mm from surface 1, inf allowed.
     """
     lens = style.detached(lens)
     if object_distance is not None:
         lens = with_object_distance(lens, object_distance)
     rule = {"wavelengths": wavelengths, "wavelength_weights": wavelength_weights, "pupil": pupil}
-    whole, dots = field_spots(lens, fields=fields, **rule)
-    fields = style.array(style.lens_fields(lens, fields))
+    points = style.lens_fields(lens, fields)
+    about = chief_reference(lens, points)[..., 0] if reference == "chief" else None
+    whole, dots = field_spots(lens, fields=fields, about=about, **rule)
+    whole = whole if about is None else dataclasses.replace(whole, centroid=about)  # what panels are centred on
+    fields = style.array(points)
     wavelengths = style.array(lens.wavelengths if wavelengths is None else wavelengths)
     airy = float(airy_radius(lens))
     half = panel_size(style.array(whole.geometric_radius), airy)
@@ -115,7 +124,8 @@ def spot_diagram(
     legend = figure.legend(
         handles=wavelength_handles(wavelengths, airy),
         title=f"{style.first_order_text(lens, first_order(lens))}\n"
-        "centred on the centroid; RMS and GEO (largest) radius about it, all wavelengths together",
+        f"centred on the {'centroid' if about is None else 'chief ray'}; RMS and GEO (largest) radius about it, "
+        "all wavelengths together",
         loc="outside lower center", ncols=6, handletextpad=0.3, title_fontproperties={"size": 8}, alignment="center",
     )  # fmt: skip
     legend.get_title().set(color=style.GREY, multialignment="center")
