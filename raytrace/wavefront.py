@@ -4,6 +4,7 @@ A longer path is a positive OPD: light with OPD growing towards +y lands towards
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -168,30 +169,39 @@ def peak_to_valley(wavefront: Wavefront, *, empty: str = "nan") -> Tensor:
     return where_lit(lit, torch.where(lit, highest - lowest, 0.0), empty=empty)[0]
 
 
-def zernike_coefficients(wavefront: Wavefront, count: int = 37, *, empty: str = "nan") -> Tensor:
-    """Noll coefficients 1 … count (D, F, W, count) in mm RMS, fitted to the rays that arrive.
+def zernike_coefficients(
+    wavefront: Wavefront, count: int = 37, numbering: str = "noll", *, empty: str = "nan"
+) -> Tensor:
+    """Coefficients 1 … count (D, F, W, count) in mm, fitted to the rays that arrive.
 
+    numbering: "noll", of polynomials that are 1 in RMS, or "fringe", of polynomials that are 1 at the rim.
     empty: what they are where the light fills too little of the entrance pupil to tell them apart (a fit would enlarge
     the least deviation ten thousand times, as in the middle 0.55 of the radius), see `spot`.
+    Raises ValueError for another numbering.
     """
-    basis, energy = _noll_basis(wavefront, count), wavefront.energy
+    if numbering not in zernike.NUMBERINGS:
+        raise ValueError(f"Zernike terms by {numbering!r}: expected one of {', '.join(zernike.NUMBERINGS)}")
+    order, unity = zernike.NUMBERINGS[numbering]
+    orders = [order(j) for j in range(1, count + 1)]
+    basis, energy = _basis(wavefront, orders), wavefront.energy
     clear = zernike.condition(basis, energy.detach()) < _WORST_CONDITION
     energy = torch.where(clear[..., None], energy, wavefront.weights)
     found = zernike.fit(torch.where(clear[..., None], wavefront.opd, 0.0), basis, energy)
+    found = found * found.new_tensor([zernike.norm(*o) for o in orders]) if unity == "rim" else found
     return where_lit(clear[..., None], found, empty=empty)[0]
 
 
 def without(wavefront: Wavefront, count: int) -> Tensor:
     """OPD (D, F, W, P) in mm less its best Noll terms 1 … count: 1 piston, 3 also tilt, 4 also focus."""
-    basis = _noll_basis(wavefront, count)
+    basis = _basis(wavefront, [zernike.noll(j) for j in range(1, count + 1)])
     fitted = zernike.fit(wavefront.opd, basis, wavefront.energy) @ basis
     return torch.where(wavefront.valid, wavefront.opd - fitted, 0.0)
 
 
-def _noll_basis(wavefront: Wavefront, count: int) -> Tensor:
+def _basis(wavefront: Wavefront, orders: Sequence[zernike.Order]) -> Tensor:
     if wavefront.pupil.dim() != 2:
         raise ValueError("Zernike fits need one set of pupil points for all fields, a pupil of shape (2, P)")
-    return zernike.polynomials([zernike.noll(j) for j in range(1, count + 1)], *wavefront.pupil)
+    return zernike.polynomials(orders, *wavefront.pupil)
 
 
 def _is_lit(wavefront: Wavefront) -> Tensor:

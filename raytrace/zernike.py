@@ -45,6 +45,19 @@ def fringe(j: int) -> Order:
     return 2 * (d - 1) - m, -m if (d * d - j) % 2 else m
 
 
+#: How terms may be numbered: the order (n, m) of the j-th, and whether its polynomial is 1 at the rim or 1 in RMS.
+NUMBERINGS = {"noll": (noll, "rms"), "fringe": (fringe, "rim")}
+
+#: What designers call the terms of low order.
+WORDS = {
+    (0, 0): "piston", (1, 1): "tilt x", (1, -1): "tilt y", (2, 0): "focus", (2, 2): "astigmatism 0°",
+    (2, -2): "astigmatism 45°", (3, 1): "coma x", (3, -1): "coma y", (3, 3): "trefoil x", (3, -3): "trefoil y",
+    (4, 0): "spherical", (4, 2): "astigmatism 0°, 5th order", (4, -2): "astigmatism 45°, 5th order",
+    (4, 4): "tetrafoil 0°", (4, -4): "tetrafoil 22.5°", (5, 1): "coma x, 5th order", (5, -1): "coma y, 5th order",
+    (6, 0): "spherical, 5th order", (8, 0): "spherical, 7th order", (10, 0): "spherical, 9th order",
+}  # fmt: skip
+
+
 def norm(n: int, m: int) -> float:
     """√((2 - δ_m0)(n + 1)), the largest value that Z takes on the edge."""
     return math.sqrt((n + 1) * (1 if m == 0 else 2))

@@ -9,6 +9,7 @@
 | encircled_energy                          | light within a radius, of diffraction or of rays               |
 | distortion, field_curvature, lateral_colour | what chief rays and the close rays about them show           |
 | relative_illumination                     | light of a field against the axis                              |
+| rms_over_field                            | RMS wavefront or spot, each wavelength and all together        |
 | seidel                                    | third-order aberrations and colours by surface, their sums     |
 | longitudinal_aberration                   | where rays cross the axis, over the pupil                      |
 | grid_distortion                           | a square grid of object points as the sensor sees it           |
@@ -51,6 +52,8 @@ from raytrace.analysis.mtf import cutoff as cutoff
 from raytrace.analysis.mtf import diffraction_limit as diffraction_limit
 from raytrace.analysis.mtf import mtf as mtf
 from raytrace.analysis.mtf import mtf_through_focus as mtf_through_focus
+from raytrace.analysis.rms import RmsOverField as RmsOverField
+from raytrace.analysis.rms import rms_over_field as rms_over_field
 from raytrace.analysis.seidel import Seidel as Seidel
 from raytrace.analysis.seidel import seidel as seidel
 from raytrace.analysis.wavefronts import WavefrontMap as WavefrontMap

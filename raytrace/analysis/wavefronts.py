@@ -21,7 +21,8 @@ class WavefrontMap(Tabular):
     """The wavefront of every field and wavelength.
 
     opd: (F, W, N, N) waves at pupil points y (rows) and x (columns) of `pupil` (N,), 0 where `valid` is False.
-    coefficients: (F, W, J) Noll's Zernike coefficients 1 … J in waves RMS, over the entrance pupil.
+    coefficients: (F, W, J) Zernike coefficients 1 … J over the entrance pupil, numbered as `numbering` says: "noll", in
+        waves RMS, or "fringe", in waves at the rim.
     rms: (F, W) waves about the mean; peak_to_valley: (F, W) waves, over a square grid of 127 points across the pupil,
         centre and ends of its axes among them.
     strehl: (F, W) the largest intensity on the sensor over that without aberrations, defocus counted among them; nan
@@ -38,14 +39,15 @@ class WavefrontMap(Tabular):
     strehl: Tensor
     fields: Tensor
     wavelengths: Tensor
+    numbering: str
 
     def columns(self) -> dict[str, Tensor]:
-        noll = torch.arange(1, self.coefficients.shape[-1] + 1, device=self.opd.device)
+        term = torch.arange(1, self.coefficients.shape[-1] + 1, device=self.opd.device)
         return {
             "field_x": axis(self.fields[0], 0, 3),
             "field_y": axis(self.fields[1], 0, 3),
             "wavelength": axis(self.wavelengths, 1, 3),
-            "noll": axis(noll, 2, 3),
+            self.numbering: axis(term, 2, 3),
             "coefficient": self.coefficients,
         }
 
@@ -68,8 +70,9 @@ def wavefront_map(
     wavelengths: Tensor | None = None,
     size: int = _GRID,
     terms: int = 37,
+    numbering: str = "noll",
 ) -> WavefrontMap:
-    """OPD over `size` × `size` pupil points, and the Noll coefficients 1 … `terms` of 784 rays.
+    """OPD over `size` × `size` pupil points, and the coefficients 1 … `terms` of 784 rays, see `zernike_coefficients`.
 
     What a field does not have is nan: everything where no ray arrives, the coefficients where the light fills too
     little of the pupil.
@@ -89,12 +92,13 @@ def wavefront_map(
         opd=opd,
         valid=valid,
         pupil=line,
-        coefficients=zernike_coefficients(front, terms)[0] / wave[:, None],
+        coefficients=zernike_coefficients(front, terms, numbering)[0] / wave[:, None],
         rms=rms(front)[0] / wave,
         peak_to_valley=peak_to_valley(dense)[0] / wave,
         strehl=_strehl(view),
         fields=view.fields,
         wavelengths=view.wavelengths,
+        numbering=numbering,
     )
 
 

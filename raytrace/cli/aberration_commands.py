@@ -80,3 +80,29 @@ def incidence(arguments: argparse.Namespace) -> None:
     if arguments.plot:
         dense = analysis.incidence(lens, fields=fields, wavelengths=wavelengths, size=DENSE)
         draw(arguments, lens, dense, "incidence_curves")
+
+
+def rms(arguments: argparse.Namespace) -> None:
+    """RMS over the field: a row for each field, the wavelengths beside one another."""
+    lens, fields = opened(arguments) if arguments.field else (open_lens(arguments), None)
+    rule = {"quantity": "spot" if arguments.spot else "wavefront", "reference": arguments.reference}
+    found = analysis.rms_over_field(lens, fields=fields, size=arguments.samples, **rule)
+    if arguments.json:
+        head = {"analysis": "rms", "quantity": found.quantity, "reference": found.reference}
+        print_json({**head, "results": rows(found.columns()), "summary": rows(found.summary())})
+    else:
+        _print_rms(found, FIELD_UNITS[lens.fields.kind])
+    if arguments.plot:
+        draw(arguments, lens, analysis.rms_over_field(lens, fields=fields, size=DENSE, **rule), "rms_curves")
+
+
+def _print_rms(found: analysis.RmsOverField, field_unit: str) -> None:
+    unit, factor = ("waves", 1.0) if found.quantity == "wavefront" else ("µm", 1e3)
+    heads = ["together", *(f"{wavelength:g} µm" for wavelength in found.wavelengths.tolist())]
+    strehl = ["Strehl"] if found.strehl is not None else []
+    print(f"{'field':>10}" + "".join(f"{head:>13}" for head in (*heads, *strehl)))
+    print(f"{field_unit:>10}" + "".join(f"{unit:>13}" for _ in heads))
+    for f, field in enumerate(found.fields.unbind(1)):
+        values = [factor * float(value) for value in (found.polychromatic[f], *found.rms[f])]
+        shown = "".join(map(_cell, values)) + ("" if found.strehl is None else f"{float(found.strehl[f]):>13.4f}")
+        print(f"{field_label(field):>10}{shown.replace('nan', '  -')}")

@@ -6,10 +6,11 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from raytrace import analysis
+from raytrace import analysis, zernike
 from raytrace.analysis.frame import Tabular, flat
 from raytrace.cli.door import CommandError, field_points, number, open_lens, print_json, say
 from raytrace.cli.reach import check_reach, refuse_empty
+from raytrace.cli.spots import cell
 from raytrace.lens import FIELD_UNITS, Lens, name_of_field
 from raytrace.numerics import broadcast_shape
 
@@ -56,14 +57,32 @@ def opd(arguments: argparse.Namespace) -> None:
 
 
 def wavefront(arguments: argparse.Namespace) -> None:
-    """Wavefront maps; the text is RMS, peak to valley and the Strehl ratio, the JSON also the coefficients."""
+    """Wavefront maps; the text is RMS, peak to valley and the Strehl ratio, on demand and in JSON the coefficients."""
     lens, fields = opened(arguments, every=True)
-    found = analysis.wavefront_map(lens, fields=fields, size=arguments.size)
+    rule = {"terms": arguments.terms or 37, "numbering": arguments.zernike or "noll"}
+    found = analysis.wavefront_map(lens, fields=fields, size=arguments.size, **rule)
     unknown = found.coefficients[..., 0].isnan() & found.rms.isfinite()
     for f in torch.nonzero(unknown.any(1))[:, 0].tolist():
         field = f"field {name_of_field(found.fields[:, f])} {FIELD_UNITS[lens.fields.kind]}"
         say(f"warning: {field}: the light fills too little of the entrance pupil for Zernike coefficients")
     report(arguments, lens, found, "wavefront_maps", summary=found.summary(), unit="waves")
+    if (arguments.zernike or arguments.terms) and not arguments.json:
+        for f, field in enumerate(found.fields.unbind(1)):
+            unit = {"noll": "waves RMS", "fringe": "waves at the rim"}[found.numbering]
+            label = f"{name_of_field(field)} {FIELD_UNITS[lens.fields.kind]}"
+            print(f"\n{found.numbering.capitalize()} coefficients of field {label}, {unit}")
+            _print_terms(found, f)
+
+
+def _print_terms(found: analysis.WavefrontMap, field: int) -> None:
+    """The coefficients of one field: a row for each term, a column for each wavelength."""
+    heads = (f"{wavelength:g} µm" for wavelength in found.wavelengths.tolist())
+    print(f"{'j':>3} {'n':>3} {'m':>3}  {'term':<26}" + "".join(f"{head:>14}" for head in heads))
+    order, _ = zernike.NUMBERINGS[found.numbering]
+    for j, row in enumerate(found.coefficients[field].T.tolist(), 1):
+        n, m = order(j)
+        cells = "".join(cell(c if not abs(c) < 5e-9 else 0.0, ">14.8f") for c in row)
+        print(f"{j:>3} {n:>3} {m:>3}  {zernike.WORDS.get((n, m), ''):<26}{cells}")
 
 
 def distortion(arguments: argparse.Namespace) -> None:

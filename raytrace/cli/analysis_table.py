@@ -28,6 +28,10 @@ def _opd(parser) -> None:
 def _maps(parser) -> None:
     _analysis(parser, "the maps")
     size(parser, "a map (default 127)", default=127)
+    parser.add_argument(
+        "--zernike", choices=("noll", "fringe"), help="print the coefficients, by Noll's numbers or fringe numbers"
+    )
+    parser.add_argument("--terms", metavar="N", type=count, help="number of Zernike terms (default 37)")
 
 
 def _curves(parser) -> None:
@@ -72,6 +76,18 @@ def _grid(parser) -> None:
 def _incidence(parser) -> None:
     _curves(parser)
     parser.add_argument("--surfaces", action="store_true", help="list every surface, not the sensor alone")
+
+
+def _rms(parser) -> None:
+    _curves(parser)
+    parser.add_argument("--spot", action="store_true", help="RMS spot radius about the centroid instead")
+    parser.add_argument(
+        "--reference",
+        choices=("primary", "own"),
+        default="primary",
+        help="spheres of the wavelengths together: about the primary one's chief ray (default: lateral colour counts), "
+        "or each about its own",
+    )
 
 
 def _light(parser) -> None:
@@ -146,9 +162,10 @@ ANALYSES = (
         "wavefront",
         "wavefront maps, Zernike coefficients, Strehl ratio",
         "RMS and peak-to-valley OPD in waves (peak to valley over 127 points across the pupil) and the Strehl ratio; "
-        "with --json also Noll's Zernike coefficients 1 to 37 (waves RMS).",
+        "with --zernike or --json also the Zernike coefficients, Noll's in waves RMS or fringe in waves at the rim.",
         """examples:
   raytrace wavefront tessar --plot wavefront.png
+  raytrace wavefront double_gauss --field 0 14 --zernike fringe --terms 16
   raytrace wavefront double_gauss --field 0 --json""",
         _maps,
         "analysis_commands.wavefront",
@@ -233,6 +250,17 @@ ANALYSES = (
   raytrace incidence double_gauss --field 0 14 --surfaces --json""",
         _incidence,
         "aberration_commands.incidence",
+    ),
+    (
+        "rms",
+        "RMS wavefront or spot over the field",
+        "RMS wavefront error in waves over the field, of each wavelength and of all together by their weights, with "
+        "the Strehl ratio exp(-(2π σ)²); or the RMS spot radius.",
+        """examples:
+  raytrace rms tessar --plot rms.png
+  raytrace rms double_gauss --spot --field 0 10 14 --json""",
+        _rms,
+        "aberration_commands.rms",
     ),
     (
         "encircled",

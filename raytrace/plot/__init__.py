@@ -7,6 +7,7 @@ nothing behind.
 from raytrace.plot.aberrations import distorted_grid as distorted_grid
 from raytrace.plot.aberrations import incidence_curves as incidence_curves
 from raytrace.plot.aberrations import longitudinal_curves as longitudinal_curves
+from raytrace.plot.aberrations import rms_curves as rms_curves
 from raytrace.plot.aberrations import seidel_bars as seidel_bars
 from raytrace.plot.analysis import curvature_curves as curvature_curves
 from raytrace.plot.analysis import distortion_curves as distortion_curves

@@ -3,9 +3,18 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from raytrace.analysis import GridDistortion, Incidence, LongitudinalAberration, Seidel
+from raytrace.analysis import GridDistortion, Incidence, LongitudinalAberration, RmsOverField, Seidel
 from raytrace.lens import Lens
-from raytrace.plot.panels import DASHES, chart, drawn_at_least, legend_below, titled, wavelength_label
+from raytrace.plot.panels import (
+    DASHES,
+    chart,
+    drawn_at_least,
+    field_axis,
+    field_name,
+    legend_below,
+    titled,
+    wavelength_label,
+)
 from raytrace.plot.style import (
     FAINT,
     GREY,
@@ -120,3 +129,25 @@ def incidence_curves(lens: Lens, found: Incidence) -> Figure:
         panel.set_xlim(np.nanmin(height), np.nanmax(height))
     legend_below(figure, panel, 4)
     return titled(figure, lens, f"angles of incidence ({wavelength_label(found, 0)})")
+
+
+@styled
+def rms_curves(lens: Lens, found: RmsOverField) -> Figure:
+    """RMS over the field: all wavelengths together dark, each in its colour; of wavefronts Maréchal's limit dotted."""
+    waves = found.quantity == "wavefront"
+    what = "RMS wavefront error" if waves else "RMS spot radius"
+    figure, panel = chart(5.6, 3.8, field_name(lens), f"{what} ({'waves' if waves else 'µm'})")
+    scale, field = 1.0 if waves else 1e3, field_axis(found)
+    order = np.argsort(field)
+    for w, colour in enumerate(wavelength_colours(found.wavelengths.tolist())):
+        style = {"color": colour, "linewidth": 1.2, "linestyle": DASHES[w % len(DASHES)]}
+        panel.plot(field[order], scale * array(found.rms[:, w])[order], label=wavelength_label(found, w), **style)
+    if len(found.wavelengths) > 1:
+        panel.plot(field[order], scale * array(found.polychromatic)[order], color=INK, linewidth=1.6, label="together")
+    if waves:
+        panel.axhline(1 / 14, color=GREY, linewidth=0.8, linestyle=":", label="λ/14")
+    panel.set_ylim(bottom=0)
+    if field.max() > field.min():
+        panel.set_xlim(field.min(), field.max())
+    legend_below(figure, panel, 5)
+    return titled(figure, lens, what)
