@@ -105,4 +105,4 @@ def _print_rms(found: analysis.RmsOverField, field_unit: str) -> None:
     for f, field in enumerate(found.fields.unbind(1)):
         values = [factor * float(value) for value in (found.polychromatic[f], *found.rms[f])]
         shown = "".join(map(_cell, values)) + ("" if found.strehl is None else f"{float(found.strehl[f]):>13.4f}")
-        print(f"{field_label(field):>10}{shown.replace('nan', '  -')}")
+        print(f"{name_of_field(field):>10}{shown.replace('nan', '  -')}")
