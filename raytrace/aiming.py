@@ -66,7 +66,7 @@ def aim_at_image(
         rays = through(unknown[:2], pupil)
         (stop, image), arrives = _crossings(lens, rays, wavelength, (lens.stop, len(lens.surfaces) - 1))
         off = [(at - fraction * to) / size for at, to in zip(image, height, strict=True)]
-        return torch.stack(off if radius is None else [*off, *(stop / radius)]), arrives
+        return torch.stack(off if radius is None else [*off, *(at / radius for at in stop)]), arrives
 
     start = estimate if radius is None else torch.cat([estimate, torch.zeros_like(estimate)])
     unknown, found = _root(missed, start, origin=torch.zeros_like)
