@@ -441,7 +441,8 @@ def test_command_gives_the_spot_of_few_rays(command):
     assert [line.split() for line in lines[0]] == [line.split() for line in lines[1]]
 
 
-def test_command_shows_a_bar_beside_the_results(command):
+def test_command_shows_a_bar_beside_the_results(command, monkeypatch):
+    monkeypatch.setattr("raytrace.cli.progress._is_terminal", lambda: True)
     code, out, err = command("spot", "double_gauss", "--rays", 2000, "--json")
     assert code == 0
     json.loads(out)
