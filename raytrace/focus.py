@@ -199,8 +199,7 @@ def real_image_distance(lens: Lens, object_distances: Tensor) -> Tensor:
     """Sensor distances (D,) mm of the paraxial images of objects at distances (D,) mm. Raises NoImage for one that is
     not behind the lens."""
     images = paraxial_image_distance(lens, object_distances)
-    side = -1 if sum(surface.is_mirror for surface in lens.surfaces) % 2 else 1
-    wrong = ~((side * images > 0) & torch.isfinite(images)).detach()
+    wrong = ~(_behind(lens, images) & torch.isfinite(images))
     if bool(wrong.any()):
         distance, image = (float(one[wrong][0]) for one in (object_distances.detach(), images.detach()))
         raise NoImage(
@@ -208,6 +207,16 @@ def real_image_distance(lens: Lens, object_distances: Tensor) -> Tensor:
             f"(paraxial image at {image:g} mm)"
         )
     return images
+
+
+def is_behind(lens: Lens, distance: Tensor) -> bool:
+    """Whether a sensor distance (mm) is one: on the side of the last surface that the light goes to."""
+    return bool(_behind(lens, distance).all())
+
+
+def _behind(lens: Lens, distance: Tensor) -> Tensor:
+    side = -1 if sum(surface.is_mirror for surface in lens.surfaces) % 2 else 1
+    return (side * distance > 0).detach()
 
 
 def focused(lens: Lens, object_distance: float, *, on: str = "paraxial") -> Lens:

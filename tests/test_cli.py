@@ -896,7 +896,7 @@ def test_samplings_agree(run, sampling):
 def test_focus_at_25_m(run):
     document = run("focus", DOUBLE_GAUSS, "--object-distance", 25000, "--json").document
     assert list(document) == ["object_distance", "sensor_before", "sensor_paraxial", "sensor_rms", "sensor_after",
-                              "rms_before", "rms_after"]  # fmt: skip
+                              "rms_before", "rms_after", "is_real"]  # fmt: skip
     assert document["object_distance"] == 25000
     assert document["sensor_before"] == 58.5
     assert document["sensor_paraxial"] == pytest.approx(IMAGE_OF_25_M, abs=1e-9)
@@ -1027,6 +1027,17 @@ def test_focus_without_a_focus_is_refused(run):
     partly = run("focus", "double_gauss", "--f-number", 0.5, "--json")
     assert partly.code == 0
     assert "lost" in partly.err
+
+
+def test_a_virtual_image_is_said(run):
+    """An object within the focal length of 100 mm: its image lies before the lens."""
+    code, out, err = run("focus", "singlet", "--object-distance", "50", "--json")
+    found = json.loads(out)
+    assert (code, found["is_real"]) == (0, False)
+    assert found["sensor_after"] < 0
+    assert "warning: the image is virtual, at -548.252 mm" in err
+    code, out, err = run("focus", "singlet", "--object-distance", "5000", "--json")
+    assert (json.loads(out)["is_real"], "virtual" in err) == (True, False)
 
 
 def test_focus_for_people(run):

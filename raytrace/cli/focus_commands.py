@@ -20,7 +20,7 @@ from raytrace.cli.door import (
 )
 from raytrace.cli.spots import pupil_points, warn_of_losses
 from raytrace.focus import focus as best_focus
-from raytrace.focus import focus_of_mean_radius, image_rays, mean_rms_radius
+from raytrace.focus import focus_of_mean_radius, image_rays, is_behind, mean_rms_radius
 from raytrace.formats import read_lens, write_lens
 from raytrace.lens import FIELD_UNITS, Lens, name_of_field, with_object_distance, with_sensor_distance
 from raytrace.paraxial import first_order, paraxial_image_distance
@@ -62,7 +62,11 @@ def focus(arguments: argparse.Namespace) -> None:
         "sensor_after": number(after),
         "rms_before": _rms(lens, before, points, weights, rule),
         "rms_after": _rms(lens, after, points, weights, rule),
+        "is_real": is_behind(lens, after),
     }
+    if not result["is_real"]:
+        place = f"{float(after):g} mm, on the side of the last surface that the light comes from"
+        say(f"warning: the image is virtual, at {place}: no sensor can stand there; take the object further away")
     focused = with_sensor_distance(lens, after)
     if arguments.plot:
         from raytrace import plot
