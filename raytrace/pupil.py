@@ -32,14 +32,18 @@ _leggauss = functools.lru_cache(maxsize=64)(np.polynomial.legendre.leggauss)
 
 
 def hexapolar(
-    rings: int = 6, *, dtype: torch.dtype = torch.float64, device: torch.device | None = None
+    rings: float = 6, *, dtype: torch.dtype = torch.float64, device: torch.device | None = None
 ) -> tuple[Tensor, Tensor]:
-    """The centre and `rings` rings of 6, 12, 18, … points at radii j/rings; each ring carries its share of the area."""
+    """The centre and `rings` rings of 6, 12, 18, … points at radii j/rings; each ring carries its share of the area.
+
+    rings: 1 or more; between whole numbers the outermost ring lies inside the edge (what a density of rays, rings²,
+    leads to: OpticStudio traces a wavelength of weight w with √w times the rings).
+    """
     points, weights = [np.zeros((2, 1))], [np.array([0.25])]
-    for ring in range(1, rings + 1):
+    for ring in range(1, int(rings) + 1):
         angle = np.arange(6 * ring) * (math.pi / 3 / ring)
         points.append(ring / rings * np.stack([np.cos(angle), np.sin(angle)]))
-        outer = min(ring + 0.5, rings)  # annuli end half way between rings, the last at the edge; units of 1/rings
+        outer = rings if ring == int(rings) else ring + 0.5  # annuli end half way between rings, the last at the edge; units of 1/rings
         weights.append(np.full(6 * ring, (outer**2 - (ring - 0.5) ** 2) / (6 * ring)))
     return _tensors(np.concatenate(points, axis=1), np.concatenate(weights) / rings**2, dtype, device)
 

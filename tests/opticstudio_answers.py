@@ -254,18 +254,22 @@ def opd_fan(case):
 
 
 def spot(case):
-    """By field: the chief ray's x, y in mm; RMS, RMS x, RMS y about it and the largest distance, µm."""
+    """By field: the chief ray's x, y in mm; RMS, RMS x, RMS y about it and the largest distance, µm.
+
+    Rays count alike, and a wavelength of weight w has √(w / the largest) times the rings.
+    """
     lens, fields = lens_of(case), fields_of(case)
-    points = pupil.hexapolar(case["rings"], dtype=torch.float64)[0]
-    rays = trace(lens, launch(lens, points, fields=fields), lens.wavelengths[:, None])
-    chief = trace(
-        lens,
-        launch(lens, points[:, :1] * 0, fields=fields, wavelengths=lens.wavelengths[lens.primary_wavelength][None]),
-        lens.wavelengths[lens.primary_wavelength],
-    ).position[:2]
-    off = 1000 * (rays.position[:2] - chief)
-    x, y = torch.sqrt((off * off).mean((-1, -2)))
-    largest = off.norm(dim=0).amax((-1, -2))
+    primary = lens.wavelengths[lens.primary_wavelength][None]
+    chief = trace(lens, launch(lens, fields.new_zeros(2, 1), fields=fields, wavelengths=primary), primary).position[:2]
+    off = []
+    shares = lens.wavelength_weights / lens.wavelength_weights.max()
+    for wavelength, share in zip(lens.wavelengths, shares.tolist(), strict=True):
+        points = pupil.hexapolar(case["rings"] * share**0.5, dtype=torch.float64)[0]
+        rays = trace(lens, launch(lens, points, fields=fields, wavelengths=wavelength[None]), wavelength)
+        off.append(1000 * (rays.position[:2] - chief)[:, :, 0])
+    off = torch.cat(off, -1)
+    x, y = torch.sqrt((off * off).mean(-1))
+    largest = off.norm(dim=0).amax(-1)
     return flat(torch.stack([*chief[:, :, 0, 0], torch.hypot(x, y), x, y, largest], -1))
 
 

@@ -30,10 +30,6 @@ OURS = {
     r"^f_vacuum_cell marginal-ray solve": ("the file's pressure of 0 (PRES) is told, and not followed", 0.04),
 }
 
-#: Spots of wavelengths whose weights differ: OpticStudio traces fewer rays of the lighter ones, in a pattern that its
-#: report does not tell; chief rays are compared, not the radii.
-UNEQUAL_WEIGHTS = r"^cooke_.* spots$"
-
 #: Diffraction off the axis takes seconds a case.
 SLOW = r"^objective (through-focus|(FFT MTF|diffraction encircled).* (1\.125|2\.25|3\.375|4\.5) mm)"
 
@@ -61,8 +57,6 @@ def test_figure(case):
     if case["call"] not in ANSWERS:
         pytest.fail(f"{case['id']}: no answer to {case['call']!r}; known are {', '.join(ANSWERS)}")
     off, tolerance = differences(case)
-    if re.search(UNEQUAL_WEIGHTS, case["id"]):
-        off, tolerance = (part.reshape(-1, 6)[:, :2] for part in (off, tolerance))
     differs = listed(THEIRS, case) or listed(OURS, case)
     if differs:
         reason, size = differs
