@@ -43,7 +43,7 @@ def hexapolar(
     for ring in range(1, int(rings) + 1):
         angle = np.arange(6 * ring) * (math.pi / 3 / ring)
         points.append(ring / rings * np.stack([np.cos(angle), np.sin(angle)]))
-        outer = rings if ring == int(rings) else ring + 0.5  # annuli end half way between rings, the last at the edge; units of 1/rings
+        outer = rings if ring == int(rings) else ring + 0.5  # half way between rings, or the edge
         weights.append(np.full(6 * ring, (outer**2 - (ring - 0.5) ** 2) / (6 * ring)))
     return _tensors(np.concatenate(points, axis=1), np.concatenate(weights) / rings**2, dtype, device)
 
