@@ -12,6 +12,7 @@ import scipy.optimize
 import torch
 from torch import Tensor
 
+from raytrace.budget import RAY_BYTES, afford
 from raytrace.launch import launch
 from raytrace.lens import Lens, with_object_distance, with_sensor_distance
 from raytrace.numerics import safe_divide, safe_sqrt
@@ -31,9 +32,16 @@ class NoImage(ValueError):
 def image_rays(lens: Lens, pupil: Tensor, *, fields: Tensor | None = None, wavelengths: Tensor | None = None) -> Rays:
     """Rays (3, F, W, P) on the sensor, with their direction before it; arguments as for `launch`.
 
-    The sensor may touch glass: what bends rays there does not tell where they came from.
+    The sensor may touch glass: what bends rays there does not tell where they came from. Raises budget.OverBudget for
+    more rays than memory holds.
     """
     wavelengths = lens.wavelengths if wavelengths is None else wavelengths
+    F, W, P = lens.fields.y.numel() if fields is None else fields.shape[1], len(wavelengths), pupil.shape[-1]
+    afford(
+        RAY_BYTES * F * W * P,
+        f"{F * W * P:,} rays ({F} fields × {W} wavelengths × {P:,} of the pupil)",
+        helps="ask for fewer fields, wavelengths or pupil points",
+    )
     indices = media(lens, wavelengths[:, None])
     rays = launch(lens, pupil, fields=fields, wavelengths=wavelengths)
     return trace_surfaces(lens.surfaces[1:], rays, indices=[*indices[:-1], indices[-2]])

@@ -4,6 +4,7 @@ from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.autograd import forward_ad
 
+from raytrace.budget import RAY_BYTES, afford
 from raytrace.grid import Grid
 from raytrace.lens import Lens, with_object_distance
 from raytrace.rays import Rays
@@ -87,9 +88,19 @@ def scene(lens: Lens, fields: Tensor, object_distances: Tensor, wavelengths: Ten
 
 
 def trace_scene(scene: Scene, pupil: Tensor) -> Rays:
-    """Rays (3, D, F, W, P) of pupil points (2, P) or (2, D, F, W, P) on the sensor, vignetting factors applied."""
+    """Rays (3, D, F, W, P) of pupil points (2, P) or (2, D, F, W, P) on the sensor, vignetting factors applied.
+
+    Raises budget.OverBudget for more rays than memory holds.
+    """
+    D, F, W = scene.shape
+    P = pupil.shape[-1]
+    afford(
+        RAY_BYTES * D * F * W * P,
+        f"{D * F * W * P:,} rays ({D} object distances × {F} fields × {W} wavelengths × {P:,} of the pupil)",
+        helps="ask for fewer fields, wavelengths or pupil points",
+    )
     rays = trace_bundle(_bundle(scene, pupil), scene.memo)
-    batch = *scene.shape, pupil.shape[-1]
+    batch = D, F, W, P
     return Rays(
         rays.position.expand(3, *batch),
         rays.direction.expand(3, *batch),

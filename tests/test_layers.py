@@ -11,6 +11,8 @@ PACKAGE = Path(__file__).parents[1] / "raytrace"
 
 #: Floor of every file of the package, by module name without "raytrace."; __init__ of a folder bears the folder's name.
 FLOORS = {
+    # below all: memory
+    "budget": -1,
     # 0: mathematics, knows no optics
     "value": 0,
     "numerics": -1,  # what the others compute with

@@ -65,3 +65,12 @@ def test_what_is_abandoned_is_closed(quick, capsys):
 
 def test_clock():
     assert [clock(s) for s in (0.4, 59.6, 3661)] == ["0:00", "1:00", "1:01:01"]
+
+
+def test_every_command_has_a_heartbeat(quick, monkeypatch, capsys):
+    """Also while it does what counts nothing."""
+    from raytrace.cli import lens_commands, main
+
+    monkeypatch.setattr(lens_commands, "info", lambda arguments: time.sleep(0.2))
+    assert main(["info", "double_gauss"]) == 0
+    assert "raytrace: info: 0:00 gone\n" in capsys.readouterr().err

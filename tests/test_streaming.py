@@ -456,7 +456,6 @@ def test_command_shows_a_bar_beside_the_results(command, monkeypatch):
         (("--rays", 100, "--points", 3), "--rays and --points exclude each other"),
         (("--rays", 100, "--sampling", "square"), "sobol (its default) or random, not square"),
         (("--rays", 100, "--plot", "spot.png"), "--plot needs the rays"),
-        (("--max-bytes", "1MB"), "--max-bytes belongs to --rays"),
         (("--rays", 100, "--max-bytes", "1kB"), "max_bytes 1000 is too little"),
         (("--rays", "1.5"), "not a whole number above 0"),
         (("--rays", "0"), "not a whole number above 0"),

@@ -130,7 +130,7 @@ def test_what_is_dear_is_said_or_refused(run):
     words = ("psf", "--element", "cubic", "--depth", "1000", "--wavelength", "0.55")
     code, out, err = run(*words, "--max-bytes", "10MB")
     assert (code, out) == (1, "")
-    assert "GB a kernel, more than 0.01 GB; take fewer by --samples or --tol, a smaller window by --size" in err
+    assert "B; 10 MB may be taken): take fewer by --samples or a larger --tol, a smaller window by --size" in err
     parts = baseline("cubic", aim())
     double = {"dtype": torch.float64}
     seen = WaveScene(

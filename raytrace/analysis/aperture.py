@@ -7,6 +7,7 @@ from torch import Tensor
 
 from raytrace import zernike
 from raytrace.analysis.setting import refuse_dark
+from raytrace.budget import piece
 from raytrace.lens import name_of_field
 from raytrace.numerics import safe_divide, safe_sqrt
 from raytrace.psf.dft import phasor
@@ -72,7 +73,31 @@ def exit_pupil(scene: Scene, *, size: int | None = None) -> ExitPupil:
     line = (2 * torch.arange(size, **like) + 1 - size) / size
     m, ell = (c.reshape(-1) for c in torch.meshgrid(line, line, indexing="ij"))
     inside = ell * ell + m * m <= 1
-    ell, m = ell[inside], m[inside]
+    # In pieces: the polynomials of all points at once would take gigabytes.
+    together = piece(8 * (6 * _TERMS + 60 * probe.opd[..., 0].numel()))
+    cells = [
+        _cells(scene, map_to_pupil, *some, size=size)
+        for some in zip(ell[inside].split(together), m[inside].split(together), strict=True)
+    ]
+    field, light = (torch.cat(parts, -1) for parts in zip(*cells, strict=True))
+    amplitude = field.new_zeros(*field.shape[1:3], size * size)
+    amplitude[..., inside] = field[0]
+    energy = torch.where(probe.valid, probe.energy, 0.0)
+    total = energy.sum(-1)
+    offset = safe_divide((energy * probe.landing).sum(-1), total.expand_as(probe.landing[..., 0]))
+    return ExitPupil(
+        amplitude=amplitude.unflatten(-1, (size, size)),
+        energy=light.sum(-1)[0],
+        step=(2 / size * half * waves_per)[:, 0],
+        centre=probe.centre[:2, 0],
+        centroid=(probe.centre[:2] + offset)[:, 0],
+        light=total[0],
+    )
+
+
+def _cells(scene: Scene, map_to_pupil: Tensor, ell: Tensor, m: Tensor, *, size: int) -> tuple[Tensor, Tensor]:
+    """The wave (1, F, W, P) in cells of `size` across about directions (P,), scaled to the disc, and its |A|²."""
+    orders = [zernike.noll(j) for j in range(1, _TERMS + 1)]
     pupil = (zernike.polynomials(orders, ell, m).T @ map_to_pupil).movedim(-1, 0)
     by_l, by_m = ((g.T @ map_to_pupil).movedim(-1, 0) for g in zernike.gradients(orders, ell, m))
     radius = safe_sqrt((pupil * pupil).sum(0))
@@ -83,19 +108,7 @@ def exit_pupil(scene: Scene, *, size: int | None = None) -> ExitPupil:
     traced = wavefront(scene, pupil * ((1 - 1e-9) / radius.clamp_min(1.0)))
     share = torch.where(traced.valid, share, 0.0)
     field = share * safe_sqrt(density) * phasor(traced.opd / (1e-3 * traced.wavelength)[:, None])
-    amplitude = field.new_zeros(*field.shape[1:3], size * size)
-    amplitude[..., inside] = field[0]
-    energy = torch.where(probe.valid, probe.energy, 0.0)
-    total = energy.sum(-1)
-    offset = safe_divide((energy * probe.landing).sum(-1), total.expand_as(probe.landing[..., 0]))
-    return ExitPupil(
-        amplitude=amplitude.unflatten(-1, (size, size)),
-        energy=(share * density).sum(-1)[0],
-        step=(2 / size * half * waves_per)[:, 0],
-        centre=probe.centre[:2, 0],
-        centroid=(probe.centre[:2] + offset)[:, 0],
-        light=total[0],
-    )
+    return field, share * density
 
 
 def _box(directions: Tensor, usable: Tensor) -> tuple[Tensor, Tensor]:

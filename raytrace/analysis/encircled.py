@@ -8,6 +8,7 @@ from torch import Tensor
 from raytrace.analysis.aperture import ExitPupil, exit_pupil
 from raytrace.analysis.frame import Tabular, axis
 from raytrace.analysis.setting import refuse_dark, scene_of, wavelength_weights, wavelengths_of
+from raytrace.budget import RAY_BYTES, afford, piece
 from raytrace.focus import image_rays
 from raytrace.lens import Lens
 from raytrace.numerics import safe_divide, safe_sqrt
@@ -76,6 +77,15 @@ def encircled_energy(
 
 def _rays(lens: Lens, fields: Tensor | None, wavelengths: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """Distances (F, W·P) from the centroid (2, F) of all wavelengths, and shares (F, W·P) of the light."""
+    view = scene_of(lens, fields, wavelengths)
+    F, W = view.fields.shape[1], len(view.wavelengths)
+    afford(64 * F * W * _RAYS, f"{F * W * _RAYS:,} rays ({F} fields × {W} wavelengths)", helps="ask for fewer fields")
+    parts = [_rays_of(lens, some, wavelengths) for some in view.fields.split(piece(RAY_BYTES * W * _RAYS), 1)]
+    distance, energy, centroid = zip(*parts, strict=True)
+    return torch.cat(distance), torch.cat(energy), torch.cat(centroid, 1)
+
+
+def _rays_of(lens: Lens, fields: Tensor, wavelengths: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     points = _spiral(_RAYS, lens.wavelengths)
     rays = image_rays(lens, points, fields=fields, wavelengths=wavelengths)
     energy = torch.where(rays.valid, wavelength_weights(lens, wavelengths)[:, None] / _RAYS, 0.0).flatten(1)

@@ -8,6 +8,7 @@ from torch import Tensor
 from raytrace.analysis.aperture import MARGIN, exit_pupil
 from raytrace.analysis.frame import Tabular, axis
 from raytrace.analysis.setting import primary_number, refuse_dark, scene_of, wavelength_weights, wavelengths_of
+from raytrace.budget import RAY_BYTES, piece
 from raytrace.focus import image_rays
 from raytrace.lens import Lens, with_sensor_distance
 from raytrace.numerics import safe_divide, safe_sqrt
@@ -203,7 +204,16 @@ def _geometric(lens: Lens, frequencies: Tensor, fields, wavelengths) -> tuple[Te
         raise ValueError(
             f"the blur needs {rings * arms} rays at {float(frequencies.max()):g} cycles/mm: focus the lens"
         )
-    points, rule = gauss_rings(rings, arms, **like)
+    pupil = gauss_rings(rings, arms, **like)
+    whole = scene_of(lens, fields, wavelengths)
+    together = piece(2 * RAY_BYTES * len(whole.wavelengths) * rings * arms)
+    parts = [_of_spots(lens, frequencies, some, wavelengths, *pupil) for some in whole.fields.split(together, 1)]
+    tangential, sagittal = (torch.cat(part) for part in zip(*parts, strict=True))
+    return tangential, sagittal
+
+
+def _of_spots(lens: Lens, frequencies: Tensor, fields: Tensor, wavelengths, points: Tensor, rule: Tensor) -> tuple:
+    """Tangential and sagittal MTF (F, K) of rays."""
     rays = image_rays(lens, points, fields=fields, wavelengths=wavelengths)
     energy = torch.where(rays.valid, rule, 0.0)
     light = energy.sum(-1)

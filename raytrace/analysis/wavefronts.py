@@ -1,10 +1,13 @@
 """Wavefront maps: the OPD over the whole pupil, its Zernike coefficients and the Strehl ratio."""
 
+import dataclasses
+
 import torch
 from torch import Tensor
 
 from raytrace.analysis.frame import Tabular, axis
 from raytrace.analysis.setting import scene_of
+from raytrace.budget import RAY_BYTES, afford, piece
 from raytrace.lens import Lens
 from raytrace.psf.diffraction import strehl
 from raytrace.pupil import gauss_rings
@@ -14,6 +17,8 @@ from raytrace.wavefront import peak_to_valley, rms, wavefront, zernike_coefficie
 
 _RINGS = 14, 56
 _GRID = 127
+_MAP_BYTES = 24  # of a point of a map, while it is made
+_BY_FIELD = ("opd", "valid", "coefficients", "rms", "peak_to_valley", "strehl")
 
 
 @value
@@ -75,10 +80,28 @@ def wavefront_map(
     """OPD over `size` × `size` pupil points, and the coefficients 1 … `terms` of 784 rays, see `zernike_coefficients`.
 
     What a field does not have is nan: everything where no ray arrives, the coefficients where the light fills too
-    little of the pupil.
+    little of the pupil. Raises budget.OverBudget for more points than memory holds.
     """
     view = scene_of(lens, fields, wavelengths)
-    like = {"dtype": lens.wavelengths.dtype, "device": lens.wavelengths.device}
+    F, W = view.fields.shape[1], len(view.wavelengths)
+    afford(
+        _MAP_BYTES * F * W * size * size,
+        f"the wavefronts of {F} fields × {W} wavelengths at {size} × {size} points",
+        helps="ask for a smaller --size, or fewer fields or wavelengths",
+    )
+    together = piece(RAY_BYTES * W * max(size, _GRID) ** 2)
+    parts = [
+        _map_of(dataclasses.replace(view, fields=some), size, terms, numbering)
+        for some in view.fields.split(together, 1)
+    ]
+    if len(parts) == 1:
+        return parts[0]
+    joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in _BY_FIELD}
+    return dataclasses.replace(parts[0], fields=view.fields, **joined)
+
+
+def _map_of(view: Scene, size: int, terms: int, numbering: str) -> WavefrontMap:
+    like = {"dtype": view.wavelengths.dtype, "device": view.wavelengths.device}
     line, inside, points = _grid(size, **like)
     drawn = wavefront(view, points)
     dense = drawn if size == _GRID else wavefront(view, _grid(_GRID, **like)[2])

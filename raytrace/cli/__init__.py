@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Callable, Sequence
 
 from raytrace.cli.commands import COMMANDS
-from raytrace.cli.options import did_you_mean
+from raytrace.cli.options import did_you_mean, max_bytes
 from raytrace.cli.several import each_distance
 
 DESCRIPTION = "A sequential, differentiable ray tracer: read a lens file, trace it, focus it, plot it."
@@ -74,6 +74,7 @@ def build_parser() -> argparse.ArgumentParser:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         command.add_arguments(child)
+        max_bytes(child)
         child.set_defaults(run=command.run)
     return parser
 
@@ -92,12 +93,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         warnings.simplefilter("always")
         warnings.showwarning = _shower()
         try:
-            with importlib.import_module("raytrace.cli.progress").heartbeat(arguments.command):
+            with (
+                importlib.import_module("raytrace.cli.progress").heartbeat(arguments.command),
+                importlib.import_module("raytrace.budget").within(getattr(arguments, "max_bytes", None)),
+            ):
                 run = getattr(importlib.import_module(f"raytrace.cli.{module}"), function)
-            if getattr(arguments, "object_distance", None) and not arguments.distances_together:
-                each_distance(run, arguments)
-            else:
-                run(arguments)
+                if getattr(arguments, "object_distance", None) and not arguments.distances_together:
+                    each_distance(run, arguments)
+                else:
+                    run(arguments)
         except KeyboardInterrupt:
             return _fail("interrupted", 130)
         except BrokenPipeError:
@@ -110,7 +114,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             if isinstance(error, (ValueError, LookupError, OSError)) and not isinstance(error, KeyError | IndexError):
                 return _fail(_one_line(error), 1)
             if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
-                return _fail("not enough memory for this many rays; ask for fewer (--rings, --points, --rays)", 1)
+                return _fail("not enough memory; ask for less (--rings, --points, --rays), or set --max-bytes", 1)
             kind = type(error).__name__
             return _fail(
                 f"{kind}: {_one_line(error)} (a defect of raytrace; RAYTRACE_TRACEBACK=1 shows where, please report)", 1

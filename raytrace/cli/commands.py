@@ -81,7 +81,10 @@ def _spot(parser):
         "traced in chunks, none kept",
     )
     parser.add_argument(
-        "--max-bytes", metavar="BYTES", type=memory, help="memory that --rays may take, as 200MB (default 256MB)"
+        "--max-bytes",
+        metavar="BYTES",
+        type=memory,
+        help="memory that may be taken, as 200MB (default with --rays 256MB, else half of what is free)",
     )
     parser.add_argument(
         "--reference",

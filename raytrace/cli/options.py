@@ -162,6 +162,18 @@ def conditions(parser: argparse.ArgumentParser, *, several: str = "") -> None:
     wavelength(group)
 
 
+def max_bytes(parser: argparse.ArgumentParser) -> None:
+    """--max-bytes, for commands that neither have it yet nor hand over to another parser."""
+    if parser._subparsers is None and not any(action.dest == "max_bytes" for action in parser._actions):
+        parser.add_argument(
+            "--max-bytes",
+            metavar="BYTES",
+            type=memory,
+            help="memory that may be taken, as 4GB: what is predicted to need more is refused before it begins "
+            "(default half of what is free)",
+        )
+
+
 def object_distance(group, several: str, *, default: list[float] | None = None) -> None:
     group.add_argument(
         "--object-distance",

@@ -20,7 +20,7 @@ from raytrace.spot import spot as spot_of
 
 def spot(arguments: argparse.Namespace) -> None:
     """Spot of every field and wavelength on the sensor."""
-    if arguments.rays is not None or arguments.max_bytes is not None:
+    if arguments.rays is not None:
         from raytrace.cli import spot_stream
 
         return spot_stream.spot(arguments)

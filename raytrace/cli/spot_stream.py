@@ -44,8 +44,6 @@ def spot(arguments: argparse.Namespace) -> None:
 def _check(arguments: argparse.Namespace) -> None:
     if arguments.reference != "centroid" or arguments.weights != "area":
         raise CommandError("--rays gives radii about the centroid by area: leave --reference and --weights out")
-    if arguments.rays is None:
-        raise CommandError("--max-bytes belongs to --rays: without it all rays are kept")
     for name in ("rings", "points"):
         if getattr(arguments, name) is not None:
             raise CommandError(f"--rays and --{name} exclude each other: both are a number of rays")

@@ -39,7 +39,6 @@ def psf(arguments: argparse.Namespace) -> None:
         engine=arguments.engine,
         samples=arguments.samples,
         tol=arguments.tol,
-        max_bytes=arguments.max_bytes,
     )
     if arguments.output:
         write_atomically(arguments.output, lambda file: save(found, arguments.element, file))

@@ -2,7 +2,7 @@
 
 import argparse
 
-from raytrace.cli.options import catalog, count, file_name, memory, positive, positive_finite, size
+from raytrace.cli.options import catalog, count, file_name, positive, positive_finite, size
 
 #: The names that `--element` takes beside files: those of wave.baselines.
 ELEMENTS = (
@@ -144,10 +144,4 @@ def feature(group, default: str) -> None:
     """--feature: size of what heights are made in."""
     group.add_argument(
         "--feature", metavar="MM", type=positive_finite, help=f"size of the features of the heights (default {default})"
-    )
-
-
-def max_bytes(group) -> None:
-    group.add_argument(
-        "--max-bytes", metavar="BYTES", type=memory, help="memory it may take, as 2GB (default half of what is free)"
     )

@@ -3,13 +3,13 @@
 import argparse
 import dataclasses
 import math
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from raytrace.budget import afford, allowed_bytes, in_words
 from raytrace.catalog import find_glass
 from raytrace.cli.door import CommandError, catalogs, say
 from raytrace.cli.options import did_you_mean
@@ -172,35 +172,25 @@ def scene(arguments: argparse.Namespace, parts: Sequence[Element]) -> WaveScene:
 
 
 @torch.no_grad()
-def kernels(found: WaveScene, *, engine: str, samples: int | None, tol: float, max_bytes: int | None = None) -> WavePsf:
+def kernels(found: WaveScene, *, engine: str, samples: int | None, tol: float) -> WavePsf:
     """PSFs of a scene; where all at once would take too much memory, one after the other. What takes more than a few
     seconds is said before it begins.
 
-    Raises CommandError where one kernel alone would take more than max_bytes (half of what is free).
+    Raises budget.OverBudget where one kernel alone would take too much.
     """
     chosen = plan(found, engine=engine, samples=samples, tol=tol)
     count = len(found.depths) * len(found.wavelengths)
-    limit = free_memory() / 2 if max_bytes is None else max_bytes
-    whole = chosen.memory < min(_PIECE, limit)
+    whole = chosen.memory < min(_PIECE, allowed_bytes())
     needed = chosen.memory if whole else chosen.memory / count
-    if needed > limit:
-        raise CommandError(
-            f"{chosen.samples} samples take {needed / 1e9:.2g} GB a kernel, more than {limit / 1e9:.2g} GB; take fewer "
-            "by --samples or --tol, a smaller window by --size, or allow more by --max-bytes"
-        )
+    afford(
+        needed,
+        f"a kernel needs {chosen.samples:,} samples across",
+        helps="take fewer by --samples or a larger --tol, a smaller window by --size",
+    )
     seconds = chosen.flops / _RATE
     if seconds > _FEW:
-        say(f"{count} kernels, {chosen.samples} samples: about {seconds:.0f} s and {needed / 1e9:.2g} GB")
+        say(f"{count} kernels, {chosen.samples} samples: about {seconds:.0f} s and {in_words(needed)}")
     return psf(found, plan=chosen) if whole else _one_by_one(found, chosen)
-
-
-def free_memory() -> float:
-    """Bytes that are free, as far as the system says."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        return 1024.0 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
-    except (OSError, StopIteration):
-        return 0.5 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def _one_by_one(found: WaveScene, chosen: Plan) -> WavePsf:

@@ -9,6 +9,7 @@ from raytrace.cli.options import (
     count,
     file_name,
     json,
+    max_bytes,
     output,
     picture_file,
     plot,
@@ -17,7 +18,7 @@ from raytrace.cli.options import (
 from raytrace.cli.wave_edof_table import EDOF
 from raytrace.cli.wave_options import ELEMENTS as ELEMENTS
 from raytrace.cli.wave_options import ENGINES as ENGINES
-from raytrace.cli.wave_options import camera, element, engine, feature, light, max_bytes, pixels
+from raytrace.cli.wave_options import camera, element, engine, feature, light, pixels
 from raytrace.cli.wave_superres_table import SUPERRES
 
 _DESCRIPTION = """\
@@ -46,7 +47,6 @@ def _psf(parser: argparse.ArgumentParser) -> None:
     light(parser)
     pixels(parser)
     engine(parser)
-    max_bytes(parser)
     json(parser)
     output(
         parser,
@@ -145,6 +145,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         add_arguments(child)
+        max_bytes(child)
         child.set_defaults(run=run)
 
 

@@ -6,11 +6,13 @@ million waves of piston cost no digits.
 
 import math
 import warnings
+from collections.abc import Callable
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from raytrace.budget import piece
 from raytrace.grid import Grid, centres
 from raytrace.numerics import safe_divide, safe_sqrt
 from raytrace.pupil import gauss_rings
@@ -76,26 +78,47 @@ def to_grid(field: Tensor, L: Tensor, M: Tensor, x: Tensor, y: Tensor, wavelengt
     The image is separable even where the pupil is not: J (X + Y) exponentials and one product of matrices.
     L, M: (..., J) direction cosines; x: (..., X), y: (..., Y) mm; wavelength: (...) mm in the image space.
     """
-    along_x = phasor(L[..., :, None] * (x[..., None, :] / wavelength[..., None, None]))
-    along_y = phasor(y[..., :, None] * (M[..., None, :] / wavelength[..., None, None]))
-    return along_y @ (field[..., :, None] * along_x)
+
+    def some(field: Tensor, L: Tensor, M: Tensor) -> Tensor:
+        along_x = phasor(L[..., :, None] * (x[..., None, :] / wavelength[..., None, None]))
+        along_y = phasor(y[..., :, None] * (M[..., None, :] / wavelength[..., None, None]))
+        return along_y @ (field[..., :, None] * along_x)
+
+    return _in_pieces(some, field, L, M, each=64 * (x.shape[-1] + y.shape[-1]) * wavelength.numel())
 
 
 def to_grid_mirrored(field: Tensor, L: Tensor, M: Tensor, x: Tensor, y: Tensor, wavelength: Tensor) -> Tensor:
     """The same sum over waves in pairs (L, M) and (-L, M) of equal field, one of which is given: a real product."""
-    turns = L[..., :, None] * (x[..., None, :] / wavelength[..., None, None])
-    cosine = 2 * torch.cos(2 * math.pi * _fraction(turns))
-    along_y = phasor(y[..., :, None] * (M[..., None, :] / wavelength[..., None, None])) * field[..., None, :]
-    return torch.complex(along_y.real @ cosine, along_y.imag @ cosine)
+
+    def some(field: Tensor, L: Tensor, M: Tensor) -> Tensor:
+        turns = L[..., :, None] * (x[..., None, :] / wavelength[..., None, None])
+        cosine = 2 * torch.cos(2 * math.pi * _fraction(turns))
+        along_y = phasor(y[..., :, None] * (M[..., None, :] / wavelength[..., None, None])) * field[..., None, :]
+        return torch.complex(along_y.real @ cosine, along_y.imag @ cosine)
+
+    return _in_pieces(some, field, L, M, each=64 * (x.shape[-1] + y.shape[-1]) * wavelength.numel())
 
 
 def rings_to_grid(field: Tensor, sine: Tensor, x: Tensor, y: Tensor, wavelength: Tensor) -> Tensor:
     """U(y, x) = Σ_j field_j J₀(2π s_j ρ/λ), (..., Y, X): cones of waves (..., J) about the axis, s their sine."""
     distance = safe_sqrt(y[..., :, None] ** 2 + x[..., None, :] ** 2)
-    argument = distance[..., None] * (2 * math.pi * sine / wavelength[..., None])[..., None, None, :]
-    J0 = bessel_j0(argument).flatten(-3, -2)
-    U = torch.complex(*(J0 @ part[..., None] for part in (field.real, field.imag)))
+
+    def some(field: Tensor, sine: Tensor) -> Tensor:
+        argument = distance[..., None] * (2 * math.pi * sine / wavelength[..., None])[..., None, None, :]
+        J0 = bessel_j0(argument).flatten(-3, -2)
+        return torch.complex(*(J0 @ part[..., None] for part in (field.real, field.imag)))
+
+    U = _in_pieces(some, field, sine, each=32 * distance[..., 0, 0].numel() * x.shape[-1] * y.shape[-1])
     return U[..., 0].unflatten(-1, distance.shape[-2:])
+
+
+def _in_pieces(sum_of: Callable[..., Tensor], *waves: Tensor, each: float) -> Tensor:
+    """sum_of(*waves), a sum over the last axis of the waves (..., J), in pieces; each: bytes that one of them takes."""
+    parts = zip(*(torch.split(wave, piece(each), -1) for wave in torch.broadcast_tensors(*waves)), strict=True)
+    total = sum_of(*next(parts))
+    for part in parts:
+        total = total + sum_of(*part)
+    return total
 
 
 def bessel_j0(x: Tensor) -> Tensor:

@@ -20,6 +20,7 @@ from raytrace import zernike
 from raytrace.grid import Grid
 from raytrace.numerics import safe_divide, safe_sqrt
 from raytrace.psf.clear import between, clear_arms
+from raytrace.psf.cost import afford_rings, afford_sensor
 from raytrace.psf.dft import (
     disc_rule,
     integrate,
@@ -144,7 +145,9 @@ def _field_kernels(scene: Scene, grid: Grid, order: int) -> Kernels:
         x, y = radii, torch.zeros_like(radii[:1])
         corner = radii.detach().max()
     else:
-        x, y, weight = sub_pixels(local, nodes_per_pixel(float(grid.pitch.detach()), cutoff, order))
+        nodes = nodes_per_pixel(float(grid.pitch.detach()), cutoff, order)
+        afford_sensor("the wave PSF", scene, grid, nodes)
+        x, y, weight = sub_pixels(local, nodes)
         corner = largest(torch.hypot(x.detach().abs().amax(-1), y.detach().abs().amax(-1)).max())
     light = _waves(scene, probe, corner, order)
     U = amplitude(light, x, y)
@@ -251,6 +254,7 @@ def _rays(scene: Scene, probe: Wavefront, fold: str, phase: float, order: int) -
     like = {"dtype": probe.opd.dtype, "device": probe.opd.device}
     rings, arms = rings_and_arms(phase, order)
     if fold == "round":
+        afford_rings("the wave PSF", scene, rings, phase)
         arms, (points, weights) = 1, gauss_rings(rings, 1, **like)
     else:
         points, weights = disc_rule(phase, order, most=_MOST_RAYS, what="the wave model", like=probe.opd)

@@ -18,8 +18,10 @@ import torch
 from torch import Tensor
 
 from raytrace import zernike as polynomials
+from raytrace.budget import piece
 from raytrace.grid import Grid
 from raytrace.paraxial import first_order, signed
+from raytrace.psf.cost import afford_rings, afford_sensor
 from raytrace.psf.dft import (
     bessel_j0,
     disc_rule,
@@ -74,9 +76,9 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0, zernike: Tensor | None 
     waves = None if zernike is None else _aberrations(scene, zernike.to(torch.float64))
     shift, blur = _moments(lens, waves)
     if waves is None and symmetry(scene) == "round" and is_centred(window):
-        kernel, centroid, covariance = _round_kernels(lens, window, order)
+        kernel, centroid, covariance = _round_kernels(scene, lens, window, order)
     else:
-        kernel, centroid, covariance = _kernels(lens, window, waves, order)
+        kernel, centroid, covariance = _kernels(scene, lens, window, waves, order)
     limit = {"ray_centroid": lens.chief + shift, "ray_covariance": blur}
     found = Kernels(kernel, grid, lens.chief + centroid, covariance, rays=0, **limit)
     return dataclasses.replace(to(found, dtype=grid.pitch.dtype), grid=grid) if single else found
@@ -92,13 +94,20 @@ def _refuse_without_pupil(lens: Paraxial) -> None:
         )
 
 
-def _kernels(lens: Paraxial, window: Grid, waves: Tensor | None, order: int) -> tuple[Tensor, Tensor, Tensor]:
+def _kernels(
+    scene: Scene, lens: Paraxial, window: Grid, waves: Tensor | None, order: int
+) -> tuple[Tensor, Tensor, Tensor]:
     """Kernels (D, F, W, rows, columns), one after the other, for each has its own phases; centroid and covariance."""
     shape = lens.defocus.shape
     centre = window.centre.reshape(2, *(window.centre.shape[1:] or (1, 1, 1))) - lens.chief
     steepest = float(largest(lens.frequency.detach().abs().max()))
     nodes = nodes_per_pixel(float(window.pitch.detach()), 2 * steepest, order)
+    afford_sensor("the Fourier PSF", scene, window, nodes)
     x, y, weight = sub_pixels(Grid(window.pitch, window.rows, window.columns, centre), nodes)
+    if waves is None:
+        corner = torch.hypot(x.detach().abs().amax(-1), y.detach().abs().amax(-1)).max()
+        phase = 2 * math.pi * steepest * float(corner) + 2 * float(lens.defocus.detach().abs().max())
+        afford_rings("the Fourier PSF", scene, rings_and_arms(phase, order)[0], phase)
     pixels, moments = [], []
     for place in itertools.product(*map(range, shape)):
         own = None if waves is None else waves[(slice(None), *place)]
@@ -109,7 +118,7 @@ def _kernels(lens: Paraxial, window: Grid, waves: Tensor | None, order: int) -> 
     return torch.stack(pixels).unflatten(0, shape), centroid, covariance
 
 
-def _round_kernels(lens: Paraxial, window: Grid, order: int) -> tuple[Tensor, Tensor, Tensor]:
+def _round_kernels(scene: Scene, lens: Paraxial, window: Grid, order: int) -> tuple[Tensor, Tensor, Tensor]:
     """The same on the axis, along one radius; Bessel functions are shared by all object distances.
 
     Sensor and pupil decide the frequency a, an object distance only the defocus.
@@ -120,11 +129,16 @@ def _round_kernels(lens: Paraxial, window: Grid, order: int) -> tuple[Tensor, Te
     radii, matrix = radii_of_waves(window, 2 * steepest, order)
     corner = float(window.pitch.detach()) * reach(window)
     phase = 2 * math.pi * steepest * corner + 2 * float(largest(lens.defocus.detach().abs().max()))
-    radius, weights = _rings(rings_and_arms(phase, order)[0], like=radii)
+    rings = rings_and_arms(phase, order)[0]
+    afford_rings("the Fourier PSF", scene, rings, phase)
+    radius, weights = _rings(rings, like=radii)
     spectrum = weights * phasor(lens.defocus[..., None] * radius * radius / (2 * math.pi))
-    J0 = bessel_j0(2 * math.pi * (frequency * radii)[..., None] * radius)
-    real, imag = (torch.einsum("dfwkj,dfwj->dfwk", J0, part) for part in (spectrum.real, spectrum.imag))
-    intensity = math.pi * lens.frequency[..., None] ** 2 * (real * real + imag * imag)
+    intensities = []
+    for some in radii.split(piece(32 * rings * frequency.numel())):
+        J0 = bessel_j0(2 * math.pi * (frequency * some)[..., None] * radius)
+        real, imag = (torch.einsum("dfwkj,dfwj->dfwk", J0, part) for part in (spectrum.real, spectrum.imag))
+        intensities.append(math.pi * lens.frequency[..., None] ** 2 * (real * real + imag * imag))
+    intensity = torch.cat(intensities, -1)
     kernel = unfold(window, intensity @ matrix.mT)
     return kernel, *round_moments(intensity @ second_moments_of_waves(window, 2 * steepest, order).mT, kernel)
 

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from raytrace.budget import afford
 from raytrace.grid import Grid
 from raytrace.numerics import safe_divide
 from raytrace.scene import varies
@@ -61,6 +62,12 @@ def _rule_of(grid: Grid, cutoff: float, order: int) -> tuple[np.ndarray, np.ndar
     argument = 2 * math.pi * cutoff * pitch * reach(grid)
     count = math.ceil(0.5 * argument + max(1.5, 2 + order) * (4 + argument ** (1 / 3)))
     nodes = math.ceil(0.5 * math.pi * cutoff * pitch) + 4 + order
+    distinct = grid.rows * grid.columns / (4 if grid.rows != grid.columns else 8) + grid.rows
+    afford(
+        8.0 * (8 * distinct * nodes**2 + (2 * distinct + 2 * count) * count),
+        f"the PSF needs its light at {count:,} radii and {nodes:,}² points of each pixel",
+        helps="ask for a smaller --size or --pixel, a slower aperture (--f-number) or --model drt",
+    )
     return _wave_rule(grid.rows, grid.columns, nodes, count)
 
 

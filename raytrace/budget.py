@@ -1,0 +1,120 @@
+"""Budget: memory is predicted where a sampling is decided, and what would take too much is refused before it begins.
+
+A limit is set for a block by `within`; without one it is half of what the machine, or the control group that the
+process runs in, has free.
+"""
+
+import contextlib
+import contextvars
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+_SMALL = 2**24  # bytes that nobody is asked about
+_PIECE = 2**27  # bytes that a piece of what is cut into pieces takes
+
+#: Predicted peak of a trace without a graph, beside its result: measured, with OPD and moments (tests/test_budget.py).
+RAY_BYTES = 400
+
+_limit: contextvars.ContextVar[float | None] = contextvars.ContextVar("limit", default=None)
+
+
+class OverBudget(ValueError):
+    """More memory would be needed than there is; the message says for what, and what helps."""
+
+
+@contextlib.contextmanager
+def within(max_bytes: float | None) -> Iterator[None]:
+    """Within the block, refuse what is predicted to take more memory; None: more than half of what is free then."""
+    token = _limit.set(max_bytes)
+    try:
+        yield
+    finally:
+        _limit.reset(token)
+
+
+def afford(needed: float, what: str, *, helps: str) -> None:
+    """Raise OverBudget if `needed` bytes are more than may be taken.
+
+    what: the thing with its size and cause, as "the wave PSF at F/0.1 needs 60000 pupil rings"; helps: what to change.
+    """
+    if needed <= _SMALL:
+        return
+    limit = allowed_bytes()
+    if needed > limit:
+        raise OverBudget(
+            f"{what} ({in_words(needed)}; {in_words(limit)} may be taken): {helps}, or allow more by --max-bytes "
+            "(raytrace.budget.within)"
+        )
+
+
+def allowed_bytes() -> float:
+    """How much may be taken: what `within` says, else half of what is free."""
+    limit = _limit.get()
+    return 0.5 * free_bytes() if limit is None else limit
+
+
+def piece(each: float) -> int:
+    """How many things of so many bytes each are worked on at a time, at least one."""
+    limit = _limit.get()
+    return max(1, int((_PIECE if limit is None else min(_PIECE, 0.25 * limit)) // max(each, 1.0)))
+
+
+def free_bytes() -> float:
+    """Memory that the process may still take: of the machine, or of its control groups where that is less."""
+    return min([_available(), *map(_left, _groups())])
+
+
+def in_words(size: float) -> str:
+    """A number of bytes for people, as 1.5 GB."""
+    if not math.isfinite(size):
+        return "more bytes than there are"
+    for unit, worth in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
+        if size >= worth:
+            return f"{size / worth:,.3g} {unit}" if size < 1e15 else f"{size / 1e12:.1e} TB"
+    return f"{size / 1e3:.3g} kB"
+
+
+def _available() -> float:
+    try:
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return 1024.0 * int(line.split()[1])
+    except OSError:
+        pass
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, ValueError, OSError):
+        return math.inf
+
+
+def _groups() -> list[Path]:
+    """Folders of the control groups that count this process's memory, of either version, up to the root."""
+    try:
+        lines = Path("/proc/self/cgroup").read_text().splitlines()
+    except OSError:
+        return []
+    found = []
+    for _, controllers, path in (line.split(":", 2) for line in lines):
+        if controllers in ("", "memory"):
+            base = Path("/sys/fs/cgroup", controllers)
+            inner = base / path.strip("/")
+            found += [inner, *(above for above in inner.parents if above.is_relative_to(base))]
+    return found
+
+
+def _left(group: Path) -> float:
+    """What a control group leaves, pages of files that can be dropped counted in; inf where it has no limit."""
+    for most, used, dropped in (
+        ("memory.max", "memory.current", "inactive_file"),
+        ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+    ):
+        try:
+            limit, taken = (group / most).read_text().strip(), float((group / used).read_text())
+            lines = (line.split() for line in (group / "memory.stat").read_text().splitlines())
+            spare = sum(float(size) for name, size in lines if name == dropped)
+        except (OSError, ValueError):
+            continue
+        return math.inf if limit == "max" else max(0.0, float(limit) - taken + spare)
+    return math.inf

@@ -1,0 +1,39 @@
+"""Cost: what waves take in memory, told in the words of a lens before they are summed."""
+
+import math
+
+from raytrace.budget import afford
+from raytrace.grid import Grid
+from raytrace.paraxial import first_order
+from raytrace.scene import Scene
+
+_HELPS = "give a larger --tol, a smaller --size or --pixel, a slower aperture (--f-number), --model drt"
+
+
+def afford_rings(what: str, scene: Scene, rings: int, phase: float) -> None:
+    """Raise OverBudget where a pupil of so many Gauss rings is too much.
+
+    phase: radians along a pupil radius. The nodes of a rule of n rings are the eigenvalues of a matrix n × n.
+    """
+    D, F, W = scene.shape
+    turns = phase / (2 * math.pi)
+    afford(
+        24.0 * rings**2 + 128.0 * rings * D * F * W,
+        f"{what} at {_speed(scene)} needs {rings:,} rings of the pupil: the phase turns {turns:,.0f} times",
+        helps=_HELPS,
+    )
+
+
+def afford_sensor(what: str, scene: Scene, grid: Grid, nodes: int) -> None:
+    """Raise OverBudget where the light at `nodes`² points of each pixel is too much; fields come one by one."""
+    D, _, W = scene.shape
+    rows, columns = grid.rows * nodes, grid.columns * nodes
+    afford(
+        64.0 * D * W * rows * columns,
+        f"{what} at {_speed(scene)} needs {columns:,} × {rows:,} points of the sensor for {D * W} kernels",
+        helps=_HELPS,
+    )
+
+
+def _speed(scene: Scene) -> str:
+    return f"F/{float(first_order(scene.lens).working_f_number.detach().abs().min()):.3g}"

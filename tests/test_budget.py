@@ -1,0 +1,169 @@
+"""Budget: what would take too much memory is refused before it begins, in the library and by every command."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+import raytrace
+from raytrace import analysis, budget
+from raytrace.budget import OverBudget, afford, free_bytes, in_words, piece, within
+from raytrace.cli import COMMANDS, build_parser, main
+from raytrace.files import shipped
+from raytrace.focus import image_rays
+from raytrace.lens import SystemAperture
+from raytrace.psf import psf
+from raytrace.psf.dft import rings_to_grid, to_grid, to_grid_mirrored
+
+LENS = shipped("lenses") / "double_gauss.zmx"
+
+
+@pytest.fixture(scope="module")
+def lens():
+    return raytrace.read_lens(LENS)
+
+
+def test_a_limit_holds_within_its_block_and_half_of_what_is_free_elsewhere(monkeypatch):
+    monkeypatch.setattr(budget, "free_bytes", lambda: 4e9)
+    afford(1.9e9, "a thing", helps="less")
+    with pytest.raises(OverBudget, match=r"a thing \(2.1 GB; 2 GB may be taken\): less, or allow more by --max-bytes"):
+        afford(2.1e9, "a thing", helps="less")
+    with within(1e8), pytest.raises(OverBudget, match="100 MB may be taken"):
+        afford(1.01e8, "a thing", helps="less")
+    with within(1e12):
+        afford(1e11, "a thing", helps="less")
+        with pytest.raises(OverBudget, match="more bytes than there are"):
+            afford(float("inf"), "a thing", helps="less")
+
+
+def test_a_control_group_counts_without_the_files_it_can_drop(monkeypatch, tmp_path):
+    for name, text in (("max", "3000000"), ("current", "2500000"), ("stat", "anon 1\ninactive_file 1000000\n")):
+        (tmp_path / f"memory.{name}").write_text(text)
+    monkeypatch.setattr(budget, "_groups", lambda: [tmp_path, tmp_path / "none"])
+    assert free_bytes() == 1.5e6
+    (tmp_path / "memory.max").write_text("max\n")
+    assert free_bytes() > 1e7
+
+
+def test_pieces_fit_into_the_limit():
+    with within(4e6):
+        assert piece(1e3) == 1000
+        assert piece(1e9) == 1
+
+
+def test_bytes_in_words():
+    assert [in_words(size) for size in (1500, 2.5e6, 57e9, 3e14, 1e22)] == [
+        "1.5 kB", "2.5 MB", "57 GB", "300 TB", "1.0e+10 TB",
+    ]  # fmt: skip
+
+
+# -- pieces give what the whole gives ----------------------------------------------------------------------------------
+
+
+def test_sums_of_waves_in_pieces_are_those_of_all_at_once():
+    generator = torch.Generator().manual_seed(3)
+    field = torch.randn(2, 100, dtype=torch.complex128, generator=generator)
+    L, M = 0.1 * torch.rand(2, 2, 100, dtype=torch.float64, generator=generator)
+    x, y = torch.linspace(-0.01, 0.01, 7, dtype=torch.float64), torch.linspace(-0.01, 0.02, 5, dtype=torch.float64)
+    wavelength = torch.tensor([5e-4, 6e-4], dtype=torch.float64)
+    for total, waves in ((to_grid, (L, M)), (to_grid_mirrored, (L, M)), (rings_to_grid, (L,))):
+        whole = total(field, *waves, x, y, wavelength)
+        with within(4e4):
+            torch.testing.assert_close(total(field, *waves, x, y, wavelength), whole, rtol=1e-12, atol=1e-12)
+
+
+def test_analyses_in_pieces_are_those_of_all_at_once(lens, monkeypatch):
+    frequencies, fields = (
+        lens.wavelengths.new_tensor([10.0, 40.0]),
+        lens.wavelengths.new_tensor([[0.0, 0.0], [0.0, 9.0]]),
+    )
+    wavefronts = sys.modules["raytrace.analysis.wavefronts"]
+    monkeypatch.setattr(wavefronts, "_strehl", lambda view: view.fields.T[:, :1])  # slow, and by field in any case
+    found = {}
+    for pieces in (False, True):
+        if pieces:
+            for module in ("aperture", "mtf", "wavefronts", "encircled"):
+                each = sys.modules[f"raytrace.analysis.{module}"]
+                monkeypatch.setattr(each, "piece", lambda each: 1 if each > 1e4 else 5000)
+        found_map = analysis.wavefront_map(lens, size=9, fields=fields)
+        found[pieces] = (
+            analysis.mtf(lens, frequencies, kind="geometric", fields=fields).tangential,
+            analysis.mtf(lens, frequencies, fields=fields).sagittal,
+            analysis.encircled_energy(lens, frequencies / 1e4, kind="geometric", fields=fields).share,
+            *(getattr(found_map, name) for name in ("opd", "rms", "coefficients")),
+        )
+    for one, whole in zip(found[True], found[False], strict=True):
+        torch.testing.assert_close(one, whole, rtol=1e-9, atol=1e-9)
+
+
+# -- what is refused ---------------------------------------------------------------------------------------------------
+
+
+def fast(lens, number: float):
+    value = torch.tensor(number, dtype=torch.float64)
+    return dataclasses.replace(lens, aperture=SystemAperture("image_f_number", value))
+
+
+NASTY = {
+    "fourier": lambda lens: psf(fast(lens, 0.02), "fourier", fields=torch.zeros(2, 1, dtype=torch.float64)),
+    "wave of x-rays": lambda lens: psf(
+        lens, "wave", fields=torch.zeros(2, 1, dtype=torch.float64), wavelengths=lens.wavelengths.new_tensor([1e-6])
+    ),
+    "wavefront": lambda lens: analysis.wavefront_map(lens, size=10**5),
+    "encircled": lambda lens: analysis.encircled_energy(lens, fields=torch.zeros(2, 10**6, dtype=torch.float64)),
+    "rays": lambda lens: image_rays(lens, torch.zeros(2, 1, dtype=torch.float64).expand(2, 10**9)),
+}
+
+
+@pytest.mark.parametrize("name", NASTY)
+def test_what_is_too_much_is_refused_within_seconds(name, lens):
+    began = time.process_time()
+    with within(1e9), pytest.raises(OverBudget, match="--max-bytes"):
+        NASTY[name](lens)
+    assert time.process_time() - began < 10
+
+
+def test_commands_refuse_in_one_line(capsys):
+    assert main(["wavefront", "double_gauss", "--size", "20000", "--max-bytes", "1GB"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("raytrace: error: the wavefronts of 3 fields × 1 wavelengths at 20000 × 20000 points (")
+    assert "1 GB may be taken" in line
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_the_option(name, capsys):
+    words = [name.name if hasattr(name, "name") else name]
+    if words == ["wave"]:
+        words.append("psf")
+    with pytest.raises(SystemExit):
+        build_parser().parse_args([*words, "--help"])
+    assert "--max-bytes" in capsys.readouterr().out
+
+
+#: Commands that take memory, and what they are allowed.
+HEAVY = (
+    (["encircled", "double_gauss", "--field", *map(str, range(0, 14))], 1.0e9),
+    (["wavefront", "double_gauss", "--size", "1500"], 2.0e9),
+    (["psf", "double_gauss", "--model", "wave", "--field", "14", "--size", "41"], 1.0e9),
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("words", "most"), HEAVY)
+def test_memory_stays_within_what_is_allowed(words, most):
+    """A process that is allowed so much either refuses, or takes at most twice that beside what torch takes."""
+    code = (
+        "import resource, sys; from raytrace.cli import main; code = main(sys.argv[1:]);"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, file=sys.stderr); sys.exit(code)"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(raytrace.__file__).parents[1]), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words, "--max-bytes", str(int(most))],
+        env=environment, capture_output=True, text=True, timeout=600,
+    )  # fmt: skip
+    assert int(done.stderr.splitlines()[-1]) < 2 * most + 0.4e9
