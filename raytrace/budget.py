@@ -8,10 +8,12 @@ import contextlib
 import contextvars
 import math
 import os
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
 _SMALL = 2**24  # bytes that nobody is asked about
+_LONG = 30.0  # s
 _PIECE = 2**27  # bytes that a piece of what is cut into pieces takes
 
 #: Predicted peak of a trace without a graph, beside its result: measured, with OPD and moments (tests/test_budget.py).
@@ -22,6 +24,10 @@ _limit: contextvars.ContextVar[float | None] = contextvars.ContextVar("limit", d
 
 class OverBudget(ValueError):
     """More memory would be needed than there is; the message says for what, and what helps."""
+
+
+class TakesLong(UserWarning):
+    """What follows is predicted to take more than half a minute; the message says what, how long, and what helps."""
 
 
 @contextlib.contextmanager
@@ -47,6 +53,13 @@ def afford(needed: float, what: str, *, helps: str) -> None:
             f"{what} ({in_words(needed)}; {in_words(limit)} may be taken): {helps}, or allow more by --max-bytes "
             "(raytrace.budget.within)"
         )
+
+
+def forewarn(seconds: float, what: str, *, helps: str) -> None:
+    """Warn TakesLong where something is predicted to take long, to a factor of three; arguments as for `afford`."""
+    if seconds > _LONG:
+        length = f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:,.0f} minutes"
+        warnings.warn(f"{what}: about {length}; for less, {helps}", TakesLong, stacklevel=3)
 
 
 def allowed_bytes() -> float:

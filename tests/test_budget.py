@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,7 @@ import torch
 
 import raytrace
 from raytrace import analysis, budget
-from raytrace.budget import OverBudget, afford, free_bytes, in_words, piece, within
+from raytrace.budget import OverBudget, TakesLong, afford, free_bytes, in_words, piece, within
 from raytrace.cli import COMMANDS, build_parser, main
 from raytrace.files import shipped
 from raytrace.focus import image_rays
@@ -126,6 +127,16 @@ def test_what_is_too_much_is_refused_within_seconds(name, lens):
     with within(1e9), pytest.raises(OverBudget, match="--max-bytes"):
         NASTY[name](lens)
     assert time.process_time() - began < 10
+
+
+def test_what_takes_long_is_said_before_it_begins(lens):
+    """Ideal waves at F/0.1: minutes. The warning made an error stops them."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", TakesLong)
+        with pytest.raises(
+            TakesLong, match=r"points of each pixel: about \d+ (s|minutes); for less, ask for a smaller"
+        ):
+            psf(fast(lens, 0.1), "fourier", fields=torch.zeros(2, 1, dtype=torch.float64))
 
 
 def test_commands_refuse_in_one_line(capsys):

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.budget import afford
+from raytrace.budget import afford, forewarn
 from raytrace.grid import Grid
 from raytrace.numerics import safe_divide
 from raytrace.scene import varies
@@ -137,6 +137,11 @@ def _wave_rule(rows: int, columns: int, nodes: int, count: int) -> tuple[np.ndar
     series = np.where(terms == 0, 1, 2)[:, None] / count * np.cos(terms[:, None] * angle)
     node, weight = (a / 2 for a in np.polynomial.legendre.leggauss(nodes))
     places = _distinct(rows, columns)[0]
+    forewarn(
+        5e-9 * count * len(places) * nodes**2,
+        f"a PSF takes its light at {count:,} radii and {nodes:,}² points of each pixel",
+        helps="ask for a smaller --size or --pixel, a slower aperture (--f-number) or --model drt",
+    )
     x, y = (places[:, axis, None] + node for axis in (0, 1))
     # T_2m by its recurrence in T_2: a tenth of the time of as many cosines.
     twice = 2 * (2 * np.minimum(np.hypot(x[:, :, None], y[:, None, :]) / corner, 1.0) ** 2 - 1)
