@@ -178,7 +178,7 @@ def test_info_says_infinite_or_nothing_where_there_is_no_number(run):
         line = next(line for line in text.splitlines() if line.strip().startswith(quantity))
         assert line.removeprefix(f"  {quantity}").split()[0] == "infinite"
     touching = run("info", singlet("touching", ("DISZ INFINITY", "DISZ 0"))).out
-    (line,) = (line for line in touching.splitlines() if "magnification" in line)
+    (line,) = (line for line in touching.splitlines() if line.strip().startswith("magnification"))
     assert line.split() == ["magnification", "-"]
 
 
