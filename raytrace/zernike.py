@@ -71,28 +71,33 @@ def polynomials(orders: Sequence[Order], x: Tensor, y: Tensor) -> Tensor:
     derivatives at the centre.
     """
     t = 2 * (x * x + y * y) - 1
-    harmonics, radial = {0: (torch.ones_like(x), torch.zeros_like(x))}, {}
+    harmonics, radial = _harmonics(orders, x, y), {}
     result = []
     for n, m in orders:
-        k, size = divmod(n - abs(m), 2)[0], abs(m)
-        if n < size or (n - size) % 2:
-            raise ValueError(f"no Zernike polynomial has n = {n}, m = {m}: n - |m| must be even and not negative")
-        for i in range(len(harmonics), size + 1):
-            c, s = harmonics[i - 1]
-            harmonics[i] = c * x - s * y, c * y + s * x
+        k, size = _degree(n, m), abs(m)
         _jacobi(radial, size, k, t)
         result.append(norm(n, m) * radial[size][k] * harmonics[size][0 if m >= 0 else 1])
     return torch.stack(result)
 
 
 def gradients(orders: Sequence[Order], x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """∂Z/∂x and ∂Z/∂y, each (J, ...), at points (...)."""
-    zero, one = torch.zeros_like(x), torch.ones_like(x)
+    """∂Z/∂x and ∂Z/∂y, each (J, ...), at points (...).
 
-    def values(x: Tensor, y: Tensor) -> Tensor:
-        return polynomials(orders, x, y)
-
-    return tuple(torch.func.jvp(values, (x, y), tangent)[1] for tangent in ((one, zero), (zero, one)))
+    ∇(P H) = H P' 4 (x, y) + P ∇H with d(x + iy)^|m| = |m| (x + iy)^(|m| - 1) (dx + i dy); P' by its recurrence.
+    """
+    t = 2 * (x * x + y * y) - 1
+    harmonics, radial, slopes = _harmonics(orders, x, y), {}, {}
+    along_x, along_y = [], []
+    for n, m in orders:
+        k, size = _degree(n, m), abs(m)
+        _jacobi(radial, size, k, t)
+        _jacobi_slopes(slopes, radial[size], size, k, t)
+        c, s = harmonics[max(size - 1, 0)]
+        by_x, by_y = (c, -s) if m >= 0 else (s, c)
+        bent = 4 * slopes[size][k] * harmonics[size][0 if m >= 0 else 1]
+        along_x.append(norm(n, m) * (bent * x + size * radial[size][k] * by_x))
+        along_y.append(norm(n, m) * (bent * y + size * radial[size][k] * by_y))
+    return torch.stack(along_x), torch.stack(along_y)
 
 
 def fit(values: Tensor, basis: Tensor, weights: Tensor | None = None) -> Tensor:
@@ -123,6 +128,23 @@ def condition(basis: Tensor, weights: Tensor) -> Tensor:
     return torch.where((weights > 0).sum(-1) < len(basis), torch.inf, found)
 
 
+def _degree(n: int, m: int) -> int:
+    """k = (n - |m|)/2. Raises ValueError if there is no such polynomial."""
+    k, odd = divmod(n - abs(m), 2)
+    if k < 0 or odd:
+        raise ValueError(f"no Zernike polynomial has n = {n}, m = {m}: n - |m| must be even and not negative")
+    return k
+
+
+def _harmonics(orders: Sequence[Order], x: Tensor, y: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Real and imaginary part of (x + iy)^|m|, from 0 to the largest |m|."""
+    found = [(torch.ones_like(x), torch.zeros_like(x))]
+    for _ in range(max((abs(m) for _, m in orders), default=0)):
+        c, s = found[-1]
+        found.append((c * x - s * y, c * y + s * x))
+    return found
+
+
 def _jacobi(known: dict[int, list[Tensor]], m: int, k: int, t: Tensor) -> None:
     """Extend known[m] up to P_k^(0, m)(t)."""
     found = known.setdefault(m, [torch.ones_like(t)])
@@ -133,6 +155,18 @@ def _jacobi(known: dict[int, list[Tensor]], m: int, k: int, t: Tensor) -> None:
         a = 2 * i + m
         ahead = (a - 1) * (a * (a - 2) * t - m * m) * found[-1] - 2 * (i - 1) * (i + m - 1) * a * found[-2]
         found.append(ahead / (2 * i * (i + m) * (a - 2)))
+
+
+def _jacobi_slopes(known: dict[int, list[Tensor]], values: list[Tensor], m: int, k: int, t: Tensor) -> None:
+    """Extend known[m] up to the derivative of P_k^(0, m) at t: that of the recurrence of the values."""
+    found = known.setdefault(m, [torch.zeros_like(t)])
+    for i in range(len(found), k + 1):
+        if i == 1:
+            found.append(torch.full_like(t, 0.5 * (m + 2)))
+            continue
+        a = 2 * i + m
+        ahead = (a - 1) * (a * (a - 2) * (t * found[-1] + values[i - 1]) - m * m * found[-1])
+        found.append((ahead - 2 * (i - 1) * (i + m - 1) * a * found[-2]) / (2 * i * (i + m) * (a - 2)))
 
 
 def _at_least(j: int, first: int, name: str) -> None:

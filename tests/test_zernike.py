@@ -73,7 +73,7 @@ def test_high_orders_keep_their_digits_at_the_edge():
 def test_gradients_are_those_of_autograd_and_finite_at_the_centre():
     x = torch.tensor([0.0, 0.3, -0.6], dtype=torch.float64, requires_grad=True)
     y = torch.tensor([0.0, -0.2, 0.7], dtype=torch.float64, requires_grad=True)
-    orders = [zernike.noll(j) for j in range(2, 29)]
+    orders = [zernike.noll(j) for j in range(2, 120)]
     by_x, by_y = zernike.gradients(orders, x.detach(), y.detach())
     for j, order in enumerate(orders):
         z = zernike.polynomials([order], x, y).sum()
