@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from raytrace.bench import wave as bench
-from raytrace.bench.wave import ERROR, TALK, WaveRow, agreement, bench_scene, gradient, measure, reference, target
+from raytrace.bench.wave import ERROR, SITZMANN, WaveRow, agreement, bench_scene, gradient, measure, reference, target
 from raytrace.bench.wave_report import KEPT, markdown, table
 from raytrace.plot.wave import bench_figure
 
@@ -32,9 +32,9 @@ def test_two_converged_references_agree(scene, monkeypatch):
     assert agreement(scene) < 3e-5
 
 
-def test_the_talks_method_comes_to_the_same_waves(scene):
+def test_sitzmanns_method_comes_to_the_same_waves(scene):
     """At 3.125 µm a sample, just below λz/(D + blur): right to the staircase of its rim, 1e-3 of the light."""
-    entrant = bench.talks(scene, torch.float64, samples=1600)
+    entrant = bench.sitzmann_method(scene, torch.float64, samples=1600)
     assert "padded to 2396²" in entrant.sampling
     assert error(entrant) < 2e-3
 
@@ -70,8 +70,8 @@ ROWS = [
     row(error=2 * ERROR, both=1e-4),
     row(error=2.4, both=1e-4, refused=True, predicted=math.nan),
     row("radial", error=1e-6, forward=5e-4, both=1e-3, sampling="95 radii"),
-    row(TALK, forward=0.5, both=1.0, predicted=None),
-    row(TALK, forward=0.3, both=0.15, predicted=None, dtype="float32"),
+    row(SITZMANN, forward=0.5, both=1.0, predicted=None),
+    row(SITZMANN, forward=0.3, both=0.15, predicted=None, dtype="float32"),
 ]
 
 

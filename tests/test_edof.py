@@ -241,7 +241,7 @@ def test_the_table_says_what_it_knows():
     assert list(found["leaves"]) == ["fresnel", "singlet"]
     rows = {record["row"]: record for record in records(found)}
     assert rows["fresnel"]["gain_blind"] == 0
-    assert rows["fresnel"]["talk"] == 17.95
+    assert rows["fresnel"]["published"] == 17.95
     assert rows["singlet"]["gain_blind"] == pytest.approx(rows["singlet"]["blind"] - rows["fresnel"]["blind"])
 
 
@@ -258,7 +258,7 @@ def test_the_strength_of_cubic_plates_is_searched_once(monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_order_of_the_talk(tmp_path):
+def test_the_order_that_was_published(tmp_path):
     """Fresnel < multifocal < cubic < hybrid, achromat < learned, in three colours (facts: only those two may swap)."""
     world = World(size=127, pixel=0.00738)
     pictures = periodic(dead_leaves(12, size=128, seed=1, smallest=2.5), 256)

@@ -29,9 +29,9 @@ def test_a_log_gets_lines_also_while_a_step_lasts(quick, capsys):
             time.sleep(0.1)
         time.sleep(0.1)
     lines = capsys.readouterr().err.splitlines()
-    assert "raytrace: tracing: 0:00 gone" in lines
-    assert "raytrace: tracing: 3/4 rays, 0:00 gone, about 0:00 left, nearly done" in lines
-    assert lines[-1] == "raytrace: psf: 0:00 gone"  # what counts nothing lives, too
+    assert "raytrace: tracing: 0:00 elapsed" in lines
+    assert "raytrace: tracing: 3/4 rays, 0:00 elapsed, about 0:00 left, nearly done" in lines
+    assert lines[-1] == "raytrace: psf: 0:00 elapsed"  # what counts nothing lives, too
     assert len(lines) >= 6
     time.sleep(0.1)
     assert capsys.readouterr().err == ""
@@ -73,4 +73,4 @@ def test_every_command_has_a_heartbeat(quick, monkeypatch, capsys):
 
     monkeypatch.setattr(lens_commands, "info", lambda arguments: time.sleep(0.2))
     assert main(["info", "double_gauss"]) == 0
-    assert "raytrace: info: 0:00 gone\n" in capsys.readouterr().err
+    assert "raytrace: info: 0:00 elapsed\n" in capsys.readouterr().err

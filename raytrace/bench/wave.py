@@ -1,4 +1,4 @@
-"""Measure PSFs of waves: time forward and forward + backward beside the error, of every engine and the talk's method.
+"""Measure PSFs of waves: time forward and forward + backward beside the error, of every engine and Sitzmann's method.
 
 The scene is one kernel of the comparison of extended depth of field: a PMMA lens of 5 mm for 1 m, 35.5 mm before the
 sensor, and a point at 0.5 m in blue, where the blur is widest and the wave shortest. Errors are relative L2 norms
@@ -29,9 +29,9 @@ from raytrace.wave.reuse import Memo
 from raytrace.wave.scene import WaveScene
 
 WAVELENGTH, DEPTH, PIXEL, SIZE = 0.46, 500.0, 0.00369, 128
-#: Samples across and padding of the talk's method: 2 µm over 5 mm, half as wide again.
+#: Samples across and padding of Sitzmann's method: 2 µm over 5 mm, half as wide again.
 SAMPLES, PITCH, PADDED = 2500, 2e-3, 3744
-TALK = "the talk's"
+SITZMANN = "sitzmann"
 #: What the opponent is to be beaten by, at an error of at most so much.
 TARGET, ERROR = 100.0, 3e-4
 
@@ -46,7 +46,8 @@ _OTHER = {"samples": 768, "nodes": 8}  # of the pupil engine beside it
 
 @dataclasses.dataclass(frozen=True)
 class WaveRow:
-    """One figure. engine: or TALK; sampling: in words; samples: across the aperture; error: relative L2 of the kernel.
+    """One figure. engine: or SITZMANN; sampling: in words; samples: across the aperture; error: relative L2 of
+    the kernel.
 
     predicted: that of the plan; cold_s: forward with nothing kept from before; forward_s, both_s: median seconds of a
     step that changes heights alone, the second with the gradient. refused: the plan does not allow this sampling.
@@ -103,8 +104,8 @@ def agreement(scene: WaveScene) -> float:
     return float((other - limit).norm() / limit.norm())
 
 
-def entrants(*, size: int = SIZE, talk: int = SAMPLES) -> list[Entrant]:
-    """Everyone: the engines, coarse to fine, and the talk's method. talk: its samples across, for a trial of fewer."""
+def entrants(*, size: int = SIZE, sitzmann: int = SAMPLES) -> list[Entrant]:
+    """Everyone: the engines, coarse to fine, and Sitzmann's method, with `sitzmann` samples across."""
     scene, exact = bench_scene(size=size), bench_scene(exact=True, size=size)
     truths = reference(scene), reference(exact)
     found = []
@@ -115,7 +116,7 @@ def entrants(*, size: int = SIZE, talk: int = SAMPLES) -> list[Entrant]:
     found += [_coarse(scene, truths[0], n) for n in _REFUSED]
     found += [_entrant(scene, truths[0], double, "fresnel", samples=n) for n in _TRANSFER]
     found += [_entrant(exact, truths[1], double, "angular_spectrum", samples=n) for n in _TRANSFER]
-    return found + [talks(scene, dtype, samples=talk) for dtype in (torch.float64, torch.float32)]
+    return found + [sitzmann_method(scene, dtype, samples=sitzmann) for dtype in (torch.float64, torch.float32)]
 
 
 def measure(
@@ -227,13 +228,13 @@ def _coefficients(dtype: torch.dtype) -> Tensor:
     return bench_scene().elements[0].profile.coefficients[:1].to(dtype)
 
 
-# -- the talk's method -------------------------------------------------------------------------------------------------
+# -- Sitzmann's method -------------------------------------------------------------------------------------------------
 
 
-def talks(scene: WaveScene, dtype: torch.dtype, *, samples: int = SAMPLES) -> Entrant:
+def sitzmann_method(scene: WaveScene, dtype: torch.dtype, *, samples: int = SAMPLES) -> Entrant:
     """The field on a grid of 2 µm carried on by Fresnel's transfer function, padded to 1.5 times, without a band limit.
 
-    As the published code of the talk does (Sitzmann et al., ACM Trans. Graph. 37, 114, 2018): a hard aperture, heights
+    As the published code does (Sitzmann et al., ACM Trans. Graph. 37, 114, 2018): a hard aperture, heights
     on the grid, phases in float64 before the field is rounded, kernels sampled at the grid's own points. It is judged
     there, against intensities of the converged field at those points; sphere and transfer function are made once.
     """
@@ -249,13 +250,13 @@ def talks(scene: WaveScene, dtype: torch.dtype, *, samples: int = SAMPLES) -> En
     truth = (waves.real**2 + waves.imag**2)[place] * pitch**2
 
     def prepare():
-        return _talks_run(scene, dtype, x, pitch, padded, seen)
+        return _transfer_run(scene, dtype, x, pitch, padded, seen)
 
     words = f"{samples}² at {1e3 * pitch:g} µm, padded to {padded}²"
-    return Entrant(TALK, words, dtype, samples, prepare, truth)
+    return Entrant(SITZMANN, words, dtype, samples, prepare, truth)
 
 
-def _talks_run(
+def _transfer_run(
     scene: WaveScene, dtype: torch.dtype, x: Tensor, pitch: float, padded: int, seen: slice
 ) -> Callable[[Tensor], Tensor]:
     wavelength, z = 1e-3 * WAVELENGTH, float(scene.sensor_distance)
@@ -284,7 +285,7 @@ def _talks_run(
 
 @dataclasses.dataclass(frozen=True)
 class Target:
-    """The fastest engine within ERROR against the talk's method of the same or the faster dtype: ratios of times."""
+    """The fastest engine within ERROR against Sitzmann's method of the same or the faster dtype: ratios of times."""
 
     best: WaveRow
     opponent: WaveRow
@@ -298,10 +299,10 @@ class Target:
 
 
 def target(rows: Sequence[WaveRow]) -> list[Target]:
-    """One for each engine that comes within ERROR, the fastest first, against the fastest run of the talk's method."""
-    opponent = min((row for row in rows if row.engine == TALK), key=lambda row: row.both_s)
+    """One for each engine that comes within ERROR, the fastest first, against the fastest run of Sitzmann's method."""
+    opponent = min((row for row in rows if row.engine == SITZMANN), key=lambda row: row.both_s)
     found = []
-    for engine in dict.fromkeys(row.engine for row in rows if row.engine != TALK):
+    for engine in dict.fromkeys(row.engine for row in rows if row.engine != SITZMANN):
         own = [row for row in rows if row.engine == engine and row.error <= ERROR and not row.refused]
         if own:
             best = min(own, key=lambda row: row.both_s)

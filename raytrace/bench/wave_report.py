@@ -6,14 +6,14 @@ from collections.abc import Mapping, Sequence
 from raytrace.bench.page import KEPT as KEPT
 from raytrace.bench.page import measured, page
 from raytrace.bench.page import table as table
-from raytrace.bench.wave import DEPTH, ERROR, PIXEL, SIZE, TALK, TARGET, WAVELENGTH, WaveRow, target
+from raytrace.bench.wave import DEPTH, ERROR, PIXEL, SITZMANN, SIZE, TARGET, WAVELENGTH, WaveRow, target
 
 _NAMES = {
     "pupil": "pupil matrix DFT",
     "radial": "ring integrals",
     "fresnel": "Fresnel transfer function, band limit",
     "angular_spectrum": "angular spectrum, band limit, true spheres",
-    TALK: "Fresnel transfer function as in the talk",
+    SITZMANN: "Fresnel transfer function as Sitzmann et al. (2018)",
 }
 
 
@@ -32,7 +32,8 @@ def markdown(
         f"{agreement:.1e}. Times are of a step that changes heights alone, as in learning: *forward*, and *with "
         "gradient* by the coefficients of the lens; *first* is a forward call that nothing is kept from.",
         "",
-        "The talk's method (Sitzmann et al. 2018): the field behind the element on 2500² samples of 2 µm, padded to "
+        "The method of Sitzmann et al. (ACM Trans. Graph. 37, 114, 2018): the field behind the element on 2500² "
+        "samples of 2 µm, padded to "
         "3744², times Fresnel's transfer function, no band limit. It is judged at its own samples, and its sphere and "
         "its transfer function are made once, outside the time.",
         "",
@@ -52,8 +53,8 @@ def markdown(
 
 def _goals(rows: Sequence[WaveRow]) -> list[str]:
     lines = [
-        f"Target: {TARGET:g} × less time than the talk's method at an error of at most {ERROR:g}. The fastest sampling "
-        "of each engine that comes so close, beside the fastest run of the talk's method:",
+        f"Target: {TARGET:g} × less time than their method at an error of at most {ERROR:g}. The fastest sampling "
+        "of each engine that comes so close, beside the fastest run of their method:",
         "",
         "| engine | sampling | error | forward | with gradient | met |",
         "| --- | --- | --- | --- | --- | --- |",

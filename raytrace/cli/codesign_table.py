@@ -19,9 +19,13 @@ AFTER_PARAXIAL = "gaussian-after-paraxial"
 
 _DESCRIPTION = """\
 Learn the sensor distance (or any variables) of a lens together with a network that restores its pictures. Step 1
-learns both with the PSFs of one model; step 2 freezes the lens and goes on with the network on ray-traced (DRT)
-PSFs, as long as step 1. `compare` runs every model and seed and writes tables, figures and a page about them;
-`sweep` finds the optima of the closed form at several apertures, ρ, noises, normalisations and starts.
+learns both with the PSFs of one model; step 2 freezes the lens and goes on with the network on PSFs of traced rays,
+as long as step 1. `compare` runs every model and seed and writes tables, figures and a page about them; `sweep` finds
+the optima of the closed form at several apertures, noises, normalisations and starts, and widths of the paraxial PSF.
+
+Models: paraxial (a Gaussian as wide as the paraxial blur), fourier (diffraction of the paraxial wavefront), gaussian
+(Gaussian DRT: centroid and covariance of traced rays), drt (differentiable ray tracing: the rays themselves). Closed
+form: the expected mean square error of pictures behind the best linear filter, from their power spectrum.
 
 A run may be stopped at any moment: the same command goes on where it was, and ends in the same numbers. Several
 processes share every batch: torchrun --nproc-per-node 2 -m raytrace codesign …"""
@@ -61,7 +65,8 @@ def _add_arguments(parser) -> None:
         "--loss",
         choices=("image", "spectral"),
         default="image",
-        help="of restored pictures (default), or in closed form: the error of the best linear filter, in seconds",
+        help="image: L1 of restored pictures, by training (default); spectral: the closed form, without a network, "
+        "in seconds",
     )
     _pictures(parser.add_argument_group("pictures"))
     _scene(parser.add_argument_group("lens and scene"))

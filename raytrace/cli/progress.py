@@ -73,7 +73,7 @@ class Bar(tqdm):
 
 
 class Lines:
-    """Progress in words: `tracing: 3/10 planes, 0:20 gone, about 0:47 left`."""
+    """Progress in words: `tracing: 3/10 planes, 0:20 elapsed, about 0:47 left`."""
 
     def __init__(self, work: int | Iterable | None, unit: str = "step", *, what: str = "", initial: int = 0):
         self.items, self.total = _parts(work)
@@ -109,7 +109,7 @@ class Lines:
     def __str__(self) -> str:
         passed, gone = time.monotonic() - self.begun, self.n - self.initial
         said = [f"{self.n:,}{f'/{self.total:,}' if self.total else ''} {self.unit}s"] if self.n else []
-        said.append(f"{clock(passed)} gone")
+        said.append(f"{clock(passed)} elapsed")
         if self.total and gone > 0 and self.n <= self.total:
             said.append(f"about {clock(passed * (self.total - self.n) / gone)} left")
         return ": ".join(filter(None, [self.what, ", ".join(filter(None, [*said, self.words]))]))

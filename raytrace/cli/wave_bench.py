@@ -15,7 +15,7 @@ from raytrace.plot.wave import bench_figure
 
 
 def bench_wave(arguments: argparse.Namespace) -> None:
-    """Every engine at several samplings beside the talk's method, in one run and one thread."""
+    """Every engine at several samplings beside the method of Sitzmann et al. (2018), in one run and one thread."""
     found = entrants()
     with progress(len(found) * (1 + arguments.repeats), what="measuring") as bar:
         rows = measure(found, repeats=arguments.repeats, progress=bar.update)

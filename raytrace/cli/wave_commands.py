@@ -236,5 +236,8 @@ def _goal(found: Learned) -> str:
 def _print_course(found: Learned, seconds: float) -> None:
     print(_goal(found))
     print(f"from {found.peak_ratios[0]:.4f} in {found.steps} steps, {seconds:.1f} s")
-    print(f"phase that is left: {found.residual:.4f} waves RMS")
-    print(f"if its pixels are flat: {found.flat_ratio:.3f}, of the {found.flat_bound:.3f} that such pixels can reach")
+    print(f"residual phase: {found.residual:.4f} waves RMS")
+    print(
+        f"peak with the height constant over each pixel: {found.flat_ratio:.3f}; the most that such pixels can "
+        f"reach: {found.flat_bound:.3f}"
+    )

@@ -18,7 +18,7 @@ from raytrace.cli.wave_edof_table import STARTS, STEPS
 from raytrace.design.edof import Quality, World, kernels, periodic, quality, spectrum
 from raytrace.design.edof_page import CAPTIONS, markdown
 from raytrace.design.edof_scene import deep, flat
-from raytrace.design.edof_table import NAMES, ROWS, TALK, Content, elements_of, records, table_of, write_records
+from raytrace.design.edof_table import NAMES, PUBLISHED, ROWS, Content, elements_of, records, table_of, write_records
 from raytrace.design.edof_training import EdofCamera, Settings, begin, learn_element
 from raytrace.design.report import below_the_mark
 from raytrace.design.training import NotFinite, OtherSettings
@@ -245,7 +245,10 @@ def _figures(found, elements, world: World, seed: int) -> dict:
 
 
 def _print_quality(own: Quality, world: World) -> None:
-    print(f"{'object at':>12} {'Wiener':>9} {'blind':>9}   PSNR of restored pictures, dB")
+    print(
+        f"{'object at':>12} {'Wiener':>9} {'invariant':>9}   PSNR of restored pictures, dB; invariant: the filter "
+        "that knows no depth"
+    )
     for i, depth in enumerate(world.depths):
         name = "infinity" if math.isinf(depth) else f"{depth / 1e3:.3g} m"
         print(f"{name:>12} {own.by_depth['wiener'][i]:>9.2f} {own.by_depth['blind'][i]:>9.2f}")
@@ -258,12 +261,19 @@ def _print_quality(own: Quality, world: World) -> None:
 def _print_table(found) -> None:
     for content in found:
         print(f"{content}: PSNR of restored pictures, dB (gain over the Fresnel lens)")
-        print(f"{'':>32} {'Wiener':>14} {'blind':>14} {'spread':>7} {'talk':>14}")
+        print(f"{'':>32} {'Wiener':>14} {'invariant':>14} {'spread':>7} {'Sitzmann 2018':>14}")
         for record in (r for r in records(found) if r["content"] == content):
-            talk = f"{record['talk']:.2f} ({record['talk'] - TALK['fresnel']:+.2f})" if record["talk"] else ""
+            published = (
+                f"{record['published']:.2f} ({record['published'] - PUBLISHED['fresnel']:+.2f})"
+                if record["published"]
+                else ""
+            )
             cells = [
                 f"{record[f]:.2f}" + ("" if record[f"gain_{f}"] is None else f" ({record[f'gain_{f}']:+.2f})")
                 for f in ("wiener", "blind")
             ]
-            print(f"{NAMES[record['row']]:>32} {cells[0]:>14} {cells[1]:>14} {record['spread_blind']:>7.2f} {talk:>14}")
+            print(
+                f"{NAMES[record['row']]:>32} {cells[0]:>14} {cells[1]:>14} {record['spread_blind']:>7.2f} "
+                f"{published:>14}"
+            )
         print()

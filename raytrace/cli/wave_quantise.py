@@ -135,8 +135,10 @@ def _etched(levels: Sequence[int]) -> list[tuple[int, float, float]]:
 
 
 def _text(rows: Sequence[dict]) -> str:
+    """The table, and below it what the words in the column `made` mean."""
+    known = [f"{way}: {WAYS[way]}" for way in dict.fromkeys(row["made"] for row in rows)]
     lines = [list(rows[0])] + [[_cell(value) for value in row.values()] for row in rows] if rows else []
-    return "\n".join("  ".join(f"{cell:>12}" for cell in line) for line in lines)
+    return "\n".join("  ".join(f"{cell:>12}" for cell in line) for line in lines) + "\n" + "; ".join(known)
 
 
 def _cell(value) -> str:
@@ -160,7 +162,7 @@ def _quantise_page(arguments, kind: str, etched, steps: Sequence[Steps], toleran
     words += ["--data DIR"] if arguments.data else []
     levels = [0, *arguments.levels]
     by = {(row.element, row.made, row.levels): row for row in steps}
-    header = ("element", "made", *(f"{n} levels" if n else "any height" for n in levels))
+    header = ("element", "how made", *(f"{n} levels" if n else "any height" for n in levels))
     kinds = list(dict.fromkeys((row.element, row.made) for row in steps))
 
     def of(column: str) -> str:
@@ -180,7 +182,7 @@ def _quantise_page(arguments, kind: str, etched, steps: Sequence[Steps], toleran
         "![Efficiency, levels and tolerance](wave/quantise.png)",
         "## A kinoform at its focus",
         table(
-            ("levels", "sinc²(1/L)", "of any width", "in 2 µm rings"),
+            ("levels", "sinc²(1/L)", "efficiency, steps of any width", "efficiency, rings of 2 µm"),
             [(n or "any", f"{law(n):.4f}", f"{one:.4f}", f"{two:.4f}") for n, one, two in etched],
         ),
         "Light at the focus over that of an ideal lens: 5 mm, f/7.1, 0.55 µm. The law is met where steps may be as "
@@ -192,6 +194,6 @@ def _quantise_page(arguments, kind: str, etched, steps: Sequence[Steps], toleran
         "The same of test pictures that the filter was not made for, mean over depths:",
         of("restored"),
         "## Errors of height",
-        "Every ring off by a uniform draw, five draws each:",
-        table(("element", "made", "levels", "± nm", "mean PSNR (dB)", "draws"), errors),
+        "The height of every ring in error by a uniform random number within ±, five draws each:",
+        table(("element", "how made", "levels", "± nm", "mean PSNR (dB)", "draws"), errors),
     ]

@@ -63,6 +63,9 @@ class _Block:
     drawn: dict
 
 
+_COLUMNS = ("scene", "optics and restoration", "expected", "restored", "over bicubic")
+
+
 def superres(arguments: argparse.Namespace) -> None:
     """Learn, restore and compare; draw, write the page."""
     train, test, kind = pictures(arguments, 96)
@@ -73,9 +76,11 @@ def superres(arguments: argparse.Namespace) -> None:
         print_json({"noise": arguments.noise, "pictures": kind, "cameras": [_document(block) for block in blocks]})
     else:
         for block in blocks:
-            print(f"pixels × {block.factor}, {_colours(block.wavelengths)}, noise {arguments.noise:g}, {kind}")
-            for scene, name, closed, restored, gain in _table_rows(block):
-                print(f"{scene:>12} {name:<32} {closed:>8} {restored:>8} {gain:>8}")
+            print(
+                f"pixels × {block.factor}, {_colours(block.wavelengths)}, noise {arguments.noise:g}, {kind}; PSNR in dB"
+            )
+            for scene, name, closed, restored, gain in [_COLUMNS, *_table_rows(block)]:
+                print(f"{scene:>12} {name:<32} {closed:>8} {restored:>8} {gain:>12}")
     _draw(arguments, blocks[0], kind, noises, blocks)
 
 
@@ -103,7 +108,7 @@ def _small(arguments, world: World, factor: int, train: Pictures, test: Pictures
     for count in counts:
         plate = Plate(world, places_of(count), parts_of_a_pixel(count, factor))
         start = hologram(plate, seed=arguments.seed)
-        plates = {"sectors": sectors(plate), "waves added": start}
+        plates = {"sectors": sectors(plate), "phase of the sum": start}
         plates["learned"] = learn_heights(plate, start, S, factor, steps=arguments.steps)
         for name, elements in plates.items():
             kernel = wide_kernels(elements, world)
@@ -201,16 +206,16 @@ def _superres_page(arguments, blocks: Sequence[_Block], kind: str, noises: list[
         f"    raytrace wave superres {' '.join(words)} --docs docs",
         f"A camera of 5 mm aperture with its sensor at 35.5 mm looks at scenes 1 m away. The picture has pixels of "
         f"3.69 µm, the sensor pixels 2 or 3 times as large, noise {arguments.noise:g} (white is 1). Filters are made "
-        f"for some {kind} and restore others. PSNR in dB of restored test pictures, over all colours; *closed form*: "
-        "what the filter expects of pictures of its spectrum.",
+        f"for some {kind} and restore others. PSNR in dB of restored test pictures, over all colours; *expected*: "
+        "the error of the filter in closed form, for pictures of the power spectrum it was made for; MMSE: the linear "
+        "filter of least mean square error; *over bicubic*: gain over the plain lens and bicubic enlargement.",
         "![Restored pictures and kernels](wave/superres.png)",
         "*Above, a scene that fills the sensor; below, a small one on a dark ground, shown at several places of one "
         "sensor and inverted jointly. Kernels on a logarithmic scale of four decades.*",
     ]
     for block in blocks:
         parts.append(f"## Pixels × {block.factor}, {_colours(block.wavelengths)}")
-        header = ("scene", "way", "closed form", "restored", "over bicubic")
-        parts.append(table(header, _table_rows(block)))
+        parts.append(table(_COLUMNS, _table_rows(block)))
     if noises:
         columns = list(noises[0])
         rows = [
@@ -219,26 +224,27 @@ def _superres_page(arguments, blocks: Sequence[_Block], kind: str, noises: list[
         parts += [
             f"## The small scene over noise, pixels × {arguments.factor[0]}",
             table(columns, rows),
-            "Everything is made anew for each noise. The places share the light: each view has a third or a quarter of "
-            "it, with the noise of a whole one.",
+            "Elements and filters are made anew for each noise. The places share the light: each copy has a third or a "
+            "quarter of it, with the noise of a whole image.",
         ]
     return [*parts, _SUPERRES_TEXT]
 
 
 _SUPERRES_TEXT = """## What it shows
 
-* **A scene that fills the sensor**: every frequency of the image is one equation for s² aliases. No kernel can do
-  better, in closed form, than to show the strongest alias and to lose the others (*upper bound of one image*): what is
-  learned is a better low pass than the lens, no more. Restored test pictures may lie above the bound, because they have
-  another spectrum than the pictures the filter was made for. Showing such a scene at three places does not help:
-  the copies add up to one image, one equation.
-* **A small scene on a dark ground**: copies that do not overlap are equations of their own, and the joint inversion
-  tells aliases apart that one image cannot. Sectors of the aperture waste no light but have a wider blur each; a plate
-  that adds the phases of all waves keeps the blur of the whole aperture. PSNR is that of the whole field,
-  dark ground included, for every way.
+* **A scene that fills the sensor**: behind pixels s times as large, every spatial frequency of the image holds the
+  sum of s² aliased frequencies of the scene. By the expected error, no PSF can do better than to pass the strongest
+  of them and to suppress the others (*upper bound of one image*): the learned element is a better low-pass filter
+  than the lens, no more. Restored test pictures may lie above the bound, because their power spectrum is not that of
+  the pictures which the filter was made for. Showing such a scene at three places does not help: the copies overlap
+  and add up to one image.
+* **A small scene on a dark ground**: copies that do not overlap are independent measurements, and joint inversion
+  separates aliased frequencies that one image cannot. Wedges on sectors of the aperture lose no light, but each sector
+  has a wider blur than the whole aperture; a plate with the phase of the sum of all tilted waves keeps the narrow blur.
+  PSNR is that of the whole field, dark ground included, for every row.
 * **What it costs**: light, and sensor. The copies take three or four times the pixels of one image: a lens of twice the
-  focal length would magnify the small scene to as many. And in noise the light is better kept together: learned heights
-  then give up places."""
+  focal length would magnify the small scene to as many. In strong noise the light is better kept together: the learned
+  plate then gives up places."""
 
 
 # --- files

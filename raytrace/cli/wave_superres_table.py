@@ -9,9 +9,10 @@ Pictures finer than the pixels of the sensor, from one exposure: 5 mm PMMA lens,
 pixels 2 or 3 times the picture's 3.69 µm.
 
 full frame: an element learned by the closed-form error of the best linear inversion, beside the plain lens behind
-bicubic interpolation and behind its own inversion, and the least error any element can reach.
-small scene: a plate that shows a scene on a dark ground at three or four places, each at another part of a pixel, and
-the joint inversion of these views: wedges on sectors, the phase of all waves added, and heights that are learned."""
+bicubic interpolation and behind its own inversion (MMSE), and the least error that any element can reach.
+small scene: a plate that images a scene on a dark ground three or four times, each shifted by a part of a pixel, and
+the joint inversion of these copies: wedges on sectors of the aperture, the phase of the sum of all tilted waves, and
+heights learned from there."""
 
 _SUPERRES_EXAMPLES = """examples:
   raytrace wave superres --json
@@ -20,10 +21,10 @@ _SUPERRES_EXAMPLES = """examples:
   raytrace wave superres --factor 2 3 --wavelength 0.55 --wavelength 0.46 0.55 0.64 --docs docs"""
 
 _QUANTISE_DESCRIPTION = """\
-What fabrication costs: steps of height, wrapping to one wave of 0.55 µm, and errors of height. Light at the focus of a
-kinoform against sinc²(1/L), and the expected PSNR over 0.5 m to infinity, in three colours, behind the best filter that
-knows no depth: of the Fresnel lens, and of a learned element of fused silica rings, wrapped and stepped afterwards or
-learned on with wraps and steps in the loop.
+What fabrication costs: quantised heights (levels), wrapping to one wave of 0.55 µm, and errors of height. Light at
+the focus of a kinoform against sinc²(1/L), and the expected PSNR over 0.5 m to infinity, in three colours, behind
+the best filter that knows no depth: of the Fresnel lens, and of a learned element of fused silica rings, wrapped and
+quantised after learning, or learned further as a wrapped and quantised element.
 
 An element is fresnel, learned (learned first, in FOLDER, or a temporary one), the folder of a run of
 `raytrace wave edof --element rings`, or a file of heights, of rings or pixels, as `raytrace wave psf` reads it."""
@@ -63,12 +64,17 @@ def _pictures(parser: argparse.ArgumentParser, least: int) -> None:
         "restored (default: dead leaves)",
     )
     group.add_argument("--limit", metavar="N", type=count, default=16, help="take N of them, evenly (default 16)")
-    group.add_argument("--seed", metavar="N", type=seed_number, default=0, help="of every draw (default 0)")
+    group.add_argument("--seed", metavar="N", type=seed_number, default=0, help="of random numbers (default 0)")
 
 
 def _superres(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--factor", metavar="S", type=_factor, nargs="+", default=[2], help="pixels of the sensor: 2 (default) or 3"
+        "--factor",
+        metavar="S",
+        type=_factor,
+        nargs="+",
+        default=[2],
+        help="sensor pixels, in pixels of the picture: 2 (default) or 3",
     )
     parser.add_argument(
         "--wavelength",
@@ -76,7 +82,7 @@ def _superres(parser: argparse.ArgumentParser) -> None:
         type=positive_finite,
         nargs="+",
         action="append",
-        help="colours, µm (default 0.55); given again, another camera",
+        help="wavelengths of one camera, µm (default 0.55); given again, another camera",
     )
     parser.add_argument(
         "--noise", metavar="S", type=positive_finite, default=0.001, help="of the sensor, white is 1 (default 0.001)"
@@ -85,7 +91,9 @@ def _superres(parser: argparse.ArgumentParser) -> None:
         "--places", metavar="V", type=int, choices=(3, 4), nargs="+", default=[3, 4], help="default both: 3 4"
     )
     parser.add_argument("--steps", metavar="N", type=count, default=40, help="of learning (default 40)")
-    parser.add_argument("--starts", metavar="N", type=_steps, default=1, help="random starts, full frame (default 1)")
+    parser.add_argument(
+        "--starts", metavar="N", type=_steps, default=1, help="random starts of the full-frame element (default 1)"
+    )
     _pictures(parser, 96)
     parser.add_argument("--docs", metavar="DOCS", type=file_name, help="folder for wave_superres.md and wave/")
     plot(parser, "pictures and elements")
@@ -156,7 +164,7 @@ SUPERRES = (
     ),
     (
         "quantise",
-        "what steps, wrapping and errors of height cost",
+        "what levels, wrapping and errors of height cost",
         _QUANTISE_DESCRIPTION,
         _QUANTISE_EXAMPLES,
         _quantise,

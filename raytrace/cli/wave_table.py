@@ -22,8 +22,8 @@ from raytrace.cli.wave_options import camera, element, engine, feature, light, p
 from raytrace.cli.wave_superres_table import SUPERRES
 
 _DESCRIPTION = """\
-Waves behind a thin phase element: point spread functions over depth and colour, and elements that are learned from
-what a camera makes of pictures. `raytrace wave SUB --help` teaches each by example."""
+Wave optics of a thin phase element before a sensor: point spread functions (PSFs) over depth and wavelength, and
+elements learned from pictures or their statistics. `raytrace wave SUB --help` teaches each by example."""
 
 _EXAMPLES = """examples:
   raytrace wave psf --element singlet --focus 1000 --depth 500 1000 inf -o psf.npz --plot psf.png
@@ -71,7 +71,7 @@ def _focus(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--samples", metavar="N", type=count, default=128, help="heights across the aperture (default 128)"
     )
-    parser.add_argument("--seed", metavar="N", type=seed_number, default=0, help="of the pictures (default 0)")
+    parser.add_argument("--seed", metavar="N", type=seed_number, default=0, help="of the random pictures (default 0)")
     json(parser)
     parser.add_argument(
         "-o",
@@ -85,8 +85,9 @@ def _focus(parser: argparse.ArgumentParser) -> None:
 
 _PSF_DESCRIPTION = """\
 Kernels of a phase element for points on the axis, over depth and wavelength, integrated over pixels. 1 is all light
-through the aperture: `energy` is the share inside the window. Named elements are those of the comparison of extended
-depth of field: smooth ones (ideal, singlet, …-refractive) of PMMA, wrapped ones of fused silica, all for one focus.
+through the aperture: `energy` is the share inside the window, `peak` that in the brightest pixel. Named elements are
+those of `raytrace wave table`: smooth ones (ideal, singlet, …-refractive) of PMMA, wrapped ones of fused silica, all
+for one focus.
 
 The engine is chosen by the scene, its sampling by --tol; a sampling that would repeat the image inside the window is
 refused. --samples sets it by hand."""
@@ -99,12 +100,13 @@ _PSF_EXAMPLES = """examples:
   raytrace wave psf --element ideal --depth 500 --engine fresnel --samples 2500 --json"""
 
 _FOCUS_DESCRIPTION = """\
-Learn a lens from pictures: a flat plate of free heights is told nothing but to make the images of dead leaves far away
-equal to the leaves. It is --aperture wide, --sensor before the sensor, for one --wavelength. `peak_ratio` is the peak
-of its PSF over that of the ideal continuous lens, both over the light through the aperture; seconds on one core.
+Learn a lens from pictures: from a flat plate, free heights are optimised only to make images of far random pictures
+(dead leaves: discs that hide one another) equal to the pictures. It is --aperture wide, --sensor before the sensor,
+for one --wavelength. `peak_ratio` is the peak of its PSF over that of the ideal continuous lens, both over the light
+through the aperture; seconds on one core.
 
 --collimator learns the element that turns a point as far before it as --sensor into a plane wave: the peak of its far
-field, and the RMS phase that is left, in waves."""
+field, and the RMS residual phase, in waves."""
 
 _FOCUS_EXAMPLES = """examples:
   raytrace wave focus --json

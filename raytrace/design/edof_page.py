@@ -4,15 +4,16 @@ import math
 from collections.abc import Mapping, Sequence
 
 from raytrace.design.edof import Quality, World
-from raytrace.design.edof_table import NAMES, TALK
+from raytrace.design.edof_table import NAMES, PUBLISHED
 from raytrace.design.report import KEPT
 
 CAPTIONS = {
-    "gain.png": "Gains over the Fresnel lens, by content and filter, beside the talk's.",
-    "depth.png": "PSNR over depth behind the best filter that does not know it.",
-    "scene.png": "A scene of dead leaves at three depths as each element's camera restores it (blind filter).",
+    "gain.png": "Gains over the Fresnel lens, by content and filter, beside those that Sitzmann et al. published.",
+    "depth.png": "PSNR over depth behind the best linear filter that does not know the depth.",
+    "scene.png": "A scene of dead leaves at three depths as each element's camera restores it (depth-invariant "
+    "filter).",
     "deep.png": "A scene from 0.5 m (below) to infinity (above) in nine layers, near leaves hiding far ones.",
-    "learned.png": "The learned element: rings of fused silica, its kernels over depth and colour, its PSNR.",
+    "learned.png": "The learned element: rings of fused silica, its PSFs over depth and colour, its PSNR.",
     "learned-smooth.png": "The learned smooth element of PMMA.",
 }
 
@@ -41,7 +42,8 @@ def markdown(
         parts += [f"## {content[0].upper()}{content[1:]}", _table(rows)]
     parts.append(
         "Mean PSNR over depths in dB, in brackets the gain over the Fresnel lens. Worst: the worst depth, spread: the "
-        "best less the worst, both of the blind filter. The talk: Sitzmann et al., SIGGRAPH 2018, of other pictures. "
+        "best less the worst, both behind the depth-invariant filter. Sitzmann 2018: as published by Sitzmann et "
+        "al., SIGGRAPH 2018, of other pictures. "
         "All figures: [table.csv](wave/table.csv)."
     )
     parts += [f"![{CAPTIONS[name]}](wave/{name})\n\n*{CAPTIONS[name]}*" for name in figures]
@@ -50,7 +52,7 @@ def markdown(
 
 def _table(rows: Mapping[str, Quality]) -> str:
     lines = [
-        "| element | Wiener, 1 m | best blind | worst | spread | light in window | the talk |",
+        "| element | Wiener, 1 m | depth-invariant | worst | spread | light in window | Sitzmann 2018 |",
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
     base = rows.get("fresnel")
@@ -59,8 +61,10 @@ def _table(rows: Mapping[str, Quality]) -> str:
         for filter in ("wiener", "blind"):
             gain = f" ({own.mean[filter] - base.mean[filter]:+.2f})" if base and own is not base else ""
             cells.append(f"{own.mean[filter]:.2f}{gain}")
-        talk = f"{TALK[name]:.2f} ({TALK[name] - TALK['fresnel']:+.2f})" if name in TALK else "–"
+        published = (
+            f"{PUBLISHED[name]:.2f} ({PUBLISHED[name] - PUBLISHED['fresnel']:+.2f})" if name in PUBLISHED else "–"
+        )
         worst, light = min(own.by_depth["blind"]), min(min(row) for row in own.energy)
-        cells += [f"{worst:.2f}", f"{own.spread['blind']:.2f}", f"{light:.2f}", talk]
+        cells += [f"{worst:.2f}", f"{own.spread['blind']:.2f}", f"{light:.2f}", published]
         lines.append(f"| {' | '.join([NAMES[name], *cells])} |")
     return "\n".join(lines)

@@ -1,6 +1,6 @@
 """The table of extended depth of field: every baseline and the learned elements, on several kinds of pictures.
 
-The talk that defined the task (Sitzmann et al., SIGGRAPH 2018) gives the PSNR of restored pictures for six elements;
+Sitzmann et al. (SIGGRAPH 2018), who defined the task, give the PSNR of restored pictures for six elements;
 its pictures, filters and prescriptions are its own, so that gains over its Fresnel lens are what compares.
 """
 
@@ -18,8 +18,8 @@ from raytrace.wave.aim import Aim, aim
 from raytrace.wave.baselines import baseline
 from raytrace.wave.element import Element
 
-#: PSNR in dB as the talk gives it, by our name of the row.
-TALK = {
+#: PSNR in dB as Sitzmann et al. published it, by our name of the row.
+PUBLISHED = {
     "fresnel": 17.95,
     "multifocal": 18.32,
     "cubic": 18.33,
@@ -54,7 +54,7 @@ NAMES = {name: title for name, title, *_ in (*ROWS, *ALSO)}
 #: Strengths of cubic plates in waves that are tried; the best in closed form is taken.
 STRENGTHS = (5.0, 10.0, 15.0, 20.0, 30.0)
 
-COLUMNS = ("content", "row", "wiener", "blind", "gain_wiener", "gain_blind", "spread_blind", "worst_blind", "talk")
+COLUMNS = ("content", "row", "wiener", "blind", "gain_wiener", "gain_blind", "spread_blind", "worst_blind", "published")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,7 +123,7 @@ def records(found: Mapping[str, Mapping[str, Quality]]) -> list[dict]:
                 record[f"gain_{filter}"] = own.mean[filter] - base.mean[filter] if base else None
             record["spread_blind"] = own.spread["blind"]
             record["worst_blind"] = min(own.by_depth["blind"])
-            record["talk"] = TALK.get(name)
+            record["published"] = PUBLISHED.get(name)
             result.append(record)
     return result
 

@@ -201,10 +201,10 @@ def _tuples(found: dict) -> dict:
 
 #: How an element may be made, and what it is called.
 WAYS = {
-    "whole": "whole height, stepped afterwards",
-    "wrapped": "wrapped and stepped afterwards",
-    "looped": "wraps in the loop, stepped afterwards",
-    "trained": "wraps and steps in the loop",
+    "whole": "full height, quantised afterwards",
+    "wrapped": "wrapped and quantised afterwards",
+    "looped": "learned wrapped, quantised afterwards",
+    "trained": "learned wrapped and quantised",
 }
 
 

@@ -14,16 +14,20 @@ from raytrace.design.study import NAMES, PAPER, Summary, summaries
 KEPT = "<!-- kept when this page is made again -->"
 
 #: What leads to the page of the sweep.
+#: Said of the columns that hold published numbers.
+_OF_PAPER = "; “paper”: the published study of this lens and these models, which does not say which focus is its own"
+
 SWEEP = "At other apertures, ρ, noise, normalisations and starts: [codesign_sweep.md](codesign_sweep.md)."
 
 #: Figures of the page, by file name: what each shows.
 CAPTIONS = {
     "loss.png": "Loss in training, mean of every epoch; bands: range over seeds.",
     "focus.png": "The sensor in training, and the object distance whose paraxial image it is.",
-    "blur.png": "Blur of traced rays on the axis, of the lenses as they were learned.",
+    "blur.png": "RMS blur of traced rays on the axis, of the learned lenses.",
     "distance.png": "Loss of test pictures with DRT PSFs after step 2, over object distance.",
     "examples.png": "A patch of dead leaves as the sensor sees it and restored, with DRT PSFs after step 2.",
-    "scan.png": "The closed form over the sensor's place: without a network, without drawn noise.",
+    "scan.png": "Expected error behind the best linear filter, over the sensor distance: without a network, without "
+    "drawn noise.",
 }
 
 
@@ -59,7 +63,7 @@ def markdown(report: Report, *, folder: str = "codesign", kept: str = "") -> str
         _table(report.found, of_paper=report.of_paper),
         *(["## The paper's claims", _claims(report)] if report.of_paper else []),
         *(f"![{CAPTIONS[name]}]({folder}/{name})\n\n*{CAPTIONS[name]}*" for name in report.figures),
-        "## The closed form beside training",
+        "## The best linear filter beside training",
         _closed_form(report),
         "## Time of a step",
         _times(report),
@@ -155,7 +159,8 @@ def _table(found: Sequence[Outcome], *, of_paper: bool) -> str:
     return (
         f"{table(header, rows)}\n\nMean ± standard deviation over seeds, of test pictures; every model of a seed sees "
         "the same crops, distances and noise. Focus is the object distance from vertex 1 whose image is on the sensor: "
-        f"the paraxial one, or that of least RMS spot{'; the paper does not say which is its own' if of_paper else ''}."
+        "the paraxial one, or that of least RMS spot"
+        f"{_OF_PAPER if of_paper else ''}."
         " Rows one by one: [table2.csv](codesign/table2.csv)."
     )
 

@@ -93,10 +93,11 @@ def page(
         "filters; the paper's are of the mean absolute error behind networks.",
     ]
     parts = [
-        "# Co-design: where the closed form puts the lens, by what the paper leaves open",
+        "# Co-design: the optimum of the best linear filter, by aperture, noise, normalisation and start",
         f"    {command}",
         f"The optimum of the closed form for {lens} and {pictures}: the sensor at which the best linear filter that "
-        "does not know the object distance errs least. Each factor is varied alone (ρ is of the paraxial model only), "
+        "does not know the object distance errs least. Each factor is varied alone (ρ, the σ of the "
+        "paraxial model over the radius of its blur, is of that model only), "
         f"then {_words(TOGETHER)} together. All rows: [sweep.csv]({folder}/sweep.csv). The experiment is that of "
         "[codesign.md](codesign.md).",
         *(verdict if of_paper else []),

@@ -1,4 +1,4 @@
-"""Figures of extended depth of field: PSNR over depth, gains beside the talk's, an element with its kernels, scenes."""
+"""Figures of extended depth of field: PSNR over depth, gains beside published ones, elements with their kernels."""
 
 from collections.abc import Mapping, Sequence
 
@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from raytrace.design.edof import Quality, World
 from raytrace.design.edof_scene import Deep
-from raytrace.design.edof_table import NAMES, TALK
+from raytrace.design.edof_table import NAMES, PUBLISHED
 from raytrace.plot.style import FIELD_COLOURS, GREY, INK, array, new_figure, styled, wavelength_colours
 from raytrace.wave.element import Element, height
 from raytrace.wave.psf import WavePsf
@@ -20,7 +20,7 @@ _MARGIN = 1e-5  # of the brightest pixel, what is black
 
 @styled
 def depth_figure(found: Mapping[str, Mapping[str, Quality]], world: World) -> Figure:
-    """PSNR behind the blind filter over depth in dioptres, a panel for each content, a line for each row."""
+    """PSNR behind the depth-invariant filter over depth in dioptres, a panel for each content, a line for each row."""
     figure = new_figure(3.1 * len(found) + 1.9, 3.8)
     axes = np.atleast_1d(figure.subplots(1, len(found), sharey=True))
     dioptres = [1e3 / depth for depth in world.depths]
@@ -29,7 +29,7 @@ def depth_figure(found: Mapping[str, Mapping[str, Quality]], world: World) -> Fi
             panel.plot(dioptres, own.by_depth["blind"], label=NAMES[name], **_look(name, list(rows)))
         panel.set(title=content, xlabel="object distance")
         _mark_depths(panel, world)
-    axes[0].set_ylabel("PSNR, best blind filter (dB)")
+    axes[0].set_ylabel("PSNR, depth-invariant filter (dB)")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right center", fontsize=7.5)
     return figure
@@ -37,7 +37,7 @@ def depth_figure(found: Mapping[str, Mapping[str, Quality]], world: World) -> Fi
 
 @styled
 def gain_figure(found: Mapping[str, Mapping[str, Quality]]) -> Figure:
-    """Gains over the Fresnel lens: of every content and both filters, and the talk's."""
+    """Gains over the Fresnel lens: of every content and both filters, and those that Sitzmann et al. published."""
     rows = [name for name in next(iter(found.values())) if name != "fresnel"]
     figure = new_figure(7.6, 0.42 * len(rows) + 1.1)
     axes = figure.subplots()
@@ -46,11 +46,13 @@ def gain_figure(found: Mapping[str, Mapping[str, Quality]]) -> Figure:
     for number, (content, own) in enumerate(found.items()):
         for filter, mark in marks.items():
             gain = [own[name].mean[filter] - own["fresnel"].mean[filter] for name in rows]
-            label = f"{content}, {'1 m Wiener' if filter == 'wiener' else 'blind'} filter"
+            label = f"{content}, {'1 m Wiener' if filter == 'wiener' else 'depth-invariant'} filter"
             face = FIELD_COLOURS[number] if filter == "blind" else "white"
             axes.plot(gain, place, mark, ms=5.5, mfc=face, mec=FIELD_COLOURS[number], label=label)
-    talk = [(TALK[name] - TALK["fresnel"], y) for name, y in zip(rows, place, strict=True) if name in TALK]
-    axes.plot(*zip(*talk, strict=True), "|", ms=15, mew=2, color=INK, label="the talk")
+    published = [
+        (PUBLISHED[name] - PUBLISHED["fresnel"], y) for name, y in zip(rows, place, strict=True) if name in PUBLISHED
+    ]
+    axes.plot(*zip(*published, strict=True), "|", ms=15, mew=2, color=INK, label="Sitzmann 2018")
     axes.set_yticks(place, [NAMES[name] for name in rows])
     axes.set_ylim(-0.6, len(rows) - 0.4)
     axes.axvline(0, color=GREY, lw=0.8)
@@ -68,7 +70,7 @@ def element_figure(elements: Sequence[Element], found: WavePsf, own: Quality, wo
     _draw_profile(profile, elements)
     dioptres = [1e3 / depth for depth in world.depths]
     for filter, mark in (("wiener", "o--"), ("blind", "s-")):
-        label = "Wiener, 1 m kernel" if filter == "wiener" else "best blind filter"
+        label = "Wiener, 1 m kernel" if filter == "wiener" else "best depth-invariant filter"
         quality.plot(dioptres, own.by_depth[filter], mark, ms=4, label=label, color=FIELD_COLOURS[filter == "blind"])
     _mark_depths(quality, world)
     quality.set(xlabel="object distance", ylabel="PSNR (dB)")
@@ -145,7 +147,9 @@ def _draw_kernels(figure, found: WavePsf) -> None:
                 panel.set_title(_depth(float(found.depths[d])), fontsize=9)
             if d == 0:
                 panel.set_ylabel(f"{1e3 * float(found.wavelengths[w]):.0f} nm", color=colours[w], fontsize=9)
-    figure.supxlabel(f"kernels, {2 * half:.0f} µm across, five decades below the brightest pixel of a row", fontsize=8)
+    figure.supxlabel(
+        f"PSFs, {2 * half:.0f} µm across; logarithmic, five decades down from the brightest pixel of a row", fontsize=8
+    )
 
 
 def _show(axes: Axes, picture: np.ndarray, title: str) -> None:

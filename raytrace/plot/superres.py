@@ -88,7 +88,7 @@ def _efficiency(ax: Axes, etched: Sequence[tuple[int, float, float]]) -> None:
     levels = sorted(row[0] for row in etched if row[0])
     fine = np.geomspace(max(min(levels), 2), max(levels), 60)
     ax.plot(fine, np.sinc(1 / fine) ** 2, color=GREY, linewidth=1.0, label="sinc²(1/L)")
-    for column, name, marker in ((1, "any width", "o"), (2, "2 µm rings", "s")):
+    for column, name, marker in ((1, "steps of any width", "o"), (2, "rings of 2 µm", "s")):
         values = {row[0]: row[column] for row in etched}
         ax.plot(levels, [values[n] for n in levels], marker, color=FIELD_COLOURS[column - 1], markersize=4, label=name)
     ax.set(title="Fresnel lens, at its focus", ylabel="light at the focus, ideal lens = 1", ylim=(0, 1.05))

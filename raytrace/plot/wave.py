@@ -40,7 +40,7 @@ _ENGINES = {
     "radial": (1, "s", "ring integrals"),
     "fresnel": (4, "D", "Fresnel transfer, band limit"),
     "angular_spectrum": (3, "v", "angular spectrum"),
-    "the talk's": (2, "*", "as in the talk"),
+    "sitzmann": (2, "*", "as Sitzmann 2018"),
 }
 
 
@@ -76,7 +76,7 @@ def psf_figure(found: WavePsf, *, title: str = "") -> Figure:
     figure.suptitle(title, fontweight="bold", fontsize=10)
     figure.supxlabel(
         f"{found.grid.columns} × {found.grid.rows} pixels of {1e3 * float(found.pitch):g} µm; brightness ∝ light^"
-        f"{_GAMMA:g}; share of the light inside the window",
+        f"{_GAMMA:g}; below each: share of the light inside the window, share in the brightest pixel",
         fontsize=7.5,
         color=GREY,
     )
@@ -238,8 +238,9 @@ def _course(panel: Axes, found: Learned) -> None:
     panel.set_ylabel("peak / ideal peak", color=field_colour(0))
     loss = panel.twinx()
     loss.plot(np.arange(len(found.losses)), found.losses, color=field_colour(2), linewidth=1.0)
-    loss.set_yscale("log")
-    loss.yaxis.set_minor_formatter(NullFormatter())
+    if found.losses and max(found.losses) > 10 * min(found.losses) > 0:  # a decade, so that the axis has numbers
+        loss.set_yscale("log")
+        loss.yaxis.set_minor_formatter(NullFormatter())
     loss.set_ylabel("mean square error", color=field_colour(2))
     loss.spines["right"].set_visible(True)
 

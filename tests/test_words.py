@@ -1,0 +1,61 @@
+"""Words for readers: commands that the documentation quotes, columns and labels in the field's terms."""
+
+import contextlib
+import io
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from raytrace.cli import COMMANDS, build_parser
+
+ROOT = Path(__file__).parents[1]
+#: What only those who made the package would understand.
+PRIVATE = re.compile(r"\b(the talk|one equation|the original's|blind (one|filter)|in the loop|waves added)\b", re.I)
+
+
+def commands(page: str) -> list[str]:
+    """The indented or fenced lines of a page that call raytrace, variables of the environment before them or not."""
+    text = page.replace("\\\n", " ")
+    return re.findall(r"^(?: {4})?(?:[A-Z_]+=\S+ )*(raytrace [a-z].*)$", text, re.MULTILINE)
+
+
+PAGES = sorted(path for path in (*ROOT.glob("docs/*.md"), ROOT / "README.md") if commands(path.read_text("utf-8")))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
+def test_quoted_commands_are_understood(page):
+    for line in commands(page.read_text("utf-8")):
+        words = shlex.split(line, comments=True)
+        assert build_parser().parse_args(words[1:]).command == words[1], line
+
+
+def test_pages_that_quote_commands_are_many():
+    assert len(PAGES) > 10
+
+
+@pytest.mark.parametrize("words", [(c.name,) for c in COMMANDS] + [("wave", s) for s in ("edof", "table", "superres")])
+def test_help_has_no_private_words(words):
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out), pytest.raises(SystemExit):
+        build_parser().parse_args([*words, "--help"])
+    assert not PRIVATE.search(" ".join(out.getvalue().split()))
+
+
+@pytest.mark.parametrize("page", [path for path in PAGES if path.stem.startswith("wave")], ids=lambda path: path.name)
+def test_pages_have_no_private_words(page):
+    assert not PRIVATE.search(" ".join(page.read_text("utf-8").split()))
+
+
+def test_the_error_axis_of_learning_has_numbers():
+    from raytrace.design.focusing import Setting, learn_to_focus
+    from raytrace.plot.wave import focus_figure
+
+    found = learn_to_focus(Setting(samples=16), steps=2, frames=(0, 2))
+    figure = focus_figure(found, title="few steps")
+    figure.canvas.draw()
+    (error,) = [axes for axes in figure.axes if axes.get_ylabel() == "mean square error"]
+    low, high = error.get_ylim()
+    said = [tick.label2.get_text() for tick in error.yaxis.get_major_ticks() if low <= tick.get_loc() <= high]
+    assert len([words for words in said if words]) >= 2
