@@ -1,4 +1,9 @@
-"""Settings of all tests: hypothesis draws the same examples in every run."""
+"""Settings of all tests: hypothesis draws the same examples in every run, and parallel workers take a core each."""
+
+import os
+
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is loaded: threads of workers would hinder each other
 
 import pytest
 from hypothesis import settings

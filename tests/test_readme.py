@@ -44,7 +44,7 @@ def test_command_one_installs_and_focuses():
 def test_command_two_installs_and_tests():
     text = "\n".join(first_block("Install and test"))
     assert ".[test]" in text
-    assert re.search(r"(^|[/\s])pytest$", text)
+    assert re.search(r"(^|[/\s])pytest -n 2$", text)
 
 
 def test_continuous_integration_runs_command_two_then_ruff():
