@@ -189,3 +189,20 @@ def test_a_cone_that_hardly_anything_passes_gives_no_absurd_numbers(run):
     assert found.document["summary"][0]["rms"] > 1
     lost = run("illumination", "double_gauss", "--f-number", 0.1, "--samples", 3)
     assert "nothing to show" in lost.err  # nor a solid angle of 1e13 sr
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "double_gauss --field 0,3 --wavelength 0.55",  # through a map of the rays
+        "cooke_triplet --f-number 1.2 --field 0,3 --wavelength 0.55",  # of rays, some of them lost
+    ],
+)
+def test_a_blur_of_very_many_pixels_is_refused_before_it_is_cut_into_cells(run, command):
+    """Cells as narrow as a pixel: 33 million of 130 bytes, or 16 million of 33, for each kernel."""
+    defocused = ["--object-distance", 1000, "--pixel", 1e-4, "--size", 9, "--tol", 0.5, "--model", "drt"]
+    found = run("psf", *command.split(), *defocused, "--max-bytes", "300MB")
+    assert found.code == 1
+    assert found.out == ""
+    assert "cells of the pupil for each of 1 kernels: the blur is wide beside a pixel" in found.err.splitlines()[-1]
+    assert "300 MB may be taken): give a larger --pixel" in found.err

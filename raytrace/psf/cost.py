@@ -1,6 +1,7 @@
 """Cost: what waves take in memory, told in the words of a lens before they are summed."""
 
 import math
+from collections.abc import Sequence
 
 from raytrace.budget import afford
 from raytrace.grid import Grid
@@ -32,6 +33,20 @@ def afford_sensor(what: str, scene: Scene, grid: Grid, nodes: int) -> None:
         64.0 * D * W * rows * columns,
         f"{what} at {_speed(scene)} needs {columns:,} × {rows:,} points of the sensor for {D * W} kernels",
         helps=_HELPS,
+    )
+
+
+def afford_cells(kernels: Sequence[int], across: int, along: int, *, each: float) -> None:
+    """Raise OverBudget where cells of the pupil narrow enough for the pixels, `each` so many bytes, are too much.
+
+    kernels: (D, F, W); across, along: cells round the pupil and from its centre to its rim.
+    """
+    count = math.prod(kernels)
+    afford(
+        each * count * across * along,
+        f"the ray-traced PSF needs {across:,} × {along:,} cells of the pupil for each of {count} kernels: the blur is "
+        "wide beside a pixel",
+        helps="give a larger --pixel, fewer fields or wavelengths at once, --rays, --model gaussian",
     )
 
 

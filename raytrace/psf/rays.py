@@ -17,6 +17,7 @@ from torch import Tensor
 from raytrace import pupil
 from raytrace.grid import Grid
 from raytrace.numerics import safe_divide
+from raytrace.psf.cost import afford_cells
 from raytrace.psf.sharing import pooled, symmetry
 from raytrace.psf.splat import cell_energy, cell_widths, cells, clear_share, histogram, splat_cells, splat_smooth
 from raytrace.scene import Kernels, Scene, beam_share, cross_scene, trace_scene
@@ -207,6 +208,9 @@ def refined(fans: Fans, parts: Sequence[int]) -> Fans:
     """The fans with every cell cut into so many parts across and along the lines, by linear interpolation."""
     limits = _FINEST // fans.points.shape[-2], _FINEST // fans.points.shape[-1]
     across, along = (max(1, min(part, limit)) for part, limit in zip(parts, limits, strict=True))
+    *kernels, count, nodes = fans.points.shape[1:]
+    # Points, clearances and what the last cut needs beside them: 33 bytes of a cell measured, with one clearance.
+    afford_cells(kernels, count * across, nodes * along, each=16.0 * (2 + len(fans.clearances)))
 
     def cut(t: Tensor) -> Tensor:
         if across > 1:
