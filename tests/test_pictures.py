@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from raytrace import pictures
 from raytrace.pictures import NoPictures, Pictures, crop, dead_leaves, draws, files, order, read, split
 
 
@@ -77,6 +78,15 @@ def test_an_epoch_takes_as_many_crops_of_every_picture():
     shades = [round(255 * float(crop(pictures, i, epoch=0, size=8)[0, 0])) for i in range(12)]
     assert sorted(shades) == [0] * 4 + [50] * 4 + [100] * 4
     assert sorted(order(12, epoch=0)) == list(range(12))
+
+
+def test_dead_leaves_laid_by_leaf_and_by_pixel_are_the_same(monkeypatch):
+    found = []
+    for few in (-1, 1000, 10**9):
+        monkeypatch.setattr(pictures, "_FEW_BARE", few)
+        found.append(dead_leaves(2, size=48, seed=3, smallest=1.5).samples)
+    np.testing.assert_array_equal(found[1], found[0])
+    np.testing.assert_array_equal(found[2], found[0])
 
 
 def test_dead_leaves_look_alike_at_every_scale():
