@@ -84,7 +84,7 @@ def test_the_command(options, capsys, tmp_path):
     assert len(document["summary"]) == 3
     assert (tmp_path / "rms.png").stat().st_size > 10_000
     assert main(arguments) == 0
-    assert "together" in capsys.readouterr().out
+    assert "all, weighted" in capsys.readouterr().out
 
 
 def test_zernike_coefficients_are_a_table(capsys):

@@ -59,3 +59,13 @@ def test_the_error_axis_of_learning_has_numbers():
     low, high = error.get_ylim()
     said = [tick.label2.get_text() for tick in error.yaxis.get_major_ticks() if low <= tick.get_loc() <= high]
     assert len([words for words in said if words]) >= 2
+
+
+def test_the_caption_of_a_single_kernel_stays_on_its_page():
+    from page import outside
+
+    from raytrace.bench.wave import bench_scene
+    from raytrace.plot.wave import psf_figure
+    from raytrace.wave.psf import psf
+
+    assert not outside(psf_figure(psf(bench_scene(size=8), engine="pupil", samples=600), title="one kernel"))

@@ -98,7 +98,7 @@ def rms(arguments: argparse.Namespace) -> None:
 
 def _print_rms(found: analysis.RmsOverField, field_unit: str) -> None:
     unit, factor = ("waves", 1.0) if found.quantity == "wavefront" else ("µm", 1e3)
-    heads = ["together", *(f"{wavelength:g} µm" for wavelength in found.wavelengths.tolist())]
+    heads = ["all, weighted", *(f"{wavelength:g} µm" for wavelength in found.wavelengths.tolist())]
     strehl = ["Strehl"] if found.strehl is not None else []
     print(f"{'field':>10}" + "".join(f"{head:>13}" for head in (*heads, *strehl)))
     print(f"{field_unit:>10}" + "".join(f"{unit:>13}" for _ in heads))

@@ -213,7 +213,8 @@ ANALYSES = (
     (
         "seidel",
         "Seidel aberrations by surface",
-        "Third-order aberrations S1 to S5 and colours C1, C2 of every surface and their sums, with y n i of the "
+        "Third-order aberrations S1 to S5 (spherical, coma, astigmatism, Petzval, distortion), C1, C2 (axial, "
+        "lateral colour) of every surface and their sums, with y n i of the "
         "marginal and chief ray, at the largest field or those of --field.",
         """examples:
   raytrace seidel tessar --plot seidel.png

@@ -143,7 +143,9 @@ def rms_curves(lens: Lens, found: RmsOverField) -> Figure:
         style = {"color": colour, "linewidth": 1.2, "linestyle": DASHES[w % len(DASHES)]}
         panel.plot(field[order], scale * array(found.rms[:, w])[order], label=wavelength_label(found, w), **style)
     if len(found.wavelengths) > 1:
-        panel.plot(field[order], scale * array(found.polychromatic)[order], color=INK, linewidth=1.6, label="together")
+        panel.plot(
+            field[order], scale * array(found.polychromatic)[order], color=INK, linewidth=1.6, label="all, weighted"
+        )
     if waves:
         panel.axhline(1 / 14, color=GREY, linewidth=0.8, linestyle=":", label="λ/14")
     panel.set_ylim(bottom=0)

@@ -1,6 +1,7 @@
 """Waves as pictures: kernels over depth and colour, heights, caustics, encircled energy, and how a lens was learned."""
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -74,9 +75,13 @@ def psf_figure(found: WavePsf, *, title: str = "") -> Figure:
         _framed(panel)
     _bar(axes[-1][0], found)
     figure.suptitle(title, fontweight="bold", fontsize=10)
+    caption = (
+        f"{found.grid.columns} × {found.grid.rows} pixels of {1e3 * float(found.pitch):g} µm; brightness ∝ "
+        f"light^{_GAMMA:g}; "
+        "below each: share of the light inside the window, share in the brightest pixel"
+    )
     figure.supxlabel(
-        f"{found.grid.columns} × {found.grid.rows} pixels of {1e3 * float(found.pitch):g} µm; brightness ∝ light^"
-        f"{_GAMMA:g}; below each: share of the light inside the window, share in the brightest pixel",
+        textwrap.fill(caption, int(16 * figure.get_figwidth())),
         fontsize=7.5,
         color=GREY,
     )
