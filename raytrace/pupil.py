@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+_BY_EIGENVALUES = 256  # points of a Gaussian rule at most
+
 
 def gauss_rings(
     rings: int = 6, arms: int | None = None, *, dtype: torch.dtype = torch.float64, device: torch.device | None = None
@@ -20,15 +22,34 @@ def gauss_rings(
     the x axis, so that the pattern is symmetric in x and in y.
     """
     arms = 4 * rings if arms is None else arms
-    nodes, weights = _leggauss(rings)
+    nodes, weights = gauss_legendre(rings)
     radius = np.sqrt(0.5 * (nodes + 1))
     angle = (np.arange(arms) + 0.5) * (2 * math.pi / arms)
     points = np.stack([np.outer(radius, np.cos(angle)).ravel(), np.outer(radius, np.sin(angle)).ravel()])
     return _tensors(points, np.repeat(0.5 * weights / arms, arms), dtype, device)
 
 
-#: Finding the nodes of a rule of a hundred rings takes milliseconds.
-_leggauss = functools.lru_cache(maxsize=64)(np.polynomial.legendre.leggauss)
+@functools.lru_cache(maxsize=64)
+def gauss_legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights of the Gaussian rule of so many points on [-1, 1], those of many points too.
+
+    Beyond a few hundred they are found by Newton's method from Tricomi's estimate, in time count² where the eigenvalues
+    of a matrix take count³: 5000 nodes in 0.1 s, not in a minute (Hale, Townsend, SIAM J. Sci. Comput. 35, 2013, §2).
+    """
+    if count <= _BY_EIGENVALUES:
+        return np.polynomial.legendre.leggauss(count)
+    k = np.arange(1, count // 2 + 1)
+    x = np.cos(np.pi * (4 * k - 1) / (4 * count + 2)) * (1 - 1 / (8 * count**2) + 1 / (8 * count**3))
+    x = np.concatenate([x, [0.0] * (count % 2)])
+    for _ in range(3):
+        before, value = np.ones_like(x), x
+        for j in range(2, count + 1):
+            before, value = value, x * value + (1 - 1 / j) * (x * value - before)
+        slope = count * (before - x * value) / (1 - x * x)
+        x = x - value / slope
+    weight = 2 / ((1 - x * x) * slope**2)
+    nodes, weights = (np.concatenate([sign * t[: len(k)], t[::-1]]) for sign, t in ((-1, x), (1, weight)))
+    return nodes, weights * (2 / weights.sum())
 
 
 def hexapolar(

@@ -4,12 +4,12 @@ An edge ρ of the clear part of an arm is a zero of a clearance c of `rays.clear
 derivatives. Two Newton steps with a constant slope s, ρ - c(ρ)/s, then carry its derivatives.
 """
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from raytrace.numerics import safe_divide
 from raytrace.psf.rays import clearance, trace_apertures
+from raytrace.pupil import gauss_legendre
 from raytrace.scene import Scene
 
 _SCAN = 32  # steps along an arm in which edges are looked for
@@ -54,7 +54,7 @@ def between(inner: Tensor, outer: Tensor, unit: Tensor, *, rings: int) -> tuple[
     opposite arms of the same length: else odd powers of r, roots of r², do not cancel. The weights of a clear pupil
     sum to 1.
     """
-    nodes, weights = (inner.new_tensor(t)[:, None] for t in np.polynomial.legendre.leggauss(rings))
+    nodes, weights = (inner.new_tensor(t)[:, None] for t in gauss_legendre(rings))
     inner, length = inner[..., None, :], (outer - inner)[..., None, :]
     radius = inner + length * 0.5 * (nodes + 1)
     directions = unit.repeat(1, inner.shape[-1] // unit.shape[1])

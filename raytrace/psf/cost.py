@@ -14,7 +14,7 @@ _HELPS = "give a larger --tol, a smaller --size or --pixel, a slower aperture (-
 def afford_rings(what: str, scene: Scene, rings: int, phase: float) -> None:
     """Raise OverBudget where a pupil of so many Gauss rings is too much.
 
-    phase: radians along a pupil radius. The nodes of a rule of n rings are the eigenvalues of a matrix n × n.
+    phase: radians along a pupil radius. n rings are counted as a matrix n × n: so do the points that they serve grow.
     """
     D, F, W = scene.shape
     turns = phase / (2 * math.pi)
