@@ -206,3 +206,9 @@ def test_a_blur_of_very_many_pixels_is_refused_before_it_is_cut_into_cells(run, 
     assert found.out == ""
     assert "cells of the pupil for each of 1 kernels: the blur is wide beside a pixel" in found.err.splitlines()[-1]
     assert "300 MB may be taken): give a larger --pixel" in found.err
+
+
+def test_an_object_in_the_first_surface_has_no_invariant_and_no_aberrations(run):
+    text = run("seidel", singlet("touching", ("DISZ INFINITY", "DISZ 0")), "--as", "waves").out
+    assert "optical invariant - mm" in text
+    assert "nan" not in text

@@ -19,7 +19,7 @@ def seidel(arguments: argparse.Namespace) -> None:
     else:
         unit = FIELD_UNITS[lens.fields.kind]
         for number, field in enumerate(found.fields.unbind(1)):
-            invariant = f"optical invariant {abs(float(found.invariant[number])):.6g} mm"
+            invariant = f"optical invariant {_cell(abs(float(found.invariant[number]))).strip()} mm"
             print(f"field {name_of_field(field)} {unit}, {invariant}, aberrations in {found.unit}")
             _print_surfaces(found, number)
     draw(arguments, lens, found, "seidel_bars")
