@@ -1,59 +1,83 @@
 """raytrace: a sequential, differentiable ray tracer with lens-file I/O, on torch.
 
-    >>> import raytrace
-    >>> lens = raytrace.read_lens("lenses/double_gauss.zmx")
-    >>> float(raytrace.first_order(lens).effective_focal_length)
+    >>> import raytrace as rt
+    >>> lens = rt.read_lens("double_gauss")
+    >>> float(rt.first_order(lens).effective_focal_length)
     99.5145515665...
 
-The nouns and the most used verbs stand here; the rest are in modules named after what they do (`raytrace.trace`,
-`raytrace.launch`, `raytrace.spot`, `raytrace.focus`, …). Everything is imported when first used: `import raytrace`
+The nouns and verbs stand here, each in the room that PUBLIC names, and are imported when first used: `import raytrace`
 alone loads neither torch nor matplotlib nor pandas.
 """
 
 import importlib
 
-#: Public names and the modules that define them.
-_PUBLIC = {
-    "AIR": "glass",
-    "MIRROR": "glass",
-    "Aperture": "surface",
-    "Fields": "lens",
-    "FirstOrder": "paraxial",
-    "Glass": "glass",
-    "Lens": "lens",
+#: Public names, and where each is defined: "room.file", or "room.file:name" if it has another name there.
+PUBLIC = {
+    # lenses and their files
+    "Aperture": "system.surface",
+    "Fields": "system.lens",
+    "Lens": "system.lens",
+    "Surface": "system.surface",
+    "SystemAperture": "system.lens",
+    "BadPrescription": "system.build",
     "LensFileError": "formats",
-    "Rays": "rays",
-    "Spot": "spot",
-    "Surface": "surface",
-    "SystemAperture": "lens",
-    "UnknownGlass": "catalog",
     "UnsupportedSurface": "formats",
-    "find_glass": "catalog",
-    "first_order": "paraxial",
-    "paraxial_image_distance": "paraxial",
-    "prepare": "fused",
+    "lens": "system.build",
     "read_lens": "formats",
-    "refractive_index": "glass",
-    "to": "value",
-    "tracing": "fused",
-    "with_object_distance": "lens",
-    "with_sensor_distance": "lens",
     "write_lens": "formats",
+    "with_object_distance": "system.lens",
+    "with_sensor_distance": "system.lens",
+    # media
+    "AIR": "media.glass",
+    "MIRROR": "media.glass",
+    "Glass": "media.glass",
+    "UnknownGlass": "media.catalog",
+    "find_glass": "media.catalog",
+    "refractive_index": "media.glass",
+    # rays
+    "FirstOrder": "optics.paraxial",
+    "Rays": "system.rays",
+    "Spot": "optics.spot",
+    "first_order": "optics.paraxial",
+    "gauss_rings": "maths.pupil",
+    "hexapolar": "maths.pupil",
+    "hit_jacobian": "optics.jacobian",
+    "paraxial_image_distance": "optics.paraxial",
+    "prepare": "fused",
+    "sobol": "maths.pupil",
+    "to": "maths.value",
+    "tracing": "fused",
+    # images and analyses
+    "Memo": "optics.reuse",
+    "Psf": "kernels",
+    "compare": "analysis",
+    "distortion": "analysis",
+    "encircled_energy": "analysis",
+    "field_curvature": "analysis",
+    "grid": "maths.grid",
+    "lateral_colour": "analysis",
+    "mtf": "analysis",
+    "mtf_through_focus": "analysis",
+    "opd_fan": "analysis",
+    "psf": "kernels",
+    "ray_fan": "analysis",
+    "relative_illumination": "analysis",
+    "seidel": "analysis",
+    "wavefront_map": "analysis",
+    # learning
+    "Camera": "camera",
+    "RedNet": "camera",
+    "Variables": "camera",
 }
-_MODULES = (
-    "catalog", "focus", "formats", "glass", "launch", "lens", "paraxial", "plot", "pupil", "rays", "spot", "surface",
-    "trace", "wavefront",
-)  # fmt: skip
 
-__all__ = [*_PUBLIC, *_MODULES]
+__all__ = [*PUBLIC]
 
 
 def __getattr__(name: str):
-    if name in _PUBLIC:
-        return getattr(importlib.import_module(f"raytrace.{_PUBLIC[name]}"), name)
-    if name in _MODULES:
-        return importlib.import_module(f"raytrace.{name}")
-    raise AttributeError(f"module 'raytrace' has no attribute {name!r}")
+    if name not in PUBLIC:
+        raise AttributeError(f"module 'raytrace' has no attribute {name!r}")
+    place, _, own = PUBLIC[name].partition(":")
+    return getattr(importlib.import_module(f"raytrace.{place}"), own or name)
 
 
 def __dir__() -> list[str]:

@@ -9,9 +9,9 @@ from decimal import Decimal, getcontext
 
 import torch
 
-from raytrace.grid import Grid
-from raytrace.psf.pixels import gaussian_pixels
-from raytrace.spot import spot_of_points
+from raytrace.kernels.pixels import gaussian_pixels
+from raytrace.maths.grid import Grid
+from raytrace.optics.spot import spot_of_points
 
 getcontext().prec = 60
 

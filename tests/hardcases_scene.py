@@ -10,12 +10,12 @@ from pathlib import Path
 
 import torch
 
-from raytrace.glass import AIR, MIRROR, constant
-from raytrace.launch import rays_from_infinity, rays_from_point
-from raytrace.numerics import dot, unit
-from raytrace.rays import Rays
-from raytrace.surface import Aperture, Surface
-from raytrace.trace import axial_path, start, steps
+from raytrace.maths.numerics import dot, unit
+from raytrace.media.glass import AIR, MIRROR, constant
+from raytrace.optics.launch import rays_from_infinity, rays_from_point
+from raytrace.optics.trace import axial_path, start, steps
+from raytrace.system.rays import Rays
+from raytrace.system.surface import Aperture, Surface
 
 ORACLE = Path(__file__).parent / "oracles" / "hardcases.json.gz"
 OUTPUTS = ("x", "y", "z", "L", "M", "N", "opl")

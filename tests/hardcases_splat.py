@@ -6,8 +6,8 @@ image, inside_energy and the one-sided derivatives of loss = Σ image[iy][ix]·(
 
 import torch
 
-from raytrace.grid import grid
-from raytrace.psf.splat import splat
+from raytrace.kernels.splat import splat
+from raytrace.maths.grid import grid
 
 EXACT = 1e-14  # of a weight of 1
 

@@ -13,17 +13,19 @@ from pathlib import Path
 
 import torch
 
-from raytrace import analysis, glass, pupil, zernike
+from raytrace import analysis
 from raytrace.analysis.setting import scene_of
-from raytrace.catalog import find_glass
-from raytrace.launch import launch, stop_radius
-from raytrace.lens import FIELD_UNITS, RAY_AIMING, Fields, Lens, SystemAperture
-from raytrace.paraxial import first_order
-from raytrace.psf import diffraction
-from raytrace.rays import Rays
-from raytrace.surface import Aperture, Surface
-from raytrace.trace import media, steps, trace
-from raytrace.wavefront import peak_to_valley, rms, wavefront
+from raytrace.kernels import diffraction
+from raytrace.maths import pupil, zernike
+from raytrace.media import glass
+from raytrace.media.catalog import find_glass
+from raytrace.optics.launch import launch, stop_radius
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.trace import media, steps, trace
+from raytrace.optics.wavefront import peak_to_valley, rms, wavefront
+from raytrace.system.lens import FIELD_UNITS, RAY_AIMING, Fields, Lens, SystemAperture
+from raytrace.system.rays import Rays
+from raytrace.system.surface import Aperture, Surface
 
 ORACLE = Path(__file__).parent / "oracles" / "opticstudio.json.gz"
 

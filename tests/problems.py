@@ -10,9 +10,9 @@ from decimal import Decimal, localcontext
 import pytest
 import torch
 
-from raytrace.glass import AIR, MIRROR, Glass, constant
-from raytrace.lens import Fields, Lens, SystemAperture
-from raytrace.surface import Aperture, Surface
+from raytrace.media.glass import AIR, MIRROR, Glass, constant
+from raytrace.system.lens import Fields, Lens, SystemAperture
+from raytrace.system.surface import Aperture, Surface
 
 #: Runs a test by torch alone and by the compiled trace (fixture `engine`).
 both_engines = pytest.mark.parametrize("engine", ["eager", "fused"], indirect=True)

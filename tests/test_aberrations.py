@@ -10,10 +10,10 @@ from problems import MICROMETRE, NANOMETRE, double_gauss, fields, lens, scalar, 
 
 from raytrace.analysis import distortion, grid_distortion, incidence, longitudinal_aberration
 from raytrace.cli import main
-from raytrace.glass import MIRROR
-from raytrace.lens import with_object_distance
-from raytrace.paraxial import first_order, paraxial_image_distance
-from raytrace.surface import Aperture
+from raytrace.media.glass import MIRROR
+from raytrace.optics.paraxial import first_order, paraxial_image_distance
+from raytrace.system.lens import with_object_distance
+from raytrace.system.surface import Aperture
 
 INF = math.inf
 SPHERE = lens([surface(None, 300.0), surface(-0.01, -50.0, MIRROR)], aperture=("entrance_pupil_diameter", 80.0))

@@ -12,15 +12,15 @@ from problems import MICROMETRE, NANOMETRE, vector
 from raytrace import analysis
 from raytrace.cli import main
 from raytrace.files import shipped
-from raytrace.focus import image_rays
 from raytrace.formats import read_lens
-from raytrace.launch import launch
-from raytrace.lens import Lens, with_sensor_distance
-from raytrace.numerics import safe_sqrt
-from raytrace.paraxial import first_order
-from raytrace.pupil import gauss_rings
-from raytrace.spot import EmptySpot
-from raytrace.trace import trace
+from raytrace.maths.numerics import safe_sqrt
+from raytrace.maths.pupil import gauss_rings
+from raytrace.optics.focus import image_rays
+from raytrace.optics.launch import launch
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.spot import EmptySpot
+from raytrace.optics.trace import trace
+from raytrace.system.lens import Lens, with_sensor_distance
 
 WAVELENGTH = 0.55e-3  # mm
 

@@ -8,8 +8,8 @@ import torch
 from problems import surface
 from torch.autograd import gradcheck, gradgradcheck
 
-from raytrace.asphere import sag_and_derivatives
-from raytrace.surface import intersect, sag
+from raytrace.system.asphere import sag_and_derivatives
+from raytrace.system.surface import intersect, sag
 
 ROUNDING = 2.0**-53
 

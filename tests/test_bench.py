@@ -12,10 +12,10 @@ from raytrace.bench.tracers import squared_radius, variables, with_leaves
 from raytrace.cli import main
 from raytrace.files import shipped
 from raytrace.formats import read_lens
-from raytrace.glass import MIRROR, constant
-from raytrace.rays import Rays
-from raytrace.surface import Surface
-from raytrace.trace import trace, trace_surfaces
+from raytrace.media.glass import MIRROR, constant
+from raytrace.optics.trace import trace, trace_surfaces
+from raytrace.system.rays import Rays
+from raytrace.system.surface import Surface
 
 TINY = ["bench", "trace", "--rays", "300", "--repeats", "1", "--no-peers", "--threads", "1"]
 

@@ -14,8 +14,8 @@ from raytrace.bench.codesign_accuracy import Accuracy, Entrant, ModelError, Plac
 from raytrace.cli import main
 from raytrace.files import shipped
 from raytrace.formats import read_lens
-from raytrace.lens import with_sensor_distance
-from raytrace.psf import psf
+from raytrace.kernels import psf
+from raytrace.system.lens import with_sensor_distance
 
 SENSOR = 57.66
 

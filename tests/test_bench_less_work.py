@@ -10,12 +10,12 @@ from raytrace.bench.less_work import cases, measure, with_spheres_for_planes
 from raytrace.bench.speed import Sizes, double_gauss
 from raytrace.bench.speed_own import with_sensor_leaf
 from raytrace.fused import prepare, tracing
-from raytrace.launch import rays_of_field
-from raytrace.lens import with_object_distance
-from raytrace.psf import fourier, ladder, psf
-from raytrace.pupil import sobol
-from raytrace.reuse import Memo, trace_bundle
-from raytrace.scene import scene, symmetry
+from raytrace.kernels import fourier, ladder, psf
+from raytrace.maths.pupil import sobol
+from raytrace.optics.launch import rays_of_field
+from raytrace.optics.reuse import Memo, trace_bundle
+from raytrace.optics.scene import scene, symmetry
+from raytrace.system.lens import with_object_distance
 
 TINY = Sizes(less=64, distances=2)
 ROUNDING = 1e-10  # of sums of kernels and gradients; a kernel 1e-12 degrees off the axis moves by 3e-11 of itself

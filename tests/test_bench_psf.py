@@ -20,11 +20,11 @@ from raytrace.bench.psf_report import judged, markdown, table, targets
 from raytrace.cli import main
 from raytrace.files import shipped
 from raytrace.formats import read_lens
-from raytrace.grid import grid
-from raytrace.psf import MODELS, diffraction, raymap
-from raytrace.psf.gaussian import kernels as gaussian_kernels
-from raytrace.scene import scene
-from raytrace.surface import Aperture
+from raytrace.kernels import MODELS, diffraction, raymap
+from raytrace.kernels.gaussian import kernels as gaussian_kernels
+from raytrace.maths.grid import grid
+from raytrace.optics.scene import scene
+from raytrace.system.surface import Aperture
 
 
 @pytest.fixture(autouse=True)

@@ -11,7 +11,9 @@ import re
 import pytest
 import torch
 
+from raytrace.bench import command_speed as command
 from raytrace.bench import speed, speed_processes
+from raytrace.bench.figure_speed import speed_figure
 from raytrace.bench.limit import Limit, build
 from raytrace.bench.measure import errors_of, field_rays, surfaces_of
 from raytrace.bench.speed import Bench, Row, Sizes, interleaved, measure, stages
@@ -19,16 +21,14 @@ from raytrace.bench.speed_own import Engine, leaves_of, three_aspheres, with_sen
 from raytrace.bench.speed_report import KEPT, document, markdown, table, targets
 from raytrace.bench.tracers import squared_radius
 from raytrace.cli import main
-from raytrace.cli import speed_bench as command
 from raytrace.files import shipped
-from raytrace.focus import spot_parabola
 from raytrace.formats import read_lens
 from raytrace.fused import NoCompiler, tracing
-from raytrace.plot.speed import speed_figure
-from raytrace.rays import Rays
-from raytrace.reuse import Memo, trace_bundle
-from raytrace.trace import trace, trace_surfaces
-from raytrace.value import to
+from raytrace.maths.value import to
+from raytrace.optics.focus import spot_parabola
+from raytrace.optics.reuse import Memo, trace_bundle
+from raytrace.optics.trace import trace, trace_surfaces
+from raytrace.system.rays import Rays
 
 #: What `raytrace bench speed --json` is read for.
 KEYS = {

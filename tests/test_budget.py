@@ -16,10 +16,10 @@ from raytrace import analysis, budget
 from raytrace.budget import OverBudget, TakesLong, afford, free_bytes, in_words, piece, within
 from raytrace.cli import COMMANDS, build_parser, main
 from raytrace.files import shipped
-from raytrace.focus import image_rays
-from raytrace.lens import SystemAperture
-from raytrace.psf import psf
-from raytrace.psf.dft import rings_to_grid, to_grid, to_grid_mirrored
+from raytrace.kernels import psf
+from raytrace.kernels.dft import rings_to_grid, to_grid, to_grid_mirrored
+from raytrace.optics.focus import image_rays
+from raytrace.system.lens import SystemAperture
 
 LENS = shipped("lenses") / "double_gauss.zmx"
 

@@ -10,8 +10,21 @@ from pathlib import Path
 import pytest
 import torch
 
-from raytrace.design.camera import Camera
-from raytrace.design.codesign import (
+from raytrace.camera.camera import Camera
+from raytrace.camera.image import blur
+from raytrace.camera.network import RedNet, RedNetShape
+from raytrace.camera.spectral import camera_error, even_distances, optimise_closed_form, out_of_focus, power_spectrum
+from raytrace.camera.training import Run, Share
+from raytrace.camera.variables import BadVariables, Variables
+from raytrace.files import shipped
+from raytrace.formats import read_lens
+from raytrace.formats.pictures import dead_leaves, split
+from raytrace.kernels import psf
+from raytrace.maths.grid import grid
+from raytrace.optics.conjugates import distance_in_focus, sensor_range
+from raytrace.optics.focus import NoImage, best_focus
+from raytrace.optics.paraxial import first_order, paraxial_image_distance
+from raytrace.studies.codesign.experiment import (
     Batches,
     Outcome,
     Settings,
@@ -24,26 +37,7 @@ from raytrace.design.codesign import (
     run_model,
     write_outcome,
 )
-from raytrace.design.conjugates import distance_in_focus, sensor_range
-from raytrace.design.network import RedNet, RedNetShape
-from raytrace.design.spectral import (
-    camera_error,
-    even_distances,
-    optimise_closed_form,
-    out_of_focus,
-    power_spectrum,
-)
-from raytrace.design.training import Run, Share
-from raytrace.design.variables import BadVariables, Variables
-from raytrace.files import shipped
-from raytrace.focus import NoImage, best_focus
-from raytrace.formats import read_lens
-from raytrace.grid import grid
-from raytrace.image import blur
-from raytrace.lens import with_object_distance
-from raytrace.paraxial import first_order, paraxial_image_distance
-from raytrace.pictures import dead_leaves, split
-from raytrace.psf import psf
+from raytrace.system.lens import with_object_distance
 
 LENS = Path(__file__).parents[1] / "lenses" / "double_gauss.zmx"
 SMALL = Settings(depth=4, width=4, patch=16, size=7, epochs=1, crops=2, batch=4)

@@ -13,9 +13,9 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from raytrace import catalog as catalogs
-from raytrace.agf import format_agf, parse_agf
-from raytrace.catalog import (
+from raytrace.media import catalog as catalogs
+from raytrace.media.agf import format_agf, parse_agf
+from raytrace.media.catalog import (
     SHIPPED,
     AmbiguousGlass,
     Catalog,
@@ -31,8 +31,8 @@ from raytrace.catalog import (
     shipped_folder,
     write_agf,
 )
-from raytrace.dispersion import AGF_FORMULAS
-from raytrace.glass import constant, index, listing_error, refractive_index
+from raytrace.media.dispersion import AGF_FORMULAS
+from raytrace.media.glass import constant, index, listing_error, refractive_index
 
 #: Glasses of which their catalog lists no nd and Vd (infrared materials, and crystals that are opaque at the d line,
 #: were entered as nd = 1, Vd = 0), so that there is nothing to compare with. No listing that exists is inconsistent.
@@ -367,7 +367,7 @@ BAD = {
 }
 
 
-@pytest.mark.filterwarnings("ignore::raytrace.catalog.CatalogWarning")
+@pytest.mark.filterwarnings("ignore::raytrace.media.catalog.CatalogWarning")
 @pytest.mark.parametrize(("text", "message"), BAD.values(), ids=BAD)
 def test_a_bad_file_gives_one_clear_error(tmp_path, text, message):
     path = tmp_path / "bad.agf"

@@ -14,12 +14,13 @@ import torch
 from PIL import Image
 
 import raytrace
-from raytrace.cli import codesign_setup, codesign_table
-from raytrace.design import study
-from raytrace.design.codesign import Settings, lens_at_start
 from raytrace.formats import read_lens
-from raytrace.paraxial import paraxial_image_distance
-from raytrace.pictures import dead_leaves
+from raytrace.formats.pictures import dead_leaves
+from raytrace.optics.paraxial import paraxial_image_distance
+from raytrace.studies.codesign import setup as codesign_setup
+from raytrace.studies.codesign import study
+from raytrace.studies.codesign import words as codesign_table
+from raytrace.studies.codesign.experiment import Settings, lens_at_start
 
 _LITTLE = "--depth 4 --width 4 --patch 16 --size 7 --epochs 1 --crops 4 --batch 4 --precision float32"
 SMALL = tuple(_LITTLE.split(" "))

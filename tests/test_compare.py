@@ -11,11 +11,11 @@ from problems import MICROMETRE, NANOMETRE
 
 from raytrace import analysis, read_lens
 from raytrace.cli import main, psf_commands
-from raytrace.focus import image_rays
-from raytrace.grid import grid
-from raytrace.lens import with_object_distance
-from raytrace.psf import NotConverged, psf
-from raytrace.pupil import gauss_rings
+from raytrace.kernels import NotConverged, psf
+from raytrace.maths.grid import grid
+from raytrace.maths.pupil import gauss_rings
+from raytrace.optics.focus import image_rays
+from raytrace.system.lens import with_object_distance
 
 LENSES = Path(__file__).parents[1] / "lenses"
 ROWS = ("DRT", "Gaussian DRT", "paraxial", "Fourier", "wave")

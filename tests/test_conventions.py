@@ -6,11 +6,11 @@ import pytest
 import torch
 from problems import double_gauss, fields, lens, surface, vector, vignetting_aperture
 
-from raytrace.glass import MIRROR, refractive_index, sellmeier
-from raytrace.launch import launch
-from raytrace.lens import check
-from raytrace.paraxial import first_order
-from raytrace.trace import media, start, steps, trace
+from raytrace.media.glass import MIRROR, refractive_index, sellmeier
+from raytrace.optics.launch import launch
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.trace import media, start, steps, trace
+from raytrace.system.lens import check
 
 CENTRE = torch.zeros(2, 1, dtype=torch.float64)
 

@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from raytrace.catalog import UnknownGlass
 from raytrace.formats import UnsupportedSurface, read_lens
-from raytrace.glass import constant, refractive_index
-from raytrace.lens import Lens
-from raytrace.paraxial import first_order
-from raytrace.trace import start, steps
+from raytrace.media.catalog import UnknownGlass
+from raytrace.media.glass import constant, refractive_index
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.trace import start, steps
+from raytrace.system.lens import Lens
 
 CORPUS = Path(__file__).parents[2] / "shared" / "corpus"
 RIGHT, REFUSED, WRONG = "loaded and right", "refused by name", "wrong"

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from raytrace.deconvolve import (
+from raytrace.camera.deconvolve import (
     blind_error,
     blind_filter,
     errors,
@@ -22,8 +22,8 @@ from raytrace.deconvolve import (
     wiener,
     within,
 )
-from raytrace.image import blur, transfer_functions
-from raytrace.pictures import dead_leaves
+from raytrace.camera.image import blur, transfer_functions
+from raytrace.formats.pictures import dead_leaves
 
 
 def draws(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> torch.Tensor:

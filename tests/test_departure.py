@@ -8,18 +8,18 @@ import torch
 from problems import lens, surface, vector
 from torch.autograd import gradcheck, gradgradcheck
 
-from raytrace import zernike
-from raytrace.departure import GridSag, ZernikeSag, covers, numbers, sag_of, spline
 from raytrace.formats import write_lens
 from raytrace.formats.source import LensFileError
-from raytrace.grid import grid
-from raytrace.launch import launch
-from raytrace.paraxial import first_order
-from raytrace.psf import psf
-from raytrace.scene import scene, symmetry
-from raytrace.surface import intersect, normal, sag, sag_at
-from raytrace.trace import media, start, steps, trace
-from raytrace.value import to
+from raytrace.kernels import psf
+from raytrace.maths import zernike
+from raytrace.maths.grid import grid
+from raytrace.maths.value import to
+from raytrace.optics.launch import launch
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.scene import scene, symmetry
+from raytrace.optics.trace import media, start, steps, trace
+from raytrace.system.departure import GridSag, ZernikeSag, covers, numbers, sag_of, spline
+from raytrace.system.surface import intersect, normal, sag, sag_at
 
 RADIUS = vector(4.0)[0]
 

@@ -7,9 +7,16 @@ import numpy as np
 import pytest
 import torch
 
-from raytrace.deconvolve import blind_filter, errors, psnr, wiener
-from raytrace.design import edof_table
-from raytrace.design.edof import (
+from raytrace.camera.deconvolve import blind_filter, errors, psnr, wiener
+from raytrace.camera.phase import PhaseVariables, radial_powers
+from raytrace.camera.training import OtherSettings
+from raytrace.formats.pictures import dead_leaves
+from raytrace.maths.zernike import polynomials
+from raytrace.media.glass import index
+from raytrace.studies.edof import table as edof_table
+from raytrace.studies.edof.table import STRENGTHS, Content, elements_of, records, table_of
+from raytrace.studies.edof.training import Settings, begin, learn_element, scheduled
+from raytrace.studies.edof.world import (
     World,
     best_gamma,
     best_of_starts,
@@ -22,17 +29,10 @@ from raytrace.design.edof import (
     spectrum,
     transfer,
 )
-from raytrace.design.edof_table import STRENGTHS, Content, elements_of, records, table_of
-from raytrace.design.edof_training import Settings, begin, learn_element, scheduled
-from raytrace.design.phase import PhaseVariables, radial_powers
-from raytrace.design.training import OtherSettings
-from raytrace.glass import index
-from raytrace.pictures import dead_leaves
 from raytrace.wave.aim import aim
 from raytrace.wave.baselines import baseline
 from raytrace.wave.element import Element, EvenPowers, height
 from raytrace.wave.psf import psf
-from raytrace.zernike import polynomials
 
 #: One colour, three depths, a window of 0.47 mm: a step takes milliseconds.
 SMALL = World(depths=(500.0, 1000.0, math.inf), wavelengths=(0.55,), size=63, pixel=0.00738)

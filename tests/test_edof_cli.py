@@ -5,9 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from raytrace.cli import main, wave_edof
-from raytrace.cli.wave_edof_table import EDOF
-from raytrace.design.edof_table import NAMES
+from raytrace.cli import main
+from raytrace.studies.edof import command as wave_edof
+from raytrace.studies.edof.table import NAMES
+from raytrace.studies.edof.words import EDOF
 
 
 def run(capsys, *words):

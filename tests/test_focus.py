@@ -7,8 +7,9 @@ import pytest
 import torch
 from problems import double_gauss, lens, scalar, surface, vector
 
-from raytrace import pupil
-from raytrace.focus import (
+from raytrace.maths import pupil
+from raytrace.media.glass import MIRROR
+from raytrace.optics.focus import (
     focus,
     focus_moments,
     focus_of_mean_radius,
@@ -17,11 +18,10 @@ from raytrace.focus import (
     spot_parabola,
     through_focus,
 )
-from raytrace.glass import MIRROR
-from raytrace.lens import with_object_distance, with_sensor_distance
-from raytrace.paraxial import first_order
-from raytrace.spot import EmptySpot, spot
-from raytrace.surface import Aperture
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.spot import EmptySpot, spot
+from raytrace.system.lens import with_object_distance, with_sensor_distance
+from raytrace.system.surface import Aperture
 
 POINTS, WEIGHTS = pupil.gauss_rings(6)
 AXIS = torch.zeros(2, 1, dtype=torch.float64)

@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from raytrace.design.focusing import (
+from raytrace.formats.pictures import dead_leaves
+from raytrace.studies.focusing.experiment import (
     Setting,
     _behind,
     best_kernel,
@@ -17,7 +18,6 @@ from raytrace.design.focusing import (
     sampled,
     scene_of,
 )
-from raytrace.pictures import dead_leaves
 from raytrace.wave.psf import psf
 
 AIRY = 1.2197 * 0.55e-3 * 25

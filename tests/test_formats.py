@@ -11,13 +11,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from raytrace.catalog import UnknownGlass
 from raytrace.formats import FORMATS, LensFileError, LensFileWarning, read_lens, read_lens_with_report, write_lens
 from raytrace.formats.frame import lens_from_frame, to_frame
 from raytrace.formats.source import MAX_BYTES, Place, decode
-from raytrace.glass import constant, model_glass
-from raytrace.lens import Lens, SystemAperture
-from raytrace.surface import Aperture
+from raytrace.media.catalog import UnknownGlass
+from raytrace.media.glass import constant, model_glass
+from raytrace.system.lens import Lens, SystemAperture
+from raytrace.system.surface import Aperture
 
 ROOT = Path(__file__).parents[1]
 OWN = sorted(path for path in (ROOT / "lenses").iterdir() if path.suffix in FORMATS)

@@ -20,8 +20,8 @@ from raytrace.cli import build_parser
 from raytrace.cli.door import find_lens
 from raytrace.cli.options import PICTURES, data_file, did_you_mean, picture_file
 from raytrace.formats import read_lens
-from raytrace.losses import losses
-from raytrace.pupil import hexapolar
+from raytrace.maths.pupil import hexapolar
+from raytrace.optics.losses import losses
 
 #: Options whose form differs between commands, and why.
 DIFFERENT = {

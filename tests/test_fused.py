@@ -12,21 +12,21 @@ from problems import both_engines, double_gauss, lens, scalar, surface, vector, 
 from torch.autograd import gradcheck, gradgradcheck
 from torch.testing import assert_close
 
-from raytrace.departure import ZernikeSag
 from raytrace.files import shipped
 from raytrace.formats import read_lens
 from raytrace.fused import NoCompiler, engine, prepare, tracing
 from raytrace.fused.choice import is_fused
 from raytrace.fused.library import library
 from raytrace.fused.run import trace_compiled
-from raytrace.glass import MIRROR
-from raytrace.jacobian import hit_jacobian
-from raytrace.launch import launch
-from raytrace.pupil import sobol
-from raytrace.rays import Rays
-from raytrace.surface import Aperture
-from raytrace.trace import media, start, trace, trace_surfaces
-from raytrace.value import to
+from raytrace.maths.pupil import sobol
+from raytrace.maths.value import to
+from raytrace.media.glass import MIRROR
+from raytrace.optics.jacobian import hit_jacobian
+from raytrace.optics.launch import launch
+from raytrace.optics.trace import media, start, trace, trace_surfaces
+from raytrace.system.departure import ZernikeSag
+from raytrace.system.rays import Rays
+from raytrace.system.surface import Aperture
 
 LENSES = sorted(path for path in shipped("lenses").iterdir() if path.suffix == ".zmx")
 #: What both traces may differ by, in direction cosines and as a share of the size of a system.

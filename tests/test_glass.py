@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.autograd import gradcheck, gradgradcheck
 
-from raytrace.dispersion import AGF_FORMULAS, COEFFICIENT_COUNTS, FORMULAS
-from raytrace.glass import (
+from raytrace.media.dispersion import AGF_FORMULAS, COEFFICIENT_COUNTS, FORMULAS
+from raytrace.media.glass import (
     AIR,
     LINES,
     MIRROR,

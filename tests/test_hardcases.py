@@ -18,8 +18,8 @@ import torch
 from hardcases_scene import CASES, OUTPUTS, Scene
 from problems import both_engines
 
-from raytrace.glass import InvalidIndex, OutOfRange, check_wavelengths, refractive_index, sellmeier
-from raytrace.wavefront import path_to_reference_sphere
+from raytrace.media.glass import InvalidIndex, OutOfRange, check_wavelengths, refractive_index, sellmeier
+from raytrace.optics.wavefront import path_to_reference_sphere
 
 getcontext().prec = 60
 

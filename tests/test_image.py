@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from raytrace.image import (
+from raytrace.camera.image import (
     BOUNDARIES,
     COMPOSITIONS,
     EXTENSIONS,

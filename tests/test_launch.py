@@ -7,8 +7,9 @@ import pytest
 import torch
 from problems import double_gauss, fields, lens, scalar, surface, vector
 
-from raytrace import pupil
-from raytrace.launch import (
+from raytrace.maths import pupil
+from raytrace.maths.value import to
+from raytrace.optics.launch import (
     MarginalRayLost,
     launch,
     rays_from_infinity,
@@ -16,10 +17,9 @@ from raytrace.launch import (
     rays_of_field,
     stop_radius,
 )
-from raytrace.lens import with_object_distance
-from raytrace.paraxial import first_order
-from raytrace.trace import media, trace, trace_surfaces
-from raytrace.value import to
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.trace import media, trace, trace_surfaces
+from raytrace.system.lens import with_object_distance
 
 POINTS, _ = pupil.hexapolar(2)
 CENTRE = torch.zeros(2, 1, dtype=torch.float64)

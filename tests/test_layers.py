@@ -9,94 +9,41 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "raytrace"
 
-#: Floor of every file of the package, by module name without "raytrace."; __init__ of a folder bears the folder's name.
+#: Floor of every room, a folder or a file directly under raytrace/; inside a room imports only have to run one way.
 FLOORS = {
-    # below all: memory
-    "budget": -1,
-    # 0: mathematics, knows no optics
-    "value": 0,
-    "numerics": -1,  # what the others compute with
-    "dispersion": 0,
-    "shards": 0,
-    "pupil": 0,
-    "zernike": 0,
+    # knows no optics: files that travel with the package, processes that share one computation
     "files": 0,
-    "arrays": 0,
-    "pictures": 1,
-    # 1: the nouns
-    "image": 1,
-    "grid": 1,
-    "glass": 1,
-    "rays": 1,
-    "asphere": 1,
-    "roots": 1,
-    "departure": 1,
-    # 2
-    "agf": 2,
-    "glass_table": 2,
-    "deconvolve": 2,
-    "superresolution": 2,
-    "surface": 2,
-    # 3
-    "catalog": 3,
-    "lens": 3,
-    # 4: verbs
-    "trace": 4,
-    # 5
-    "paraxial": 5,
-    "jacobian": 5,
-    "aiming": 5,
-    "vignetting": 5,
-    # 6
-    "launch": 6,
-    "spot": 6,
-    # 7
-    "focus": 7,
-    "losses": 7,
-    "reuse": 7,
-    # 8
-    "f_number": 8,
-    "scene": 8,
-    "streaming": 8,
-    # 9
-    "wavefront": 9,
-    "stream_gradient": 9,
-    # lens files: a family of its own between the lens and the plots
-    "formats.source": 4,
-    "formats.zemax_keywords": 4,
-    "formats.report": 5,
-    "formats.finite": 5,
-    "formats.media": 6,
-    "formats.writing": 6,
-    "formats.table_columns": 6,
-    "formats.texts": 4,
-    "formats.zemax_records": 6,
-    "formats.table_system": 7,
-    "formats.zemax_system": 7,
-    "formats.table_text": 8,
-    "formats.table_media": 8,
-    "formats.table_rows": 9,
-    "formats.zemax_surface": 8,
-    "formats.table_surface": 9,
-    "formats.table": 10,
-    "formats.zemax": 10,
-    "formats.table_write": 10,
-    "formats.zemax_write": 10,
-    "formats.frame": 11,
-    "formats": 12,
-    # a command's modules are loaded when it runs
-    "__init__": 17,
-    "__main__": 17,
+    "budget": 0,
+    "pages": 0,
+    "shards": 0,
+    "maths": 1,
+    # nouns
+    "media": 2,
+    "system": 3,
+    # lens files, and the trace in C++
+    "formats": 4,
+    "fused": 4,
+    # verbs
+    "optics": 5,
+    "kernels": 6,
+    "analysis": 7,
+    "wave": 7,
+    "camera": 8,
+    # people
+    "plot": 9,
+    "cli": 10,
+    # experiments and measurements: nothing imports them
+    "studies": 11,
+    "bench": 11,
+    "__init__": 12,
+    "__main__": 12,
 }
-
-#: Folders that stand on one floor as a whole; inside them imports only have to run one way (no cycle).
-FAMILIES = {"fused": 3, "psf": 10, "analysis": 11, "wave": 12, "design": 13, "plot": 14, "bench": 15, "cli": 16}
 
 #: What only these files may import.
 RESERVED = {
-    "matplotlib": ("plot",),
-    "pandas": ("formats.frame", "analysis.frame", "cli", "bench"),
-    "tqdm": ("cli", "bench"),
+    "matplotlib": ("plot", "studies", "bench"),
+    "pandas": ("formats.frame", "analysis.frame", "cli", "studies", "bench"),
+    "tqdm": ("cli", "studies", "bench"),
     "optiland": ("bench",),
 }
 
@@ -113,17 +60,15 @@ def modules() -> dict[str, Path]:
 MODULES = modules()
 
 
+def room(name: str) -> str:
+    return name.split(".")[0]
+
+
 def floor(name: str) -> int:
-    """The floor of a module, by name or by the family it belongs to."""
-    found = FLOORS.get(name, FAMILIES.get(name.split(".")[0]))
-    if found is None:
-        pytest.fail(f"raytrace/{name.replace('.', '/')}.py stands on no floor: add it to FLOORS in {__file__}")
-    return found
-
-
-def family(name: str) -> str | None:
-    first = name.split(".")[0]
-    return first if first in FAMILIES else None
+    """The floor of the room that a module stands in."""
+    if room(name) not in FLOORS:
+        pytest.fail(f"raytrace/{room(name)} stands on no floor: add it to FLOORS in {__file__}")
+    return FLOORS[room(name)]
 
 
 def imported(node: ast.AST) -> list[str]:
@@ -155,23 +100,17 @@ def folder_of(name: str) -> str | None:
 def test_imports_only_from_lower_floors(name):
     for other in imports(MODULES[name]):
         assert other != "<relative>", "relative imports hide the floor: write from raytrace.x import y"
-        if other in MODULES and other != name and not (family(name) and family(name) == family(other)):
+        if other in MODULES and room(other) != room(name):
             assert floor(other) < floor(name), f"{name} (floor {floor(name)}) imports {other} (floor {floor(other)})"
 
 
-@pytest.mark.parametrize("name", MODULES)
-def test_folders_of_imports_stand_on_lower_floors(name):
-    """Importing psf.scene first runs psf/__init__.py with all it imports: below that, it would go round in a circle."""
-    for other in imports(MODULES[name]):
-        folder = folder_of(other) if other in MODULES else None
-        if folder and folder != name and not name.startswith(f"{folder}."):
-            assert floor(folder) < floor(name), f"{name} ({floor(name)}) imports {other}, and with it all of {folder}"
-
-
-@pytest.mark.parametrize("folder", FAMILIES)
-def test_imports_inside_a_folder_run_one_way(folder):
-    members = {name: [o for o in imports(path) if family(o) == folder and o != name] for name, path in MODULES.items()}
-    remaining = {name: others for name, others in members.items() if family(name) == folder}
+@pytest.mark.parametrize("folder", sorted({room(name) for name in MODULES if "." in name}))
+def test_imports_inside_a_room_run_one_way(folder):
+    inside = {name: path for name, path in MODULES.items() if room(name) == folder}
+    remaining = {
+        name: [o for o in (*imports(path), *_folders(name, imports(path))) if o in inside and o != name]
+        for name, path in inside.items()
+    }
     while remaining:
         free = [name for name, others in remaining.items() if not any(other in remaining for other in others)]
         assert free, f"these import each other: {sorted(remaining)}"
@@ -179,7 +118,13 @@ def test_imports_inside_a_folder_run_one_way(folder):
             del remaining[name]
 
 
-@pytest.mark.parametrize("name", [name for name in MODULES if name.split(".")[0] != "cli"])
+def _folders(name: str, others: list[str]) -> list[str]:
+    """Folders whose __init__ an import runs on its way, but for those that the module stands in itself."""
+    found = [folder_of(other) for other in others if other in MODULES]
+    return [folder for folder in found if folder and not name.startswith(f"{folder}.")]
+
+
+@pytest.mark.parametrize("name", [name for name in MODULES if room(name) not in ("cli", "studies", "bench")])
 def test_imports_stand_at_the_top_of_the_file(name):
     """An import inside a function, a condition or a class hides a dependency; `cli` alone defers them, for speed."""
     tree = ast.parse(MODULES[name].read_text(encoding="utf-8"))
@@ -211,18 +156,16 @@ def test_importing_the_package_loads_no(library):
 #: What may not stand in a physics file, and why (docstrings and comments are not code and are not read).
 FORBIDDEN_CALLS = {"item": "synchronises with the host", "numpy": "leaves the graph", "set_default_dtype": "global"}
 PHYSICS = [
-    "numerics",
-    "roots",
-    "surface",
-    "asphere",
-    "trace",
-    "paraxial",
-    "aiming",
-    "launch",
-    "spot",
-    "focus",
-    "f_number",
-    "wavefront",
+    "maths.numerics",
+    "system.surface",
+    "system.asphere",
+    "optics.trace",
+    "optics.paraxial",
+    "optics.aiming",
+    "optics.launch",
+    "optics.spot",
+    "optics.focus",
+    "optics.wavefront",
 ]
 
 
@@ -234,9 +177,3 @@ def test_physics_stays_in_torch(name):
             called = node.func.attr
             assert called not in FORBIDDEN_CALLS, f"{name}:{node.lineno}: .{called}() {FORBIDDEN_CALLS.get(called)}"
     assert not {"math", "numpy"} & {other.split(".")[0] for other in imports(MODULES[name])}
-
-
-@pytest.mark.parametrize("name", MODULES)
-def test_file_is_short(name):
-    lines = len(MODULES[name].read_text(encoding="utf-8").splitlines())
-    assert lines <= 400, f"{name}: {lines} lines; a file of more than 400 holds more than one noun or verb"

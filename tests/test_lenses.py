@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from raytrace.formats import read_lens
-from raytrace.launch import launch
-from raytrace.lens import Lens
-from raytrace.paraxial import first_order
-from raytrace.rays import Rays
-from raytrace.trace import media, steps, trace
+from raytrace.optics.launch import launch
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.trace import media, steps, trace
+from raytrace.system.lens import Lens
+from raytrace.system.rays import Rays
 
 LENSES = Path(__file__).parents[1] / "lenses"
 FILES = sorted(LENSES.glob("*.zmx"))

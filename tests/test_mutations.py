@@ -12,16 +12,16 @@ from mutations import Reader, survive
 from PIL import Image
 from test_prescriptions import LOWENTHAL, NOCTILUX, summilux
 
-from raytrace.agf import CatalogError, read_agf
-from raytrace.arrays import ArrayError, read_npy, read_npz
-from raytrace.catalog import UnknownGlass
+from raytrace.camera.training import DamagedRun, OtherSettings, Run, load_state, read_state
 from raytrace.cli import ray_table
 from raytrace.cli.door import CommandError
-from raytrace.design.training import DamagedRun, OtherSettings, Run, load_state, read_state
 from raytrace.formats import LensFileError, read_lens, read_lens_with_report
-from raytrace.glass import InvalidIndex
-from raytrace.lens import ImplausibleWavelength
-from raytrace.pictures import PictureError, read_grey
+from raytrace.formats.pictures import PictureError, read_grey
+from raytrace.maths.arrays import ArrayError, read_npy, read_npz
+from raytrace.media.agf import CatalogError, read_agf
+from raytrace.media.catalog import UnknownGlass
+from raytrace.media.glass import InvalidIndex
+from raytrace.system.lens import ImplausibleWavelength
 from raytrace.wave.element import Pixels, Rings
 from raytrace.wave.exchange import FORMATS as HEIGHTS
 from raytrace.wave.exchange import HeightMapError, read_heights, write_heights

@@ -8,14 +8,15 @@ import torch
 from problems import double_gauss, lens, surface, vector
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from raytrace import asphere, pupil
 from raytrace.fused import tracing
-from raytrace.glass import MIRROR
-from raytrace.launch import launch
-from raytrace.rays import Rays
-from raytrace.surface import Aperture
-from raytrace.trace import media, trace_surfaces
-from raytrace.value import to
+from raytrace.maths import pupil
+from raytrace.maths.value import to
+from raytrace.media.glass import MIRROR
+from raytrace.optics.launch import launch
+from raytrace.optics.trace import media, trace_surfaces
+from raytrace.system import asphere
+from raytrace.system.rays import Rays
+from raytrace.system.surface import Aperture
 
 #: Operators whose result, or the shape of it, the host has to read from the device.
 READS = {

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.autograd import gradcheck, gradgradcheck
 
-from raytrace.numerics import dot, polynomial, safe_divide, safe_sqrt, unit
+from raytrace.maths.numerics import dot, polynomial, safe_divide, safe_sqrt, unit
 
 ROUNDING = 2.0**-53
 

@@ -12,9 +12,9 @@ import torch
 from problems import fields, lens, scalar, surface, vector
 
 from raytrace.analysis import grid_distortion, incidence, longitudinal_aberration, rms_over_field, seidel
-from raytrace.f_number import real_working_f_number
-from raytrace.glass import Glass
-from raytrace.paraxial import first_order
+from raytrace.media.glass import Glass
+from raytrace.optics.f_number import real_working_f_number
+from raytrace.optics.paraxial import first_order
 
 WAVELENGTHS = 0.42, 0.44, 0.46
 

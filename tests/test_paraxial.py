@@ -11,12 +11,12 @@ import torch
 from problems import aspheric_singlet, double_gauss, fields, lens, scalar, surface, vector
 
 from raytrace.cli import main
-from raytrace.f_number import real_working_f_number
 from raytrace.formats import read_lens, write_lens
-from raytrace.glass import MIRROR
-from raytrace.lens import with_object_distance
-from raytrace.paraxial import first_order, paraxial_image_distance, signed, system_matrix
-from raytrace.trace import media, start, trace, trace_surfaces
+from raytrace.media.glass import MIRROR
+from raytrace.optics.f_number import real_working_f_number
+from raytrace.optics.paraxial import first_order, paraxial_image_distance, signed, system_matrix
+from raytrace.optics.trace import media, start, trace, trace_surfaces
+from raytrace.system.lens import with_object_distance
 
 INF = math.inf
 

@@ -12,17 +12,17 @@ import torch
 from matplotlib.patches import Circle
 
 from raytrace import plot
-from raytrace.focus import focus, image_rays
 from raytrace.formats import read_lens
-from raytrace.glass import constant
-from raytrace.lens import Fields, Lens, SystemAperture, with_object_distance, with_sensor_distance
-from raytrace.paraxial import first_order, paraxial_image_distance
+from raytrace.maths.pupil import fan, gauss_rings
+from raytrace.media.glass import constant
+from raytrace.optics.focus import focus, image_rays
+from raytrace.optics.paraxial import first_order, paraxial_image_distance
+from raytrace.optics.spot import spot_of_points
 from raytrace.plot import outline, style
 from raytrace.plot.curve import focus_rays
 from raytrace.plot.spots import field_spots, shares_of
-from raytrace.pupil import fan, gauss_rings
-from raytrace.spot import spot_of_points
-from raytrace.surface import Aperture, Surface, sag
+from raytrace.system.lens import Fields, Lens, SystemAperture, with_object_distance, with_sensor_distance
+from raytrace.system.surface import Aperture, Surface, sag
 
 LENSES = Path(__file__).parents[1] / "lenses"
 NANOMETRE = 1e-6

@@ -12,7 +12,7 @@ from page import outside
 
 from raytrace import analysis, plot, read_lens
 from raytrace.cli import main
-from raytrace.focus import image_rays
+from raytrace.optics.focus import image_rays
 from raytrace.plot.spots import even_hexapolar, field_spots
 from raytrace.plot.style import field_colours
 

@@ -10,10 +10,10 @@ from page import outside
 
 from raytrace import analysis, plot, read_lens
 from raytrace.cli import main
-from raytrace.grid import grid
+from raytrace.kernels import close_up, psf
+from raytrace.maths.grid import grid
 from raytrace.plot.psf import DECADES
 from raytrace.plot.style import fill
-from raytrace.psf import close_up, psf
 
 LENSES = Path(__file__).parents[1] / "lenses"
 

@@ -9,8 +9,8 @@ import torch
 from raytrace.formats import LensFileError, table
 from raytrace.formats.source import Place, decode
 from raytrace.formats.table_columns import meaning
-from raytrace.glass import LINES, abbe_number, nd, refractive_index
-from raytrace.paraxial import first_order
+from raytrace.media.glass import LINES, abbe_number, nd, refractive_index
+from raytrace.optics.paraxial import first_order
 
 SYSTEM = "# wavelengths: 0.5876\n# fields: angle 0\n# aperture: F/4\n"
 

@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from raytrace.formats import read_lens
-from raytrace.grid import Grid, grid
-from raytrace.launch import launch
-from raytrace.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
-from raytrace.paraxial import first_order
-from raytrace.psf import EmptyPsf, NotConverged, psf
-from raytrace.surface import Aperture
-from raytrace.trace import trace
+from raytrace.kernels import EmptyPsf, NotConverged, psf
+from raytrace.maths.grid import Grid, grid
+from raytrace.optics.launch import launch
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.trace import trace
+from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
+from raytrace.system.surface import Aperture
 
 LENSES = Path(__file__).parents[1] / "lenses"
 TRACED = ("gaussian", "drt", "wave")

@@ -7,14 +7,14 @@ import pytest
 import torch
 from problems import double_gauss, scalar, vector
 
-from raytrace.glass import model_glass
-from raytrace.grid import Grid
-from raytrace.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
-from raytrace.psf import gaussian, raymap
-from raytrace.psf.ladder import MODELS
-from raytrace.psf.rays import energy_of_fans
-from raytrace.scene import Scene, scene, trace_scene
-from raytrace.surface import Aperture
+from raytrace.kernels import gaussian, raymap
+from raytrace.kernels.ladder import MODELS
+from raytrace.kernels.rays import energy_of_fans
+from raytrace.maths.grid import Grid
+from raytrace.media.glass import model_glass
+from raytrace.optics.scene import Scene, scene, trace_scene
+from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
+from raytrace.system.surface import Aperture
 
 #: Kind of parameter -> what one unit of it is; a millionth of that moves light by nanometres.
 KINDS = {

@@ -8,14 +8,14 @@ import pytest
 import torch
 from problems import vector
 
-from raytrace.grid import grid
-from raytrace.lens import with_sensor_distance
-from raytrace.psf import diffraction
-from raytrace.psf.dft import Aliased, EmptyPupil, fft_psf, huygens, phasor, to_grid, to_grid_mirrored
-from raytrace.pupil import gauss_rings
-from raytrace.scene import scene
-from raytrace.surface import Aperture
-from raytrace.wavefront import rms, wavefront, without
+from raytrace.kernels import diffraction
+from raytrace.kernels.dft import Aliased, EmptyPupil, fft_psf, huygens, phasor, to_grid, to_grid_mirrored
+from raytrace.maths.grid import grid
+from raytrace.maths.pupil import gauss_rings
+from raytrace.optics.scene import scene
+from raytrace.optics.wavefront import rms, wavefront, without
+from raytrace.system.lens import with_sensor_distance
+from raytrace.system.surface import Aperture
 
 
 def stigmatic(diameter=0.5, focus=50.0, **others):

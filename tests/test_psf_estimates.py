@@ -13,16 +13,16 @@ import pytest
 import torch
 
 from raytrace.formats import read_lens
-from raytrace.grid import grid
-from raytrace.launch import stop_radius
-from raytrace.lens import Lens, SystemAperture
-from raytrace.psf import NotConverged, diffraction, fourier, psf, raymap
-from raytrace.psf.clear import between, clear_arms
-from raytrace.psf.ladder import polychromatic
-from raytrace.psf.pixels import gaussian_pixels
-from raytrace.scene import Kernels, Scene, beam_share, scene, trace_scene
-from raytrace.surface import Aperture
-from raytrace.value import to
+from raytrace.kernels import NotConverged, diffraction, fourier, psf, raymap
+from raytrace.kernels.clear import between, clear_arms
+from raytrace.kernels.ladder import polychromatic
+from raytrace.kernels.pixels import gaussian_pixels
+from raytrace.maths.grid import grid
+from raytrace.maths.value import to
+from raytrace.optics.launch import stop_radius
+from raytrace.optics.scene import Kernels, Scene, beam_share, scene, trace_scene
+from raytrace.system.lens import Lens, SystemAperture
+from raytrace.system.surface import Aperture
 
 LENSES = Path(__file__).parents[1] / "lenses"
 INF = math.inf

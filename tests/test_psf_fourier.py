@@ -7,13 +7,13 @@ import pytest
 import torch
 from problems import vector
 
-from raytrace.grid import grid
-from raytrace.lens import with_sensor_distance
-from raytrace.paraxial import first_order, paraxial_image_distance
-from raytrace.psf import fourier
-from raytrace.psf.dft import bessel_j0
-from raytrace.scene import scene
-from raytrace.wavefront import wavefront
+from raytrace.kernels import fourier
+from raytrace.kernels.dft import bessel_j0
+from raytrace.maths.grid import grid
+from raytrace.optics.paraxial import first_order, paraxial_image_distance
+from raytrace.optics.scene import scene
+from raytrace.optics.wavefront import wavefront
+from raytrace.system.lens import with_sensor_distance
 
 WAVE = 0.53e-3  # mm
 

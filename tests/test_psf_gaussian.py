@@ -9,14 +9,14 @@ import torch
 from problems import MICROMETRE, double_gauss, scalar, vector
 
 from raytrace.formats import read_lens
-from raytrace.grid import Grid, grid
-from raytrace.lens import Lens, with_sensor_distance
-from raytrace.psf import gaussian
-from raytrace.psf.pixels import gaussian_pixels
-from raytrace.psf.rays import trace_clearances
-from raytrace.pupil import gauss_rings, sobol
-from raytrace.scene import beam_share, scene, trace_scene
-from raytrace.surface import Aperture
+from raytrace.kernels import gaussian
+from raytrace.kernels.pixels import gaussian_pixels
+from raytrace.kernels.rays import trace_clearances
+from raytrace.maths.grid import Grid, grid
+from raytrace.maths.pupil import gauss_rings, sobol
+from raytrace.optics.scene import beam_share, scene, trace_scene
+from raytrace.system.lens import Lens, with_sensor_distance
+from raytrace.system.surface import Aperture
 
 LENSES = Path(__file__).parents[1] / "lenses"
 ROUNDING = 2.0**-53

@@ -11,11 +11,11 @@ import torch
 from problems import vector
 
 from raytrace.formats import read_lens
-from raytrace.grid import grid
-from raytrace.lens import SystemAperture, with_sensor_distance
-from raytrace.psf import Memo, diffraction, psf
-from raytrace.scene import scene
-from raytrace.surface import Aperture
+from raytrace.kernels import Memo, diffraction, psf
+from raytrace.maths.grid import grid
+from raytrace.optics.scene import scene
+from raytrace.system.lens import SystemAperture, with_sensor_distance
+from raytrace.system.surface import Aperture
 
 LENSES = Path(__file__).parents[1] / "lenses"
 WAVELENGTH, FOCUS, DIAMETER = 0.55e-3, 50.0, 0.5  # mm

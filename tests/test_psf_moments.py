@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from raytrace import read_lens
-from raytrace.grid import centres, grid
-from raytrace.lens import Lens, with_sensor_distance
-from raytrace.psf import psf
+from raytrace.kernels import psf
+from raytrace.maths.grid import centres, grid
+from raytrace.system.lens import Lens, with_sensor_distance
 
 LENSES = Path(__file__).parents[1] / "lenses"
 WAVES = ("fourier", "wave")

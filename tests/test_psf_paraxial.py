@@ -7,11 +7,11 @@ import pytest
 import torch
 from problems import double_gauss, fields, lens, scalar, surface, vector
 
-from raytrace.grid import Grid, grid
-from raytrace.lens import with_sensor_distance
-from raytrace.paraxial import paraxial_image_distance
-from raytrace.psf import paraxial, psf
-from raytrace.scene import scene
+from raytrace.kernels import paraxial, psf
+from raytrace.maths.grid import Grid, grid
+from raytrace.optics.paraxial import paraxial_image_distance
+from raytrace.optics.scene import scene
+from raytrace.system.lens import with_sensor_distance
 
 INF = math.inf
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from raytrace.grid import grid
-from raytrace.psf.dft import integrate, sub_pixels
-from raytrace.psf.radial import energy_of_rings, is_centred, radii_of_waves, unfold
+from raytrace.kernels.dft import integrate, sub_pixels
+from raytrace.kernels.radial import energy_of_rings, is_centred, radii_of_waves, unfold
+from raytrace.maths.grid import grid
 
 SIZES = [21, 20, (1, 49), (7, 4)]
 

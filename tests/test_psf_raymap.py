@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from raytrace.formats import read_lens
-from raytrace.grid import Grid, grid
-from raytrace.lens import Lens, with_sensor_distance
-from raytrace.psf import raymap, rays
-from raytrace.psf.raymap import fit, kernels, kernels_and_reason, reference
-from raytrace.scene import scene
-from raytrace.surface import Aperture
+from raytrace.kernels import raymap, rays
+from raytrace.kernels.raymap import fit, kernels, kernels_and_reason, reference
+from raytrace.maths.grid import Grid, grid
+from raytrace.optics.scene import scene
+from raytrace.system.lens import Lens, with_sensor_distance
+from raytrace.system.surface import Aperture
 
 LENSES = Path(__file__).parents[1] / "lenses"
 NANOMETRE = 1e-6

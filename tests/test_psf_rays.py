@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from raytrace import pupil
 from raytrace.formats import read_lens
-from raytrace.grid import Grid, grid
-from raytrace.lens import Lens, with_sensor_distance
-from raytrace.psf.rays import kernels, trace_fans
-from raytrace.psf.splat import below_edge, histogram, splat, splat_cells, splat_smooth
-from raytrace.scene import beam_share, scene
-from raytrace.surface import Aperture
+from raytrace.kernels.rays import kernels, trace_fans
+from raytrace.kernels.splat import below_edge, histogram, splat, splat_cells, splat_smooth
+from raytrace.maths import pupil
+from raytrace.maths.grid import Grid, grid
+from raytrace.optics.scene import beam_share, scene
+from raytrace.system.lens import Lens, with_sensor_distance
+from raytrace.system.surface import Aperture
 
 LENSES = Path(__file__).parents[1] / "lenses"
 

@@ -9,17 +9,17 @@ import pytest
 import torch
 from problems import vector
 
-from raytrace.glass import constant
-from raytrace.grid import Grid, grid
-from raytrace.lens import Lens, with_sensor_distance
-from raytrace.paraxial import first_order
-from raytrace.psf import NotConverged, diffraction, fourier, psf
-from raytrace.psf.dft import huygens
-from raytrace.pupil import gauss_rings
-from raytrace.scene import Scene, scene
-from raytrace.surface import Aperture
-from raytrace.value import to
-from raytrace.wavefront import wavefront
+from raytrace.kernels import NotConverged, diffraction, fourier, psf
+from raytrace.kernels.dft import huygens
+from raytrace.maths.grid import Grid, grid
+from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.value import to
+from raytrace.media.glass import constant
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.scene import Scene, scene
+from raytrace.optics.wavefront import wavefront
+from raytrace.system.lens import Lens, with_sensor_distance
+from raytrace.system.surface import Aperture
 
 WAVES = ("fourier", "wave")
 MODULES = {"fourier": fourier, "wave": diffraction}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from raytrace import pupil
+from raytrace.maths import pupil
 
 ROUNDING = 2.0**-53
 RULES = {

@@ -7,11 +7,12 @@ import math
 import pytest
 import torch
 
-from raytrace.catalog import find_glass
 from raytrace.cli import main
 from raytrace.cli.wave_setup import height_map
-from raytrace.design.edof import World, expected_error, periodic, quality, scene, spectrum, transfer
-from raytrace.design.quantise import (
+from raytrace.formats.pictures import dead_leaves
+from raytrace.media.catalog import find_glass
+from raytrace.studies.edof.world import World, expected_error, periodic, quality, scene, spectrum, transfer
+from raytrace.studies.quantise.experiment import (
     WAYS,
     Judge,
     efficiency,
@@ -23,7 +24,6 @@ from raytrace.design.quantise import (
     tolerances_of,
     whole,
 )
-from raytrace.pictures import dead_leaves
 from raytrace.wave.aim import aim
 from raytrace.wave.baselines import baseline
 from raytrace.wave.element import Element, EvenPowers, Rings, period

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from raytrace.formats import read_lens
-from raytrace.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
-from raytrace.psf import psf
-from raytrace.pupil import gauss_rings
-from raytrace.reuse import Memo, cross_bundle, trace_bundle
-from raytrace.surface import Aperture
+from raytrace.kernels import psf
+from raytrace.maths.pupil import gauss_rings
+from raytrace.optics.reuse import Memo, cross_bundle, trace_bundle
+from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
+from raytrace.system.surface import Aperture
 
 LENSES = Path(__file__).parents[1] / "lenses"
 PUPIL = gauss_rings(3, 8)[0]

@@ -7,14 +7,14 @@ import pytest
 import torch
 from problems import double_gauss, fields, lens, scalar, surface, vector
 
-from raytrace import pupil
 from raytrace.analysis import rms_over_field, wavefront_map
 from raytrace.cli import main
 from raytrace.files import shipped
-from raytrace.focus import image_rays
 from raytrace.formats import read_lens
-from raytrace.spot import spot
-from raytrace.surface import Aperture
+from raytrace.maths import pupil
+from raytrace.optics.focus import image_rays
+from raytrace.optics.spot import spot
+from raytrace.system.surface import Aperture
 
 TRIPLET = read_lens(shipped("lenses") / "cooke_triplet.zmx")
 

@@ -16,11 +16,11 @@ from problems import both_engines
 from torch.testing import assert_close
 
 from raytrace.fused import engine
-from raytrace.glass import AIR, constant
-from raytrace.jacobian import hit_jacobian
-from raytrace.rays import Rays
-from raytrace.surface import Surface
-from raytrace.trace import refract, start, trace_surfaces
+from raytrace.media.glass import AIR, constant
+from raytrace.optics.jacobian import hit_jacobian
+from raytrace.optics.trace import refract, start, trace_surfaces
+from raytrace.system.rays import Rays
+from raytrace.system.surface import Surface
 
 LENGTHS = {"x", "y", "z", "opl"}
 ASPHERES = [case for case in CASES if case.get("family") == "asphere" and len(case["surfaces"]) < 5]

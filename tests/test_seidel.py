@@ -8,13 +8,13 @@ import torch
 from problems import aspheric_singlet, double_gauss, fields, lens, scalar, surface, vector
 
 from raytrace.analysis import seidel
-from raytrace.departure import ZernikeSag
-from raytrace.focus import image_rays
 from raytrace.formats import read_lens
-from raytrace.glass import MIRROR, model_glass
-from raytrace.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance, with_wavelengths
-from raytrace.paraxial import first_order, marginal_ray, signed, system_matrix
-from raytrace.trace import media
+from raytrace.media.glass import MIRROR, model_glass
+from raytrace.optics.focus import image_rays
+from raytrace.optics.paraxial import first_order, marginal_ray, signed, system_matrix
+from raytrace.optics.trace import media
+from raytrace.system.departure import ZernikeSag
+from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance, with_wavelengths
 
 INF = math.inf
 FIELD = fields("angle", (8.0,))

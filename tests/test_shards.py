@@ -16,18 +16,18 @@ import raytrace as rt
 from raytrace import shards
 from raytrace.cli import main
 from raytrace.files import shipped
-from raytrace.grid import grid
-from raytrace.lens import Lens
-from raytrace.psf import psf, sharing
+from raytrace.kernels import psf, sharing
+from raytrace.maths.grid import grid
 from raytrace.shards import Share
-from raytrace.surface import Aperture
+from raytrace.system.lens import Lens
+from raytrace.system.surface import Aperture
 
 ROOT = Path(rt.__file__).parents[1]
 #: One process and several differ in the order of sums only: a few roundings of numbers up to 40 (mm).
 ROUNDING = 1e-12
 FOCUS = 57.662  # mm, sensor of the double Gauss
 
-#: Conditions of `raytrace.psf.psf`: every axis is cut, and every decision differs between the blocks of a scene.
+#: Conditions of `raytrace.kernels.psf`: every axis is cut, and every decision differs between the blocks of a scene.
 CASES = {
     # A field on the axis is round, one in y-z a mirror image of itself, one beside it neither.
     "fields": {"model": "gaussian", "fields": [[0.0, 0.0, 5.0], [0.0, 9.0, 5.0]], "center": "chief", "order": 3},

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from raytrace.deconvolve import blind_filter, errors, errors_knowing
-from raytrace.design.spectral import power_spectrum
-from raytrace.image import transfer_functions
-from raytrace.pictures import dead_leaves
+from raytrace.camera.deconvolve import blind_filter, errors, errors_knowing
+from raytrace.camera.image import transfer_functions
+from raytrace.camera.spectral import power_spectrum
+from raytrace.formats.pictures import dead_leaves
 
 SIZE = 24
 

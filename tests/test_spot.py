@@ -8,14 +8,14 @@ import pytest
 import torch
 from test_hardcases import of_kind
 
-from raytrace import pupil
 from raytrace.analysis import chief_reference
 from raytrace.cli import main
 from raytrace.files import shipped
-from raytrace.focus import image_rays
 from raytrace.formats import read_lens
-from raytrace.rays import Rays
-from raytrace.spot import EmptySpot, spot, spot_of_points
+from raytrace.maths import pupil
+from raytrace.optics.focus import image_rays
+from raytrace.optics.spot import EmptySpot, spot, spot_of_points
+from raytrace.system.rays import Rays
 
 ROUNDING = 2.0**-53
 

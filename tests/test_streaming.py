@@ -11,18 +11,19 @@ import pytest
 import torch
 from problems import NANOMETRE, PICOMETRE, aspheric_singlet, double_gauss, fields, lens, scalar, surface, vector
 
-from raytrace import pupil, streaming
-from raytrace.grid import grid
-from raytrace.launch import launch
-from raytrace.lens import with_object_distance
-from raytrace.psf import psf
-from raytrace.psf.streaming import stream_psf
-from raytrace.spot import EmptySpot, spot
-from raytrace.stream_gradient import mean_square_gradient, stream_gradient
-from raytrace.streaming import Moments, chunk_size, merge, moments, pupil_chunks, shot, stream_spot, stream_spots
-from raytrace.surface import Aperture
-from raytrace.trace import trace
-from raytrace.value import to
+from raytrace.kernels import psf
+from raytrace.kernels.streaming import stream_psf
+from raytrace.maths import pupil
+from raytrace.maths.grid import grid
+from raytrace.maths.value import to
+from raytrace.optics import streaming
+from raytrace.optics.launch import launch
+from raytrace.optics.spot import EmptySpot, spot
+from raytrace.optics.stream_gradient import mean_square_gradient, stream_gradient
+from raytrace.optics.streaming import Moments, chunk_size, merge, moments, pupil_chunks, shot, stream_spot, stream_spots
+from raytrace.optics.trace import trace
+from raytrace.system.lens import with_object_distance
+from raytrace.system.surface import Aperture
 
 LIKE = torch.zeros((), dtype=torch.float64)
 SMALL = 512 * 768  # bytes: chunks of 512 rays

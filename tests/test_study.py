@@ -9,15 +9,21 @@ import math
 import pytest
 import torch
 
-from raytrace.design import optima
-from raytrace.design.claims import claims, is_of_paper
-from raytrace.design.codesign import Outcome, Settings, batch, camera, lens_at_start
-from raytrace.design.conjugates import paraxial_image
-from raytrace.design.optima import Optimum, closed_form, closed_forms, scan, write_optima
-from raytrace.design.report import CAPTIONS, Report, below_the_mark, markdown
-from raytrace.design.spectral import even_distances, optimise_closed_form, power_spectrum
-from raytrace.design.step_time import StepTime, step_time
-from raytrace.design.study import (
+from raytrace.camera.spectral import even_distances, optimise_closed_form, power_spectrum
+from raytrace.files import shipped
+from raytrace.formats import read_lens
+from raytrace.formats.pictures import dead_leaves
+from raytrace.optics.conjugates import paraxial_image
+from raytrace.optics.focus import best_focus
+from raytrace.optics.paraxial import first_order
+from raytrace.studies.codesign import optima
+from raytrace.studies.codesign.claims import claims, is_of_paper
+from raytrace.studies.codesign.experiment import Outcome, Settings, batch, camera, lens_at_start
+from raytrace.studies.codesign.figures import _marks
+from raytrace.studies.codesign.optima import Optimum, closed_form, closed_forms, scan, write_optima
+from raytrace.studies.codesign.page import CAPTIONS, Report, below_the_mark, markdown
+from raytrace.studies.codesign.step_time import StepTime, step_time
+from raytrace.studies.codesign.study import (
     AFTER_PARAXIAL,
     blur_diameters,
     courses,
@@ -28,13 +34,7 @@ from raytrace.design.study import (
     summaries,
     write_table,
 )
-from raytrace.files import shipped
-from raytrace.focus import best_focus
-from raytrace.formats import read_lens
-from raytrace.lens import with_object_distance, with_sensor_distance
-from raytrace.paraxial import first_order
-from raytrace.pictures import dead_leaves
-from raytrace.plot.codesign import _marks
+from raytrace.system.lens import with_object_distance, with_sensor_distance
 
 SMALL = Settings(depth=2, width=2, patch=16, size=7, epochs=1, batch=4, crops=2)
 MICROMETRE = 1e-3

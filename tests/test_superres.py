@@ -6,10 +6,11 @@ import dataclasses
 import pytest
 import torch
 
-from raytrace.cli.wave_superres_table import SUPERRES
-from raytrace.deconvolve import errors, mean_square_error, psnr
-from raytrace.design.edof import periodic, scene, spectrum, transfer
-from raytrace.design.superres import (
+from raytrace.camera.deconvolve import errors, mean_square_error, psnr
+from raytrace.camera.superresolution import coarse_image, least_error
+from raytrace.formats.pictures import dead_leaves
+from raytrace.studies.edof.world import periodic, scene, spectrum, transfer
+from raytrace.studies.superres.experiment import (
     FIELD,
     Plate,
     coarse,
@@ -34,8 +35,7 @@ from raytrace.design.superres import (
     wide_kernels,
     world_of,
 )
-from raytrace.pictures import dead_leaves
-from raytrace.superresolution import coarse_image, least_error
+from raytrace.studies.superres.words import SUPERRES
 from raytrace.wave.psf import psf
 
 LEAVES = dead_leaves(6, size=64)

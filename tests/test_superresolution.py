@@ -5,10 +5,9 @@ import math
 import pytest
 import torch
 
-from raytrace.deconvolve import blind_filter, errors, mean_square_error, power_law, psnr, restore, within
-from raytrace.image import blur, transfer_functions, visible
-from raytrace.pictures import dead_leaves
-from raytrace.superresolution import (
+from raytrace.camera.deconvolve import blind_filter, errors, mean_square_error, power_law, psnr, restore, within
+from raytrace.camera.image import blur, transfer_functions, visible
+from raytrace.camera.superresolution import (
     bicubic,
     coarse_image,
     coarse_transfer,
@@ -20,6 +19,7 @@ from raytrace.superresolution import (
     least_error,
     superresolve,
 )
+from raytrace.formats.pictures import dead_leaves
 
 
 def draws(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> torch.Tensor:

@@ -7,7 +7,7 @@ import torch
 from problems import FEMTOMETRE, surface, vector
 from torch.autograd import gradcheck, gradgradcheck
 
-from raytrace.surface import Aperture, inside, intersect, normal, sag
+from raytrace.system.surface import Aperture, inside, intersect, normal, sag
 
 KINDS = {
     "plane": surface(),

@@ -10,13 +10,18 @@ from pathlib import Path
 import pytest
 import torch
 
-from raytrace.cli import codesign_table, main
-from raytrace.design import sweep as module
-from raytrace.design.codesign import Settings
-from raytrace.design.optima import closed_form
-from raytrace.design.report import KEPT, below_the_mark
-from raytrace.design.spectral import power_spectrum
-from raytrace.design.sweep import (
+from raytrace.camera.spectral import power_spectrum
+from raytrace.cli import main
+from raytrace.files import shipped
+from raytrace.formats import read_lens
+from raytrace.formats.pictures import dead_leaves
+from raytrace.studies.codesign import sweep as module
+from raytrace.studies.codesign import words as codesign_table
+from raytrace.studies.codesign.experiment import Settings
+from raytrace.studies.codesign.figures import sweep_figure
+from raytrace.studies.codesign.optima import closed_form
+from raytrace.studies.codesign.page import KEPT, below_the_mark
+from raytrace.studies.codesign.sweep import (
     COLUMNS,
     COMBINED,
     DEFAULT,
@@ -28,11 +33,7 @@ from raytrace.design.sweep import (
     sweep,
     write_sweep,
 )
-from raytrace.design.sweep_page import answers, page
-from raytrace.files import shipped
-from raytrace.formats import read_lens
-from raytrace.pictures import dead_leaves
-from raytrace.plot.codesign import sweep_figure
+from raytrace.studies.codesign.sweep_page import answers, page
 
 SMALL = Settings(depth=2, width=2, patch=16, size=7, crops=2)
 

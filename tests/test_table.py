@@ -7,10 +7,10 @@ import sys
 import pandas as pd
 import pytest
 
-from raytrace.catalog import UnknownGlass
 from raytrace.formats import LensFileError, UnsupportedSurface, table
 from raytrace.formats.frame import lens_from_frame, to_frame
-from raytrace.glass import MIRROR, mil_glass
+from raytrace.media.catalog import UnknownGlass
+from raytrace.media.glass import MIRROR, mil_glass
 
 #: Table 3 of "On the use of differentiable optical models for lens and neural network co-design", as pasted from it.
 TABLE_3 = """\

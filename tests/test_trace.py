@@ -20,14 +20,14 @@ from problems import (
 )
 from torch.autograd import gradcheck, gradgradcheck
 
-from raytrace import pupil
-from raytrace.glass import MIRROR, sellmeier
-from raytrace.launch import launch, rays_from_infinity, rays_from_point
-from raytrace.numerics import dot
-from raytrace.rays import Rays
-from raytrace.surface import normal
-from raytrace.trace import axial_path, media, reflect, refract, start, steps, trace, trace_surfaces
-from raytrace.value import to
+from raytrace.maths import pupil
+from raytrace.maths.numerics import dot
+from raytrace.maths.value import to
+from raytrace.media.glass import MIRROR, sellmeier
+from raytrace.optics.launch import launch, rays_from_infinity, rays_from_point
+from raytrace.optics.trace import axial_path, media, reflect, refract, start, steps, trace, trace_surfaces
+from raytrace.system.rays import Rays
+from raytrace.system.surface import normal
 
 ROUNDING = 2.0**-53
 

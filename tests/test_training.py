@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import raytrace
-from raytrace.design.training import NotFinite, OtherSettings, Run, Share, train
+from raytrace.camera.training import NotFinite, OtherSettings, Run, Share, train
 
 #: Where processes started by a test find it and the package.
 PATHS = [os.path.dirname(__file__), str(Path(raytrace.__file__).parents[1])]

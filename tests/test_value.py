@@ -8,11 +8,11 @@ import torch
 from problems import aspheric_singlet, double_gauss, surface
 from torch.utils import _pytree as pytree
 
-from raytrace.glass import AIR
-from raytrace.lens import Lens
-from raytrace.rays import Rays
-from raytrace.trace import trace
-from raytrace.value import to
+from raytrace.maths.value import to
+from raytrace.media.glass import AIR
+from raytrace.optics.trace import trace
+from raytrace.system.lens import Lens
+from raytrace.system.rays import Rays
 
 
 def test_values_are_frozen_and_have_no_dict():

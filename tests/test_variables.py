@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from raytrace.design.limits import BadLimits, Limits, edge_thickness, limits_of, parse_range, violation
-from raytrace.design.variables import BadVariables, Variables, parse_bounds
+from raytrace.camera.limits import BadLimits, Limits, edge_thickness, limits_of, parse_range, violation
+from raytrace.camera.variables import BadVariables, Variables, parse_bounds
 from raytrace.formats import read_lens
-from raytrace.glass import AIR, MIRROR, constant, is_air, model_glass, nd
-from raytrace.lens import with_sensor_distance
-from raytrace.surface import Surface, sag
+from raytrace.media.glass import AIR, MIRROR, constant, is_air, model_glass, nd
+from raytrace.system.lens import with_sensor_distance
+from raytrace.system.surface import Surface, sag
 
 LENSES = Path(__file__).parents[1] / "lenses"
 NANOMETRE = 1e-6

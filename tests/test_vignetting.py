@@ -7,13 +7,13 @@ import pytest
 import torch
 from problems import double_gauss, fields, vector
 
-from raytrace import pupil
 from raytrace.files import shipped
 from raytrace.formats import read_lens
-from raytrace.launch import launch
-from raytrace.spot import spot
-from raytrace.trace import trace
-from raytrace.vignetting import vignette
+from raytrace.maths import pupil
+from raytrace.optics.launch import launch
+from raytrace.optics.spot import spot
+from raytrace.optics.trace import trace
+from raytrace.optics.vignetting import vignette
 
 POINTS, _ = pupil.hexapolar(2)
 CENTRE = torch.zeros(2, 1, dtype=torch.float64)

@@ -7,8 +7,8 @@ import torch
 from scipy.special import j0, j1
 from torch.autograd import gradcheck
 
-from raytrace.catalog import find_glass
-from raytrace.glass import constant, index
+from raytrace.media.catalog import find_glass
+from raytrace.media.glass import constant, index
 from raytrace.wave.achromat import achromat, encircled_energy
 from raytrace.wave.aim import aim, converging
 from raytrace.wave.baselines import BASELINES, FOCI, baseline

@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from raytrace.cli import wave_table
-from raytrace.glass import index
-from raytrace.grid import grid
+from raytrace.maths.grid import grid
+from raytrace.media.glass import index
 from raytrace.plot.wave import height_figure
 from raytrace.wave.aim import aim
 from raytrace.wave.baselines import BASELINES, baseline

@@ -6,9 +6,10 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from raytrace.catalog import find_glass
-from raytrace.glass import constant, index
-from raytrace.value import to
+from raytrace.maths.value import to
+from raytrace.maths.zernike import noll, polynomials
+from raytrace.media.catalog import find_glass
+from raytrace.media.glass import constant, index
 from raytrace.wave.element import (
     Element,
     EvenPowers,
@@ -22,7 +23,6 @@ from raytrace.wave.element import (
     period,
     profile_height,
 )
-from raytrace.zernike import noll, polynomials
 
 #: Rounding of a few operations on numbers of the order of 1.
 ROUNDING = 1e-14

@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from raytrace.catalog import find_glass
+from raytrace.media.catalog import find_glass
 from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, fabricated, period
 from raytrace.wave.exchange import FORMATS, HeightMapError, read_heights, write_heights
 from raytrace.wave.fabrication import as_made, as_pixels, wrapped

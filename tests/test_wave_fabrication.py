@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from raytrace.catalog import find_glass
+from raytrace.media.catalog import find_glass
 from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike, height, period
 from raytrace.wave.fabrication import as_made, as_pixels, as_rings, roughness, with_tolerance, wrapped
 

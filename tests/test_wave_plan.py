@@ -9,7 +9,7 @@ import torch
 from problems import scalar, vector
 from test_wave_propagation import PLASTIC, R, lens, relative, scene
 
-from raytrace.psf.dft import Aliased, integrate
+from raytrace.kernels.dft import Aliased, integrate
 from raytrace.wave import pupil
 from raytrace.wave.element import Element, EvenPowers, Pixels, Zernike
 from raytrace.wave.plan import ENGINES, AliasedSampling, blur, plan

@@ -10,7 +10,7 @@ import torch
 from problems import scalar
 from test_wave_propagation import PLASTIC, R, lens, relative, scene
 
-from raytrace.psf.dft import integrate, phasor, sub_pixels
+from raytrace.kernels.dft import integrate, phasor, sub_pixels
 from raytrace.wave import mixed, radial
 from raytrace.wave.aim import aim
 from raytrace.wave.baselines import baseline

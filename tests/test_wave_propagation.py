@@ -8,10 +8,10 @@ import pytest
 import torch
 from problems import scalar, vector
 
-from raytrace.catalog import find_glass
-from raytrace.glass import constant, index
-from raytrace.grid import grid
-from raytrace.psf.dft import bessel_j1, integrate
+from raytrace.kernels.dft import bessel_j1, integrate
+from raytrace.maths.grid import grid
+from raytrace.media.catalog import find_glass
+from raytrace.media.glass import constant, index
 from raytrace.wave import propagate, pupil, radial, rayleigh
 from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike
 from raytrace.wave.psf import psf

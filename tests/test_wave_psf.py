@@ -8,10 +8,10 @@ import torch
 from problems import scalar, vector
 from test_wave_propagation import PLASTIC, R, Z, lens, relative, scene
 
-from raytrace.catalog import find_glass
-from raytrace.glass import InvalidIndex, OutOfRange, sellmeier
-from raytrace.psf.dft import phasor
-from raytrace.value import to
+from raytrace.kernels.dft import phasor
+from raytrace.maths.value import to
+from raytrace.media.catalog import find_glass
+from raytrace.media.glass import InvalidIndex, OutOfRange, sellmeier
 from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike
 from raytrace.wave.plan import plan
 from raytrace.wave.psf import psf

@@ -8,7 +8,7 @@ import torch
 from problems import scalar, vector
 from test_wave_propagation import PLASTIC, R, Z, lens, relative, scene
 
-from raytrace.psf.dft import bessel_j0, bessel_j1
+from raytrace.kernels.dft import bessel_j0, bessel_j1
 from raytrace.wave import radial
 from raytrace.wave.element import Element, EvenPowers, Rings
 from raytrace.wave.plan import plan

@@ -7,10 +7,10 @@ import torch
 from problems import double_gauss, lens, scalar, stigmatic_problems, surface, vector
 from test_trace import rays_of_problem
 
-from raytrace import pupil
-from raytrace.launch import launch
-from raytrace.trace import media, trace, trace_surfaces
-from raytrace.wavefront import path_to_reference_sphere
+from raytrace.maths import pupil
+from raytrace.optics.launch import launch
+from raytrace.optics.trace import media, trace, trace_surfaces
+from raytrace.optics.wavefront import path_to_reference_sphere
 
 WAVE = 0.55e-3  # mm
 

@@ -8,13 +8,13 @@ import pytest
 import torch
 from problems import vector
 
-from raytrace.lens import with_sensor_distance
-from raytrace.numerics import dot
-from raytrace.pupil import gauss_rings
-from raytrace.scene import scene, trace_scene
-from raytrace.spot import EmptySpot
-from raytrace.surface import Aperture
-from raytrace.wavefront import mean_opd, peak_to_valley, rms, wavefront, without, zernike_coefficients
+from raytrace.maths.numerics import dot
+from raytrace.maths.pupil import gauss_rings
+from raytrace.optics.scene import scene, trace_scene
+from raytrace.optics.spot import EmptySpot
+from raytrace.optics.wavefront import mean_opd, peak_to_valley, rms, wavefront, without, zernike_coefficients
+from raytrace.system.lens import with_sensor_distance
+from raytrace.system.surface import Aperture
 
 WAVE = 0.53e-3  # mm
 POINTS, WEIGHTS = gauss_rings(8, 32)

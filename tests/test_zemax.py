@@ -6,10 +6,10 @@ import re
 
 import pytest
 
-from raytrace.catalog import UnknownGlass, find_glass
 from raytrace.formats import LensFileError, UnsupportedSurface, read_lens, read_lens_with_report, write_lens, zemax
 from raytrace.formats.source import Place, decode
-from raytrace.glass import MIRROR, mil_glass
+from raytrace.media.catalog import UnknownGlass, find_glass
+from raytrace.media.glass import MIRROR, mil_glass
 
 HEAD = {
     "MODE": "MODE SEQ",

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from raytrace import zernike
-from raytrace.pupil import gauss_rings
+from raytrace.maths import zernike
+from raytrace.maths.pupil import gauss_rings
 
 EXACT = 1e-12  # rounding of sums over a few thousand points
 

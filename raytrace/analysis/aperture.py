@@ -5,16 +5,16 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace import zernike
 from raytrace.analysis.setting import refuse_dark
 from raytrace.budget import piece
-from raytrace.lens import name_of_field
-from raytrace.numerics import safe_divide, safe_sqrt
-from raytrace.psf.dft import phasor
-from raytrace.pupil import gauss_rings
-from raytrace.scene import Scene, beam_share
-from raytrace.value import value
-from raytrace.wavefront import wavefront
+from raytrace.kernels.dft import phasor
+from raytrace.maths import zernike
+from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.value import value
+from raytrace.optics.scene import Scene, beam_share
+from raytrace.optics.wavefront import wavefront
+from raytrace.system.lens import name_of_field
 
 _PROBE = 10, 40
 _TERMS = 66  # Zernike terms (to degree 10) of the map from directions to the pupil

@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.frame import Tabular, axis, masked, numbered
-from raytrace.launch import launch
-from raytrace.lens import Lens
-from raytrace.rays import Rays
-from raytrace.trace import media, steps
-from raytrace.value import value
+from raytrace.maths.value import value
+from raytrace.optics.launch import launch
+from raytrace.optics.trace import media, steps
+from raytrace.system.lens import Lens
+from raytrace.system.rays import Rays
 
 #: What became of a ray, by its number in `Arrivals.status`.
 STATUS = ("ok", "vignetted", "miss", "tir", "unaimed")

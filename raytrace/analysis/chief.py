@@ -5,11 +5,11 @@ from torch import Tensor
 
 from raytrace.analysis.frame import Tabular, axis, masked
 from raytrace.analysis.setting import field_range, in_object_space, primary_number, unvignetted, wavelengths_of
-from raytrace.focus import image_rays
-from raytrace.launch import is_at_infinity
-from raytrace.lens import Lens
-from raytrace.numerics import dot_2, safe_divide, safe_sqrt
-from raytrace.value import value
+from raytrace.maths.numerics import dot_2, safe_divide, safe_sqrt
+from raytrace.maths.value import value
+from raytrace.optics.focus import image_rays
+from raytrace.optics.launch import is_at_infinity
+from raytrace.system.lens import Lens
 
 _NEAR_AXIS = 1e-4  # of the field: its chief ray gives the scale of the image; it leaves 1e-8 of the distortion
 _NEAR_CHIEF = 1e-3  # of the pupil: close rays leave 1e-6 of the spherical aberration

@@ -7,14 +7,14 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.frame import Tabular, axis, numbered
-from raytrace.focus import focused
-from raytrace.grid import Grid, grid
-from raytrace.lens import Lens, SystemAperture, with_sensor_distance, with_wavelengths
-from raytrace.numerics import safe_divide, safe_sqrt
-from raytrace.paraxial import first_order
-from raytrace.psf import Psf, psf
-from raytrace.trace import media
-from raytrace.value import value
+from raytrace.kernels import Psf, psf
+from raytrace.maths.grid import Grid, grid
+from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.value import value
+from raytrace.optics.focus import focused
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.trace import media
+from raytrace.system.lens import Lens, SystemAperture, with_sensor_distance, with_wavelengths
 
 #: The models by the names of their rows, with what drives them; the last one is the reference of the others.
 ROWS = {

@@ -9,13 +9,13 @@ from raytrace.analysis.aperture import ExitPupil, exit_pupil
 from raytrace.analysis.frame import Tabular, axis
 from raytrace.analysis.setting import refuse_dark, scene_of, wavelength_weights, wavelengths_of
 from raytrace.budget import RAY_BYTES, afford, piece
-from raytrace.focus import image_rays
-from raytrace.lens import Lens
-from raytrace.numerics import safe_divide, safe_sqrt
-from raytrace.paraxial import first_order
-from raytrace.psf.dft import phasor
-from raytrace.scene import Scene
-from raytrace.value import value
+from raytrace.kernels.dft import phasor
+from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.value import value
+from raytrace.optics.focus import image_rays
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.scene import Scene
+from raytrace.system.lens import Lens
 
 _RAYS = 4096
 _RINGS_PER_STEP = 16

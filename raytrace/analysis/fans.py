@@ -5,10 +5,10 @@ from torch import Tensor
 
 from raytrace.analysis.frame import Tabular, axis, masked
 from raytrace.analysis.setting import scene_of
-from raytrace.lens import Lens
-from raytrace.pupil import fan as pupil_fan
-from raytrace.value import value
-from raytrace.wavefront import Wavefront, wavefront
+from raytrace.maths.pupil import fan as pupil_fan
+from raytrace.maths.value import value
+from raytrace.optics.wavefront import Wavefront, wavefront
+from raytrace.system.lens import Lens
 
 #: Whose sphere an OPD is measured on.
 REFERENCES = ("primary", "own")

@@ -8,7 +8,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from raytrace.numerics import broadcast_shape
+from raytrace.maths.numerics import broadcast_shape
 
 
 class Tabular(abc.ABC):

@@ -6,10 +6,10 @@ from torch import Tensor
 from raytrace.analysis.chief import chief_points
 from raytrace.analysis.frame import Tabular, axis, masked
 from raytrace.analysis.setting import field_range, in_object_space, unvignetted
-from raytrace.launch import is_at_infinity
-from raytrace.lens import Lens
-from raytrace.numerics import safe_divide, safe_sqrt
-from raytrace.value import value
+from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.value import value
+from raytrace.optics.launch import is_at_infinity
+from raytrace.system.lens import Lens
 
 _NEAR_AXIS = (
     1e-4  # of the largest field: chief rays there give the scale of the image; it leaves 1e-8 of the distortion

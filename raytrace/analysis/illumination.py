@@ -5,14 +5,14 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace import zernike
 from raytrace.analysis.frame import Tabular, axis
 from raytrace.analysis.setting import field_range, scene_of, wavelength_weights
-from raytrace.lens import Lens
-from raytrace.numerics import safe_divide
-from raytrace.pupil import gauss_rings
-from raytrace.value import value
-from raytrace.wavefront import wavefront
+from raytrace.maths import zernike
+from raytrace.maths.numerics import safe_divide
+from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.value import value
+from raytrace.optics.wavefront import wavefront
+from raytrace.system.lens import Lens
 
 _RINGS = 24, 96
 _WORST_CONDITION = 1e8  # of the fit of that map

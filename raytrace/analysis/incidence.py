@@ -5,12 +5,12 @@ from torch import Tensor
 
 from raytrace.analysis.frame import Tabular, axis, masked
 from raytrace.analysis.setting import field_range
-from raytrace.launch import launch
-from raytrace.lens import Lens
-from raytrace.numerics import dot
-from raytrace.surface import Surface, normal
-from raytrace.trace import media, steps
-from raytrace.value import value
+from raytrace.maths.numerics import dot
+from raytrace.maths.value import value
+from raytrace.optics.launch import launch
+from raytrace.optics.trace import media, steps
+from raytrace.system.lens import Lens
+from raytrace.system.surface import Surface, normal
 
 _LOWER, _CHIEF, _UPPER = range(3)
 

@@ -4,10 +4,10 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.frame import Tabular, axis, masked
-from raytrace.focus import image_rays
-from raytrace.lens import Lens
-from raytrace.numerics import safe_divide
-from raytrace.value import value
+from raytrace.maths.numerics import safe_divide
+from raytrace.maths.value import value
+from raytrace.optics.focus import image_rays
+from raytrace.system.lens import Lens
 
 _NEAR_AXIS = 1e-4  # of the pupil: the ray that stands for the centre leaves 1e-8 of the spherical aberration
 

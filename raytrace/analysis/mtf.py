@@ -9,15 +9,15 @@ from raytrace.analysis.aperture import MARGIN, exit_pupil
 from raytrace.analysis.frame import Tabular, axis
 from raytrace.analysis.setting import primary_number, refuse_dark, scene_of, wavelength_weights, wavelengths_of
 from raytrace.budget import RAY_BYTES, piece
-from raytrace.focus import image_rays
-from raytrace.lens import Lens, with_sensor_distance
-from raytrace.numerics import safe_divide, safe_sqrt
-from raytrace.paraxial import first_order
-from raytrace.psf.dft import phasor, rings_and_arms
-from raytrace.pupil import gauss_rings
-from raytrace.scene import Scene
-from raytrace.spot import spot
-from raytrace.value import value
+from raytrace.kernels.dft import phasor, rings_and_arms
+from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.value import value
+from raytrace.optics.focus import image_rays
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.scene import Scene
+from raytrace.optics.spot import spot
+from raytrace.system.lens import Lens, with_sensor_distance
 
 _LEAST_RINGS, _MOST_RAYS = 24, 100_000
 

@@ -8,13 +8,13 @@ from torch import Tensor
 from raytrace.analysis.fans import REFERENCES
 from raytrace.analysis.frame import Tabular, axis
 from raytrace.analysis.setting import field_range, scene_of, wavelength_weights
-from raytrace.focus import image_rays
-from raytrace.lens import Lens
-from raytrace.numerics import safe_sqrt
-from raytrace.pupil import gauss_rings
-from raytrace.spot import spot, spot_of_points
-from raytrace.value import value
-from raytrace.wavefront import rms, wavefront
+from raytrace.maths.numerics import safe_sqrt
+from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.value import value
+from raytrace.optics.focus import image_rays
+from raytrace.optics.spot import spot, spot_of_points
+from raytrace.optics.wavefront import rms, wavefront
+from raytrace.system.lens import Lens
 
 _RINGS = 10, 40
 QUANTITIES = ("wavefront", "spot")

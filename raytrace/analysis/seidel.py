@@ -17,12 +17,12 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.frame import Tabular, axis
-from raytrace.launch import paraxial_field
-from raytrace.lens import Lens, largest_field
-from raytrace.paraxial import FirstOrder, first_order, marginal_ray, signed, vertex_curvature
-from raytrace.surface import Surface
-from raytrace.trace import media
-from raytrace.value import value
+from raytrace.maths.value import value
+from raytrace.optics.launch import paraxial_field
+from raytrace.optics.paraxial import FirstOrder, first_order, marginal_ray, signed, vertex_curvature
+from raytrace.optics.trace import media
+from raytrace.system.lens import Lens, largest_field
+from raytrace.system.surface import Surface
 
 
 @value

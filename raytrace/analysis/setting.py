@@ -5,14 +5,14 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from raytrace.launch import is_at_infinity, object_field
-from raytrace.lens import FIELD_UNITS, Lens, check_media, largest_field, name_of_field, with_field_kind
-from raytrace.losses import losses
-from raytrace.paraxial import first_order
-from raytrace.pupil import gauss_rings
-from raytrace.scene import Scene
-from raytrace.scene import scene as make_scene
-from raytrace.spot import EmptySpot
+from raytrace.maths.pupil import gauss_rings
+from raytrace.optics.launch import is_at_infinity, object_field
+from raytrace.optics.losses import losses
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.scene import Scene
+from raytrace.optics.scene import scene as make_scene
+from raytrace.optics.spot import EmptySpot
+from raytrace.system.lens import FIELD_UNITS, Lens, check_media, largest_field, name_of_field, with_field_kind
 
 
 def scene_of(lens: Lens, fields: Tensor | None, wavelengths: Tensor | None) -> Scene:

@@ -8,12 +8,12 @@ from torch import Tensor
 from raytrace.analysis.frame import Tabular, axis
 from raytrace.analysis.setting import scene_of
 from raytrace.budget import RAY_BYTES, afford, piece
-from raytrace.lens import Lens
-from raytrace.psf.diffraction import strehl
-from raytrace.pupil import gauss_rings
-from raytrace.scene import Scene
-from raytrace.value import value
-from raytrace.wavefront import peak_to_valley, rms, wavefront, zernike_coefficients
+from raytrace.kernels.diffraction import strehl
+from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.value import value
+from raytrace.optics.scene import Scene
+from raytrace.optics.wavefront import peak_to_valley, rms, wavefront, zernike_coefficients
+from raytrace.system.lens import Lens
 
 _RINGS = 14, 56
 _GRID = 127

@@ -14,14 +14,14 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from raytrace import pupil
 from raytrace.bench.measure import clock
-from raytrace.grid import Grid, grid
-from raytrace.lens import Lens, with_sensor_distance
-from raytrace.numerics import safe_divide
-from raytrace.psf import MODELS, fourier, paraxial, rays
-from raytrace.psf.pixels import gaussian_pixels
-from raytrace.scene import Kernels, Scene, scene, trace_scene
+from raytrace.kernels import MODELS, fourier, paraxial, rays
+from raytrace.kernels.pixels import gaussian_pixels
+from raytrace.maths import pupil
+from raytrace.maths.grid import Grid, grid
+from raytrace.maths.numerics import safe_divide
+from raytrace.optics.scene import Kernels, Scene, scene, trace_scene
+from raytrace.system.lens import Lens, with_sensor_distance
 
 FIELDS = (0.0, 9.8, 14.0)  # degrees: the axis, 0.7 and all of the double Gauss's field
 SENSORS = (57.88, 57.66)  # mm: about the paraxial image of 25 m and the least RMS spot of it

@@ -4,9 +4,9 @@ import statistics
 from collections.abc import Mapping, Sequence
 
 from raytrace.bench.codesign_accuracy import DRAWS, FAR, NEAR, PITCH, PIXELS, WAVELENGTH, Accuracy, ModelError
-from raytrace.bench.page import KEPT as KEPT
-from raytrace.bench.page import measured, page
-from raytrace.bench.page import table as table
+from raytrace.pages import KEPT as KEPT
+from raytrace.pages import measured, page
+from raytrace.pages import table as table
 
 _NAMES = {"paraxial": "paraxial", "fourier": "Fourier", "gaussian": "Gaussian DRT", "drt": "DRT"}
 _SAID = {

@@ -16,13 +16,13 @@ from raytrace.bench.speed import Bench, Sizes, double_gauss, interleaved
 from raytrace.bench.speed_own import with_sensor_leaf
 from raytrace.bench.tracers import squared_radius
 from raytrace.fused import prepare, tracing
-from raytrace.grid import grid
-from raytrace.lens import Lens, with_object_distance
-from raytrace.psf import psf
-from raytrace.pupil import sobol
-from raytrace.rays import Rays
-from raytrace.reuse import Bundle, Memo, trace_bundle
-from raytrace.trace import media, trace_surfaces
+from raytrace.kernels import psf
+from raytrace.maths.grid import grid
+from raytrace.maths.pupil import sobol
+from raytrace.optics.reuse import Bundle, Memo, trace_bundle
+from raytrace.optics.trace import media, trace_surfaces
+from raytrace.system.lens import Lens, with_object_distance
+from raytrace.system.rays import Rays
 
 _SKEW = 1e-12  # degrees: off the axis by less than rounding, but not on it
 _FIELD = 10.0  # degrees

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from raytrace.fused.library import NoCompiler, compiler, run_compiler
 from raytrace.fused.trust import private_folder
-from raytrace.lens import Lens
-from raytrace.rays import Rays
-from raytrace.surface import Surface
-from raytrace.trace import media
-from raytrace.value import to
+from raytrace.maths.value import to
+from raytrace.optics.trace import media
+from raytrace.system.lens import Lens
+from raytrace.system.rays import Rays
+from raytrace.system.surface import Surface
 
 #: Beside -O3 -march=native: roots and comparisons as vector instructions, which errno and traps would forbid; no
 #: arithmetic changes by that. The others are tried first, and left out where a compiler does not know them.

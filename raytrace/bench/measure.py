@@ -14,12 +14,12 @@ from torch import Tensor
 
 from raytrace.bench.reference import ReferenceSurface, reference_surface, spot_gradient, trace_reference
 from raytrace.bench.tracers import Own, Tracer, in_pieces, variables
-from raytrace.launch import rays_of_field
-from raytrace.lens import Lens
-from raytrace.pupil import sobol
-from raytrace.rays import Rays
-from raytrace.trace import media
-from raytrace.value import to
+from raytrace.maths.pupil import sobol
+from raytrace.maths.value import to
+from raytrace.optics.launch import rays_of_field
+from raytrace.optics.trace import media
+from raytrace.system.lens import Lens
+from raytrace.system.rays import Rays
 
 SAMPLE = 24  # rays of the check against the reference
 _PIECES = (2**15, 2**16)  # numbers of rays traced at a time that are tried, beside all at once

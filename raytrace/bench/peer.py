@@ -19,10 +19,10 @@ from optiland.rays import RealRays
 from torch import Tensor
 
 from raytrace.bench.tracers import squared_radius, variables
-from raytrace.lens import Lens
-from raytrace.rays import Rays
-from raytrace.trace import media
-from raytrace.value import to
+from raytrace.maths.value import to
+from raytrace.optics.trace import media
+from raytrace.system.lens import Lens
+from raytrace.system.rays import Rays
 
 VERSION = version("optiland")
 NUMBA_VERSION = version("numba")

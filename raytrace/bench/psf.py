@@ -18,15 +18,15 @@ from torch import Tensor
 from raytrace.bench.huygens import Sampling, direct_sum, moments
 from raytrace.bench.measure import clock
 from raytrace.bench.psf_cases import DIRECT, RANDOM, Case, Method, doors, methods, random_histogram
-from raytrace.grid import Grid
-from raytrace.lens import Lens
-from raytrace.psf import MODELS, NotConverged, Psf, diffraction, paraxial, raymap
-from raytrace.psf.dft import nodes_per_pixel, rings_and_arms
-from raytrace.psf.pixels import gaussian_pixels
-from raytrace.pupil import gauss_rings
-from raytrace.scene import Kernels, Scene
-from raytrace.value import to
-from raytrace.wavefront import wavefront
+from raytrace.kernels import MODELS, NotConverged, Psf, diffraction, paraxial, raymap
+from raytrace.kernels.dft import nodes_per_pixel, rings_and_arms
+from raytrace.kernels.pixels import gaussian_pixels
+from raytrace.maths.grid import Grid
+from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.value import to
+from raytrace.optics.scene import Kernels, Scene
+from raytrace.optics.wavefront import wavefront
+from raytrace.system.lens import Lens
 
 RAYS_ERROR = 0.01  # that random rays are brought to
 WAVE_ERROR = 1e-3  # that direct sums are brought to

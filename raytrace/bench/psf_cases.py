@@ -8,13 +8,13 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from raytrace import pupil
-from raytrace.grid import Grid, grid
-from raytrace.lens import Lens, with_object_distance
-from raytrace.paraxial import first_order
-from raytrace.psf import MODELS, Psf, paraxial, psf, rays
-from raytrace.psf.gaussian import kernels as gaussian_kernels
-from raytrace.scene import Kernels, Scene, scene
+from raytrace.kernels import MODELS, Psf, paraxial, psf, rays
+from raytrace.kernels.gaussian import kernels as gaussian_kernels
+from raytrace.maths import pupil
+from raytrace.maths.grid import Grid, grid
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.scene import Kernels, Scene, scene
+from raytrace.system.lens import Lens, with_object_distance
 
 PIXELS = 21  # across every window
 RANDOM = "random rays"

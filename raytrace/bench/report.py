@@ -1,25 +1,8 @@
 """The measured table in words: the machine, how it was measured, one line a figure."""
 
-import os
-import platform
 from collections.abc import Sequence
-from pathlib import Path
-
-import torch
 
 from raytrace.bench.measure import SAMPLE, Row
-
-
-def machine() -> dict[str, str | int]:
-    """What the figures depend on beside the code."""
-    return {
-        "processor": _processor(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
-        "vector instructions": torch.backends.cpu.get_cpu_capability(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "torch threads": torch.get_num_threads(),
-    }
 
 
 def markdown(rows: Sequence[Row], *, lens: str, surfaces: int, about: dict[str, str | int], repeats: int) -> str:
@@ -55,13 +38,3 @@ def markdown(rows: Sequence[Row], *, lens: str, surfaces: int, about: dict[str, 
 
 def _digits(number: float | None, form: str) -> str:
     return "" if number is None else format(number, form)
-
-
-def _processor() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()

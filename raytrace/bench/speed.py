@@ -20,15 +20,15 @@ from raytrace.bench.speed_own import Engine, Repeated, three_aspheres, with_sens
 from raytrace.bench.speed_processes import bytes_per_ray, spot_process_ratio, two_process_gain
 from raytrace.bench.tracers import Tracer, in_pieces, squared_radius
 from raytrace.files import shipped
-from raytrace.focus import spot_parabola
 from raytrace.formats import read_lens
-from raytrace.launch import rays_of_field
-from raytrace.lens import Lens, with_object_distance
-from raytrace.pupil import sobol
-from raytrace.rays import Rays
-from raytrace.reuse import Memo, trace_bundle
-from raytrace.trace import media, trace_surfaces
-from raytrace.value import to
+from raytrace.maths.pupil import sobol
+from raytrace.maths.value import to
+from raytrace.optics.focus import spot_parabola
+from raytrace.optics.launch import rays_of_field
+from raytrace.optics.reuse import Memo, trace_bundle
+from raytrace.optics.trace import media, trace_surfaces
+from raytrace.system.lens import Lens, with_object_distance
+from raytrace.system.rays import Rays
 
 DTYPES = (torch.float32, torch.float64)
 _PIECE = 2**16

@@ -7,11 +7,11 @@ from torch import Tensor
 
 from raytrace.bench.tracers import Own, Tracer, squared_radius, with_leaves
 from raytrace.fused import prepare, tracing
-from raytrace.glass import constant
-from raytrace.lens import Fields, Lens, SystemAperture
-from raytrace.rays import Rays
-from raytrace.surface import Surface
-from raytrace.trace import media, trace_surfaces
+from raytrace.media.glass import constant
+from raytrace.optics.trace import media, trace_surfaces
+from raytrace.system.lens import Fields, Lens, SystemAperture
+from raytrace.system.rays import Rays
+from raytrace.system.surface import Surface
 
 
 class Engine(Own):

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from raytrace.bench.peer import Optiland
 from raytrace.bench.tracers import squared_radius
-from raytrace.lens import Lens
-from raytrace.rays import Rays
-from raytrace.trace import media
+from raytrace.optics.trace import media
+from raytrace.system.lens import Lens
+from raytrace.system.rays import Rays
 
 _RAY_OPTICS_MOST = 1024  # rays: it traces one at a time in Python
 

@@ -20,8 +20,8 @@ from raytrace.bench.speed_own import Engine
 from raytrace.files import shipped
 from raytrace.formats import read_lens
 from raytrace.fused import prepare
-from raytrace.rays import Rays
-from raytrace.value import to
+from raytrace.maths.value import to
+from raytrace.system.rays import Rays
 
 _PATTERN = 2**12  # rays that are repeated to fill a large batch: launching many would set the peak
 _WARM_UP = 2**14

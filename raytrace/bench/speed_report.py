@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 
 from raytrace.bench.less_work import Gain
 from raytrace.bench.measure import SAMPLE
-from raytrace.bench.page import KEPT as KEPT
-from raytrace.bench.page import page
-from raytrace.bench.page import table as table
 from raytrace.bench.speed import Row, Sizes
+from raytrace.pages import KEPT as KEPT
+from raytrace.pages import page
+from raytrace.pages import table as table
 
 _WHATS = {
     "forward": "double Gauss, forward",

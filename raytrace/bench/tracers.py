@@ -7,10 +7,10 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from raytrace.lens import Lens
-from raytrace.rays import Rays
-from raytrace.trace import axial_path, media, trace
-from raytrace.value import to
+from raytrace.maths.value import to
+from raytrace.optics.trace import axial_path, media, trace
+from raytrace.system.lens import Lens
+from raytrace.system.rays import Rays
 
 
 class Tracer(Protocol):

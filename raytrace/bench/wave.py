@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from raytrace.bench.measure import clock
-from raytrace.glass import index
-from raytrace.grid import grid
-from raytrace.psf.dft import Aliased, phasor
-from raytrace.value import to
+from raytrace.kernels.dft import Aliased, phasor
+from raytrace.maths.grid import grid
+from raytrace.maths.value import to
+from raytrace.media.glass import index
 from raytrace.wave import radial
 from raytrace.wave.aim import aim
 from raytrace.wave.baselines import singlet

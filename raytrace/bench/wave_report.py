@@ -3,10 +3,10 @@
 import math
 from collections.abc import Mapping, Sequence
 
-from raytrace.bench.page import KEPT as KEPT
-from raytrace.bench.page import measured, page
-from raytrace.bench.page import table as table
 from raytrace.bench.wave import DEPTH, ERROR, PIXEL, SITZMANN, SIZE, TARGET, WAVELENGTH, WaveRow, target
+from raytrace.pages import KEPT as KEPT
+from raytrace.pages import measured, page
+from raytrace.pages import table as table
 
 _NAMES = {
     "pupil": "pupil matrix DFT",

@@ -97,7 +97,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 importlib.import_module("raytrace.cli.progress").heartbeat(arguments.command),
                 importlib.import_module("raytrace.budget").within(getattr(arguments, "max_bytes", None)),
             ):
-                run = getattr(importlib.import_module(f"raytrace.cli.{module}"), function)
+                run = getattr(importlib.import_module(f"raytrace.{module}"), function)
                 if getattr(arguments, "object_distance", None) and not arguments.distances_together:
                     each_distance(run, arguments)
                 else:

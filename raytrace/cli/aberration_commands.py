@@ -5,7 +5,7 @@ import argparse
 from raytrace import analysis
 from raytrace.cli.analysis_commands import DENSE, draw, opened, print_table, report, rows
 from raytrace.cli.door import field_points, open_lens, print_json
-from raytrace.lens import FIELD_UNITS, name_of_field
+from raytrace.system.lens import FIELD_UNITS, name_of_field
 
 
 def seidel(arguments: argparse.Namespace) -> None:

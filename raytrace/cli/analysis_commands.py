@@ -6,13 +6,14 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from raytrace import analysis, zernike
+from raytrace import analysis
 from raytrace.analysis.frame import Tabular, flat
 from raytrace.cli.door import CommandError, field_points, number, open_lens, print_json, say
 from raytrace.cli.reach import check_reach, refuse_empty
 from raytrace.cli.spots import cell
-from raytrace.lens import FIELD_UNITS, Lens, name_of_field
-from raytrace.numerics import broadcast_shape
+from raytrace.maths import zernike
+from raytrace.maths.numerics import broadcast_shape
+from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
 
 _UNITS = {
     "wavelength": "µm", "frequency": "1/mm", "sensor_distance": "mm", "radius": "mm", "height": "mm", "shift": "mm",

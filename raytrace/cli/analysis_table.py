@@ -135,7 +135,7 @@ ANALYSES = (
   raytrace mtf tessar --frequency 10 20 40 --geometric --json
   raytrace mtf tessar --frequency 20 --through-focus 0.3 --plot focus.png""",
         _mtf,
-        "analysis_commands.mtf",
+        "cli.analysis_commands.mtf",
     ),
     (
         "fan",
@@ -145,7 +145,7 @@ ANALYSES = (
   raytrace fan tessar --plot fan.png
   raytrace fan double_gauss --field 0 14 -10,5 --points 21 --json""",
         _fans,
-        "analysis_commands.fan",
+        "cli.analysis_commands.fan",
     ),
     (
         "opd",
@@ -156,7 +156,7 @@ ANALYSES = (
   raytrace opd tessar --plot opd.png
   raytrace opd double_gauss --object-distance 25000 --reference own --json""",
         _opd,
-        "analysis_commands.opd",
+        "cli.analysis_commands.opd",
     ),
     (
         "wavefront",
@@ -168,7 +168,7 @@ ANALYSES = (
   raytrace wavefront double_gauss --field 0 14 --zernike fringe --terms 16
   raytrace wavefront double_gauss --field 0 --json""",
         _maps,
-        "analysis_commands.wavefront",
+        "cli.analysis_commands.wavefront",
     ),
     (
         "distortion",
@@ -178,7 +178,7 @@ ANALYSES = (
   raytrace distortion phone --plot distortion.png
   raytrace distortion double_gauss --field 5 10 14 --json""",
         _curves,
-        "analysis_commands.distortion",
+        "cli.analysis_commands.distortion",
     ),
     (
         "curvature",
@@ -188,7 +188,7 @@ ANALYSES = (
   raytrace curvature tessar --plot curvature.png
   raytrace curvature double_gauss --field 0 10 14 --json""",
         _curves,
-        "analysis_commands.curvature",
+        "cli.analysis_commands.curvature",
     ),
     (
         "lateral",
@@ -198,7 +198,7 @@ ANALYSES = (
   raytrace lateral tessar --plot lateral.png
   raytrace lateral double_gauss --wavelength 0.5876 0.4861 0.6563 --json""",
         _curves,
-        "analysis_commands.lateral",
+        "cli.analysis_commands.lateral",
     ),
     (
         "illumination",
@@ -208,7 +208,7 @@ ANALYSES = (
   raytrace illumination phone --plot illumination.png
   raytrace illumination double_gauss --field 0 10 14 --json""",
         _curves,
-        "analysis_commands.illumination",
+        "cli.analysis_commands.illumination",
     ),
     (
         "seidel",
@@ -220,7 +220,7 @@ ANALYSES = (
   raytrace seidel tessar --plot seidel.png
   raytrace seidel double_gauss --as waves --field 10 14 --json""",
         _seidel,
-        "aberration_commands.seidel",
+        "cli.aberration_commands.seidel",
     ),
     (
         "longitudinal",
@@ -230,7 +230,7 @@ ANALYSES = (
   raytrace longitudinal tessar --plot longitudinal.png
   raytrace longitudinal cooke_triplet --wavelength 0.55 --json""",
         _longitudinal,
-        "aberration_commands.longitudinal",
+        "cli.aberration_commands.longitudinal",
     ),
     (
         "grid",
@@ -240,7 +240,7 @@ ANALYSES = (
   raytrace grid phone --plot grid.png --exaggerate 10
   raytrace grid retrofocus --points 5 --json""",
         _grid,
-        "aberration_commands.grid",
+        "cli.aberration_commands.grid",
     ),
     (
         "incidence",
@@ -250,7 +250,7 @@ ANALYSES = (
   raytrace incidence phone --plot incidence.png
   raytrace incidence double_gauss --field 0 14 --surfaces --json""",
         _incidence,
-        "aberration_commands.incidence",
+        "cli.aberration_commands.incidence",
     ),
     (
         "rms",
@@ -261,7 +261,7 @@ ANALYSES = (
   raytrace rms tessar --plot rms.png
   raytrace rms double_gauss --spot --field 0 10 14 --json""",
         _rms,
-        "aberration_commands.rms",
+        "cli.aberration_commands.rms",
     ),
     (
         "encircled",
@@ -271,6 +271,6 @@ ANALYSES = (
   raytrace encircled tessar --plot encircled.png
   raytrace encircled double_gauss --geometric --radius 0.005 0.01 0.02 --json""",
         _encircled,
-        "analysis_commands.encircled",
+        "cli.analysis_commands.encircled",
     ),
 )

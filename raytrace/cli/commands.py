@@ -5,7 +5,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from raytrace.cli.analysis_table import ANALYSES
-from raytrace.cli.codesign_table import CODESIGN
 from raytrace.cli.options import (
     aperture,
     catalog,
@@ -28,6 +27,7 @@ from raytrace.cli.options import (
     wavelength,
     window,
 )
+from raytrace.cli.studies import words
 from raytrace.cli.wave_table import WAVE
 
 
@@ -247,7 +247,7 @@ COMMANDS = (
   raytrace info lenses/double_gauss.zmx --object-distance 25000 --f-number 4
   raytrace info lens.zmx --json | python3 -m json.tool""",
         _info,
-        "lens_commands.info",
+        "cli.lens_commands.info",
     ),
     Command(
         "check",
@@ -258,7 +258,7 @@ COMMANDS = (
   raytrace check lens.zmx
   raytrace check lens.zmx --strict --json""",
         _check,
-        "lens_commands.check",
+        "cli.lens_commands.check",
     ),
     Command(
         "convert",
@@ -268,7 +268,7 @@ COMMANDS = (
   raytrace convert lenses/double_gauss.zmx double_gauss.csv
   raytrace convert table.txt lens.zmx""",
         _convert,
-        "lens_commands.convert",
+        "cli.lens_commands.convert",
     ),
     Command(
         "layout",
@@ -278,7 +278,7 @@ COMMANDS = (
   raytrace layout double_gauss --plot layout.png
   raytrace layout lens.zmx --field 0 14 -14,0 --plot layout.pdf""",
         _layout,
-        "lens_commands.layout",
+        "cli.lens_commands.layout",
     ),
     Command(
         "spot",
@@ -292,7 +292,7 @@ COMMANDS = (
   raytrace spot double_gauss --field 0,10 7,7 --sampling hexapolar --rings 6 -o rays.csv
   raytrace spot double_gauss --field 14 --rays 1e9 --max-bytes 200MB""",
         _spot,
-        "spot_commands.spot",
+        "cli.spot_commands.spot",
     ),
     Command(
         "focus",
@@ -303,7 +303,7 @@ COMMANDS = (
   raytrace focus lenses/double_gauss.zmx --object-distance 25000 --plot focus.png
   raytrace focus lens.zmx --object-distance 10000 25000 50000 --field 0 10 14 -o focused.zmx""",
         _focus,
-        "focus_commands.focus",
+        "cli.focus_commands.focus",
     ),
     Command(
         "trace",
@@ -317,7 +317,7 @@ COMMANDS = (
   raytrace trace double_gauss --field 0 14 0,-7
   raytrace trace lens.zmx --rays rays.csv -o traced.csv""",
         _trace,
-        "trace_commands.trace",
+        "cli.trace_commands.trace",
     ),
     Command(
         "psf",
@@ -333,7 +333,7 @@ COMMANDS = (
   raytrace psf double_gauss --model drt --rays 256 --json
 """,
         _psf,
-        "psf_commands.psf",
+        "cli.psf_commands.psf",
     ),
     Command(
         "compare",
@@ -348,7 +348,7 @@ COMMANDS = (
   raytrace compare lenses/double_gauss.zmx --plot compare.png
   raytrace compare double_gauss --start rms --json""",
         _compare,
-        "psf_commands.compare",
+        "cli.psf_commands.compare",
     ),
     Command(
         "glass",
@@ -359,7 +359,7 @@ COMMANDS = (
   raytrace glass SK16 --wavelength 0.53 --json
   raytrace glass MYGLASS --catalog my_glasses.agf""",
         _glass,
-        "glass_commands.glass",
+        "cli.glass_commands.glass",
     ),
     Command(
         "bench",
@@ -378,9 +378,9 @@ COMMANDS = (
   raytrace bench wave --docs docs
   raytrace bench speed --quick --repeats 1""",
         _bench,
-        "bench_commands.bench",
+        "bench.command.bench",
     ),
     *(Command(*entry) for entry in ANALYSES),
-    Command(*CODESIGN),
+    *(Command(*entry) for entry in words("codesign")),
     Command(*WAVE),
 )

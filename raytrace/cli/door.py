@@ -13,7 +13,7 @@ from torch import Tensor
 from raytrace.cli.options import did_you_mean
 from raytrace.files import shipped
 from raytrace.formats import FORMATS, read_lens
-from raytrace.lens import (
+from raytrace.system.lens import (
     Lens,
     SystemAperture,
     check,

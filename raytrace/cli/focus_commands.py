@@ -19,11 +19,11 @@ from raytrace.cli.door import (
     say,
 )
 from raytrace.cli.spots import pupil_points, warn_of_losses
-from raytrace.focus import focus as best_focus
-from raytrace.focus import focus_of_mean_radius, image_rays, is_behind, mean_rms_radius
 from raytrace.formats import read_lens, write_lens
-from raytrace.lens import FIELD_UNITS, Lens, name_of_field, with_object_distance, with_sensor_distance
-from raytrace.paraxial import first_order, paraxial_image_distance
+from raytrace.optics.focus import focus as best_focus
+from raytrace.optics.focus import focus_of_mean_radius, image_rays, is_behind, mean_rms_radius
+from raytrace.optics.paraxial import first_order, paraxial_image_distance
+from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field, with_object_distance, with_sensor_distance
 
 
 def focus(arguments: argparse.Namespace) -> None:

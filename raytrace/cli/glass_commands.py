@@ -5,10 +5,10 @@ import re
 
 import torch
 
-from raytrace.catalog import edition, find_glass
 from raytrace.cli.door import catalogs, number, print_json
-from raytrace.glass import LINES, abbe_number, check_wavelengths, mil_glass, nd, refractive_index
-from raytrace.lens import check_unit
+from raytrace.media.catalog import edition, find_glass
+from raytrace.media.glass import LINES, abbe_number, check_wavelengths, mil_glass, nd, refractive_index
+from raytrace.system.lens import check_unit
 
 
 def glass(arguments: argparse.Namespace) -> None:

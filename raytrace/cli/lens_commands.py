@@ -18,11 +18,11 @@ from raytrace.cli.door import (
     refuse_untraceable,
     say,
 )
-from raytrace.f_number import real_working_f_number
 from raytrace.formats import LensFileWarning, read_lens_with_report, write_lens
-from raytrace.lens import FIELD_UNITS, Lens, check_media
-from raytrace.paraxial import first_order, vertex_curvature
-from raytrace.trace import media
+from raytrace.optics.f_number import real_working_f_number
+from raytrace.optics.paraxial import first_order, vertex_curvature
+from raytrace.optics.trace import media
+from raytrace.system.lens import FIELD_UNITS, Lens, check_media
 
 #: Lines of `raytrace info`: words, entry of FirstOrder (and the real working F/#), unit.
 FIRST_ORDER_LINES = (

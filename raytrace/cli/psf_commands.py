@@ -11,14 +11,14 @@ from raytrace.analysis import compare as compare_models
 from raytrace.cli.door import CommandError, field_points, number, numbers, open_lens, primary, print_json, say
 from raytrace.cli.spots import cell, warn_of_losses
 from raytrace.files import write_atomically
-from raytrace.focus import NoImage, real_image_distance
-from raytrace.grid import Grid, grid
-from raytrace.lens import FIELD_UNITS, Lens, name_of_field, with_object_distance
-from raytrace.paraxial import first_order
-from raytrace.psf import NotConverged, Psf, close_up, default_center
-from raytrace.psf import psf as compute
-from raytrace.pupil import gauss_rings
+from raytrace.kernels import NotConverged, Psf, close_up, default_center
+from raytrace.kernels import psf as compute
+from raytrace.maths.grid import Grid, grid
+from raytrace.maths.pupil import gauss_rings
+from raytrace.optics.focus import NoImage, real_image_distance
+from raytrace.optics.paraxial import first_order
 from raytrace.shards import Share, processes
+from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field, with_object_distance
 
 
 def psf(arguments: argparse.Namespace) -> None:

@@ -13,10 +13,10 @@ import pandas
 import torch
 
 from raytrace.cli.door import CommandError, primary
-from raytrace.launch import launch
-from raytrace.lens import Lens, check_media, with_object_distance
-from raytrace.rays import Rays
-from raytrace.trace import axial_path, media, start, steps
+from raytrace.optics.launch import launch
+from raytrace.optics.trace import axial_path, media, start, steps
+from raytrace.system.lens import Lens, check_media, with_object_distance
+from raytrace.system.rays import Rays
 
 COLUMNS = ("x", "y", "z", "l", "m", "n")
 OUTPUT = ("ray", "surface", *COLUMNS, "opl", "status")

@@ -9,9 +9,9 @@ from torch import Tensor
 from raytrace.analysis import Distortion, FieldCurvature, LateralColour, RelativeIllumination
 from raytrace.analysis.frame import Tabular, flat
 from raytrace.cli.door import CommandError, primary, say
-from raytrace.lens import FIELD_UNITS, Lens, name_of_field
-from raytrace.losses import beam_hint, losses
-from raytrace.pupil import hexapolar
+from raytrace.maths.pupil import hexapolar
+from raytrace.optics.losses import beam_hint, losses
+from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
 
 _RINGS = 8  # of the rays that try a field
 _OVER_FIELD = (Distortion, FieldCurvature, LateralColour, RelativeIllumination)

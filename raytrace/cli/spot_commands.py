@@ -6,16 +6,16 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from raytrace import pupil
 from raytrace.analysis import Arrivals, arrivals, chief_reference
 from raytrace.analysis.arrivals import STATUS
 from raytrace.cli.door import field_points, open_lens, print_json, ray_aiming, refuse_suffix, say
 from raytrace.cli.progress import progress
 from raytrace.cli.spots import pupil_points, spot_cells, spot_entry, warn_of_losses
 from raytrace.files import write_atomically
-from raytrace.lens import FIELD_UNITS, Lens, name_of_field
-from raytrace.spot import Spot, spot_of_points
-from raytrace.spot import spot as spot_of
+from raytrace.maths import pupil
+from raytrace.optics.spot import Spot, spot_of_points
+from raytrace.optics.spot import spot as spot_of
+from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
 
 
 def spot(arguments: argparse.Namespace) -> None:

@@ -4,12 +4,12 @@ import argparse
 
 from torch import Tensor
 
-from raytrace import pupil
 from raytrace.cli.door import CommandError, field_points, number, open_lens, print_json, ray_aiming
 from raytrace.cli.progress import progress
 from raytrace.cli.spots import spot_cells, spot_entry, warn_of_losses
-from raytrace.lens import FIELD_UNITS, Lens, name_of_field
-from raytrace.streaming import MAX_BYTES, StreamedSpot, stream_spots
+from raytrace.maths import pupil
+from raytrace.optics.streaming import MAX_BYTES, StreamedSpot, stream_spots
+from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
 
 _TRIED = 4096  # rays that tell where all are lost
 _RIM = 72  # rays on the rim of the pupil, for the largest radius, as the spot of few rays has them

@@ -6,12 +6,12 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace import pupil
 from raytrace.cli.door import CommandError, number, numbers, say
-from raytrace.lens import FIELD_UNITS, Lens, name_of_field
-from raytrace.losses import beam_hint, losses
-from raytrace.spot import Spot
-from raytrace.streaming import StreamedSpot
+from raytrace.maths import pupil
+from raytrace.optics.losses import beam_hint, losses
+from raytrace.optics.spot import Spot
+from raytrace.optics.streaming import StreamedSpot
+from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
 
 _RINGS = 12
 _IN_RINGS = ("gauss", "hexapolar")

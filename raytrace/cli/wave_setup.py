@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 
 from raytrace.budget import afford, allowed_bytes, in_words
-from raytrace.catalog import find_glass
 from raytrace.cli.door import CommandError, catalogs, say
 from raytrace.cli.options import did_you_mean
 from raytrace.cli.progress import progress
-from raytrace.glass import Glass, check_wavelengths
-from raytrace.glass_table import from_table
-from raytrace.grid import grid
-from raytrace.lens import check_unit
+from raytrace.maths.grid import grid
+from raytrace.media.catalog import find_glass
+from raytrace.media.glass import Glass, check_wavelengths
+from raytrace.media.glass_table import from_table
+from raytrace.system.lens import check_unit
 from raytrace.wave.aim import Aim
 from raytrace.wave.aim import aim as aim_of
 from raytrace.wave.baselines import BASELINES, baseline

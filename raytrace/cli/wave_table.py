@@ -5,21 +5,11 @@ SUBCOMMANDS holds (name, summary, description, examples, add_arguments, "module.
 
 import argparse
 
-from raytrace.cli.options import (
-    count,
-    file_name,
-    json,
-    max_bytes,
-    output,
-    picture_file,
-    plot,
-    seed_number,
-)
-from raytrace.cli.wave_edof_table import EDOF
+from raytrace.cli.options import count, file_name, json, max_bytes, output, picture_file, plot, seed_number
+from raytrace.cli.studies import words
 from raytrace.cli.wave_options import ELEMENTS as ELEMENTS
 from raytrace.cli.wave_options import ENGINES as ENGINES
 from raytrace.cli.wave_options import camera, element, engine, feature, light, pixels
-from raytrace.cli.wave_superres_table import SUPERRES
 
 _DESCRIPTION = """\
 Wave optics of a thin phase element before a sensor: point spread functions (PSFs) over depth and wavelength, and
@@ -121,7 +111,7 @@ SUBCOMMANDS = (
         _PSF_DESCRIPTION,
         _PSF_EXAMPLES,
         _psf,
-        "wave_commands.psf",
+        "cli.wave_commands.psf",
     ),
     (
         "focus",
@@ -129,10 +119,10 @@ SUBCOMMANDS = (
         _FOCUS_DESCRIPTION,
         _FOCUS_EXAMPLES,
         _focus,
-        "wave_commands.focus",
+        "studies.focusing.command.focus",
     ),
-    *EDOF,
-    *SUPERRES,
+    *words("edof"),
+    *words("superres"),
 )
 
 
@@ -157,5 +147,5 @@ WAVE = (
     _DESCRIPTION,
     _EXAMPLES,
     _add_arguments,
-    "wave_commands.psf",
+    "cli.wave_commands.psf",
 )

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from raytrace.catalog import UnknownGlass
 from raytrace.files import write_atomically
 from raytrace.formats import table, table_write, zemax, zemax_write
 from raytrace.formats.report import ImportReport as ImportReport
@@ -14,7 +13,8 @@ from raytrace.formats.source import LensFileError as LensFileError
 from raytrace.formats.source import LensFileWarning as LensFileWarning
 from raytrace.formats.source import Place, decode, read_text, shown
 from raytrace.formats.source import UnsupportedSurface as UnsupportedSurface
-from raytrace.lens import Lens, check_unit
+from raytrace.media.catalog import UnknownGlass
+from raytrace.system.lens import Lens, check_unit
 
 
 class Format(NamedTuple):
@@ -36,7 +36,8 @@ FORMATS = {
 def read_lens(path: str | os.PathLike, *, catalogs: Sequence[str | Path] = (), strict: bool = False) -> Lens:
     """The lens of a file, in mm and µm: .zmx (Zemax OpticStudio), or a prescription table .csv, .tsv, .txt.
 
-    catalogs: further glass catalogs (.agf), searched as `raytrace.catalog.find_glass` does. strict: raise where the
+    catalogs: further glass catalogs (.agf), searched as `raytrace.media.catalog.find_glass` does. strict: raise where
+    the
     file holds something unknown or something has to be assumed; otherwise that is one LensFileWarning.
     Raises LensFileError, its subclass UnsupportedSurface, and UnknownGlass, each naming file, line and surface.
     """

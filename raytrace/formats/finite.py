@@ -3,7 +3,7 @@
 import torch
 
 from raytrace.formats.source import LensFileError, Place
-from raytrace.lens import Lens
+from raytrace.system.lens import Lens
 
 
 def refuse_overflow(lens: Lens, file: str) -> None:

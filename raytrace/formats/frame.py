@@ -11,7 +11,7 @@ from raytrace.formats.table import build
 from raytrace.formats.table_text import Table, add_metadata, add_row, header
 from raytrace.formats.table_write import header as header_lines
 from raytrace.formats.table_write import rows
-from raytrace.lens import Lens
+from raytrace.system.lens import Lens
 
 _NUMERIC = ("curvature", "thickness", "conic", "semi_diameter")
 _PLACE = Place("DataFrame")

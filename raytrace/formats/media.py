@@ -4,10 +4,10 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
-from raytrace.catalog import AmbiguousGlass, find_glass, missing_catalogs
 from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, Place, shown
-from raytrace.glass import Glass
+from raytrace.media.catalog import AmbiguousGlass, find_glass, missing_catalogs
+from raytrace.media.glass import Glass
 
 #: More characters than the name of any glass has.
 _LONGEST = 80

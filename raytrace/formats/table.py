@@ -36,9 +36,9 @@ from raytrace.formats.source import LensFileError, Place, integer, is_infinite, 
 from raytrace.formats.table_rows import cleaned
 from raytrace.formats.table_text import Row, Table, parse
 from raytrace.formats.zemax_keywords import MILLIMETRES
-from raytrace.glass import AIR
-from raytrace.lens import Lens
-from raytrace.surface import Surface
+from raytrace.media.glass import AIR
+from raytrace.system.lens import Lens
+from raytrace.system.surface import Surface
 
 _STOP = re.compile(r"\b(stop|sto|aperture|diaphragm|iris|blende|diaphragme)\b|絞り|光阑|光圈", re.IGNORECASE)
 _IMAGE = re.compile(r"\b(image|ima|img|sensor|detector|bild|bildebene)\b|像面|成像|撮像|センサ", re.IGNORECASE)

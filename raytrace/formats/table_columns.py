@@ -14,7 +14,7 @@ from typing import NamedTuple
 from raytrace.formats.report import IGNORED, READ, UNKNOWN, Draft
 from raytrace.formats.source import LensFileError, Place, shown
 from raytrace.formats.zemax_keywords import MILLIMETRES
-from raytrace.glass import LINES
+from raytrace.media.glass import LINES
 
 _SPELLINGS = {
     "label": "surface, surf, srf, s, si, i, j, m, no, nr, num, number, #, id, surface no, surface number, surface #"

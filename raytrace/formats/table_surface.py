@@ -14,8 +14,8 @@ from raytrace.formats.table_columns import order
 from raytrace.formats.table_media import figures as figures_of
 from raytrace.formats.table_media import medium
 from raytrace.formats.table_text import Row
-from raytrace.glass import AIR, LINES, MIRROR, Glass, constant, mil_glass, model_glass, refractive_index
-from raytrace.surface import Aperture, Surface
+from raytrace.media.glass import AIR, LINES, MIRROR, Glass, constant, mil_glass, model_glass, refractive_index
+from raytrace.system.surface import Aperture, Surface
 
 _AIR = ("", "air", "-", "none", "nan", "vacuum", "luft", "空気", "空气")
 _MIRROR = re.compile(r"\b(mirror|reflect|reflecting|refl)\b", re.IGNORECASE)

@@ -27,8 +27,8 @@ from torch import Tensor
 
 from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, Place, integer, is_number, number, shown
-from raytrace.glass import LINES
-from raytrace.lens import APERTURE_KINDS, FIELD_UNITS, RAY_AIMING, Fields, SystemAperture
+from raytrace.media.glass import LINES
+from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, RAY_AIMING, Fields, SystemAperture
 
 #: Header keys: "once" or "repeated" (notes).
 KEYS = {

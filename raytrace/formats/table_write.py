@@ -17,9 +17,9 @@ from raytrace.formats.writing import (
     refuse_departure,
     thickness,
 )
-from raytrace.glass import Glass, mil_glass
-from raytrace.lens import Lens
-from raytrace.surface import Aperture, Surface
+from raytrace.media.glass import Glass, mil_glass
+from raytrace.system.lens import Lens
+from raytrace.system.surface import Aperture, Surface
 
 Metadata = list[tuple[str, str]]
 

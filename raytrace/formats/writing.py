@@ -7,12 +7,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from raytrace.catalog import AmbiguousGlass, UnknownGlass, find_glass
 from raytrace.formats.source import LensFileError, Place
 from raytrace.formats.texts import is_printable
-from raytrace.glass import Glass
-from raytrace.lens import Lens
-from raytrace.surface import Surface
+from raytrace.media.catalog import AmbiguousGlass, UnknownGlass, find_glass
+from raytrace.media.glass import Glass
+from raytrace.system.lens import Lens
+from raytrace.system.surface import Surface
 
 
 def exact(number: Tensor | float, what: str, place: Place) -> str:

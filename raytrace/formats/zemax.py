@@ -21,7 +21,7 @@ from raytrace.formats.media import report_missing_catalogs
 from raytrace.formats.report import Draft, ImportReport
 from raytrace.formats.source import LensFileError, UnsupportedSurface
 from raytrace.formats.zemax_records import Block, Sections, sections
-from raytrace.lens import Lens
+from raytrace.system.lens import Lens
 
 
 def read(text: str, file: str, *, catalogs: Sequence[Path] = (), strict: bool = False) -> tuple[Lens, ImportReport]:

@@ -11,8 +11,8 @@ from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, UnsupportedSurface, is_infinite, shown
 from raytrace.formats.zemax_keywords import APERTURES, MODELLED_TYPES, TYPE_NAMES
 from raytrace.formats.zemax_records import Block, Record
-from raytrace.glass import AIR, MIRROR, Glass, constant, mil_glass, model_glass
-from raytrace.surface import Aperture, Surface
+from raytrace.media.glass import AIR, MIRROR, Glass, constant, mil_glass, model_glass
+from raytrace.system.surface import Aperture, Surface
 
 
 def refuse_unsupported(blocks: Sequence[Block]) -> None:

@@ -9,7 +9,7 @@ from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, is_number, shown
 from raytrace.formats.zemax_keywords import FIELD_KINDS, FIELD_NAMES, MILLIMETRES
 from raytrace.formats.zemax_records import Block, Record
-from raytrace.lens import RAY_AIMING, Fields, SystemAperture
+from raytrace.system.lens import RAY_AIMING, Fields, SystemAperture
 
 #: OpticStudio cuts a long note into pieces of this many characters.
 NOTE_PIECE = 200

@@ -16,9 +16,9 @@ from raytrace.formats.writing import (
 )
 from raytrace.formats.zemax_keywords import APERTURES, FIELD_KINDS
 from raytrace.formats.zemax_system import NOTE_PIECE
-from raytrace.glass import Glass, mil_glass
-from raytrace.lens import RAY_AIMING, Lens
-from raytrace.surface import Aperture, Surface
+from raytrace.media.glass import Glass, mil_glass
+from raytrace.system.lens import RAY_AIMING, Lens
+from raytrace.system.surface import Aperture, Surface
 
 #: OpticStudio has this many wavelengths.
 _WAVELENGTHS = 24

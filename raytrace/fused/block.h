@@ -2,7 +2,7 @@
 //
 // Every loop over a block runs over whole vectors (a block is filled up with axial rays), so a ray's result does not
 // depend on its neighbours. ; `careful.h` then takes the
-// flagged rays one by one, in the arithmetic of raytrace/surface.py.
+// flagged rays one by one, in the arithmetic of raytrace/system/surface.py.
 #pragma once
 #include <cmath>
 #include <cstdint>

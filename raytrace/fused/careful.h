@@ -1,4 +1,4 @@
-// One ray at one surface in the arithmetic of raytrace/surface.py and asphere.py, with every case they know; in float64
+// One ray at one surface in the arithmetic of raytrace/system/surface.py and asphere.py, with every case they know; in float64
 // also for float32 rays, for what becomes of a ray must not be decided by rounding.
 #pragma once
 #include "loops.h"

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from raytrace.fused.library import NoCompiler, is_built, library
-from raytrace.rays import Rays
+from raytrace.system.rays import Rays
 
 ENGINES = ("auto", "eager", "fused")
 

@@ -1,4 +1,4 @@
-// The surfaces as loops over a block: the algebra of raytrace/surface.py and trace.py where nothing can go wrong.
+// The surfaces as loops over a block: the algebra of raytrace/system/surface.py and trace.py where nothing can go wrong.
 #pragma once
 #include "block.h"
 

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from raytrace.fused.library import library
 from raytrace.fused.structure import Structure, structure_of, with_numbers
-from raytrace.numerics import broadcast_shape, with_batch_axes
-from raytrace.rays import Rays
-from raytrace.surface import Surface
+from raytrace.maths.numerics import broadcast_shape, with_batch_axes
+from raytrace.system.rays import Rays
+from raytrace.system.surface import Surface
 
 _WORTH_A_THREAD = 2**16  # rays × surfaces
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.surface import Surface
+from raytrace.system.surface import Surface
 
 _FIELDS = 18  # integers of a surface, see `Layout` in block.h
 _MOST_TERMS = 16  # of an even asphere

@@ -4,7 +4,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from raytrace.analysis import GridDistortion, Incidence, LongitudinalAberration, RmsOverField, Seidel
-from raytrace.lens import Lens
 from raytrace.plot.panels import (
     DASHES,
     chart,
@@ -27,6 +26,7 @@ from raytrace.plot.style import (
     styled,
     wavelength_colours,
 )
+from raytrace.system.lens import Lens
 
 _WORDS = {
     "S1": "spherical", "S2": "coma", "S3": "astigmatism", "S4": "Petzval", "S5": "distortion", "C1": "axial colour",

@@ -18,7 +18,6 @@ from raytrace.analysis import (
     WavefrontMap,
     cutoff,
 )
-from raytrace.lens import Lens
 from raytrace.plot.panels import (
     DASHES,
     FEW,
@@ -46,6 +45,7 @@ from raytrace.plot.style import (
     styled,
     wavelength_colours,
 )
+from raytrace.system.lens import Lens
 
 _SAGITTAL = (0, (4, 2))
 

@@ -9,14 +9,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from raytrace.focus import focus_moments, image_rays, through_focus
-from raytrace.lens import Lens, with_object_distance
-from raytrace.numerics import safe_divide
-from raytrace.paraxial import first_order, paraxial_image_distance
+from raytrace.maths.numerics import safe_divide
+from raytrace.maths.pupil import gauss_rings
+from raytrace.optics.focus import focus_moments, image_rays, through_focus
+from raytrace.optics.paraxial import first_order, paraxial_image_distance
 from raytrace.plot import style
 from raytrace.plot.spots import shares_of
-from raytrace.pupil import gauss_rings
-from raytrace.rays import Rays
+from raytrace.system.lens import Lens, with_object_distance
+from raytrace.system.rays import Rays
 
 _SAMPLES = 401
 

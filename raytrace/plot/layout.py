@@ -10,12 +10,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from torch import Tensor
 
-from raytrace.launch import stop_radius
-from raytrace.lens import Lens, with_object_distance
-from raytrace.paraxial import first_order
+from raytrace.maths.pupil import fan
+from raytrace.optics.launch import stop_radius
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.trace import media
 from raytrace.plot import outline, style
-from raytrace.pupil import fan
-from raytrace.trace import media
+from raytrace.system.lens import Lens, with_object_distance
 
 _LEAD = 0.14  # of the length of the lens: how far in front of it rays of a far object start
 _NEAR = 1.5  # an object nearer than this many lengths of the lens is drawn

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.launch import launch, stop_radius
-from raytrace.lens import Lens
+from raytrace.maths.pupil import fan
+from raytrace.optics.launch import launch, stop_radius
+from raytrace.optics.trace import media, steps
 from raytrace.plot.style import array
-from raytrace.pupil import fan
-from raytrace.surface import Surface, intersect, sag_at
-from raytrace.trace import media, steps
+from raytrace.system.lens import Lens
+from raytrace.system.surface import Surface, intersect, sag_at
 
 _POINTS = 181  # of a surface's profile: smooth at any size of print
 

@@ -6,17 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from raytrace.lens import Lens
-from raytrace.plot.style import (
-    GREY,
-    array,
-    field_label,
-    field_title,
-    fill,
-    new_figure,
-    number_text,
-    wavelength_colours,
-)
+from raytrace.plot.style import GREY, array, field_label, field_title, fill, new_figure, number_text, wavelength_colours
+from raytrace.system.lens import Lens
 
 #: Dashes of wavelengths, in order, for readers who do not tell their colours apart.
 DASHES = ("solid", (0, (5, 1.5)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)))

@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from raytrace.analysis import Comparison
-from raytrace.grid import Grid
+from raytrace.kernels import CloseUp, Psf
+from raytrace.maths.grid import Grid
 from raytrace.plot.style import GREY, INK, array, bar_on_dark, fill, new_figure, round_length, styled
-from raytrace.psf import CloseUp, Psf
 
 DECADES = 4  # of light on a logarithmic scale
 _MOST_PIXELS = 16  # across a panel, whose edges are drawn

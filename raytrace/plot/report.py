@@ -9,13 +9,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from raytrace.lens import Lens, with_object_distance
-from raytrace.paraxial import first_order, paraxial_image_distance
+from raytrace.optics.paraxial import first_order, paraxial_image_distance
 from raytrace.plot import style
 from raytrace.plot.curve import FocusRays, draw_curves, focus_rays, focus_span
 from raytrace.plot.layout import draw_layout
 from raytrace.plot.spots import airy_radius, draw_dots, draw_spot, field_spots, panel_size, wavelength_handles
-from raytrace.rays import Rays
+from raytrace.system.lens import Lens, with_object_distance
+from raytrace.system.rays import Rays
 
 _MOST_SPOTS = 5  # columns of spots that stay legible
 _DASHES = {"sensor before": (0, (6, 2.5)), "sensor after": "solid", "paraxial focus": (0, (1, 1.6))}

@@ -13,13 +13,13 @@ from matplotlib.patches import Circle
 from torch import Tensor
 
 from raytrace.analysis import chief_reference
-from raytrace.focus import image_rays
-from raytrace.lens import Lens, with_object_distance
-from raytrace.numerics import safe_divide
-from raytrace.paraxial import first_order
+from raytrace.maths.numerics import safe_divide
+from raytrace.maths.pupil import gauss_rings, hexapolar, with_rim
+from raytrace.optics.focus import image_rays
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.spot import Spot, spot_of_points
 from raytrace.plot import style
-from raytrace.pupil import gauss_rings, hexapolar, with_rim
-from raytrace.spot import Spot, spot_of_points
+from raytrace.system.lens import Lens, with_object_distance
 
 _DOT_RINGS = 12  # 469 dots of a wavelength
 

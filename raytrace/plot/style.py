@@ -20,8 +20,8 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.files import write_atomically
-from raytrace.lens import FIELD_UNITS, Lens
-from raytrace.paraxial import FirstOrder
+from raytrace.optics.paraxial import FirstOrder
+from raytrace.system.lens import FIELD_UNITS, Lens
 
 INK = "#262626"
 GREY = "#7a7a7a"
@@ -62,6 +62,15 @@ _STYLE = {
     "svg.fonttype": "path",
     "svg.hashsalt": "raytrace",
     "savefig.facecolor": "white",
+}
+
+#: How the models are drawn: colour and dashes, to be told apart in print.
+LOOKS = {
+    "paraxial": (FIELD_COLOURS[0], (0, (5, 2))),
+    "fourier": (FIELD_COLOURS[1], (0, (1, 1.2))),
+    "gaussian": (FIELD_COLOURS[2], "solid"),
+    "drt": (INK, (0, (6, 1.5, 1, 1.5))),
+    "gaussian-after-paraxial": (FIELD_COLOURS[3], (0, (3, 1, 1, 1, 1, 1))),
 }
 
 

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.catalog import find_glass
-from raytrace.glass import Glass, index
-from raytrace.numerics import polynomial
+from raytrace.maths.numerics import polynomial
+from raytrace.media.catalog import find_glass
+from raytrace.media.glass import Glass, index
 from raytrace.wave.aim import Aim, converging
 from raytrace.wave.element import Element, Rings, fabricated, period
 from raytrace.wave.fabrication import ETCHED, features

@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace.value import value
+from raytrace.maths.value import value
 
 #: How steep a sphere may be, (R/z)², for its series to be worth summing.
 _STEEPEST = 0.8

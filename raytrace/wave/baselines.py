@@ -11,14 +11,14 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.catalog import find_glass
-from raytrace.glass import Glass, constant, index
-from raytrace.numerics import polynomial
+from raytrace.maths.numerics import polynomial
+from raytrace.maths.zernike import noll, norm
+from raytrace.media.catalog import find_glass
+from raytrace.media.glass import Glass, constant, index
 from raytrace.wave.achromat import achromat
 from raytrace.wave.aim import Aim, converging
 from raytrace.wave.element import Element, EvenPowers, Rings, Zernike
 from raytrace.wave.fabrication import ETCHED, TURNED, as_rings, features, wrapped
-from raytrace.zernike import noll, norm
 
 #: Object distances of the multifocal lens, mm: 2, 1.5, 1, 0.5 and 0 dioptres.
 FOCI = (500.0, 2000 / 3, 1000.0, 2000.0, math.inf)

@@ -17,14 +17,8 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace.departure import GridSag, ZernikeSag, numbers, sag_of, spline
-from raytrace.glass import index
-from raytrace.grid import Grid
-from raytrace.launch import rays_of_field
-from raytrace.lens import Fields, Lens, SystemAperture, with_object_distance
-from raytrace.numerics import safe_divide
-from raytrace.psf.dft import integrate, nodes_per_pixel, rings_and_arms, sub_pixels
-from raytrace.psf.diffraction import (
+from raytrace.kernels.dft import integrate, nodes_per_pixel, rings_and_arms, sub_pixels
+from raytrace.kernels.diffraction import (
     Waves,
     amplitude,
     half_spread,
@@ -33,16 +27,22 @@ from raytrace.psf.diffraction import (
     phase_along_radius,
     waves,
 )
-from raytrace.psf.radial import is_centred, radii_of_waves, unfold
-from raytrace.pupil import gauss_rings
-from raytrace.scene import Scene, symmetry
-from raytrace.surface import Surface, sag_at
-from raytrace.trace import media, trace_surfaces
-from raytrace.value import to, value
-from raytrace.vignetting import vignette
+from raytrace.kernels.radial import is_centred, radii_of_waves, unfold
+from raytrace.maths.grid import Grid
+from raytrace.maths.numerics import safe_divide
+from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.value import to, value
+from raytrace.maths.zernike import noll
+from raytrace.media.glass import index
+from raytrace.optics.launch import rays_of_field
+from raytrace.optics.scene import Scene, symmetry
+from raytrace.optics.trace import media, trace_surfaces
+from raytrace.optics.vignetting import vignette
+from raytrace.optics.wavefront import Wavefront, wavefront
+from raytrace.system.departure import GridSag, ZernikeSag, numbers, sag_of, spline
+from raytrace.system.lens import Fields, Lens, SystemAperture, with_object_distance
+from raytrace.system.surface import Surface, sag_at
 from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike, is_radial, path, profile_height
-from raytrace.wavefront import Wavefront, wavefront
-from raytrace.zernike import noll
 
 _MOST_RAYS = 400_000  # of one kernel
 _PROBE = 8, 32  # rings and arms of the rays that find how far directions spread and beams reach

@@ -5,7 +5,7 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from raytrace.grid import grid
+from raytrace.maths.grid import grid
 from raytrace.wave.psf import psf
 from raytrace.wave.scene import WaveScene
 

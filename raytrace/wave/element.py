@@ -13,10 +13,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from raytrace.glass import Glass, index
-from raytrace.numerics import safe_sqrt
-from raytrace.value import value
-from raytrace.zernike import noll, polynomials
+from raytrace.maths.numerics import safe_sqrt
+from raytrace.maths.value import value
+from raytrace.maths.zernike import noll, polynomials
+from raytrace.media.glass import Glass, index
 
 
 @value

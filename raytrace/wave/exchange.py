@@ -24,9 +24,9 @@ import numpy as np
 import torch
 from PIL import Image, PngImagePlugin
 
-from raytrace.arrays import LARGEST, ArrayError, read_npy
 from raytrace.files import read_bytes, write_atomically
-from raytrace.pictures import PictureError, decoded
+from raytrace.formats.pictures import PictureError, decoded
+from raytrace.maths.arrays import LARGEST, ArrayError, read_npy
 from raytrace.wave.element import Pixels, Rings
 
 Map = Pixels | Rings

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import torch
 
-from raytrace.dispersion import COEFFICIENT_COUNTS
 from raytrace.files import write_atomically
-from raytrace.glass import Glass
+from raytrace.media.dispersion import COEFFICIENT_COUNTS
+from raytrace.media.glass import Glass
 from raytrace.wave.element import Element
 from raytrace.wave.exchange import HeightMapError, write_heights
 

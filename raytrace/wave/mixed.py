@@ -17,9 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.psf.dft import bessel_j0, phasor, sub_pixels
-from raytrace.psf.radial import is_centred
-from raytrace.value import value
+from raytrace.kernels.dft import bessel_j0, phasor, sub_pixels
+from raytrace.kernels.radial import is_centred
+from raytrace.maths.value import value
 from raytrace.wave.element import Element, is_radial, path
 from raytrace.wave.pupil import halves, light_of, waves_at
 from raytrace.wave.radial import edges, rule, slope

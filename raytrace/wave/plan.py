@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from raytrace.psf.dft import Aliased, rings_and_arms
-from raytrace.psf.ladder import NotConverged
-from raytrace.psf.radial import is_centred, reach
+from raytrace.kernels.dft import Aliased, rings_and_arms
+from raytrace.kernels.ladder import NotConverged
+from raytrace.kernels.radial import is_centred, reach
 from raytrace.wave import propagate, radial
 from raytrace.wave.element import Pixels, Rings
 from raytrace.wave.mixed import deflection, extent_of, is_mixed, radii_of_band, round_part

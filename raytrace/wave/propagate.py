@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.numerics import safe_sqrt
-from raytrace.psf.dft import phasor, sub_pixels
+from raytrace.kernels.dft import phasor, sub_pixels
+from raytrace.maths.numerics import safe_sqrt
 from raytrace.wave.element import path
 from raytrace.wave.pupil import disc_cells
 from raytrace.wave.scene import WaveScene, aperture, excess, millimetres

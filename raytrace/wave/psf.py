@@ -2,9 +2,9 @@
 
 from torch import Tensor
 
-from raytrace.grid import Grid
-from raytrace.psf.dft import integrate
-from raytrace.value import value
+from raytrace.kernels.dft import integrate
+from raytrace.maths.grid import Grid
+from raytrace.maths.value import value
 from raytrace.wave import mixed, propagate, pupil, radial
 from raytrace.wave import plan as planning
 from raytrace.wave.mixed import MixedSums

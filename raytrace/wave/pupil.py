@@ -16,10 +16,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.numerics import safe_sqrt
-from raytrace.psf.dft import phasor, sub_pixels
-from raytrace.psf.radial import is_centred
-from raytrace.value import value
+from raytrace.kernels.dft import phasor, sub_pixels
+from raytrace.kernels.radial import is_centred
+from raytrace.maths.numerics import safe_sqrt
+from raytrace.maths.value import value
 from raytrace.wave.element import path
 from raytrace.wave.scene import WaveScene, aperture, is_smooth, millimetres, residual, spheres
 

@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.psf.dft import bessel_j0, phasor
-from raytrace.psf.radial import radii_of_waves, unfold
-from raytrace.value import value
+from raytrace.kernels.dft import bessel_j0, phasor
+from raytrace.kernels.radial import radii_of_waves, unfold
+from raytrace.maths.value import value
 from raytrace.wave.element import Element, Rings, path, profile_height
 from raytrace.wave.scene import WaveScene, aperture, millimetres, spheres
 

@@ -11,8 +11,8 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace.psf.dft import phasor
-from raytrace.pupil import gauss_rings
+from raytrace.kernels.dft import phasor
+from raytrace.maths.pupil import gauss_rings
 from raytrace.wave.element import path
 from raytrace.wave.scene import WaveScene, aperture, excess, millimetres
 

@@ -10,10 +10,10 @@ by 8 rad. The light of the source is as bright all over the aperture.
 import torch
 from torch import Tensor
 
-from raytrace.glass import index
-from raytrace.grid import Grid
-from raytrace.lens import check_unit
-from raytrace.value import value
+from raytrace.maths.grid import Grid
+from raytrace.maths.value import value
+from raytrace.media.glass import index
+from raytrace.system.lens import check_unit
 from raytrace.wave.element import Element, Pixels, Rings, is_radial, path
 
 

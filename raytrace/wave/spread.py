@@ -11,9 +11,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from raytrace.glass import index
-from raytrace.pupil import gauss_rings
-from raytrace.value import to, value
+from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.value import to, value
+from raytrace.media.glass import index
 from raytrace.wave import radial
 from raytrace.wave.element import Element, Pixels, Rings, fabricated, height, profile_height
 from raytrace.wave.scene import WaveScene, aperture, millimetres, residual, spheres

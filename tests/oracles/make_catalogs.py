@@ -24,9 +24,9 @@ from pathlib import Path
 
 import torch
 
-from raytrace.agf import Catalog, write_agf
-from raytrace.dispersion import AGF_FORMULAS, COEFFICIENT_COUNTS
-from raytrace.glass import LINES, Glass, normal_line_deviation, refractive_index
+from raytrace.media.agf import Catalog, write_agf
+from raytrace.media.dispersion import AGF_FORMULAS, COEFFICIENT_COUNTS
+from raytrace.media.glass import LINES, Glass, normal_line_deviation, refractive_index
 
 TITLE = "{name}: dispersion coefficients that agree in two or more public sources; each glass names them in its comment"
 

@@ -1,0 +1,139 @@
+"""Camera: a lens with variables, a sensor, and a network that restores its pictures, as one module.
+
+camera = Camera(Variables(lens, "sensor"), RedNet(), model="gaussian")
+restored = camera(pictures, object_distances)
+(restored - camera.target(pictures)).abs().mean().backward()
+"""
+
+import dataclasses
+import warnings
+
+import torch
+from torch import Tensor, nn
+
+from raytrace.camera.image import add_noise, blur
+from raytrace.camera.variables import Variables
+from raytrace.kernels import NotConverged, psf
+from raytrace.maths.grid import Grid, grid
+from raytrace.optics.reuse import Memo
+from raytrace.optics.scene import scene, trace_scene
+from raytrace.system.lens import Lens
+
+
+class Camera(nn.Module):
+    """Pictures (B, H, W) in [0, 1], each at its own object distance, as a lens, a sensor and a network give them back.
+
+    variables: what of the lens is learned; network: (B, 1, h, w) -> the same; model: a PSF model.
+    object_distances: smallest and largest, mm; fields: (2, F) in the lens's kind of field, on the axis by default.
+    pixels: the window of the PSF, 21 × 21 of 5 µm by default; normalise: "window" or "energy", as for `psf`.
+    noise: standard deviation of the sensor's noise. tol: what the kernels may err by: the order of the PSF model is
+    chosen once, for the lens as it is at the first call (`plan`). rho: of the paraxial model.
+    network_dtype: torch.bfloat16 runs the network alone in it (autocast); the optics keep the lens's dtype.
+    The object is taken to be flat at one distance, and upright: magnification and its sign change no loss.
+    """
+
+    def __init__(
+        self,
+        variables: Variables,
+        network: nn.Module,
+        *,
+        model: str = "gaussian",
+        object_distances: tuple[float, float] = (1e4, 5e4),
+        fields: Tensor | None = None,
+        pixels: Grid | None = None,
+        normalise: str = "window",
+        noise: float = 0.1,
+        tol: float = 1e-2,
+        rho: float = 0.5,
+        network_dtype: torch.dtype | None = None,
+    ):
+        super().__init__()
+        self.variables, self.network, self.model = variables, network, model
+        self.range = object_distances
+        like = variables.lens.wavelengths
+        self.fields = like.new_zeros(2, 1) if fields is None else fields
+        self.pixels = grid(like.new_tensor(0.005), 21) if pixels is None else pixels
+        self.normalise, self.noise, self.tol, self.rho, self.network_dtype = normalise, noise, tol, rho, network_dtype
+        self._order: int | None = None
+        self._memo = Memo(object_distances=object_distances)
+
+    @property
+    def margin(self) -> int:
+        """By how many rows and columns a picture shrinks: the PSF needs them."""
+        return self.pixels.rows - 1
+
+    def use(self, model: str) -> None:
+        """Simulate with another PSF model from now on."""
+        self.model, self._order = model, None
+
+    @torch.no_grad()
+    def plan(self) -> int:
+        """The order of the PSF model that meets the tolerance at the ends and the middle of the range."""
+        near, far = self.range
+        distances = self.fields.new_tensor([near, 2 / (1 / near + 1 / far), far])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", NotConverged)  # the finest order is the best there is
+            self._order = self._psf(distances, self.fields, tol=self.tol).order
+        return self._order
+
+    def kernels(self, object_distances: Tensor, field: int = 0) -> Tensor:
+        """PSFs (B, rows, columns) of object distances (B,) mm at one of the fields, around its chief ray."""
+        order = self.plan() if self._order is None else self._order
+        return self._psf(object_distances, self.fields[:, field : field + 1], order=order).kernel[:, 0]
+
+    def _psf(self, distances: Tensor, fields: Tensor, **work):
+        # These know of a field only where its image lies: about their own chief ray it is the image on the axis, while
+        # the traced chief ray is as far from it as the lens distorts.
+        fields = torch.zeros_like(fields) if self.model in ("paraxial", "fourier") else fields
+        lens, distances = self.variables(), distances.to(self.fields.dtype)
+        return psf(
+            lens,
+            self.model,
+            fields=fields,
+            object_distances=distances,
+            grid=self._window(lens, fields, distances),
+            normalise=self.normalise,
+            rho=self.rho,
+            memo=self._memo,
+            **work,
+        )
+
+    def _window(self, lens: Lens, fields: Tensor, distances: Tensor) -> Grid:
+        """The pixels around the chief ray: they follow it with its derivatives, for where a picture lies is no loss."""
+        if bool((fields == 0).all()):
+            return self.pixels
+        primary = lens.wavelengths[lens.primary_wavelength][None]
+        rays = trace_scene(scene(lens, fields, distances, primary, self._memo), fields.new_zeros(2, 1))
+        chief = rays.position[:2, ..., 0, 0].expand(2, len(distances), fields.shape[1])
+        return dataclasses.replace(self.pixels, centre=self.pixels.centre[:, None, None] + chief)
+
+    def image(self, picture: Tensor, object_distances: Tensor, field: int = 0) -> Tensor:
+        """What falls on the sensor, without noise: (B, H - margin, W - margin)."""
+        return blur(picture, self.kernels(object_distances, field).to(picture.dtype))
+
+    def restore(self, image: Tensor) -> Tensor:
+        """The network's answer (B, h, w) to a noisy image."""
+        with torch.autocast(image.device.type, self.network_dtype, enabled=self.network_dtype is not None):
+            stack = image[:, None].contiguous(memory_format=torch.channels_last)
+            return self.network(stack)[:, 0].to(image.dtype)
+
+    def forward(
+        self,
+        picture: Tensor,
+        object_distances: Tensor,
+        *,
+        field: int = 0,
+        noise: Tensor | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Blur, add noise, restore. noise: (B, h, w) of deviation 1 to use instead of drawing it."""
+        image = self.image(picture, object_distances, field)
+        if noise is None:
+            return self.restore(add_noise(image, self.noise, generator=generator))
+        return self.restore(image + self.noise * noise)
+
+    def target(self, picture: Tensor) -> Tensor:
+        """What a perfect camera gives: the picture without its margin."""
+        rows, columns = self.pixels.rows // 2, self.pixels.columns // 2
+        bottom, right = self.pixels.rows - 1 - rows, self.pixels.columns - 1 - columns
+        return picture[..., rows : picture.shape[-2] - bottom, columns : picture.shape[-1] - right]

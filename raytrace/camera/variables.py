@@ -1,0 +1,162 @@
+"""Variables: which numbers of a lens are learned, how far one step moves them, and what keeps the lens buildable.
+
+variables = Variables(lens, "sensor thickness:5,6 curvature:1-4")
+changed = variables()          # the lens with its variables, differentiable
+"""
+
+import dataclasses
+import re
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from raytrace.camera.limits import limits_of, violation
+from raytrace.system.lens import Lens
+
+KINDS = ("sensor", "thickness", "curvature", "conic")
+
+
+class BadVariables(ValueError):
+    """A list of variables that the lens does not have, or that cannot be read."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Variable:
+    """One number of one surface.
+
+    unit: how much of the lens's number one unit of the parameter is. Thicknesses are in mm; curvatures and conics in
+    what moves the surface by 1 mm of sag at its semi-diameter, so that one step means the same for all of them.
+    """
+
+    kind: str
+    surface: int
+    start: float
+    unit: float
+
+    @property
+    def name(self) -> str:
+        return "sensor" if self.kind == "sensor" else f"{self.kind}_{self.surface}"
+
+
+class Variables(nn.Module):
+    """The variables of a lens as parameters: 0 at the start, in units of `Variable.unit`.
+
+    vary: "sensor", and lists like "thickness:5,6,10 curvature:1-4", of the file's surface numbers.
+    bounds: by name ("sensor", "curvature_3"), smallest and largest number of the lens; `project` keeps them.
+    glass_thickness, air_thickness: least and greatest in mm at the axis; edge: least of glass at its edge; by default
+    they go with the size of the lens (`limits_of`). `violation` says how far the lens is from them.
+    """
+
+    def __init__(
+        self,
+        lens: Lens,
+        vary: str = "sensor",
+        *,
+        bounds: Mapping[str, tuple[float, float]] | None = None,
+        glass_thickness: tuple[float, float] | None = None,
+        air_thickness: tuple[float, float] | None = None,
+        edge: float | None = None,
+    ):
+        super().__init__()
+        self.lens = lens
+        self.variables = parse(lens, vary)
+        self.bounds = dict(bounds or {})
+        self.limits = limits_of(lens, glass=glass_thickness, air=air_thickness, edge=edge)
+        unknown = set(self.bounds) - {variable.name for variable in self.variables}
+        if unknown:
+            raise BadVariables(f"bounds for {', '.join(sorted(unknown))}, not among the variables: {vary}")
+        for variable in self.variables:
+            start = torch.zeros((), dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
+            self.register_parameter(variable.name, nn.Parameter(start))
+
+    def forward(self) -> Lens:
+        """The lens with its variables where they are now."""
+        surfaces = list(self.lens.surfaces)
+        for variable in self.variables:
+            kind = "thickness" if variable.kind == "sensor" else variable.kind
+            surface = surfaces[variable.surface]
+            surfaces[variable.surface] = dataclasses.replace(surface, **{kind: self.number(variable)})
+        return dataclasses.replace(self.lens, surfaces=tuple(surfaces))
+
+    def number(self, variable: Variable) -> Tensor:
+        """The lens's number, 1/mm or mm."""
+        return variable.start + variable.unit * getattr(self, variable.name)
+
+    def numbers(self) -> dict[str, float]:
+        """Every variable as the lens has it, by name."""
+        return {variable.name: float(self.number(variable).detach()) for variable in self.variables}
+
+    @torch.no_grad()
+    def project(self) -> None:
+        """Bring variables back within their bounds, after a step of an optimiser."""
+        for variable in self.variables:
+            if variable.name in self.bounds:
+                low, high = ((end - variable.start) / variable.unit for end in self.bounds[variable.name])
+                getattr(self, variable.name).clamp_(min(low, high), max(low, high))
+
+    def violation(self) -> Tensor:
+        """How far the lens is from its limits, mm² (`limits.violation`)."""
+        return violation(self(), self.limits)
+
+
+def parse(lens: Lens, vary: str) -> tuple[Variable, ...]:
+    """The variables of a list like "sensor thickness:5,6 curvature:1-4". Raises BadVariables saying what is wrong."""
+    found: dict[str, Variable] = {}
+    for word in vary.split():
+        kind, _, numbers = word.partition(":")
+        if kind not in KINDS or bool(numbers) == (kind == "sensor"):
+            raise BadVariables(
+                f"{word!r}: expected sensor, or one of {', '.join(KINDS[1:])} with surfaces: thickness:5,6"
+            )
+        last = len(lens.surfaces) - 2
+        for number in [last] if kind == "sensor" else _numbers(word, numbers):
+            variable = _variable(lens, kind, number, word)
+            found[f"{'thickness' if kind == 'sensor' else kind}_{number}"] = variable
+    if not found:
+        raise BadVariables("no variables: give sensor, or thickness:…, curvature:…, conic:… with surface numbers")
+    return tuple(found.values())
+
+
+def parse_bounds(text: str) -> dict[str, tuple[float, float]]:
+    """Bounds by name of a list like "sensor:57.5,58 curvature_3:-0.1,0". Raises BadVariables saying what is wrong."""
+    found = {}
+    for word in text.split():
+        name, _, ends = word.partition(":")
+        try:
+            low, high = (float(end) for end in ends.split(","))
+        except ValueError as error:
+            raise BadVariables(f"{word!r}: expected a variable and its bounds, like thickness_5:8,12") from error
+        if not low < high:
+            raise BadVariables(f"{word!r}: {low:g} is not less than {high:g}")
+        found[name] = (low, high)
+    return found
+
+
+def _numbers(word: str, numbers: str) -> list[int]:
+    found: list[int] = []
+    for part in numbers.split(","):
+        match = re.fullmatch(r"(\d+)(?:-(\d+))?", part)
+        if not match:
+            raise BadVariables(f"{word!r}: {part!r} is no surface number; expected numbers and ranges like 1,3-5")
+        first, last = int(match[1]), int(match[2] or match[1])
+        found += range(first, last + 1)
+    return found
+
+
+def _variable(lens: Lens, kind: str, number: int, word: str) -> Variable:
+    if not 1 <= number <= len(lens.surfaces) - 2:
+        raise BadVariables(f"{word!r}: surface {number}; this lens has surfaces 1 to {len(lens.surfaces) - 2} to vary")
+    surface = lens.surfaces[number]
+    if kind in ("sensor", "thickness"):
+        return Variable(kind, number, float(surface.thickness), 1.0)
+    edge = surface.semi_diameter
+    if not edge:
+        raise BadVariables(f"{word!r}: surface {number} has no semi-diameter, by which its {kind} is scaled; give one")
+    curvature = 0.0 if surface.curvature is None else float(surface.curvature)
+    if kind == "curvature":
+        return Variable(kind, number, curvature, 2 / edge**2)  # z ≈ c r²/2
+    if curvature == 0:
+        raise BadVariables(f"{word!r}: surface {number} is flat, and a conic constant changes nothing there")
+    start = 0.0 if surface.conic is None else float(surface.conic)
+    return Variable(kind, number, start, 8 / (abs(curvature) ** 3 * edge**4))  # z ≈ … + (1 + k) c³ r⁴/8

@@ -1,0 +1,69 @@
+"""Paraxial PSF: the defocus of a thin lens, as a Gaussian."""
+
+import torch
+from torch import Tensor
+
+from raytrace.kernels.pixels import gaussian_pixels
+from raytrace.maths.grid import Grid
+from raytrace.maths.numerics import safe_divide
+from raytrace.optics.launch import object_field
+from raytrace.optics.paraxial import first_order, signed, system_matrix
+from raytrace.optics.scene import Kernels, Scene, is_on_axis
+from raytrace.optics.trace import media
+
+
+def kernels(scene: Scene, grid: Grid, *, rho: float | Tensor = 0.5) -> Kernels:
+    """Isotropic Gaussians of σ = ρ ε around the paraxial chief ray, with all the light of the entrance pupil.
+
+    rho: 0.5 gives the second moment per axis of a uniform disc of radius ε. In focus σ is 0 and so is its gradient:
+    the Gaussian's energy moves between pixels with σ², so nothing is lost.
+    """
+    sigma = rho * blur_radius(scene)
+    variance = (sigma * sigma).expand(scene.shape)
+    centroid = chief_ray_height(scene)
+    kernel = gaussian_pixels(grid, centroid, torch.stack([variance, variance]))
+    covariance = torch.stack([variance, torch.zeros_like(variance), variance])
+    return Kernels(kernel, grid, centroid, covariance, rays=0)
+
+
+def blur_radius(scene: Scene) -> Tensor:
+    """ε = R |1 - z_i (1/f - 1/z_o)|, (D, 1, W) mm; derivative 0 in focus.
+
+    R: radius of the entrance pupil; z_i: from the rear principal plane to the sensor, z_o: from the object to the
+    front one, both along the light. In media 1/z_o is n/n′ of it.
+    """
+    lens = scene.lens
+    wavelengths = scene.wavelengths
+    paraxial = first_order(lens, wavelengths)
+    n = signed(lens.surfaces[1:-1], media(lens, wavelengths)[:-1])
+    z_i = torch.sign(n[-1]) * (lens.surfaces[-2].thickness - paraxial.rear_principal_plane)
+    z_o = lens.surfaces[0].thickness + paraxial.front_principal_plane
+    vergence = safe_divide((n[0] / n[-1].abs()).expand_as(z_o), z_o)
+    defocus = 1 - z_i * (1 / paraxial.effective_focal_length - vergence)
+    return 0.5 * paraxial.entrance_pupil_diameter * defocus.abs()
+
+
+def chief_ray_height(scene: Scene) -> Tensor:
+    """Where the paraxial ray through the centre of the entrance pupil meets the sensor, (2, D, F, W) mm."""
+    lens, wavelengths = scene.lens, scene.wavelengths
+    if is_on_axis(scene):
+        return wavelengths.new_zeros(2, *scene.shape)
+    paraxial = first_order(lens)
+    field, _ = object_field(lens, scene.fields[:, :, None], paraxial)
+    distance, pupil = lens.surfaces[0].thickness, paraxial.entrance_pupil_position
+    n = signed(lens.surfaces[1:-1], media(lens, wavelengths)[:-1])
+    A, B, C, D = system_matrix(lens.surfaces[1:-1], n)
+    to_sensor = lens.surfaces[-2].thickness / n[-1]
+    finite = ~torch.isinf(distance.detach())
+    heights = []
+    for component in field:
+        if lens.fields.telecentric:
+            y, slope = component, torch.zeros_like(component)
+        else:
+            # A field at infinity is a slope, a finite one a height.
+            reach = torch.where(finite, distance + pupil, -1.0)
+            slope = -component / reach
+            y = -pupil * slope
+        omega = n[0] * slope
+        heights.append((A * y + B * omega + to_sensor * (C * y + D * omega)).expand(scene.shape))
+    return torch.stack(heights)

@@ -1,0 +1,221 @@
+"""Pixels: the energy of a two-dimensional Gaussian in every pixel of a grid."""
+
+import itertools
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.maths.grid import Grid, centres, edges
+from raytrace.maths.numerics import safe_divide, safe_sqrt
+
+#: Standard deviations beyond which a normal distribution is 0 in float64.
+_FAR = 40.0
+#: Half-widths h (and h·m, m the midpoint; both over σ) up to which an interval is integrated by its midpoint series.
+_NARROW = 0.25
+_TERMS = 8  # of that series: the next one is 1e-18 of the first
+#: The rotated rule leaves out what lies e^-37 below its peak, and takes Φ(t) as 1 beyond t = 8.3.
+_DROP, _SATURATED = 74.0, 8.3
+_NODES, _WEIGHTS = (x.tolist() for x in np.polynomial.legendre.leggauss(28))
+
+
+def gaussian_pixels(grid: Grid, centroid: Tensor, covariance: Tensor) -> Tensor:
+    """Energy (..., rows, columns) of a Gaussian of energy 1 in every pixel, exactly integrated.
+
+        P = ∬_pixel exp(-½ rᵀ Σ⁻¹ r) / (2π √det Σ) dx dy,   r = (x, y) - centroid
+
+    centroid: (2, ...) mm; covariance: (3, ...) mm², xx, xy, yy, or (2, ...), xx and yy of a Gaussian known to have no
+    xy: then P is a product of two differences of Φ, of rows + columns numbers. In general P is an integral over x of
+    Φ differences in y, by a rule of fixed cost that keeps relative precision in the tails and has the limits xy = 0
+    and det Σ = 0, a line. A variance of 0 is a point: all in one pixel, halves on an edge, and derivative 0.
+    First and second derivatives are exact in all of centroid, covariance, pitch and centre.
+    """
+    x, y = centres(grid)
+    left_right, low_high = edges(grid)
+    half = 0.5 * grid.pitch
+    x, left_right = x - centroid[0][..., None], left_right - centroid[0][..., None]
+    y, low_high = y - centroid[1][..., None], low_high - centroid[1][..., None]
+    across = left_right[..., None, :-1], left_right[..., None, 1:], x[..., None, :], half
+    along = low_high[..., :-1, None], low_high[..., 1:, None], y[..., :, None], half
+    # A σ of 1e-30 mm is a point: its derivatives would overflow.
+    smallest = 1e-60 if covariance.dtype == torch.float64 else 1e-16
+    both = (covariance[0] > smallest) & (covariance[-1] > smallest)
+    variance_x, variance_y = (
+        torch.where(t > smallest, t, 0.0)[..., None, None] for t in (covariance[0], covariance[-1])
+    )
+    if len(covariance) == 2:
+        return _interval(*across, safe_sqrt(variance_x)) * _interval(*along, safe_sqrt(variance_y))
+    return _rotated(across, along, variance_x, torch.where(both, covariance[1], 0.0)[..., None, None], variance_y)
+
+
+def _standard(distance: Tensor, sigma: Tensor) -> Tensor:
+    """distance/σ, limited to ±40 with derivative 0 beyond; σ = 0 gives ±40, or 0 at distance 0."""
+    resolved = distance.abs() < _FAR * sigma
+    quotient = torch.where(resolved, distance, 0.0) / torch.where(resolved, sigma, 1.0)
+    return torch.where(resolved, quotient, _FAR * torch.sign(distance.detach()))
+
+
+def _interval(lower: Tensor, upper: Tensor, middle: Tensor, half: Tensor, sigma: Tensor) -> Tensor:
+    """Φ(upper/σ) - Φ(lower/σ) to a few roundings of its own size; middle, half: of the same interval, all mm.
+
+    Differences of erfc on the side of a tail, of erf around the centre, and where those would cancel,
+
+        2 h φ(m) Σ_k He_2k(m) h^2k / (2k + 1)!
+    """
+    a, b, m, h = (_standard(distance, sigma) for distance in (lower, upper, middle, half))
+    root = 2.0**-0.5
+    left = m < 0
+    near, far = root * torch.where(left, -b, a), root * torch.where(left, -a, b)
+    wide = torch.where(near > 0, torch.erfc(near) - torch.erfc(far), torch.erf(far) - torch.erf(near))
+    narrow = (h <= _NARROW) & ((h * m).abs() <= _NARROW)
+    h, m = torch.where(narrow, h, 0.0), torch.where(narrow, m, 0.0)
+    # e_n = He_n(m) h^n by He_(n+1) = m He_n - n He_(n-1).
+    q, z = h * h, h * m
+    before, now, total, factorial = torch.ones_like(z), z, torch.ones_like(z), 1.0
+    for n in range(1, 2 * _TERMS, 2):
+        factorial *= (n + 1) * (n + 2)
+        before = z * now - n * q * before
+        total = total + before / factorial
+        now = z * before - (n + 1) * q * now
+    return torch.where(narrow, 2 * h * _bell(m) * total, 0.5 * wide)
+
+
+def _bell(t: Tensor) -> Tensor:
+    """φ(t) = exp(-t²/2)/√(2π)."""
+    return (2 * torch.pi) ** -0.5 * torch.exp(-0.5 * t * t)
+
+
+def _density(distance: Tensor, sigma: Tensor) -> Tensor:
+    """φ(distance/σ)/σ, 1/mm; 0 where σ = 0."""
+    return safe_divide(_bell(_standard(distance, sigma)), sigma)
+
+
+def _rotated(across: tuple, along: tuple, xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
+    """The value by quadrature outside the graph, its derivatives in closed form.
+
+    With p the density, ∂P/∂x is p integrated over an edge; as ∂p/∂Σxx = ½ ∂²p/∂x² and ∂p/∂Σxy = ∂²p/∂x∂y (Plackett
+    1954), derivatives in the covariance are integrals over edges and values at corners. An edge is a density in
+    one coordinate times a Φ difference in the other.
+    """
+    det = _determinant(xx, xy, yy)
+    x, y = _edges(across, along, xx, xy, det), _edges(along, across, yy, xy, det)
+    derivatives = [
+        (across[2], x[0]),
+        (across[3], x[1]),
+        (along[2], y[0]),
+        (along[3], y[1]),
+        (xx, 0.5 * x[2]),
+        (yy, 0.5 * y[2]),
+        (xy, x[3]),
+    ]
+    value = _rule(*([t.detach() for t in side] for side in (across, along)), *(t.detach() for t in (xx, xy, yy, det)))
+    # Σ (p - p₀) ½ (g(p) + g(p₀)) is 0 and has the first derivative g and the second derivative ∂g of P itself.
+    return value + sum((p - p.detach()) * (0.5 * (g + g.detach())) for p, g in derivatives)
+
+
+def _determinant(xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
+    """xx·yy - xy², its value from exact products (Veltkamp, Dekker 1971): the rounding of ρ² would blur a thin line."""
+
+    def product(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+        (a1, a2), (b1, b2) = split(a), split(b)
+        whole = a * b
+        return whole, a2 * b2 - (((whole - a1 * b1) - a2 * b1) - a1 * b2)
+
+    def split(a: Tensor) -> tuple[Tensor, Tensor]:
+        c = (2.0**27 + 1 if a.dtype == torch.float64 else 2.0**12 + 1) * a
+        high = c - (c - a)
+        return high, a - high
+
+    (p, dp), (q, dq) = product(xx.detach(), yy.detach()), product(xy.detach(), xy.detach())
+    plain = xx * yy - xy * xy
+    return (plain - plain.detach()) + ((p - q) + (dp - dq)).clamp_min(0.0)
+
+
+def _edges(side: tuple, other: tuple, variance: Tensor, xy: Tensor, det: Tensor) -> tuple[Tensor, ...]:
+    """E₁ - E₀, E₁ + E₀, E′₁ - E′₀ and C₁ - C₀ of the edges x₀, x₁ of a pixel.
+
+    E(x) = ∫ p dy and E′(x) = ∫ ∂p/∂x dy over an edge, C(x): p at its upper end less p at its lower end.
+    """
+    lower, upper, middle, half = other
+    sigma, slope = safe_sqrt(variance), safe_divide(xy, variance)
+    s = safe_sqrt(safe_divide(det, variance))
+    own, strip, energy, tilt, ends = [], [], [], [], []
+    for x in side[:2]:
+        shift = slope * x
+        own.append(_density(x, sigma))
+        strip.append(_interval(lower - shift, upper - shift, middle - shift, half, s))
+        ends.append(own[-1] * (_density(upper - shift, s) - _density(lower - shift, s)))
+        energy.append(own[-1] * strip[-1])
+        tilt.append(-(safe_divide(x, torch.broadcast_tensors(variance, x)[0]) * energy[-1]) - slope * ends[-1])
+    difference = 0.5 * (
+        _difference(own, side, sigma) * (strip[0] + strip[1]) + (own[0] + own[1]) * (strip[1] - strip[0])
+    )
+    return difference, energy[0] + energy[1], tilt[1] - tilt[0], ends[1] - ends[0]
+
+
+def _difference(density: list, side: tuple, sigma: Tensor) -> Tensor:
+    """Density at x₁ less that at x₀; for a narrow pixel -2 p(m) exp(-h²/2) sinh(m h), which does not cancel."""
+    m, h = (_standard(distance, sigma) for distance in side[2:])
+    narrow = (h <= 1) & ((h * m).abs() <= 1)
+    h, m = torch.where(narrow, h, 0.0), torch.where(narrow, m, 0.0)
+    stable = safe_divide(-2 * _bell(m) * torch.exp(-0.5 * h * h) * torch.sinh(m * h), sigma)
+    return torch.where(narrow, stable, density[1] - density[0])
+
+
+def _rule(across: list, along: list, xx: Tensor, xy: Tensor, yy: Tensor, det: Tensor) -> Tensor:
+    """∫ φ(u) [Φ((y₁ - ρu)/r) - Φ((y₀ - ρu)/r)] du over a pixel, r² = 1 - ρ², all over σ; a Gaussian rule in pieces.
+
+    The integrand is log-concave with its peak at u*, the point of the pixel nearest to the centroid in the norm of Σ:
+    g(u) = u² + max(0, y₀ - ρu, ρu - y₁)²/r² is least there. Outside {g ≤ g(u*) + 74} nothing is left in float64; the
+    rest is cut where it turns: at u*, where either Φ is ½, and where either is 1.
+    """
+    sigma_x, sigma_y = safe_sqrt(xx), safe_sqrt(yy)
+    rho = safe_divide(xy, sigma_x * sigma_y)
+    # ρ > 0 without loss: mirror y.
+    mirrored = rho < 0
+    lower, upper, middle, half = along
+    lower, upper = torch.where(mirrored, -upper, lower), torch.where(mirrored, -lower, upper)
+    middle = torch.where(mirrored, -middle, middle)
+    rho = rho.abs().clamp_max(1.0)
+    r = safe_sqrt(safe_divide(det, xx * yy)).clamp_max(1.0)
+    y0, y1, y, y_half = (_standard(t, sigma_y) for t in (lower, upper, middle, half))
+    a, b, x, x_half = (_standard(t, sigma_x) for t in across)
+
+    # Narrow pixels count u from their centre, so that their width keeps its digits.
+    origin = torch.where(x_half <= 1, x, 0.0)
+    a, b = torch.where(x_half <= 1, -x_half, a), torch.where(x_half <= 1, x_half, b)
+    pieces = _pieces(a + origin, b + origin, y0, y1, rho, r)
+    a, b, *pieces = torch.broadcast_tensors(a, b, *pieces)
+    cuts = torch.stack([torch.minimum(torch.maximum(piece - origin, a), b) for piece in pieces]).sort(0).values
+    total = torch.zeros_like(a)
+    nodes, weights = (total.new_tensor(t).reshape(-1, *(1,) * total.dim()) for t in (_NODES, _WEIGHTS))
+    for start, end in itertools.pairwise(cuts):
+        length = 0.5 * (end - start)
+        u = origin + (start + (1 + nodes) * length)
+        shift = rho * u
+        strip = _interval(y0 - shift, y1 - shift, y - shift, y_half, r)
+        total = total + length * (weights * (_bell(u) * strip)).sum(0)
+    straight = _interval(*across, sigma_x) * _interval(*along, sigma_y)
+    return torch.where(xy == 0, straight, total)
+
+
+def _pieces(a: Tensor, b: Tensor, y0: Tensor, y1: Tensor, rho: Tensor, r: Tensor) -> list[Tensor]:
+    """Where to cut the integral over u: both ends of {g ≤ g(u*) + 74}, u*, and both ends of both steps of Φ.
+
+    u² + (y - ρu)²/r² = R² at u = ρy ± r √(R² - y²), and is least, y², at u = ρy.
+    """
+    floor = 1e-18 if r.dtype == torch.float64 else 1e-9
+    peak = torch.where(y0 > 0, rho * y0, torch.where(y1 < 0, rho * y1, 0.0))
+    peak = torch.minimum(torch.maximum(peak, a), b)
+    beyond = torch.maximum(y0 - rho * peak, rho * peak - y1).clamp_min(0.0) / r.clamp_min(floor)
+    R = torch.sqrt(peak * peak + beyond * beyond + _DROP)
+    reach0, reach1 = (r * safe_sqrt(R * R - y * y) for y in (y0, y1))
+    first = torch.maximum(
+        torch.where(y0 > -rho * R, rho * y0 - reach0, -R), torch.where(y1 < -rho * R, rho * y1 - reach1, -R)
+    )
+    last = torch.minimum(
+        torch.where(y1 < rho * R, rho * y1 + reach1, R), torch.where(y0 > rho * R, rho * y0 + reach0, R)
+    )
+    first, last = torch.maximum(first, a), torch.minimum(last, b)
+    steps = [y / rho.clamp_min(floor) for y in (y0, y0 + _SATURATED * r, y1 - _SATURATED * r, y1)]
+    return [first, last, *(torch.minimum(torch.maximum(t, first), last) for t in (peak, *steps))]

@@ -1,0 +1,294 @@
+"""AGF, the file format of glass catalogs: a Catalog from a file and back."""
+
+import codecs
+import math
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+import torch
+from torch import Tensor
+
+from raytrace.files import read_bytes, write_atomically
+from raytrace.media.dispersion import AGF_FORMULAS, COEFFICIENT_COUNTS
+from raytrace.media.glass import Glass
+
+_STATUSES = {0: "standard", 1: "preferred", 2: "obsolete", 3: "special", 4: "melt"}
+_NUMERIC = ("CD", "TD", "ED", "MD", "OD", "LD", "IT")
+_KEYWORDS = ("CC", "NM", "GC", *_NUMERIC)
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?", re.ASCII)
+_LARGEST_FILE = 64 * 2**20
+
+
+class CatalogError(ValueError):
+    """A glass catalog cannot be read: says file and line, what was found, what was expected and the likely fix."""
+
+
+class CatalogWarning(UserWarning):
+    """A catalog was read, but something in it was left aside."""
+
+
+@dataclass(frozen=True, eq=False)
+class Catalog:
+    """A glass catalog: `name`, its `glasses` by name in file order, and the comment lines of its header."""
+
+    name: str
+    glasses: Mapping[str, Glass]
+    comments: tuple[str, ...] = ()
+
+    def find(self, name: str) -> Glass | None:
+        """The glass of this name, or of this name but for upper and lower case; None if there is none."""
+        if name in self.glasses:
+            return self.glasses[name]
+        return next((glass for listed, glass in self.glasses.items() if listed.upper() == name.upper()), None)
+
+
+# -- reading ----------------------------------------------------------------------------------------------------------
+
+
+def read_agf(path: str | Path) -> Catalog:
+    """Read a glass catalog in AGF format: UTF-16, UTF-8 or Latin-1, any line ends.
+
+    Raises CatalogError; warns CatalogWarning of records it does not know and of a name defined twice.
+    """
+    return parse_agf(read_text(path), path)
+
+
+def read_text(path: str | Path) -> str:
+    """The text of a catalog's file, however it is encoded. Raises CatalogError."""
+    path = Path(path)
+    try:
+        content = read_bytes(path, _LARGEST_FILE)
+    except OSError as error:
+        raise CatalogError(f"{path}: cannot be read ({error.strerror or error}); expected a glass catalog") from error
+    return decode(content, path)
+
+
+def decode(content: bytes, path: str | Path) -> str:
+    """Text of a file that does not say how it is encoded: by its byte-order mark, else by where its zeros lie."""
+    sample = content[:4096]
+    half = max(len(sample) // 2, 1)
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        encoding = "utf-16"
+    elif sample[1::2].count(0) > 0.4 * half:
+        encoding = "utf-16-le"
+    elif sample[0::2].count(0) > 0.4 * half:
+        encoding = "utf-16-be"
+    else:
+        encoding = "utf-8-sig"
+    try:
+        text = content.decode(encoding)
+    except UnicodeDecodeError as error:
+        if encoding != "utf-8-sig":
+            raise CatalogError(f"{path}: damaged {encoding.upper()} text at byte {error.start}; cut off?") from error
+        text = content.decode("latin-1")
+    text = text.rstrip("\x1a\0")  # end-of-file marks of old programs
+    binary = re.search(r"[\0-\x08\x0e-\x1f]", text)
+    if binary:
+        line = text.count("\n", 0, binary.start()) + 1
+        raise CatalogError(
+            f"{path}:{line}: found binary data (byte {ord(binary[0]):#04x}), expected the text of an AGF"
+        )
+    return text
+
+
+def parse_agf(text: str, path: str | Path) -> Catalog:
+    """The catalog written in the text of an AGF file; `path` gives its name and its place in messages."""
+    path = Path(path)
+    name, comments, glasses = path.stem.upper(), [], {}
+    unknown: dict[str, int] = {}
+    for block in _blocks(_records(text, unknown)):
+        comments += [rest for _, keyword, rest in block if keyword == "CC" and rest]
+        if block[0][1] != "NM":
+            stray = next((record for record in block if record[1] != "CC"), None)
+            if stray:
+                raise _fault(path, stray[0], f"a {stray[1]} record before any glass", "an NM record first")
+            continue
+        glass = _glass(block, name, path)
+        first = glasses.setdefault(glass.listed_name, glass)
+        if first is not glass:
+            message = f"{path}:{block[0][0]}: {glass.listed_name} is defined again; the first definition holds"
+            warnings.warn(message, CatalogWarning, stacklevel=3)
+    if not glasses:
+        raise _fault(path, 1, "no glass", "an AGF catalog, with one NM record for each glass")
+    if unknown:
+        listed = ", ".join(f"{word!r} (line {line})" for word, line in list(unknown.items())[:5])
+        warnings.warn(f"{path}: left aside lines that begin with {listed}", CatalogWarning, stacklevel=3)
+    return Catalog(name, MappingProxyType(glasses), tuple(comments))
+
+
+def _fault(path: Path, line: int, found: str, expected: str, fix: str = "") -> CatalogError:
+    return CatalogError(f"{path}:{line}: found {found}, expected {expected}" + (f"; {fix}" if fix else ""))
+
+
+def _records(text: str, unknown: dict[str, int]) -> Iterator[tuple[int, str, str]]:
+    """(line, keyword, rest) of every record.
+
+    A line that begins with a number continues the numeric record before it; one that begins with "!" explains a
+    status; what is neither is noted in `unknown` as word -> line.
+    """
+    line_of_record, keyword, parts = 0, "", []
+    for line, content in enumerate(re.split(r"\r\n|\r|\n", text), 1):
+        word, *rest = content.split(maxsplit=1) or [""]
+        if not word or word.startswith("!"):
+            continue
+        if keyword in _NUMERIC and _NUMBER.fullmatch(word):
+            parts.append(content)
+        elif word in _KEYWORDS:
+            if keyword:
+                yield line_of_record, keyword, " ".join(parts).strip()
+            line_of_record, keyword, parts = line, word, rest
+        elif len(unknown) < 100:
+            unknown.setdefault(word[:20], line)
+    if keyword:
+        yield line_of_record, keyword, " ".join(parts).strip()
+
+
+def _blocks(records: Iterator[tuple[int, str, str]]) -> Iterator[list[tuple[int, str, str]]]:
+    """The records of each glass, its NM first; the file's header, if any, before them."""
+    block: list[tuple[int, str, str]] = []
+    for record in records:
+        if record[1] == "NM" and block:
+            yield block
+            block = []
+        block.append(record)
+    if block:
+        yield block
+
+
+def _glass(block: Sequence[tuple[int, str, str]], catalog: str, path: Path) -> Glass:
+    line, _, rest = block[0]
+    words = rest.split()
+    if len(words) < 5:
+        raise _fault(path, line, f"NM {rest[:40]}", "NM name formula code nd Vd …", "is the line cut off?")
+    name = words[0]
+    number, nd_listed, abbe_listed, *flags = _numbers([words[1], *words[3:7]], path, line, blanks=True)
+    formula = AGF_FORMULAS.get(number)
+    if formula is None:
+        raise _fault(path, line, f"dispersion formula {words[1]} for {name}", "1 to 13, as the AGF format numbers them")
+    comment = "\n".join(text for _, keyword, text in block if keyword == "GC" and text)
+    listing = re.search(r"\balternatives: *([^;\n]+)", comment)
+    unlisted = nd_listed <= 0 or (nd_listed == 1 and abbe_listed == 0)  # what catalogs write where nd is not known
+    return Glass(
+        name=name,
+        formula=formula,
+        coefficients=_coefficients(block, name, formula, path),
+        catalog=catalog,
+        wavelength_range=_wavelength_range(block, name, path),
+        status=_STATUSES.get(flags[1], "") if len(flags) > 1 else "",
+        nd_listed=None if unlisted else nd_listed,
+        abbe_listed=None if unlisted else abbe_listed,
+        alternatives=tuple(listing[1].replace(",", " ").split()) if listing else (),
+        listed_name=name,
+        comment=comment,
+        records=tuple(
+            (keyword, _numbers(text.split(), path, line, blanks=True))
+            for line, keyword, text in block
+            if keyword in ("ED", "TD", "MD", "OD", "IT") and text
+        ),
+    )
+
+
+def _coefficients(block: Sequence[tuple[int, str, str]], name: str, formula: str, path: Path) -> Tensor:
+    line, text = _only(block, "CD", name, path)
+    numbers, count = _numbers(text.split(), path, line), COEFFICIENT_COUNTS[formula]
+    if len(numbers) < count:
+        expected = f"at least {count} for formula {formula}"
+        raise _fault(path, line, f"{len(numbers)} coefficients for {name}", expected, "is the line cut off?")
+    return torch.tensor(numbers[:count], dtype=torch.float64)
+
+
+def _wavelength_range(block: Sequence[tuple[int, str, str]], name: str, path: Path) -> tuple[float, float] | None:
+    line, text = _only(block, "LD", name, path)
+    numbers = _numbers(text.split(), path, line)[:2]
+    if numbers == (0.0, 0.0):
+        return None
+    if len(numbers) < 2 or not 0 < numbers[0] < numbers[1]:
+        raise _fault(path, line, f"LD {text[:40]} for {name}", "the shortest and the longest wavelength in µm")
+    return numbers
+
+
+def _only(block: Sequence[tuple[int, str, str]], keyword: str, name: str, path: Path) -> tuple[int, str]:
+    """The one record of a keyword that every glass must have, (line, text).
+
+    A second one is the sign of a lost NM line, and must not give one glass the figures of the next.
+    """
+    found = [(line, text) for line, key, text in block if key == keyword]
+    if not found:
+        raise _fault(path, block[-1][0], f"{name} without a {keyword} record", "one", "is the file cut off?")
+    if len(found) > 1:
+        fix = "is the NM line of the next glass missing or misspelt?"
+        raise _fault(path, found[1][0], f"a second {keyword} record for {name}", "one for each glass", fix)
+    return found[0]
+
+
+def _numbers(words: Sequence[str], path: Path, line: int, *, blanks: bool = False) -> tuple[float, ...]:
+    """Numbers of a record; where `blanks`, "-" and "_" stand for a figure that is not known, which AGF writes as -1."""
+    numbers = []
+    for word in words:
+        if blanks and word in ("-", "_"):
+            word = "-1"
+        try:
+            number = float(word if "D" not in word else word.replace("D", "E"))  # Fortran writes 1.0D-03
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number) or "_" in word:
+            fix = "write decimals with a point" if "," in word else "is the line damaged?"
+            raise _fault(path, line, repr(word[:40]), "a finite number", fix)
+        numbers.append(number)
+    return tuple(numbers)
+
+
+# -- writing ----------------------------------------------------------------------------------------------------------
+
+
+def write_agf(catalog: Catalog, path: str | Path) -> None:
+    """Write a catalog as an AGF file in UTF-8, every number so that it reads back to the same bits; atomically.
+
+    Raises ValueError for a glass that the format cannot hold (its formula, or a blank in its name).
+    """
+    content = format_agf(catalog).encode()
+    write_atomically(path, lambda file: file.write(content))
+
+
+def format_agf(catalog: Catalog) -> str:
+    """The text of an AGF file."""
+    lines = [f"CC {comment}" for comment in catalog.comments or (catalog.name,)]
+    for listed, glass in catalog.glasses.items():
+        lines += _glass_lines(listed, glass)
+    return "\n".join(lines) + "\n"
+
+
+def _glass_lines(name: str, glass: Glass) -> list[str]:
+    numbers = {formula: number for number, formula in AGF_FORMULAS.items()}
+    if glass.formula not in numbers or len(name.split()) != 1:
+        raise ValueError(f"glass {name!r} with formula {glass.formula!r} cannot be written as AGF")
+    n, v = (1.0, 0.0) if glass.nd_listed is None else (glass.nd_listed, glass.abbe_listed)
+    code = f"{round(n * 1000) % 1000:03d}{round(v * 10) % 1000:03d}"
+    status = next((number for number, status in _STATUSES.items() if status == glass.status), -1)
+    coefficients = glass.coefficients.tolist()
+    coefficients += [0.0] * (10 - len(coefficients))
+    span = glass.wavelength_range or (0.0, 0.0)
+    before = [_record(*record) for record in glass.records if record[0] == "ED"]
+    after = [_record(*record) for record in glass.records if record[0] in ("TD", "MD", "OD")]
+    transmissions = [_record(*record) for record in glass.records if record[0] == "IT"]
+    return [
+        f"NM {name} {numbers[glass.formula]} {code} {_spell(n)} {_spell(v)} 0 {status} -1",
+        *[f"GC {comment}" for comment in glass.comment.split("\n") if comment],
+        *before,
+        _record("CD", coefficients),
+        *after,
+        _record("LD", span),
+        *transmissions,
+    ]
+
+
+def _record(keyword: str, numbers: Sequence[float]) -> str:
+    return " ".join([keyword, *map(_spell, numbers)])
+
+
+def _spell(number: float) -> str:
+    return repr(float(number)).removesuffix(".0")

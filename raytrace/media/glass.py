@@ -1,0 +1,249 @@
+"""Glass: media by their dispersion formulas (`dispersion.py`), and the door where a wavelength is refused.
+
+Two ways to an index, on purpose:
+
+* `refractive_index(glass, wavelength)` is pure mathematics, for use inside `torch.func`, `torch.compile` and
+  optimisation. Where the formula has no real index (n² ≤ 0, a pole, a wavelength that is no length) it returns 0 with
+  gradient 0, never NaN: 0 is the index of no medium and reads as the mask `index > 0`.
+* `check_wavelengths(glass, wavelengths)` is the door: it raises `InvalidIndex` there and warns `OutOfRange` where the
+  glass's coefficients were not fitted. `index(glass, wavelength)` is both in one call.
+
+Wavelengths in µm, indices relative to air at the catalog's reference temperature.
+"""
+
+import math
+import warnings
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from raytrace.maths.numerics import safe_divide
+from raytrace.maths.value import value
+from raytrace.media.dispersion import FORMULAS
+
+#: Spectral lines, µm (ISO 7944 and the neighbours that catalogs list).
+LINES = {
+    "i": 0.3650146,
+    "h": 0.4046561,
+    "g": 0.4358343,
+    "F'": 0.4799914,
+    "F": 0.4861327,
+    "e": 0.5460740,
+    "d": 0.5875618,
+    "D": 0.5892938,
+    "C'": 0.6438469,
+    "C": 0.6562725,
+    "r": 0.7065188,
+    "s": 0.8521100,
+    "t": 1.0139800,
+}
+
+#: Wavelengths, µm, outside which no formula is evaluated: powers down to λ⁻¹² and their derivatives stay finite inside.
+_SHORTEST, _LONGEST = 1e-20, 1e12
+#: Relative slack at the ends of a wavelength range: a few float32 spacings.
+_RANGE_SLACK = 1e-6
+
+
+class InvalidIndex(ValueError):
+    """A glass has no real, positive refractive index at a wavelength asked of it."""
+
+
+class OutOfRange(UserWarning):
+    """A wavelength lies outside the range that the coefficients of a glass were fitted to."""
+
+
+@value
+class Glass:
+    """A refracting medium: a dispersion formula with its coefficients.
+
+    name: as written in the lens file, "" for air.
+    formula: key of FORMULAS ("constant", "model", "schott", "sellmeier_1", ...), or "mirror".
+    coefficients: (m, ...) of the formula, float64; trailing axes broadcast against the wavelength.
+    catalog: name of the catalog the glass came from, "" if none.
+    wavelength_range: µm (shortest, longest) or None.
+    status: "standard", "preferred", "obsolete", "special", "melt", or "" if not listed.
+    nd_listed, abbe_listed: n_d and V_d as the catalog lists them (rounded by its maker), None if it does not.
+    alternatives: names of present-day glasses of the same catalog that come near, as the catalog comments say.
+    listed_name: the catalog's own spelling of the name.
+    comment: the catalog's comment on the glass.
+    records: further figures of the catalog, (keyword, numbers) in file order: ED, TD, MD, OD, IT.
+    """
+
+    name: str
+    formula: str
+    coefficients: Tensor
+    catalog: str = ""
+    wavelength_range: tuple[float, float] | None = None
+    status: str = ""
+    nd_listed: float | None = None
+    abbe_listed: float | None = None
+    alternatives: tuple[str, ...] = ()
+    listed_name: str = ""
+    comment: str = ""
+    records: tuple[tuple[str, tuple[float, ...]], ...] = ()
+
+
+# -- the index --------------------------------------------------------------------------------------------------------
+
+
+def refractive_index(glass: Glass, wavelength: Tensor) -> Tensor:
+    """n of a glass, evaluated in float64; 0 with gradient 0 where the formula has no real, positive index.
+
+    wavelength: (...) µm; a constant index takes any number. Returns (...), broadcast with the trailing axes of the
+    coefficients, in the dtype and on the device of `wavelength`. No check, no warning, no host synchronisation: see
+    the module's docstring.
+    Raises InvalidIndex for MIRROR, which has no index: light stays in the medium before it.
+    """
+    if glass.formula == "mirror":
+        raise InvalidIndex("a mirror has no refractive index: the light stays in the medium before it")
+    exact = wavelength.to(torch.float64)
+    coefficients = glass.coefficients.to(device=wavelength.device, dtype=torch.float64)
+    count, *batch = coefficients.shape
+    coefficients = coefficients.reshape(count, *[1] * (exact.dim() - len(batch)), *batch)
+    if glass.formula == "constant":  # air is half of all media: no formula, no wavelength
+        n = FORMULAS["constant"](coefficients, exact)
+        return torch.where((n > 0) & (n < torch.inf), n, 0.0).to(wavelength.dtype)
+    finite = coefficients.abs() < torch.inf
+    usable = (exact > _SHORTEST) & (exact < _LONGEST) & finite.all(0)
+    n = FORMULAS[glass.formula](torch.where(finite, coefficients, 0.0), torch.where(usable, exact, 1.0))
+    return torch.where(usable & (n > 0) & (n < torch.inf), n, 0.0).to(wavelength.dtype)
+
+
+def check_wavelengths(glass: Glass, wavelengths: Tensor | Sequence[float] | float, *, where: str = "") -> None:
+    """Refuse wavelengths (µm) at which a glass has no index; warn of those outside its range.
+
+    where: the place to name in the message ("lens.zmx:31, surface 2"). Raises InvalidIndex; warns OutOfRange.
+    """
+    if glass.formula == "mirror":
+        return
+    wavelengths = _as_wavelength(wavelengths).detach()
+    place = f"{where}: " if where else ""
+    name = f"{glass.name or 'medium'} ({glass.catalog})" if glass.catalog else glass.name or "medium"
+    span = glass.wavelength_range
+    fitted = f"its coefficients hold from {span[0]:g} to {span[1]:g} µm" if span else "it lists no wavelength range"
+    n = refractive_index(glass, wavelengths).detach()
+    exists = (n > 0) & (wavelengths > 0) & torch.isfinite(wavelengths)
+    missing = wavelengths.expand(exists.shape)[~exists]
+    if missing.numel():
+        raise InvalidIndex(
+            f"{place}{name} has no real refractive index at {_spell(missing)} µm (formula {glass.formula}: "
+            f"n² ≤ 0, a pole, or not a wavelength); {fitted}. Check the wavelength, in µm, or choose another glass"
+        )
+    if span:
+        shortest, longest = span[0] * (1 - _RANGE_SLACK), span[1] * (1 + _RANGE_SLACK)
+        outside = wavelengths[(wavelengths < shortest) | (wavelengths > longest)]
+        if outside.numel():
+            message = f"{place}{name} is extrapolated to {_spell(outside)} µm; {fitted}"
+            warnings.warn(message, OutOfRange, stacklevel=2)
+
+
+def index(glass: Glass, wavelength: Tensor | float) -> Tensor:
+    """n of a glass at wavelengths (...) µm, checked: raises InvalidIndex, warns OutOfRange (`check_wavelengths`)."""
+    wavelength = _as_wavelength(wavelength)
+    check_wavelengths(glass, wavelength)
+    return refractive_index(glass, wavelength)
+
+
+def _as_wavelength(wavelength: Tensor | Sequence[float] | float) -> Tensor:
+    if isinstance(wavelength, Tensor) and wavelength.is_floating_point():
+        return wavelength
+    return torch.as_tensor(wavelength, dtype=torch.float64)
+
+
+def _spell(wavelengths: Tensor) -> str:
+    listed = list(dict.fromkeys(f"{number:.7g}" for number in wavelengths.flatten().tolist()))
+    return ", ".join(listed[:5]) + (f" and {len(listed) - 5} more" if len(listed) > 5 else "")
+
+
+def _at_lines(glass: Glass, lines: str) -> tuple[Tensor, ...]:
+    device = glass.coefficients.device
+    return tuple(
+        refractive_index(glass, torch.tensor(LINES[line], dtype=torch.float64, device=device)) for line in lines
+    )
+
+
+def nd(glass: Glass) -> Tensor:
+    """n at the helium d line (0.5875618 µm), by the formula also where that lies outside the glass's range."""
+    return _at_lines(glass, "d")[0]
+
+
+def abbe_number(glass: Glass) -> Tensor:
+    """V_d = (n_d - 1)/(n_F - n_C); 0 for a medium without dispersion, as lens files write it."""
+    d, blue, red = _at_lines(glass, "dFC")
+    return safe_divide(d - 1.0, blue - red)
+
+
+# -- media ------------------------------------------------------------------------------------------------------------
+
+
+def constant(index: float | Tensor, name: str = "") -> Glass:
+    """A medium of one refractive index at every wavelength."""
+    return Glass(name, "constant", torch.as_tensor(index, dtype=torch.float64).reshape(1))
+
+
+def sellmeier(strengths: Tensor | Sequence[float], poles: Tensor | Sequence[float], name: str = "", **known) -> Glass:
+    """The glass n² = 1 + Σ_i B_i λ²/(λ² - C_i): strengths B_i and poles C_i (µm²), (m, ...) with m ≤ 5.
+
+    known: further fields of Glass, such as `wavelength_range`.
+    """
+    b, c = (torch.as_tensor(part, dtype=torch.float64) for part in (strengths, poles))
+    terms = next((terms for terms in (3, 4, 5) if terms >= b.shape[0]), None)
+    if b.shape[:1] != c.shape[:1] or terms is None:
+        raise ValueError(f"expected as many strengths as poles and at most 5, found {b.shape[0]} and {c.shape[0]}")
+    b, c = torch.broadcast_tensors(b, c)
+    pairs = torch.stack([b, c], 1).flatten(0, 1)
+    padding = pairs.new_zeros(2 * terms - pairs.shape[0], *pairs.shape[1:])
+    return Glass(
+        name, {3: "sellmeier_1", 4: "sellmeier_3", 5: "sellmeier_5"}[terms], torch.cat([pairs, padding]), **known
+    )
+
+
+def model_glass(nd: float | Tensor, vd: float | Tensor, dpgf: float | Tensor = 0.0, *, name: str = "") -> Glass:
+    """The medium of index n_d, Abbe number V_d and deviation ΔP_gF from the normal line (`FORMULAS["model"]`).
+
+    Differentiable in all three. V_d = 0 is a constant index. Raises ValueError where a number is not finite or nd ≤ 0.
+    """
+    numbers = torch.broadcast_tensors(*(torch.as_tensor(part, dtype=torch.float64) for part in (nd, vd, dpgf)))
+    coefficients = torch.stack(numbers)
+    if not (torch.isfinite(coefficients).all() and (numbers[0] > 0).all() and (numbers[1] >= 0).all()):
+        raise ValueError(f"a model glass needs finite nd > 0, Vd ≥ 0 and ΔPgF; found {nd}, {vd}, {dpgf}")
+    return Glass(name, "model", coefficients)
+
+
+def mil_glass(code: str) -> Glass:
+    """The model glass of a six-digit code: "517642" is n_d = 1.517, V_d = 64.2.
+
+    The code holds three decimals of n_d - 1, so an index of 2 or more cannot be written (003283 reads 1.003).
+    Raises ValueError for anything but six digits.
+    """
+    if len(code) != 6 or not (code.isascii() and code.isdigit()):
+        raise ValueError(f"a MIL glass code is six digits, as 517642 for nd = 1.517 and Vd = 64.2; found {code!r}")
+    return model_glass(float(f"1.{code[:3]}"), float(f"{code[3:5]}.{code[5]}"), name=code)
+
+
+def normal_line_deviation(glass: Glass) -> Tensor:
+    """ΔP_gF = (n_g - n_F)/(n_F - n_C) - 0.6438 + 0.001682 V_d, the number a model glass takes; 0 without dispersion."""
+    violet, blue, red = _at_lines(glass, "gFC")
+    normal = 0.6438 - 0.001682 * abbe_number(glass)
+    return torch.where(blue == red, 0.0, safe_divide(violet - blue, blue - red) - normal)
+
+
+def listing_error(glass: Glass) -> tuple[float, float]:
+    """How far n_d and V_d by the coefficients lie from the listed ones; (nan, nan) where the catalog lists none."""
+    if glass.nd_listed is None or glass.abbe_listed is None:
+        return math.nan, math.nan
+    return float(nd(glass)) - glass.nd_listed, float(abbe_number(glass)) - glass.abbe_listed
+
+
+#: How far from 1 the index of a gas may be: air at 1 atm has 1.0003, carbon dioxide 1.0005.
+_GAS = 1e-3
+
+
+def is_air(glass: Glass) -> bool:
+    """Whether a medium is air, or as thin as it: its index at the d line is 1 to 1e-3, whatever its name."""
+    return glass.formula != "mirror" and bool(((nd(glass).detach() - 1).abs() < _GAS).all())
+
+
+AIR = constant(1.0)
+MIRROR = Glass("MIRROR", "mirror", torch.ones(1, dtype=torch.float64))

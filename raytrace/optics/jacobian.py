@@ -1,0 +1,66 @@
+"""Jacobian: how every hit moves with every variable of the lens, in one forward pass over the rays.
+
+A gradient goes backward, from one merit to all variables. The Jacobian has as many rows as there are rays: it goes
+forward, each change through the surfaces behind it, all of them while a block of rays is in the cache. Least squares
+(Gauss-Newton, Levenberg-Marquardt) live on it.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from raytrace.fused.choice import is_fused
+from raytrace.fused.run import Task, push, task_of
+from raytrace.fused.structure import is_expressible, with_numbers
+from raytrace.optics.trace import trace_surfaces
+from raytrace.system.rays import Rays
+from raytrace.system.surface import Surface
+
+
+def hit_jacobian(
+    surfaces: Sequence[Surface], rays: Rays, variables: Sequence[Tensor], *, indices: Sequence[Tensor]
+) -> Tensor:
+    """∂(x, y)/∂v (V, 2, ...) of the hits on the last surface by every entry of the variables, in their order.
+
+    variables: tensors that require a gradient and that numbers of the surfaces or indices were computed from, or are;
+    V counts all their entries. surfaces, rays, indices: as for `trace.steps`, the rays before surfaces[0] held fixed.
+    Rays that are lost do not move. Raises ValueError for a departure from even aspheres, for more than 16 of their
+    terms, and for numbers of a lens that differ from ray to ray of the last axis.
+    """
+    task = task_of(surfaces, rays, indices=indices) if all(map(is_expressible, surfaces)) else None
+    if task is None:
+        raise ValueError(
+            "no Jacobian for departures, more than 16 terms, numbers of another dtype than the rays, or numbers that "
+            "differ along the last axis of the rays: use torch.func.jacfwd on the trace"
+        )
+    changes = _changes(task.given[3], variables)
+    if is_fused(rays, changes, len(surfaces)):
+        return push(task, changes)[0][:, :2]
+    return torch.stack([_pushed_by_torch(surfaces, task, change) for change in changes])
+
+
+def _changes(table: Tensor, variables: Sequence[Tensor]) -> Tensor:
+    """∂table/∂v (V, rows, K)."""
+    every = torch.eye(table.numel(), dtype=table.dtype, device=table.device)
+    found = torch.autograd.grad(
+        table.reshape(-1), list(variables), every, retain_graph=True, is_grads_batched=True, allow_unused=True
+    )
+    columns = [
+        table.new_zeros(v.numel(), table.numel()) if g is None else g.reshape(table.numel(), -1).T
+        for v, g in zip(variables, found, strict=True)
+    ]
+    return torch.cat(columns).reshape(-1, *table.shape)
+
+
+def _pushed_by_torch(surfaces: Sequence[Surface], task: Task, change: Tensor) -> Tensor:
+    """The same of one change (rows, K): (2, ...)."""
+    position, direction, opl, table = task.given
+
+    def hits(table: Tensor) -> Tensor:
+        shape = *task.valid.shape[:-1], 1
+        numbers = [n.reshape(()) if len(table) == 1 else n.reshape(shape) for n in table.unbind(-1)]
+        own, indices, _ = with_numbers(task.structure, surfaces, numbers)
+        return trace_surfaces(own, Rays(position, direction, task.valid, opl), indices=indices).position[:2]
+
+    return torch.func.jvp(hits, (table.detach(),), (change,))[1]

@@ -1,0 +1,308 @@
+"""Trace rays through a sequence of surfaces: transfer, intersect, refract or reflect, clip.
+
+The trace is a generator. To record, draw or find where a ray was lost, consume `steps`; to trace on from stored
+rays, hand them with the surfaces that are left.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from raytrace.fused.choice import is_fused
+from raytrace.fused.run import trace_compiled
+from raytrace.fused.structure import is_expressible
+from raytrace.maths.numerics import dot, unit, with_batch_axes
+from raytrace.maths.value import value
+from raytrace.media import glass
+from raytrace.system.lens import Lens
+from raytrace.system.rays import Rays
+from raytrace.system.surface import Surface, in_double, inside, meet, normal
+
+
+@value
+class Crossing:
+    """What happened to rays at one surface.
+
+    rays: Rays behind the surface, in its vertex frame.
+    missed, totally_reflected: (...) bool, the ray ends here for that reason; also one vignetted before, which goes on.
+    clipped: (...) bool, the ray was vignetted here, and not lost before.
+    """
+
+    rays: Rays
+    missed: Tensor
+    totally_reflected: Tensor
+    clipped: Tensor
+
+
+def refract(direction, normal, cosine, norm_squared, n1: Tensor, n2: Tensor, b_squared: Tensor | None = None):
+    """Snell's law n1 sin θ1 = n2 sin θ2 as a vector, and whether light passes (False: total internal reflection).
+
+        d' = (n1/n2) d + sign(n·d) D/(a + b)/n2 n,   D = (n2 - n1)(n2 + n1),   a = n1 |n·d|,   b = √(a² + D |n|²)
+
+    direction: unit, by components; normal: by components, of squared length norm_squared; cosine: n·d.
+    b_squared: b² in float64 where it is known better than by these numbers; it then decides.
+    No 1 - cos² anywhere: equal indices return d exactly, and grazing rays keep their digits. The squared length of
+    d' is then brought to 1 within rounding, by a factor that is 1 identically and so is not differentiated.
+    """
+    a = n1 * cosine
+    D = (n2 - n1) * (n2 + n1)
+    exact, b_squared = b_squared, torch.addcmul(D * norm_squared, a, a)
+    passes = (b_squared if exact is None else exact) > 0
+    if exact is not None:
+        smallest = torch.finfo(b_squared.dtype).tiny
+        b_squared = exact.to(b_squared.dtype).clamp_min(smallest) + (b_squared - b_squared.detach())
+    b = torch.sqrt(torch.where(passes, b_squared, 1.0))
+    # An index of 0 is a medium without a real index: nothing passes into it.
+    n2 = torch.where(n2 > 0, n2, 1.0)
+    along_normal = (D / n2) / (a + torch.copysign(b, a))
+    ratio = n1 / n2
+    refracted = [torch.addcmul(ratio * d, along_normal, n) for d, n in zip(direction, normal, strict=True)]
+    return _renormalise(refracted), passes
+
+
+def _snell_discriminant(surface: Surface, hit, direction, n1: Tensor, n2: Tensor) -> Tensor:
+    """b² of `refract` in float64, outside the graph."""
+    with torch.no_grad():
+        n, norm_squared = normal(in_double(surface), hit)
+        n1, n2 = n1.double(), n2.double()
+        a = n1 * dot(n, direction)
+        return torch.addcmul((n2 - n1) * (n2 + n1) * torch.as_tensor(norm_squared), a, a).detach()
+
+
+def reflect(direction, normal, cosine, norm_squared):
+    """Law of reflection d' = d - 2 (n·d) n / |n|²; arguments as for `refract`."""
+    twice = 2 * cosine / norm_squared
+    return _renormalise([torch.addcmul(d, twice, n, value=-1) for d, n in zip(direction, normal, strict=True)])
+
+
+def _renormalise(direction):
+    detached = [d.detach() for d in direction]
+    factor = torch.rsub(dot(detached, detached), 1.5, alpha=0.5)
+    return [d * factor for d in direction]
+
+
+class _Ray(NamedTuple):
+    """Rays by components, as the loop over surfaces carries them."""
+
+    position: Sequence[Tensor]
+    direction: Sequence[Tensor]
+    valid: Tensor
+    opl: Tensor | None
+
+    @staticmethod
+    def of(rays: Rays) -> "_Ray":
+        return _Ray(rays.position.unbind(0), rays.direction.unbind(0), rays.valid, rays.opl)
+
+    def rays(self) -> Rays:
+        x, y, z, L, M, N = torch.broadcast_tensors(*self.position, *self.direction)
+        return Rays(torch.stack([x, y, z]), torch.stack([L, M, N]), self.valid, self.opl)
+
+
+def cross(surface: Surface, rays: Rays, gap: Tensor | None, side: int, n1: Tensor, n2: Tensor) -> Crossing:
+    """Carry rays over the gap before a surface and through the surface.
+
+    rays: in the frame of the surface before, or of this one if gap is None; gap: mm between the two vertices;
+    side: σ = ±1, the axial direction of light in the gap; n1, n2: (...) indices before and behind.
+    If n2 is the same tensor as n1 the surface is a dummy and does not bend.
+    """
+    return _crossing(_Ray.of(rays), *_cross(surface, _Ray.of(rays), gap, side, n1, n2))
+
+
+def _crossing(before: _Ray, after: _Ray, met: Tensor, passes: Tensor | None, clear: Tensor | None) -> Crossing:
+    survives = met if passes is None else met & passes
+    return Crossing(
+        after.rays(),
+        ~met,
+        torch.zeros_like(met) if passes is None else met & ~passes,
+        torch.zeros_like(after.valid) if clear is None else before.valid & survives & ~clear,
+    )
+
+
+def _cross(surface: Surface, rays: _Ray, gap: Tensor | None, side: int, n1: Tensor, n2: Tensor):
+    """Rays behind the surface, and which of those before met it, were not totally reflected, pass its apertures."""
+    direction = rays.direction
+    x, y, z = rays.position
+    arrival = rays.position if gap is None else (x, y, z - gap)
+    hit, cosine, met, known, exact = meet(surface, arrival, direction)
+    opl = rays.opl
+    if opl is not None:
+        opl = opl + n1 * _reduced_path(rays.position, hit, direction, gap, side)
+    passes = None
+    if surface.is_mirror or n2 is not n1:
+        n, norm_squared = normal(surface, hit) if known is None else known
+        if surface.is_mirror:
+            direction = reflect(direction, n, cosine, norm_squared)
+        else:
+            sure = None if exact is None else _snell_discriminant(surface, *exact, n1, n2)
+            direction, passes = refract(direction, n, cosine, norm_squared, n1, n2, sure)
+    survives = met if passes is None else met & passes
+    clear = inside(surface, hit)
+    valid = rays.valid & survives
+    after = _Ray(
+        position=[at if surface.is_plane and i == 2 else torch.where(survives, at, 0.0) for i, at in enumerate(hit)],
+        direction=[torch.where(survives, d, axis) for d, axis in zip(direction, (0.0, 0.0, 1.0), strict=True)],
+        valid=valid if clear is None else valid & clear,
+        opl=opl if opl is None else torch.where(survives, opl, 0.0),
+    )
+    return after, met, passes, clear
+
+
+def _reduced_path(start, hit, direction, gap: Tensor | None, side: int) -> Tensor:
+    """Path from start (old frame) to hit (new frame) less the axial ray's T σ, without forming either.
+
+    t - T σ = (hit - start)·d + T (N - σ),   N - σ = -σ (L² + M²)/(1 + σ N)
+    """
+    path = dot([a - b for a, b in zip(hit, start, strict=True)], direction)
+    if gap is None:
+        return path
+    L, M, N = direction
+    forward = side * N > 0
+    lag = torch.where(forward, -side * (L * L + M * M) / torch.where(forward, 1 + side * N, 1.0), N - side)
+    return path + gap * lag
+
+
+def steps(
+    surfaces: Sequence[Surface],
+    rays: Rays,
+    *,
+    indices: Sequence[Tensor],
+    side: int = 1,
+    gap: Tensor | None = None,
+) -> Iterator[Crossing]:
+    """Yield what happens at each surface in turn.
+
+    rays: before surfaces[0], in its frame, or with `gap` in that of a vertex `gap` mm before it; indices:
+    len(surfaces) + 1 media (...), the first before surfaces[0]; side: axial direction of light before it (-1 behind
+    an odd number of mirrors).
+    """
+    for before, crossed in _walk(surfaces, rays, indices, side, gap):
+        yield _crossing(before, *crossed)
+
+
+def _walk(surfaces: Sequence[Surface], rays: Rays, indices: Sequence[Tensor], side: int, gap: Tensor | None):
+    before = _Ray.of(rays)
+    for surface, n1, n2 in zip(surfaces, indices[:-1], indices[1:], strict=True):
+        crossed = _cross(surface, before, gap, side, n1, n2)
+        yield before, crossed
+        before, gap = crossed[0], surface.thickness
+        side = -side if surface.is_mirror else side
+
+
+def trace_surfaces(
+    surfaces: Sequence[Surface],
+    rays: Rays,
+    *,
+    indices: Sequence[Tensor],
+    side: int = 1,
+    gap: Tensor | None = None,
+) -> Rays:
+    """The rays behind the last of the surfaces; arguments as for `steps`.
+
+    The compiled trace takes the runs of surfaces that it knows, where it pays: see `fused.tracing`.
+    """
+    if torch.compiler.is_compiling():
+        return _eager(surfaces, rays, indices=indices, side=side, gap=gap)
+    first = 0
+    for expressible, run in itertools.groupby(surfaces, is_expressible):
+        last = first + len(list(run))
+        how = {"indices": indices[first : last + 1], "side": side, "gap": gap}
+        rays = (_fused if expressible else _eager)(surfaces[first:last], rays, **how)
+        side = -side if sum(surface.is_mirror for surface in surfaces[first:last]) % 2 else side
+        gap, first = surfaces[last - 1].thickness, last
+    return rays
+
+
+def _fused(surfaces: Sequence[Surface], rays: Rays, **how) -> Rays:
+    if is_fused(rays, how["indices"][0], len(surfaces)):
+        end = trace_compiled(surfaces, rays, **how, eager=_eager)
+        if end is not None:
+            return end
+    return _eager(surfaces, rays, **how)
+
+
+def _eager(surfaces: Sequence[Surface], rays: Rays, *, indices, side: int, gap: Tensor | None) -> Rays:
+    after = None
+    for _, crossed in _walk(surfaces, rays, indices, side, gap):
+        after = crossed[0]
+    return rays if after is None else after.rays()
+
+
+def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:
+    """Refractive index behind every surface, object first; positive also behind a mirror.
+
+    wavelength: (...) µm; returns one tensor (...) for each surface of the lens, in the lens's dtype. A medium that
+    does not change is the same tensor, which tells `cross` that nothing bends.
+    """
+    media: list[glass.Glass] = []
+    for surface in lens.surfaces:
+        same = media and (surface.is_mirror or _same_medium(surface.glass, media[-1]))
+        media.append(media[-1] if same else surface.glass)
+    # Air stands between all elements: each medium is evaluated once, and none for a surface that keeps the one before.
+    distinct = {(medium.formula, id(medium.coefficients)): medium for medium in media}
+    dtype = lens.surfaces[-2].thickness.dtype
+    found = _refractive_indices(list(distinct.values()), wavelength)
+    by_medium = dict(zip(distinct, (n.to(dtype) for n in found), strict=True))
+    return [by_medium[medium.formula, id(medium.coefficients)] for medium in media]
+
+
+def _refractive_indices(glasses: Sequence[glass.Glass], wavelength: Tensor) -> list[Tensor]:
+    """n of each glass, as `refractive_index` gives it; glasses of one formula are evaluated together."""
+    groups: dict[object, list[int]] = {}
+    for number, medium in enumerate(glasses):
+        together = medium.formula not in ("mirror", "constant") and medium.coefficients.dim() == 1
+        groups.setdefault((medium.formula, len(medium.coefficients)) if together else number, []).append(number)
+    found: dict[int, Tensor] = {}
+    for numbers in groups.values():
+        if len(numbers) == 1:
+            found[numbers[0]] = glass.refractive_index(glasses[numbers[0]], wavelength)
+            continue
+        stacked = torch.stack([glasses[number].coefficients for number in numbers], -1)
+        stacked = stacked.reshape(*stacked.shape, *(1,) * wavelength.dim())
+        indices = glass.refractive_index(
+            dataclasses.replace(glasses[numbers[0]], coefficients=stacked), wavelength[None]
+        )
+        found |= dict(zip(numbers, indices.unbind(0), strict=True))
+    return [found[number] for number in range(len(glasses))]
+
+
+def _same_medium(a: glass.Glass, b: glass.Glass) -> bool:
+    return a is b or (a.formula == b.formula and a.coefficients is b.coefficients)
+
+
+def trace(lens: Lens, rays: Rays, wavelength: Tensor) -> Rays:
+    """Trace rays from the frame of surface 1 to the image surface.
+
+    wavelength: µm, broadcast against the batch shape of the rays. Returns the rays in the frame of the image.
+    """
+    return trace_surfaces(lens.surfaces[1:], rays, indices=media(lens, wavelength))
+
+
+def start(position: Tensor, direction: Tensor, opl: Tensor | None = None) -> Rays:
+    """Rays from points and directions of any length; what is not finite or has no direction is lost from the start.
+
+    position, direction: (3, ...) mm and any unit; opl: (...) mm or None.
+    """
+    axes = max(position.dim(), direction.dim()) - 1
+    position, direction = torch.broadcast_tensors(with_batch_axes(position, axes), with_batch_axes(direction, axes))
+    usable = torch.isfinite(position).all(0) & torch.isfinite(direction).all(0) & (direction != 0).any(0)
+    axis = torch.zeros_like(direction)
+    axis[2] = 1.0
+    return Rays(
+        position=torch.where(usable, position, 0.0),
+        direction=unit(torch.where(usable, direction, axis)),
+        valid=usable,
+        opl=opl if opl is None else torch.where(usable, opl, 0.0),
+    )
+
+
+def axial_path(surfaces: Sequence[Surface], indices: Sequence[Tensor], side: int = 1) -> Tensor:
+    """Σ n T σ (...) in mm of the axial ray, first to last vertex: add it to `Rays.opl` for the full path."""
+    total = torch.zeros_like(indices[0])
+    for surface, n in zip(surfaces[:-1], indices[1:-1], strict=True):
+        side = -side if surface.is_mirror else side
+        total = total + n * surface.thickness * side
+    return total

@@ -1,0 +1,362 @@
+"""Co-design: a lens and a network learned together, then the network refined on ray-traced PSFs.
+
+Step 1 ("joint") learns the variables of the lens and the network with one PSF model. Step 2 ("refine") freezes the lens
+and goes on with the network on ray-traced (DRT) PSFs, the same budget for every model: which model's lens was best?
+
+Every sample is keyed by its number: crop, object distance and noise are the same for all models of a seed.
+"""
+
+import dataclasses
+import json
+import math
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.camera.camera import Camera
+from raytrace.camera.descent import NoOptimum
+from raytrace.camera.limits import parse_range
+from raytrace.camera.network import RedNet, RedNetShape
+from raytrace.camera.spectral import optimise_closed_form, out_of_focus, power_spectrum
+from raytrace.camera.training import DamagedRun, Record, Run, Share, read_json, train
+from raytrace.camera.variables import Variables, parse_bounds
+from raytrace.files import write_atomically
+from raytrace.formats import write_lens
+from raytrace.formats.pictures import Pictures, crop, draws
+from raytrace.maths.grid import grid
+from raytrace.optics.conjugates import distance_in_focus, paraxial_image
+from raytrace.optics.focus import best_focus, focused, real_image_distance
+from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance, with_wavelengths
+
+_SAMPLE = 10  # last number of the key of what a sample draws
+_TEST_EPOCH = 2**20  # test samples are those of an epoch that no training reaches
+STEPS = ("joint", "refine")
+LENS = "lens.zmx"  # of a run: the lens as it was learned
+_INFINITE = ("focus_paraxial_m", "focus_rms_m")  # of an outcome; null in its file
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """All that decides the result of a run. Lengths in mm but for wavelengths in µm; angles in degrees.
+
+    model: PSF model of step 1; vary: variables of the lens; bounds: of some of them, "sensor:57.5,58 thickness_5:8,12".
+    glass_thickness, air_thickness: least, or least and greatest, "2:15"; edge: least of glass at its edge; those that
+    are not given go with the size of the lens (`limits.limits_of`).
+    start: "paraxial" (the sensor at the paraxial image of `focus_distance`), "rms" (at its best focus), "spectral"
+    (from the paraxial image to the optimum of the closed form), or a sensor distance; f_number: EFL over entrance pupil
+    diameter, None for that of the file; wavelengths, the first being the primary one, of which PSFs are sums by
+    wavelength_weights; near, far: object distances, drawn evenly; noise: standard deviation in a range of 1.
+    patch: pixels of what is restored; crops: a picture and epoch; precision: of the network, "float32" or "bfloat16"
+    (`network.faster_precision` tells which this machine prefers).
+    fields: field points in y, samples take them in turn; rate_network, rate_optics: of Adam; tol: of the PSFs; rho: of
+    the paraxial model, σ over the radius of the blur.
+    """
+
+    model: str = "gaussian"
+    seed: int = 0
+    vary: str = "sensor"
+    bounds: str = ""
+    glass_thickness: str = ""
+    air_thickness: str = ""
+    edge: float | None = None
+    start: str = "paraxial"
+    focus_distance: float = 25e3
+    f_number: float | None = None
+    wavelengths: tuple[float, ...] = (0.53,)
+    wavelength_weights: tuple[float, ...] = (1.0,)
+    near: float = 10e3
+    far: float = 50e3
+    fields: tuple[float, ...] = (0.0,)
+    pixel: float = 0.005
+    size: int = 21
+    normalise: str = "window"
+    noise: float = 0.1
+    depth: int = 10
+    width: int = 32
+    epochs: int = 30
+    batch: int = 32
+    patch: int = 64
+    crops: int = 4
+    rate_network: float = 1e-3
+    rate_optics: float = 1e-3
+    precision: str = "float32"
+    tol: float = 1e-2
+    rho: float = 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What one run found: a row of the table.
+
+    l1_joint: on test pictures after step 1, with the PSFs of its own model; l1_drt: after step 2, with DRT PSFs;
+    l1_before: between the two, the network of step 1 on DRT PSFs. focus_paraxial_m, focus_rms_m: object distance from
+    vertex 1 in focus, of paraxial rays and of least RMS spot. by_distance: L1 with DRT PSFs after step 2. penalty: mm²
+    of what thicknesses lack (`limits.violation`), no part of the losses; no_optimum: why the lens is none of least loss
+    ("" where nothing speaks against it).
+    """
+
+    model: str
+    seed: int
+    l1_joint: float
+    l1_before: float
+    l1_drt: float
+    focus_paraxial_m: float
+    focus_rms_m: float
+    sensor_mm: float
+    variables: dict[str, float]
+    by_distance: dict[str, float]
+    penalty: float = 0.0
+    no_optimum: str = ""
+
+
+def lens_at_start(lens: Lens, settings: Settings) -> Lens:
+    """The lens at the wavelengths and aperture of the experiment, focused as it begins.
+
+    Raises NoImage where an object at the focus distance, or between near and far, has no real image.
+    """
+    wavelengths, weights = (lens.wavelengths.new_tensor(n) for n in (settings.wavelengths, settings.wavelength_weights))
+    if weights.shape != wavelengths.shape or not bool((weights >= 0).all() and weights.sum() > 0):
+        raise ValueError(f"{len(weights)} weights of {len(wavelengths)} wavelengths; expected one ≥ 0 for each")
+    lens = with_wavelengths(lens, wavelengths, weights)
+    if settings.f_number is not None:
+        number = SystemAperture("image_f_number", wavelengths.new_tensor(settings.f_number))
+        lens = dataclasses.replace(lens, aperture=number)
+    real_image_distance(lens, wavelengths.new_tensor([settings.near, settings.far]))  # refuses what has none
+    if settings.start in ("paraxial", "rms", "spectral"):
+        return focused(lens, settings.focus_distance, on="rms" if settings.start == "rms" else "paraxial")
+    try:
+        return with_sensor_distance(with_object_distance(lens, settings.focus_distance), float(settings.start))
+    except ValueError as error:
+        raise ValueError(
+            f"start {settings.start!r}: expected paraxial, rms, spectral or a sensor distance in mm"
+        ) from error
+
+
+def variables(lens: Lens, settings: Settings) -> Variables:
+    """The variables of an experiment as it begins, with their bounds and the limits of thicknesses."""
+    return Variables(
+        lens_at_start(lens, settings),
+        settings.vary,
+        bounds=parse_bounds(settings.bounds),
+        glass_thickness=parse_range(settings.glass_thickness) if settings.glass_thickness else None,
+        air_thickness=parse_range(settings.air_thickness) if settings.air_thickness else None,
+        edge=settings.edge,
+    )
+
+
+def camera(lens: Lens, settings: Settings) -> Camera:
+    """The camera of an experiment, as it begins."""
+    like = lens.wavelengths
+    fields = torch.stack([like.new_zeros(len(settings.fields)), like.new_tensor(settings.fields)])
+    if settings.precision not in ("float32", "bfloat16"):
+        raise ValueError(f"precision {settings.precision!r}: expected float32 or bfloat16")
+    return Camera(
+        variables(lens, settings),
+        RedNet(RedNetShape(settings.depth, settings.width), seed=settings.seed).to(memory_format=torch.channels_last),
+        model=settings.model,
+        object_distances=(settings.near, settings.far),
+        fields=fields,
+        pixels=grid(like.new_tensor(settings.pixel), settings.size),
+        normalise=settings.normalise,
+        noise=settings.noise,
+        tol=settings.tol,
+        rho=settings.rho,
+        network_dtype=torch.bfloat16 if settings.precision == "bfloat16" else None,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Batch:
+    """Samples of one step: picture (B, H, W) float32, distance (B,) mm float64, noise (B, h, w) of deviation 1."""
+
+    picture: Tensor
+    distance: Tensor
+    noise: Tensor
+    field: list[int]
+
+
+def batch(pictures: Pictures, settings: Settings, samples: list[int], epoch: int) -> Batch:
+    """The samples of an epoch with these numbers."""
+    size, parts = settings.patch + settings.size - 1, []
+    for sample in samples:
+        patch = crop(pictures, sample, epoch=epoch, size=size, crops=settings.crops, seed=settings.seed)
+        random = draws(settings.seed, epoch, sample, _SAMPLE)
+        distance = random.uniform(settings.near, settings.far)
+        parts.append((patch, distance, random.standard_normal((settings.patch,) * 2, dtype=np.float32)))
+    picture, distance, noise = (np.stack(part) for part in zip(*parts, strict=True))
+    field = [sample % len(settings.fields) for sample in samples]
+    return Batch(torch.as_tensor(picture), torch.as_tensor(distance), torch.as_tensor(noise), field)
+
+
+class Batches:
+    """The batches of a run by step; the next one is made while a step is taken."""
+
+    def __init__(self, pictures: Pictures, settings: Settings):
+        self.pictures, self.settings = pictures, settings
+        self.steps_per_epoch = len(pictures) * settings.crops // settings.batch
+        if not self.steps_per_epoch:
+            raise ValueError(
+                f"{len(pictures)} pictures of {settings.crops} crops do not fill a batch of {settings.batch}: give more"
+            )
+        self._maker = ThreadPoolExecutor(1)
+        self._coming: dict[tuple[int, Share], object] = {}
+
+    def __call__(self, step: int, share: Share) -> Batch:
+        ready = self._coming.pop((step, share), None) or self._make(step, share)
+        self._coming = {(step + 1, share): self._make(step + 1, share)}
+        return ready.result()
+
+    def _make(self, step: int, share: Share):
+        epoch, place = divmod(step, self.steps_per_epoch)
+        first = place * self.settings.batch
+        samples = share.of(range(first, first + self.settings.batch))
+        return self._maker.submit(batch, self.pictures, self.settings, samples, epoch)
+
+
+def absolute_error(camera: Camera, batch: Batch) -> Tensor:
+    """Σ |restored - picture| of every sample, (B,)."""
+    if len(camera.fields[0]) == 1:
+        restored = camera(batch.picture, batch.distance, noise=batch.noise)
+        return (restored - camera.target(batch.picture)).abs().sum((-2, -1))
+    errors = torch.zeros(len(batch.field))
+    for field in sorted(set(batch.field)):
+        where = torch.tensor([i for i, own in enumerate(batch.field) if own == field])
+        restored = camera(batch.picture[where], batch.distance[where], field=field, noise=batch.noise[where])
+        difference = (restored - camera.target(batch.picture[where])).abs().sum((-2, -1))
+        errors = errors.index_put((where,), difference)
+    return errors
+
+
+def optimise(
+    camera: Camera, pictures: Pictures, settings: Settings, run: Run, *, every: int = 50
+) -> Iterator[tuple[int, Record]]:
+    """The steps of one training, one at a time; variables of the lens that need no gradient stay where they are."""
+    batches, pixels = Batches(pictures, settings), settings.batch * settings.patch**2
+    optics = [p for p in camera.variables.parameters() if p.requires_grad]
+    groups = [{"params": list(camera.network.parameters()), "lr": settings.rate_network}]
+    groups += [{"params": optics, "lr": settings.rate_optics}] if optics else []
+
+    def loss(step: int, share: Share) -> tuple[Tensor, Record]:
+        return absolute_error(camera, batches(step, share)).sum() / pixels, camera.variables.numbers()
+
+    yield from train(
+        camera,
+        torch.optim.Adam(groups),
+        loss,
+        steps=settings.epochs * batches.steps_per_epoch,
+        run=run,
+        every=every,
+        after_step=camera.variables.project,
+        penalty=camera.variables.violation,
+    )
+
+
+#: Wraps the batches of a test, for a bar.
+Progress = Callable[[Sequence[int]], Iterable[int]]
+
+
+@torch.no_grad()
+def held_out_error(
+    camera: Camera,
+    pictures: Pictures,
+    settings: Settings,
+    *,
+    distance: float | None = None,
+    progress: Progress = iter,
+) -> float:
+    """Mean |restored - picture| of all test samples, at drawn object distances or at one."""
+    count, total = len(pictures) * settings.crops, 0.0
+    for first in progress(range(0, count, settings.batch)):
+        found = batch(pictures, settings, list(range(first, min(first + settings.batch, count))), _TEST_EPOCH)
+        if distance is not None:
+            found = dataclasses.replace(found, distance=torch.full_like(found.distance, distance))
+        total += float(absolute_error(camera, found).sum())
+    return total / (count * settings.patch**2)
+
+
+def run_model(
+    lens: Lens,
+    train_pictures: Pictures,
+    test_pictures: Pictures,
+    settings: Settings,
+    folder: Path,
+    *,
+    about: dict,
+    distances: tuple[float, ...],
+    catalogs: Sequence[str | Path] = (),
+    progress: Progress = iter,
+) -> Iterator[tuple[str, int, Record]]:
+    """Both steps of one model and seed, a training step at a time: (step's name, its number, what it reports).
+
+    folder: of this run, resumed if begun; about: what else decides the result (lens file, pictures); progress: wraps
+    the batches of every test; catalogs: of glass, that the lens was read with. At the end the learned lens is written
+    to `lens.zmx` there, and the outcome to `outcome.json`, read by `outcome`.
+    """
+    folder = Path(folder)
+    if (folder / "outcome.json").exists():
+        Run(folder / STEPS[0], {**dataclasses.asdict(settings), **about, "step": STEPS[0]})  # refuses other settings
+        return
+    own = camera(lens, settings)
+    own.plan()  # before a checkpoint moves the lens: a run that goes on has the PSFs of one that never stopped
+    for step, record in _steps(own, train_pictures, settings, folder, about, STEPS[0]):
+        yield STEPS[0], step, record
+    l1_joint = held_out_error(own, test_pictures, settings, progress=progress)
+    own.variables.requires_grad_(False)
+    own.use("drt")
+    l1_before = held_out_error(own, test_pictures, settings, progress=progress)
+    for step, record in _steps(own, train_pictures, settings, folder, about, STEPS[1]):
+        yield STEPS[1], step, record
+    found = own.variables()
+    result = Outcome(
+        model=settings.model,
+        seed=settings.seed,
+        l1_joint=l1_joint,
+        l1_before=l1_before,
+        l1_drt=held_out_error(own, test_pictures, settings, progress=progress),
+        focus_paraxial_m=1e-3 * distance_in_focus(found, paraxial_image),
+        focus_rms_m=1e-3 * distance_in_focus(found, best_focus),
+        sensor_mm=float(found.surfaces[-2].thickness),
+        variables=own.variables.numbers(),
+        penalty=float(own.variables.violation().detach()),
+        no_optimum=out_of_focus(own),
+        by_distance={
+            f"{d:g}": held_out_error(own, test_pictures, settings, distance=d, progress=progress) for d in distances
+        },
+    )
+    write_lens(found, folder / LENS, catalogs=catalogs)
+    write_outcome(result, folder)
+
+
+def write_outcome(found: Outcome, folder: Path) -> None:
+    """Write `outcome.json`; a focus at infinity is null there."""
+    document = dataclasses.asdict(found)
+    document |= {key: None for key in _INFINITE if math.isinf(document[key])}
+    write_atomically(Path(folder) / "outcome.json", lambda file: file.write(json.dumps(document, indent=1).encode()))
+
+
+def outcome(folder: Path) -> Outcome | None:
+    """What a finished run found, None for one that is not."""
+    path = Path(folder) / "outcome.json"
+    if not path.exists():
+        return None
+    document = read_json(path)
+    document |= {key: math.inf for key in _INFINITE if document.get(key, 0.0) is None}
+    try:
+        return Outcome(**document)
+    except TypeError as error:
+        raise DamagedRun(f"{path}: not what a run found ({error})") from error
+
+
+def _steps(own: Camera, pictures: Pictures, settings: Settings, folder: Path, about: dict, name: str):
+    run = Run(folder / name, {**dataclasses.asdict(settings), **about, "step": name})
+    if settings.start == "spectral" and name == STEPS[0] and not run.checkpoint.exists():
+        size = settings.patch + settings.size - 1
+        course = optimise_closed_form(own, power_spectrum(pictures, size, crops=settings.crops, seed=settings.seed))
+        if course.no_optimum:
+            warnings.warn(f"start spectral: {course.no_optimum}", NoOptimum, stacklevel=2)
+    yield from optimise(own, pictures, settings, run)

@@ -1,0 +1,294 @@
+"""What the forms of `raytrace codesign` share: settings, pictures, and one run with its progress."""
+
+import argparse
+import dataclasses
+import hashlib
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import distributed
+from tqdm import tqdm
+
+from raytrace.camera.network import PRESETS, RedNetShape, faster_precision
+from raytrace.camera.training import NotFinite, Record, read_json
+from raytrace.cli.door import (
+    CommandError,
+    catalogs,
+    field_points,
+    find_lens,
+    number,
+    open_lens,
+    refuse_untraceable,
+    say,
+)
+from raytrace.formats import FORMATS
+from raytrace.formats.pictures import Pictures, dead_leaves, files, read, split
+from raytrace.optics.focus import NoImage
+from raytrace.optics.paraxial import paraxial_image_distance
+from raytrace.shards import share
+from raytrace.studies.codesign.experiment import STEPS, Outcome, Settings, camera, lens_at_start, outcome, run_model
+from raytrace.system.lens import Lens
+
+_LEAVES = 100  # pictures, where none are given
+_DISTANCES = 9  # at which a finished run is tested
+
+
+@dataclasses.dataclass(frozen=True)
+class Experiment:
+    """A lens, settings and pictures; about: what of them decides the result, for the folders of the runs; catalogs: of
+    glass, that the lens was read with."""
+
+    lens: Lens
+    name: str
+    settings: Settings
+    train: Pictures
+    test: Pictures
+    about: dict[str, str]
+    kind: str
+    catalogs: tuple[Path, ...] = ()
+
+    @property
+    def steps_per_epoch(self) -> int:
+        return len(self.train) * self.settings.crops // self.settings.batch
+
+    @property
+    def distances(self) -> tuple[float, ...]:
+        """Object distances in mm at which runs are tested."""
+        return tuple(np.linspace(self.settings.near, self.settings.far, _DISTANCES).tolist())
+
+
+def experiment(arguments: argparse.Namespace, settings: Settings) -> Experiment:
+    """Open the lens, refuse what cannot be simulated, then read the pictures."""
+    path = find_lens(arguments.lens)
+    lens = open_lens(argparse.Namespace(lens=arguments.lens, catalog=arguments.catalog))
+    if settings.near >= settings.far:
+        raise CommandError(f"--near {settings.near:g} is not nearer than --far {settings.far:g}")
+    field_points(lens, argparse.Namespace(field=[(0.0, y) for y in settings.fields]))
+    try:
+        camera(lens, settings)  # refuses bad variables, starts and networks
+    except NoImage as error:
+        message = "give --near, --far and --focus-distance beyond the focal length"
+        raise CommandError(f"{arguments.lens}: {error}; {message}") from error
+    begun = lens_at_start(lens, settings)
+    refuse_untraceable(begun, str(path))
+    FORMATS[".zmx"].write(begun, str(path), catalogs=catalogs(arguments))  # refuses what a learned lens could not keep
+    pictures = _pictures(arguments, settings)
+    train, test = split(pictures)
+    about = {
+        "lens": f"{path.stem}, sha256 {hashlib.sha256(path.read_bytes()).hexdigest()[:16]}",
+        "pictures": f"{len(pictures)}, blake2 {_digest(pictures)}",
+    }
+    kind = "pictures" if arguments.data else "dead leaves"
+    return Experiment(lens, path.stem, settings, train, test, about, kind, catalogs(arguments))
+
+
+def refuse_too_few(given: Experiment) -> None:
+    """Raise where the pictures to train on do not fill one batch."""
+    if not given.steps_per_epoch:
+        raise CommandError(
+            f"{len(given.train)} pictures to train on, {given.settings.crops} crops of each, do not fill one batch of "
+            f"{given.settings.batch}; give more pictures, more --crops or a smaller --batch"
+        )
+
+
+def settings_of(arguments: argparse.Namespace, begun: Path) -> Settings:
+    """Settings by the options; begun: `settings.json` of what may have been begun, whose precision "auto" keeps."""
+    preset = PRESETS[arguments.preset]
+    given: dict = {"depth": preset.depth, "width": preset.width}
+    for field in dataclasses.fields(Settings):
+        value = getattr(arguments, field.name, None)
+        if value is not None:
+            given[field.name] = value
+    for words in ("vary", "bounds"):
+        if getattr(arguments, words):
+            given[words] = " ".join(getattr(arguments, words))
+    if arguments.field:
+        if any(x for x, _ in arguments.field):
+            raise CommandError("--field X,Y: co-design takes field points along y, --field Y")
+        given["fields"] = tuple(y for _, y in arguments.field)
+    given |= _light(arguments)
+    if arguments.precision == "auto":
+        shape = RedNetShape(given["depth"], given["width"])
+        given["precision"] = _agreed(lambda: recorded(begun).get("precision") or faster_precision(shape))
+    return Settings(**given)
+
+
+def _light(arguments: argparse.Namespace) -> dict[str, tuple[float, ...]]:
+    """Wavelengths and weights by the options: those given, or the file's own, its primary one first."""
+    if not arguments.file_wavelengths:
+        wavelengths = tuple(arguments.wavelength or Settings.wavelengths)
+        weights = tuple(arguments.wavelength_weights or [1.0] * len(wavelengths))
+        return {"wavelengths": wavelengths, "wavelength_weights": weights}
+    if arguments.wavelength or arguments.wavelength_weights:
+        raise CommandError("--file-wavelengths takes the file's own: leave out --wavelength and --wavelength-weights")
+    lens = open_lens(argparse.Namespace(lens=arguments.lens, catalog=arguments.catalog))
+    order = sorted(range(len(lens.wavelengths)), key=lambda k: k != lens.primary_wavelength)
+    return {
+        "wavelengths": tuple(lens.wavelengths[order].tolist()),
+        "wavelength_weights": tuple(lens.wavelength_weights[order].tolist()),
+    }
+
+
+def settings_without_network(arguments: argparse.Namespace) -> Settings:
+    """Settings by the options, for work that trains no network: nothing is tried out."""
+    return settings_of(argparse.Namespace(**{**vars(arguments), "precision": "float32"}), Path())
+
+
+def _agreed(choose: Callable[[], str]) -> str:
+    """The choice of the first process, for all."""
+    chosen = [choose() if share().rank == 0 else ""]
+    if share().processes > 1:
+        distributed.broadcast_object_list(chosen)
+    return chosen[0]
+
+
+def recorded(path: Path) -> dict:
+    """A `settings.json`, empty if there is none."""
+    return read_json(path) if path.exists() else {}
+
+
+def _pictures(arguments: argparse.Namespace, settings: Settings) -> Pictures:
+    if not arguments.data:
+        count = arguments.limit or _LEAVES
+        say(f"no --data: training on {count} pictures of dead leaves, discs that hide one another")
+        size = max(256, settings.patch + settings.size - 1)
+        leaves = [dead_leaves(1, size=size, seed=seed).samples[0] for seed in bar(range(count), "dead leaves")]
+        return Pictures(tuple(leaves), tuple(f"dead leaves {seed}" for seed in range(count)))
+    paths = files(arguments.data)
+    if arguments.limit and arguments.limit < len(paths):
+        paths = [paths[i * len(paths) // arguments.limit] for i in range(arguments.limit)]
+    return read(paths, least=settings.patch + settings.size - 1, progress=lambda given: bar(given, "pictures"))
+
+
+def bar(given, what: str):
+    """The given things behind a bar, on a terminal."""
+    return tqdm(given, desc=what, unit="", leave=False, disable=None)
+
+
+def _digest(pictures: Pictures) -> str:
+    found = hashlib.blake2b(digest_size=8)
+    for sample in pictures.samples:
+        found.update(repr(sample.shape).encode())
+        found.update(np.ascontiguousarray(sample))
+    return found.hexdigest()
+
+
+def train_run(given: Experiment, settings: Settings, folder: Path, label: str) -> Outcome:
+    """Both steps of one run, or what is left of them, with a bar; a run that is finished is read again."""
+    length = settings.epochs * given.steps_per_epoch
+    progress = Progress(label, length, given.steps_per_epoch, focus_of(given.lens, settings))
+    steps = run_model(
+        given.lens,
+        given.train,
+        given.test,
+        settings,
+        folder,
+        about=given.about,
+        distances=given.distances,
+        catalogs=given.catalogs,
+        progress=progress.testing,
+    )
+    try:
+        for name, step, record in steps:
+            progress(name, step, record)
+    except NotFinite as error:
+        raise CommandError(str(error)) from error
+    finally:
+        progress.close()
+    if progress.bar is None:
+        say(f"{label}: finished before, nothing to train")
+    return outcome(folder)
+
+
+class Progress:
+    """A bar over both steps of a run on a terminal; elsewhere a line for every epoch."""
+
+    def __init__(self, label: str, length: int, steps_per_epoch: int, focus: Callable[[float], float] | None):
+        self.label, self.length, self.steps_per_epoch, self.focus = label, length, steps_per_epoch, focus
+        self.bar: tqdm | None = None
+        self.losses: list[float] = []
+        self.first, self.since, self.is_testing = 0, time.monotonic(), False
+
+    def __call__(self, name: str, step: int, record: Record) -> None:
+        place = STEPS.index(name) * self.length + step + 1
+        if self.bar is None:
+            self.first = place - 1
+            if self.first:
+                say(f"{self.label}: going on behind step {self.first} of {2 * self.length}")
+            self.bar = tqdm(total=2 * self.length, initial=self.first, unit="step", disable=None, dynamic_ncols=True)
+        self.is_testing = False
+        self.losses.append(record["loss"])
+        if self.bar.disable:
+            if (step + 1) % self.steps_per_epoch == 0:
+                self._line(name, step, record, place)
+        else:
+            self.bar.set_description(f"{self.label}, {name}", refresh=False)
+            self.bar.set_postfix_str(f"loss {record['loss']:.4f}{self._lens(record)}", refresh=False)
+            self.bar.update()
+
+    def testing(self, batches: Sequence[int]) -> Iterator[int]:
+        """The batches of a test one by one, counted on the bar; elsewhere one line for all tests behind a step."""
+        is_drawn = self.bar is not None and not self.bar.disable
+        if not (is_drawn or self.is_testing):
+            say(f"{self.label}: testing")
+            sys.stderr.flush()
+        self.is_testing = True
+        for place, first in enumerate(batches, 1):
+            if is_drawn:
+                self.bar.set_description(f"{self.label}, testing", refresh=False)
+                self.bar.set_postfix_str(f"batch {place} of {len(batches)}")
+            yield first
+
+    def close(self) -> None:
+        if self.bar is not None:
+            self.bar.close()
+
+    def _line(self, name: str, step: int, record: Record, place: int) -> None:
+        left = (2 * self.length - place) * (time.monotonic() - self.since) / (place - self.first)
+        epoch, epochs = (step + 1) // self.steps_per_epoch, self.length // self.steps_per_epoch
+        loss = sum(self.losses) / len(self.losses)
+        self.losses.clear()
+        say(
+            f"{self.label}, {name}, epoch {epoch} of {epochs}: loss {loss:.4f}{self._lens(record)}, "
+            f"{tqdm.format_interval(left)} left"
+        )
+        sys.stderr.flush()
+
+    def _lens(self, record: Record) -> str:
+        """Penalty and place of the sensor."""
+        said = f", penalty {record['penalty']:.3g} mm²" if record["penalty"] else ""
+        if "sensor" not in record:
+            return said
+        said += f", sensor {record['sensor']:.4f} mm"
+        return said if self.focus is None else f"{said}, focus {self.focus(record['sensor']):.1f} m"
+
+
+def conjugates(lens: Lens, settings: Settings) -> tuple[list[float], list[float]]:
+    """Sensor distances in mm, ascending, and the object distances in m whose paraxial images are there."""
+    distances = np.geomspace(settings.near / 10, settings.far * 200, 2000)
+    lens = lens_at_start(lens, settings)
+    with torch.no_grad():
+        images = paraxial_image_distance(lens, lens.wavelengths.new_tensor(distances)).tolist()
+    order = np.argsort(images)
+    return np.asarray(images)[order].tolist(), (distances[order] / 1e3).tolist()
+
+
+def focus_of(lens: Lens, settings: Settings) -> Callable[[float], float] | None:
+    """Object distance in m in paraxial focus, of a sensor distance in mm; None where more than the sensor varies."""
+    if settings.vary.split() != ["sensor"]:
+        return None
+    sensors, distances = conjugates(lens, settings)
+    return lambda sensor: float(np.interp(sensor, sensors, distances))
+
+
+def plain(value):
+    """A document for JSON: null for what is no finite number."""
+    if isinstance(value, dict):
+        return {key: plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(entry) for entry in value]
+    return number(value) if isinstance(value, float) else value

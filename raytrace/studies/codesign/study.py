@@ -1,0 +1,167 @@
+"""Study: the runs of several models and seeds side by side: tables, courses and what to draw.
+
+A study is a folder of runs, `<row>-<seed>/`; finished ones are read again, never repeated. A row is a PSF model, or
+`AFTER_PARAXIAL`: Gaussian DRT with the sensor where the paraxial run of the same seed ended.
+"""
+
+import csv
+import dataclasses
+import io
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from raytrace.camera.camera import Camera
+from raytrace.camera.training import load_state, read_log, read_state
+from raytrace.files import write_atomically
+from raytrace.formats.pictures import Pictures
+from raytrace.maths.pupil import gauss_rings
+from raytrace.optics.launch import launch
+from raytrace.optics.spot import spot
+from raytrace.optics.trace import trace
+from raytrace.studies.codesign.experiment import STEPS, Outcome, Settings, batch, outcome
+from raytrace.studies.codesign.experiment import camera as camera_at_start
+from raytrace.system.lens import Lens, with_object_distance
+
+#: The paper's table: L1 after step 1, L1 with DRT PSFs after step 2, focus distance in m.
+PAPER = {"paraxial": (0.0415, 0.0504, 33.9), "fourier": (0.0408, 0.0509, 35.7), "gaussian": (0.0429, 0.0430, 27.3)}
+
+AFTER_PARAXIAL = "gaussian-after-paraxial"
+#: What the rows are called in tables and figures.
+NAMES = {
+    "paraxial": "paraxial",
+    "fourier": "Fourier",
+    "gaussian": "Gaussian DRT",
+    "drt": "DRT",
+    AFTER_PARAXIAL: "Gaussian DRT from paraxial",
+}
+
+ROWS = tuple(NAMES)
+
+_CHOICE = 16  # patches of which the one with most contrast is shown
+
+COLUMNS = ("model", "seed", "l1_joint", "l1_drt", "focus_paraxial_m", "focus_rms_m", "sensor_mm")
+
+
+@dataclasses.dataclass(frozen=True)
+class Summary:
+    """One model over its seeds: mean and standard deviation of every column of the table; seeds: how many."""
+
+    model: str
+    seeds: int
+    mean: dict[str, float]
+    deviation: dict[str, float]
+
+
+def run_folder(study: Path, row: str, seed: int) -> Path:
+    return Path(study) / f"{row}-{seed}"
+
+
+def run_settings(study: Path, row: str, seed: int, settings: Settings) -> Settings | None:
+    """The settings of one run; None where it starts from a run that is not finished."""
+    if row != AFTER_PARAXIAL:
+        return dataclasses.replace(settings, model=row, seed=seed)
+    before = outcome(run_folder(study, "paraxial", seed))
+    return before and dataclasses.replace(settings, model="gaussian", seed=seed, start=repr(before.sensor_mm))
+
+
+def outcomes(study: Path, models: Sequence[str], seeds: Sequence[int]) -> list[Outcome]:
+    """The finished runs of a study, each with its row as its model."""
+    found = [(model, outcome(run_folder(study, model, seed))) for model in models for seed in seeds]
+    return [dataclasses.replace(one, model=model) for model, one in found if one is not None]
+
+
+def rows(found: Sequence[Outcome]) -> list[dict[str, str | float]]:
+    """The table, a row for each model and seed."""
+    return [{column: getattr(one, column) for column in COLUMNS} for one in found]
+
+
+def write_table(found: Sequence[Outcome], path: Path) -> None:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows(found))
+    write_atomically(path, lambda file: file.write(text.getvalue().encode()))
+
+
+def summaries(found: Sequence[Outcome]) -> list[Summary]:
+    """Mean and deviation over seeds, in the order in which the models come first."""
+    result = []
+    for model in dict.fromkeys(one.model for one in found):
+        own = [one for one in found if one.model == model]
+        values = {c: [float(getattr(one, c)) for one in own] for c in (*COLUMNS[2:], "l1_before")}
+        mean = {c: statistics.fmean(v) for c, v in values.items()}
+        deviation = {c: statistics.stdev(v) if len(v) > 1 else 0.0 for c, v in values.items()}
+        result.append(Summary(model, len(own), mean, deviation))
+    return result
+
+
+def course(study: Path, model: str, seed: int, step: str = STEPS[0]) -> dict[str, list[float]]:
+    """The log of one step of one run, a list for each of its columns; empty if it has not begun."""
+    path = run_folder(study, model, seed) / step / "log.csv"
+    if not path.exists():
+        return {}
+    rows = read_log(path)
+    return {key: [row[key] for row in rows] for key in (rows[0] if rows else ())}
+
+
+def courses(study: Path, found: Sequence[Outcome], column: str, step: str = STEPS[0]) -> dict[str, list[list[float]]]:
+    """One column of the logs of finished runs, by model, a list for each seed; models without it are left out."""
+    result: dict[str, list[list[float]]] = {}
+    for one in found:
+        values = course(study, one.model, one.seed, step).get(column)
+        if values:
+            result.setdefault(one.model, []).append(values)
+    return result
+
+
+def losses_by_distance(found: Sequence[Outcome]) -> tuple[list[float], dict[str, list[list[float]]]]:
+    """Object distances in mm and the loss with DRT PSFs after step 2 at each, by model, a list for each seed."""
+    distances = sorted({float(d) for one in found for d in one.by_distance})
+    result: dict[str, list[list[float]]] = {}
+    for one in found:
+        own = {float(d): loss for d, loss in one.by_distance.items()}
+        result.setdefault(one.model, []).append([own[d] for d in distances])
+    return distances, result
+
+
+def trained(lens: Lens, settings: Settings, folder: Path) -> Camera:
+    """The camera of a finished run as it ended, with DRT PSFs. settings: those of the run."""
+    own = camera_at_start(lens, settings)
+    kept = Path(folder) / STEPS[1] / "checkpoint.pt"
+    load_state(own, read_state(kept), kept)
+    own.variables.requires_grad_(False)
+    own.use("drt")
+    return own
+
+
+@torch.no_grad()
+def blur_diameters(lens: Lens, distances: Tensor) -> Tensor:
+    """RMS blur diameter (Z,) mm of traced rays on the axis, over object distances (Z,) mm."""
+    pupil, weights = gauss_rings(12, dtype=lens.wavelengths.dtype)
+    axis = lens.wavelengths.new_zeros(2, 1)
+    found = []
+    for distance in distances:
+        own = with_object_distance(lens, distance)
+        rays = trace(own, launch(own, pupil, fields=axis), own.wavelengths[:, None])
+        share = own.wavelength_weights / own.wavelength_weights.sum()
+        found.append(2 * (share * spot(rays, weights).mean_square_radius[0]).sum().sqrt())
+    return torch.stack(found)
+
+
+@torch.no_grad()
+def examples(camera: Camera, pictures: Pictures, settings: Settings, distances: Sequence[float]) -> dict[str, Tensor]:
+    """A test patch at several distances (Z,): "picture", "image" and "restored", each (Z, h, w).
+
+    Of the first patches it is the one of most contrast: a plain one shows no blur.
+    """
+    few = list(range(min(_CHOICE, len(pictures) * settings.crops)))
+    own = batch(pictures, settings, few, 2**20)
+    chosen = int(own.picture.flatten(1).std(1).argmax())
+    many = torch.tensor(distances, dtype=camera.fields.dtype)
+    picture = own.picture[chosen].expand(len(many), -1, -1)
+    image = camera.image(picture, many) + camera.noise * own.noise[chosen]
+    return {"picture": camera.target(picture), "image": image, "restored": camera.restore(image)}

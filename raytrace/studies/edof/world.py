@@ -1,0 +1,229 @@
+"""Extended depth of field: how well one phase element and one linear filter show scenes at every depth, in all colours.
+
+The pictures are periodic (mirrored to twice their size, so that nothing jumps), each at one depth. Light that lands
+beyond the window of the kernel is no loss: it comes back as haze, even over the picture. Two filters restore them: the
+classic Wiener filter of the design depth with the best constant γ, and the best linear one that knows no depth.
+"""
+
+import dataclasses
+import math
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+import scipy.optimize
+import torch
+from torch import Tensor, nn
+
+from raytrace.camera.deconvolve import blind_error, blind_filter, errors, power_spectrum, psnr, wiener
+from raytrace.camera.descent import NoOptimum, minimise
+from raytrace.camera.image import transfer_functions
+from raytrace.formats.pictures import Pictures, draws
+from raytrace.maths.grid import grid
+from raytrace.wave.element import Element, Rings
+from raytrace.wave.plan import plan
+from raytrace.wave.psf import WavePsf, psf
+from raytrace.wave.reuse import Memo
+from raytrace.wave.scene import WaveScene, is_round
+
+FILTERS = ("wiener", "blind")
+_START = 21  # last number of the key of a random start
+
+
+@dataclasses.dataclass(frozen=True)
+class World:
+    """Where the camera works. Lengths in mm, wavelengths in µm.
+
+    depths: of the scenes; design: the depth whose kernel the Wiener filter inverts; pixel, size: of the window of the
+    kernels, an odd number, so that no picture is shifted; noise: standard deviation, for pictures in [0, 1].
+    """
+
+    radius: float = 2.5
+    sensor_distance: float = 35.5
+    depths: tuple[float, ...] = (500.0, 2000 / 3, 1000.0, 2000.0, math.inf)
+    design: float = 1000.0
+    wavelengths: tuple[float, ...] = (0.46, 0.55, 0.64)
+    pixel: float = 0.00369
+    size: int = 255
+    noise: float = 0.01
+    exact: bool = False
+
+
+def scene(elements: Sequence[Element], world: World, *, depths: Sequence[float] | None = None) -> WaveScene:
+    """What a world looks like through elements in contact."""
+    like = elements[0].radius
+    return WaveScene(
+        elements=tuple(elements),
+        sensor_distance=like.new_tensor(world.sensor_distance),
+        depths=like.new_tensor(world.depths if depths is None else depths),
+        wavelengths=like.new_tensor(world.wavelengths),
+        grid=grid(like.new_tensor(world.pixel), world.size),
+        exact=world.exact,
+    )
+
+
+def kernels(elements: Sequence[Element], world: World, *, depths: Sequence[float] | None = None) -> WavePsf:
+    """PSFs of elements in a world. Where they are not round, depth by depth, for memory, to half a per cent; rings with
+    anything else are sampled at their own pitch (2,500 cells across 5 mm of 2 µm rings).
+    """
+    own = scene(elements, world, depths=depths)
+    if is_round(own):
+        return psf(own)
+    samples = None
+    rings = [element.profile.pitch for element in elements if isinstance(element.profile, Rings)]
+    if rings:
+        samples = math.ceil(float(2 * elements[0].radius / min(rings)))
+    parts = [
+        psf(dataclasses.replace(own, depths=depth[None]), tol=5e-3, samples=samples) for depth in own.depths.unbind()
+    ]
+    return dataclasses.replace(parts[0], kernel=torch.cat([part.kernel for part in parts]), depths=own.depths)
+
+
+def transfer(found: WavePsf, size: int) -> Tensor:
+    """H (D, W, size, size) of kernels normalised by the light through the aperture; what misses the window is haze."""
+    H = transfer_functions(found.kernel, size)
+    haze = torch.zeros_like(H.real)
+    haze[..., 0, 0] = 1
+    return H + haze * (1 - found.energy)[..., None, None]
+
+
+def periodic(pictures: Pictures, size: int) -> Tensor:
+    """Pictures (B, size, size) in [0, 1], float64: the middle of each, mirrored to one period of an endless picture."""
+    half, found = size // 2, []
+    for sample in pictures.samples:
+        if min(sample.shape) < half:
+            raise ValueError(f"a picture of {sample.shape[0]} × {sample.shape[1]} pixels, expected {half} at least")
+        row, column = ((n - half) // 2 for n in sample.shape)
+        found.append(mirrored(sample[row : row + half, column : column + half].astype(np.float64) / 255))
+    return torch.as_tensor(np.stack(found))
+
+
+def mirrored(picture: np.ndarray) -> np.ndarray:
+    """A picture (h, w) and its mirror images: one period (2h, 2w) of a picture without a jump."""
+    picture = np.concatenate([picture, picture[::-1]], 0)
+    return np.concatenate([picture, picture[:, ::-1]], 1)
+
+
+def spectrum(pictures: Tensor) -> Tensor:
+    """S (size, size) of periodic pictures (B, size, size)."""
+    return power_spectrum(pictures, window="none")
+
+
+def expected_error(H: Tensor, S: Tensor, noise: float) -> Tensor:
+    """Mean square error behind the best blind filter, in closed form, mean over colours."""
+    return blind_error(H, S, noise).mean()
+
+
+@dataclasses.dataclass(frozen=True)
+class Quality:
+    """What an element is worth, by filter: PSNR in dB of restored pictures.
+
+    by_depth: (D,) of each filter, of the error over pictures and colours; mean: over the depths; spread: best less
+    worst depth; by_colour: (W,), mean over the depths; gamma: of the Wiener filter; energy: (D, W) inside the window.
+    """
+
+    by_depth: dict[str, tuple[float, ...]]
+    by_colour: dict[str, tuple[float, ...]]
+    mean: dict[str, float]
+    spread: dict[str, float]
+    gamma: float
+    energy: tuple[tuple[float, ...], ...]
+
+
+@torch.no_grad()
+def quality(
+    elements: Sequence[Element],
+    world: World,
+    *,
+    train: Tensor,
+    test: Tensor,
+    seed: int = 0,
+    found: WavePsf | None = None,
+) -> Quality:
+    """Restore test pictures (B, N, N) with noise drawn once, filters made for training pictures (A, N, N) alone."""
+    found = kernels(elements, world) if found is None else found
+    size = test.shape[-1]
+    H, S = transfer(found, size), spectrum(train)
+    if world.design in world.depths:
+        at_design = H[world.depths.index(world.design)]
+    else:
+        at_design = transfer(kernels(elements, world, depths=[world.design]), size)[0]
+    gamma = best_gamma(H, S, world.noise, at_design)
+    filters = {"wiener": wiener(at_design, gamma), "blind": blind_filter(H, S, world.noise)}
+    generator = torch.Generator().manual_seed(seed)
+    noise = world.noise * torch.randn(len(test), *H.shape[1:], generator=generator, dtype=test.dtype)
+    by_depth, by_colour = {}, {}
+    for name, G in filters.items():
+        left = torch.stack([_mean_square(test, H_z, G, noise) for H_z in H])  # (D, W)
+        by_depth[name] = tuple(psnr(left.mean(1)).tolist())
+        by_colour[name] = tuple(psnr(left).mean(0).tolist())
+    return Quality(
+        by_depth,
+        by_colour,
+        {name: float(np.mean(values)) for name, values in by_depth.items()},
+        {name: max(values) - min(values) for name, values in by_depth.items()},
+        gamma,
+        tuple(map(tuple, found.energy.tolist())),
+    )
+
+
+def restored(H: Tensor, G: Tensor, pictures: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """What the sensor sees and what the filter makes of it, each (B, W, N, N), of pictures (B, N, N) at one depth.
+
+    H, G: (W, N, N); noise: (B, W, N, N), added.
+    """
+    seen = torch.fft.ifft2(torch.fft.fft2(pictures)[:, None] * H).real + noise
+    return seen, torch.fft.ifft2(torch.fft.fft2(seen) * G).real
+
+
+def _mean_square(pictures: Tensor, H: Tensor, G: Tensor, noise: Tensor) -> Tensor:
+    estimate = restored(H, G, pictures, noise)[1]
+    return (estimate - pictures[:, None]).square().mean((0, -2, -1))
+
+
+def best_gamma(H: Tensor, S: Tensor, noise: float, at_design: Tensor) -> float:
+    """The constant γ of the Wiener filter of the design depth (W, N, N) that errs least over all depths."""
+
+    def error(logarithm: float) -> float:
+        return float(errors(H, S, noise, filter=wiener(at_design, 10**logarithm)).mean())
+
+    # Coarse steps first: far from the best γ the error is flat.
+    places = np.arange(-6.0, 2.0, 0.5)
+    start = min(places, key=error)
+    if start in (places[0], places[-1]):
+        message = f"no optimum of the filter's constant inside 10^{places[0]:g} to 10^{places[-1]:g}"
+        warnings.warn(f"{message}: the error still falls at its end", NoOptimum, stacklevel=2)
+    return 10 ** float(scipy.optimize.minimize_scalar(error, bounds=(start - 0.5, start + 0.5), method="bounded").x)
+
+
+def best_of_starts(
+    variables: Callable[[], nn.Module],
+    world: World,
+    spectrum: Tensor,
+    *,
+    starts: int,
+    spread: float,
+    steps: int,
+    seed: int = 0,
+    progress: Callable[[Iterable], Iterable] = iter,
+) -> nn.Module:
+    """Phase variables at the least closed-form error that L-BFGS reaches from random starts; several optima exist.
+
+    variables: makes them anew; spread: standard deviation of the first changes; starts 0: as they are made.
+    """
+    best, least, memo = variables(), math.inf, Memo()
+    for number in progress(range(starts)):
+        own = variables()
+        with torch.no_grad():
+            for p in own.parameters():
+                p.copy_(torch.as_tensor(spread * draws(seed, number, _START).standard_normal(p.shape)))
+        how = plan(scene(own(), world))
+
+        def error(own=own, how=how) -> Tensor:
+            found = psf(scene(own(), world), plan=how, memo=memo)
+            return expected_error(transfer(found, spectrum.shape[-1]), spectrum, world.noise)
+
+        found = min(minimise(list(own.parameters()), error, steps=steps).course)
+        if found < least:
+            best, least = own, found
+    return best

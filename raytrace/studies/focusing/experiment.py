@@ -1,0 +1,267 @@
+"""Focusing: a flat plate of free heights that learns to be a lens from nothing but pictures.
+
+    loss = mean (picture * PSF - picture)²        over dead leaves, a draw of its own at every step
+
+A height is the phase at the middle of its pixel: between them the field is that of the samples, as of a polished
+surface. Flat pixels would lose what a lens bends across each of them; the record says how much.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.camera.image import blur, visible
+from raytrace.camera.phase import PhaseVariables
+from raytrace.formats.pictures import Pictures, crop, dead_leaves
+from raytrace.kernels.dft import phasor
+from raytrace.maths.grid import grid
+from raytrace.media.catalog import find_glass
+from raytrace.media.glass import index
+from raytrace.wave.aim import Aim, aim
+from raytrace.wave.baselines import ideal
+from raytrace.wave.element import Element, Pixels, height
+from raytrace.wave.plan import Plan
+from raytrace.wave.plan import plan as plan_of
+from raytrace.wave.psf import psf
+from raytrace.wave.pupil import disc_cells
+from raytrace.wave.reuse import Memo
+from raytrace.wave.scene import WaveScene, millimetres, residual
+
+#: Rates of learning by method, on the phase in radians.
+RATES = {"sgd": 2e4, "adam": 0.3}
+_ACROSS = 8  # samples along a flat pixel, where that is asked for
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """What is learned. Lengths mm, wavelength µm.
+
+    diameter: of the aperture; distance: to the sensor, or of a collimator from the point source; samples: heights
+    across; pixel, size: of the window of the PSF, odd; patch: pixels of an image; batch: images a step.
+    collimator: the point stands at the front focus, and what comes out is looked at by a perfect lens of that focus.
+    """
+
+    diameter: float = 1.0
+    distance: float = 25.0
+    wavelength: float = 0.55
+    samples: int = 128
+    pixel: float = 0.004
+    size: int = 65
+    patch: int = 64
+    batch: int = 4
+    method: str = "sgd"
+    rate: float | None = None
+    seed: int = 0
+    collimator: bool = False
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Frame:
+    """One moment of learning. heights: (N, N) mm; kernel: (size, size); picture, image: (patch, patch)."""
+
+    step: int
+    peak_ratio: float
+    heights: Tensor
+    kernel: Tensor
+    picture: Tensor
+    image: Tensor
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Learned:
+    """What became of the plate. peak_ratios: before the first step, then after each; losses: of each step.
+
+    flat_ratio: the peak ratio if pixels are flat, and flat_bound that of the best flat pixels, those of the ideal lens;
+    residual: RMS phase that is left in the aperture, waves; frames: of the steps asked for, then the ideal lens as one
+    of step -1.
+    """
+
+    setting: Setting
+    peak_ratios: tuple[float, ...]
+    losses: tuple[float, ...]
+    flat_ratio: float
+    flat_bound: float
+    residual: float
+    element: Element
+    frames: tuple[Frame, ...]
+
+    @property
+    def steps(self) -> int:
+        return len(self.losses)
+
+    @property
+    def wave(self) -> float:
+        """Height in mm that delays the light by one wave."""
+        return 2 * math.pi * radian(self.setting)
+
+
+def learn_to_focus(
+    setting: Setting,
+    *,
+    steps: int = 300,
+    enough: float = 0.999,
+    frames: Sequence[int] = (),
+    progress: Callable[[int, float], object] = lambda step, ratio: None,
+) -> Learned:
+    """Learn by SGD with Nesterov's momentum of 0.5 or by Adam, until the peak is `enough` of the ideal lens's.
+
+    frames: steps (0: before the first) of which pictures are kept, beside the last. progress: (step, peak ratio).
+    Raises ValueError for a window whose size is not odd, which has no pixel at its middle.
+    """
+    if setting.size % 2 == 0:
+        raise ValueError(f"a window of {setting.size} pixels has no pixel at its middle: expected an odd size")
+    variables = PhaseVariables(plate(setting), unit=radian(setting), others=_behind(setting))
+    plan, memo = sampled(setting, variables()), Memo()
+    best = best_kernel(setting)
+    leaves = dead_leaves(8, size=2 * (setting.patch + setting.size), seed=setting.seed, smallest=1.5)
+    optimizer = _optimizer(setting, variables)
+    ratios, losses, kept = [], [], []
+    for step in range(steps + 1):
+        kernel = psf(scene_of(setting, variables()), plan=plan, memo=memo).kernel[0, 0]
+        ratios.append(float((kernel.max() / best.max()).detach()))
+        progress(step, ratios[-1])
+        last = step == steps or ratios[-1] >= enough
+        if last or step in frames:
+            kept.append(_frame(setting, step, ratios[-1], variables.numbers(), kernel, leaves))
+        if last:
+            break
+        picture = draw(leaves, setting, step)
+        loss = (blur(picture, kernel) - visible(picture, kernel.shape)).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+    with torch.no_grad():
+        kept.append(_frame(setting, -1, 1.0, ideal_heights(setting), best, leaves))
+        return Learned(
+            setting=setting,
+            peak_ratios=tuple(ratios),
+            losses=tuple(losses),
+            flat_ratio=float(_flat_kernel(setting, variables.numbers()).max() / best.max()),
+            flat_bound=float(_flat_kernel(setting, ideal_heights(setting)).max() / best.max()),
+            residual=residual_phase(setting, variables()),
+            element=variables()[0],
+            frames=tuple(kept),
+        )
+
+
+# -- the camera --------------------------------------------------------------------------------------------------------
+
+
+def plate(setting: Setting, heights: Tensor | None = None) -> Element:
+    """A plate of fused silica of these heights (N, N) mm, flat by default."""
+    count = setting.samples
+    heights = torch.zeros(count, count, dtype=torch.float64) if heights is None else heights
+    pitch = torch.tensor(setting.diameter / count, dtype=torch.float64)
+    return Element(Pixels(heights, pitch), 0.5 * count * pitch, find_glass("F_SILICA"))
+
+
+def radian(setting: Setting) -> float:
+    """Height in mm that delays the light by a radian."""
+    return 1e-3 * setting.wavelength / (2 * math.pi * (float(index(find_glass("F_SILICA"), setting.wavelength)) - 1))
+
+
+def scene_of(setting: Setting, elements: Sequence[Element]) -> WaveScene:
+    """A point at infinity before the element; for a collimator the point at its focus, and a lens looks at infinity."""
+    number = elements[0].radius.new_tensor
+    return WaveScene(
+        elements=tuple(elements),
+        sensor_distance=number(setting.distance),
+        depths=number([setting.distance if setting.collimator else math.inf]),
+        wavelengths=number([setting.wavelength]),
+        grid=grid(number(setting.pixel), setting.size),
+        exact=setting.collimator,
+    )
+
+
+def sampled(setting: Setting, elements: Sequence[Element], across: int = 1) -> Plan:
+    """The pupil engine with one sample to each height, or with `across` of them along a flat pixel."""
+    count = across * setting.samples
+    found = plan_of(scene_of(setting, elements), engine="pupil", samples=count)
+    return dataclasses.replace(found, cells="sampled", samples=count, extent=1.0, parts=1)
+
+
+def best_kernel(setting: Setting) -> Tensor:
+    """(size, size) of the ideal continuous lens in the same aperture."""
+    return psf(scene_of(setting, (_ideal(setting), *_behind(setting))), tol=1e-6).kernel[0, 0]
+
+
+def ideal_heights(setting: Setting) -> Tensor:
+    """Heights (N, N) mm of that lens in the middles of the pixels, modulo one wave, of the plate's glass."""
+    flat = plate(setting)
+    pitch, wave = flat.profile.pitch, 2 * math.pi * radian(setting)
+    x = (torch.arange(setting.samples, dtype=torch.float64) - 0.5 * (setting.samples - 1)) * pitch
+    path = height(_ideal(setting), x.expand(len(x), -1), x[:, None].expand(-1, len(x)))
+    turns = path / (1e-3 * setting.wavelength)  # the ideal lens has n - 1 = 1
+    return torch.remainder(turns, 1.0) * wave
+
+
+def residual_phase(setting: Setting, elements: Sequence[Element]) -> float:
+    """RMS in waves of what is left of the phase in the aperture, modulo a wave, about the phase of its mean field."""
+    scene = scene_of(setting, elements)
+    pitch = elements[0].profile.pitch
+    x = (torch.arange(setting.samples, dtype=torch.float64) - 0.5 * (setting.samples - 1)) * pitch
+    y, x = torch.meshgrid(x, x, indexing="ij")
+    turns = residual(scene, x, y)[0, 0] / millimetres(scene)[0]
+    light = torch.as_tensor(disc_cells(setting.samples))
+    mean = (light * phasor(turns)).sum()
+    left = turns - torch.angle(mean) / (2 * math.pi)
+    left = left - left.round()
+    return float(torch.sqrt((light * left**2).sum() / light.sum()))
+
+
+def _ideal(setting: Setting) -> Element:
+    """The continuous lens that the plate is to become."""
+    (lens,) = ideal(_aim(setting))
+    return lens
+
+
+def _behind(setting: Setting) -> tuple[Element, ...]:
+    """What looks at the far field of a collimator: a lens without fault that brings plane waves to the sensor."""
+    return ideal(_aim(setting)) if setting.collimator else ()
+
+
+def _aim(setting: Setting) -> Aim:
+    return aim(
+        radius=0.5 * setting.diameter,
+        sensor=setting.distance,
+        focus=math.inf,
+        wavelength=setting.wavelength,
+        exact=setting.collimator,
+    )
+
+
+def _flat_kernel(setting: Setting, heights: Tensor) -> Tensor:
+    """The kernel of heights whose pixels are flat, by so many samples across each as tell it from that."""
+    elements = (plate(setting, heights), *_behind(setting))
+    return psf(scene_of(setting, elements), plan=sampled(setting, elements, _ACROSS)).kernel[0, 0]
+
+
+# -- pictures ----------------------------------------------------------------------------------------------------------
+
+
+def draw(leaves: Pictures, setting: Setting, step: int) -> Tensor:
+    """Pictures (batch, P, P) of a step, in [0, 1], keyed by it: the margin of the kernel around each patch."""
+    size = setting.patch + setting.size - 1
+    crops = [
+        crop(leaves, sample, epoch=step, size=size, crops=setting.batch, seed=setting.seed)
+        for sample in range(setting.batch)
+    ]
+    return torch.as_tensor(np.stack(crops), dtype=torch.float64)
+
+
+def _frame(setting: Setting, step: int, ratio: float, heights: Tensor, kernel: Tensor, leaves: Pictures) -> Frame:
+    picture = draw(leaves, setting, 0)[0]
+    image = blur(picture, kernel)
+    return Frame(step, ratio, *(t.detach().clone() for t in (heights, kernel, visible(picture, kernel.shape), image)))
+
+
+def _optimizer(setting: Setting, variables: PhaseVariables) -> torch.optim.Optimizer:
+    rate = setting.rate or RATES[setting.method]
+    if setting.method == "adam":
+        return torch.optim.Adam(variables.parameters(), rate)
+    return torch.optim.SGD(variables.parameters(), rate, momentum=0.5, nesterov=True)

@@ -1,0 +1,282 @@
+"""What fabrication costs a phase element: steps of height, wrapping to one wave, and errors of height.
+
+    efficiency   |⟨exp(ik W)⟩|² over the area of the aperture: light at the focus of a lens, over that of the ideal one;
+                 a kinoform of L levels keeps sinc²(1/L) (Goodman and Silvestri, IBM J. Res. Dev. 14, 478, 1970)
+    error        of an element of extended depth of field behind the best blind filter (`edof`), as PSNR in dB
+
+An element learned in whole heights is wrapped and stepped afterwards, or learned on with wraps, or wraps and steps, in
+the loop: gradients pass them as if they were not there (straight-through).
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from raytrace.camera.deconvolve import blind_filter, errors, psnr
+from raytrace.camera.phase import PhaseVariables
+from raytrace.camera.training import DamagedRun, Record, load_state, read_json
+from raytrace.formats.pictures import Pictures, draws
+from raytrace.studies.edof.training import EdofCamera, Settings, begin, learn_element, scheduled
+from raytrace.studies.edof.world import World, expected_error, scene, spectrum, transfer
+from raytrace.studies.edof.world import kernels as kernels_of
+from raytrace.wave.element import Element, Pixels, Rings, period
+from raytrace.wave.fabrication import with_tolerance, wrapped
+from raytrace.wave.plan import plan
+from raytrace.wave.psf import psf
+from raytrace.wave.reuse import Memo
+from raytrace.wave.scene import residual
+
+WAVELENGTH = 0.55  # µm: at which heights are wrapped, and whose period is stepped
+_POINTS = 400_000  # over the aperture, of equal area
+_DRAW = 24  # last number of the key of a draw of errors
+
+
+# --- efficiency
+
+
+def law(levels: int) -> float:
+    """sinc²(1/L); 1 of any height (0)."""
+    if not levels:
+        return 1.0
+    return (math.sin(math.pi / levels) / (math.pi / levels)) ** 2
+
+
+@torch.no_grad()
+def efficiency(element: Element, world: World, *, points: int = _POINTS) -> float:
+    """Light at the sensor's centre over that of an ideal lens, of a point at the design depth, at 0.55 µm."""
+    there = dataclasses.replace(world, wavelengths=(WAVELENGTH,))
+    found = scene((element,), there, depths=[world.design])
+    place = (torch.arange(points, dtype=element.radius.dtype) + 0.5) / points
+    r = element.radius * torch.sqrt(place)
+    x, y = r, torch.zeros_like(r)
+    if isinstance(element.profile, Pixels):  # all round, by the golden angle
+        turn = math.pi * (3 - math.sqrt(5)) * (place * points - 0.5)
+        x, y = r * torch.cos(turn), r * torch.sin(turn)
+    phase = 2 * math.pi / (1e-3 * WAVELENGTH) * residual(found, x, y)[0, 0]
+    return float(torch.cos(phase).mean() ** 2 + torch.sin(phase).mean() ** 2)
+
+
+# --- elements as they are made
+
+
+def whole(element: Element) -> Element:
+    """The element before it is wrapped or stepped."""
+    return dataclasses.replace(element, period=None, levels=0)
+
+
+def made(element: Element, levels: int, *, wrap: bool) -> Element:
+    """Rings or pixels as they are made: in `levels` steps of a period (0: any height), modulo the period or not."""
+    element = whole(element)
+    if wrap:
+        return wrapped(element, WAVELENGTH, levels=levels)
+    if not levels:
+        return element
+    step = period(element.glass, WAVELENGTH).to(element.radius) / levels
+    heights = element.profile.heights
+    stepped = torch.floor((heights / step).detach() + 1e-4) * step
+    return dataclasses.replace(element, profile=dataclasses.replace(element.profile, heights=stepped))
+
+
+class Judge:
+    """Errors of elements in one world, for pictures of spectrum S (n, n): what the heights of rings do not change is
+    kept; maps of pixels are computed depth by depth, for memory.
+    """
+
+    def __init__(self, world: World, S: Tensor):
+        self.world, self.S, self._memo, self._plan = world, S, Memo(), None
+
+    def error(self, element: Element) -> Tensor:
+        """Mean square error of the best blind filter in closed form, mean over colours; differentiable."""
+        return expected_error(self.transfer(element), self.S, self.world.noise)
+
+    def transfer(self, element: Element) -> Tensor:
+        """H (D, W, n, n)."""
+        if isinstance(element.profile, Pixels):
+            return transfer(kernels_of((element,), self.world), self.S.shape[-1])
+        found = scene((element,), self.world)
+        # The sums of rings depend on their heights no more than the plan should: one for all.
+        self._plan = self._plan or plan(scene((whole(element),), self.world))
+        kernels = psf(found, plan=self._plan, memo=self._memo)
+        return transfer(kernels, self.S.shape[-1])
+
+    @torch.no_grad()
+    def closed(self, element: Element) -> float:
+        """The same as PSNR, dB."""
+        return float(psnr(self.error(element)))
+
+    @torch.no_grad()
+    def restored(self, element: Element, test: Tensor) -> float:
+        """PSNR of test pictures (B, n, n) behind a filter made for S, dB: mean over depths, expected over noise."""
+        H = self.transfer(element)
+        G = blind_filter(H, self.S, self.world.noise)
+        left = errors(H, spectrum(test), self.world.noise, filter=G)  # (D, W)
+        return float(psnr(left.mean(1)).mean())
+
+
+def learn_on(
+    element: Element,
+    judge: Judge,
+    *,
+    steps: int = 30,
+    rate: float = 0.02,
+    progress: Callable[[Iterable], Iterable] = iter,
+) -> Element:
+    """The best that Adam meets from an element as it is made, steps and wraps in the loop; never worse than it was.
+
+    rate: µm a step, falling to 0 as a cosine.
+    """
+    variables = PhaseVariables(element)
+    optimizer = torch.optim.Adam(variables.parameters(), lr=rate)
+    best, least = element, math.inf
+    for step in progress(range(steps + 1)):
+        error = judge.error(variables()[0])
+        if float(error.detach()) < least:
+            least = float(error.detach())
+            heights = variables.numbers().detach().clone()
+            best = dataclasses.replace(element, profile=dataclasses.replace(element.profile, heights=heights))
+        if step == steps:
+            break
+        for group in optimizer.param_groups:
+            group["lr"] = rate * scheduled("cosine", step / steps)
+        optimizer.zero_grad()
+        error.backward()
+        optimizer.step()
+    return best
+
+
+# --- the learned element
+
+
+def learned(
+    settings: Settings, world: World, S: Tensor, pictures: Pictures, folder: str | Path
+) -> Iterable[tuple[int, Record]]:
+    """The steps of learning rings in a folder of `raytrace wave edof`, those that are left; then `read` has them."""
+    camera, run = begin(settings, world, S, folder)
+    return learn_element(camera, pictures, settings, run)
+
+
+def read(folder: str | Path, S: Tensor) -> tuple[Element, World]:
+    """The element of a run's last checkpoint as it was learned, and its world.
+
+    Raises ValueError for a folder without a run, and for an element that is not in rings.
+    """
+    written = Path(folder) / "settings.json"
+    if not written.exists():
+        raise ValueError(f"{folder}: no settings.json; expected the folder of a run of `raytrace wave edof`")
+    given = read_json(written)
+    try:
+        world, settings = World(**_tuples(given.pop("world"))), Settings(**_tuples(given))
+    except (KeyError, TypeError, AttributeError) as error:
+        raise DamagedRun(f"{written}: no settings of `raytrace wave edof` ({error})") from error
+    camera, run = begin(settings, world, S, folder)
+    return _ringed(_loaded(camera, run), folder), world
+
+
+def _loaded(camera: EdofCamera, run) -> Element:
+    state = run.load()
+    if state is None:
+        raise ValueError(f"{run.folder}: no checkpoint; let `raytrace wave edof` finish")
+    load_state(camera, state, run.checkpoint)
+    with torch.no_grad():
+        return camera.variables()[0]
+
+
+def _ringed(element: Element, name: str | Path) -> Element:
+    if not isinstance(element.profile, Rings):
+        kind = type(element.profile).__name__
+        raise ValueError(f"{name}: heights are {kind}; expected Rings: learn with --element rings")
+    heights = element.profile.heights.detach()
+    return dataclasses.replace(element, profile=dataclasses.replace(element.profile, heights=heights))
+
+
+def _tuples(found: dict) -> dict:
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in found.items()}
+
+
+# --- what it costs
+
+#: How an element may be made, and what it is called.
+WAYS = {
+    "whole": "full height, quantised afterwards",
+    "wrapped": "wrapped and quantised afterwards",
+    "looped": "learned wrapped, quantised afterwards",
+    "trained": "learned wrapped and quantised",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Steps:
+    """PSNR in dB of an element in so many levels (0: any height).
+
+    closed: in closed form; restored: of test pictures; efficiency: at the design depth, at 0.55 µm. made: of WAYS.
+    """
+
+    element: str
+    made: str
+    levels: int
+    closed: float
+    restored: float
+    efficiency: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Tolerance:
+    """PSNR in dB, closed form, of an element whose heights err by up to ± nm: mean, least and greatest of draws."""
+
+    element: str
+    made: str
+    levels: int
+    nm: float
+    mean: float
+    least: float
+    greatest: float
+
+
+def steps_of(
+    name: str,
+    element: Element,
+    judge: Judge,
+    test: Tensor,
+    *,
+    levels: Sequence[int],
+    ways: Sequence[str],
+    steps: int = 20,
+    progress: Callable[[Iterable], Iterable] = iter,
+) -> tuple[list[Steps], dict[tuple[str, int], Element]]:
+    """A row for any height and every number of levels, by every way of making; and what was made, by (way, levels).
+
+    steps: of learning on, 4 times as many for the wraps.
+    """
+    looped = None
+    if {"looped", "trained"} & set(ways):
+        looped = learn_on(made(element, 0, wrap=True), judge, steps=4 * steps, progress=progress)
+    rows, elements = [], {}
+    for way, count in progress([(way, count) for way in ways for count in (0, *levels)]):
+        own = made(looped if way in ("looped", "trained") else element, count, wrap=way != "whole")
+        if way == "trained":
+            own = learn_on(own, judge, steps=steps)
+        shown = judge.restored(own, test)
+        rows.append(Steps(name, way, count, judge.closed(own), shown, efficiency(own, judge.world)))
+        elements[way, count] = own
+    return rows, elements
+
+
+@torch.no_grad()
+def tolerances_of(
+    name: str, way: str, element: Element, judge: Judge, *, nm: Sequence[float], count: int = 5, seed: int = 0
+) -> list[Tolerance]:
+    """A row for every tolerance, `count` draws each; the same errors, larger, at each."""
+    rows = []
+    for most in nm:
+        found = []
+        for number in range(count):
+            key = int(draws(seed, number, _DRAW).integers(2**62))
+            off = with_tolerance(element, 1e-6 * most, generator=torch.Generator().manual_seed(key))
+            found.append(judge.closed(off))
+        mean = sum(found) / len(found)
+        rows.append(Tolerance(name, way, element.levels, most, mean, min(found), max(found)))
+    return rows

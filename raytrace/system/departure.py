@@ -1,0 +1,261 @@
+"""Departure: what the sag of a surface has beside its conic and even terms, z = S(r²) + D(x, y).
+
+    GridSag      D = Σ_ij c_ij B(x/p - i) B(y/p - j), the cubic spline through heights at points p apart
+    SplineSag    the same by its coefficients c, found once
+    ZernikeSag   D = Σ_j c_j Z_j(x/R, y/R), Noll's polynomials
+
+Slopes and second derivatives are written out, and autograd may differentiate them further. Everything a search needs
+of a departure is two tensors, its `numbers`: those of all kinds pass through one operator.
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.maths.value import value
+from raytrace.maths.zernike import noll, norm
+
+_LEAST = 4  # points along a side of a grid: a cubic
+_FELT = 32  # points: influence falls by 2 - √3 from one to the next, to 1e-18
+_BLOCK = 128  # coefficients that are found together
+
+
+@value
+class GridSag:
+    """The spline through heights (rows, columns) mm at points `pitch` mm apart, the vertex in their middle.
+
+    Row 0 lies at the smallest y, column 0 at the smallest x. The spline is cubic with continuous second derivatives;
+    at the ends the third derivative is continuous at the last point but one ("not a knot"), so that the error falls as
+    pitch⁴ up to the rim. The surface ends half a pitch beyond the outermost points: a ray that crosses farther out
+    misses it. Every meeting of rays and surface finds the coefficients of the spline anew: see `spline`.
+    """
+
+    heights: Tensor
+    pitch: Tensor
+
+
+@value
+class SplineSag:
+    """A cubic spline by its coefficients (rows + 2, columns + 2) mm, those beyond either end included; pitch: mm."""
+
+    coefficients: Tensor
+    pitch: Tensor
+
+
+@value
+class ZernikeSag:
+    """Noll's polynomials from j = 1 on: coefficients (J,) mm RMS over the disc of `radius` mm; it goes on beyond."""
+
+    coefficients: Tensor
+    radius: Tensor
+
+
+Departure = GridSag | SplineSag | ZernikeSag
+
+
+class Sag(NamedTuple):
+    """D (...) mm with its slopes and second derivatives (...); those above the highest asked for are 0."""
+
+    z: Tensor
+    x: Tensor
+    y: Tensor
+    xx: Tensor
+    xy: Tensor
+    yy: Tensor
+
+
+def numbers(departure: Departure) -> tuple[Tensor, Tensor]:
+    """What `sag_of` needs, in float64: spline coefficients (rows + 2, columns + 2) and pitch, or (J,) and the radius.
+
+    Raises ValueError for a grid of fewer than 4 × 4 heights.
+    """
+    if isinstance(departure, ZernikeSag):
+        return departure.coefficients.double(), departure.radius.double()
+    if isinstance(departure, GridSag):
+        departure = spline(departure)
+    return departure.coefficients.double(), departure.pitch.double()
+
+
+def spline(grid: GridSag) -> SplineSag:
+    """The spline of a grid, in float64: what is traced many times is filtered once, gradients to the heights included.
+
+    Raises ValueError for a grid of fewer than 4 × 4 heights.
+    """
+    heights = grid.heights.double()
+    rows, columns = heights.shape
+    if min(rows, columns) < _LEAST:
+        raise ValueError(f"{rows} × {columns} heights: a cubic spline needs at least {_LEAST} × {_LEAST}")
+    return SplineSag(_spline_coefficients(_spline_coefficients(heights).T).T, grid.pitch.double())
+
+
+def sag_of(numbers: tuple[Tensor, Tensor], x: Tensor, y: Tensor, *, highest: int = 2) -> Sag:
+    """The departure of these `numbers` at points (...) mm; a grid's goes on beyond its edge with the height there."""
+    shape, scale = numbers
+    return (_spline if shape.dim() == 2 else _zernike)(shape, scale, x, y, highest)
+
+
+def covers(numbers: tuple[Tensor, Tensor], x: Tensor, y: Tensor) -> Tensor:
+    """Whether there is a surface at points (...) mm."""
+    shape, pitch = numbers
+    if shape.dim() == 1:
+        return torch.ones_like(x, dtype=torch.bool)
+    half_y, half_x = (0.5 * (count - 2) * pitch for count in shape.shape)
+    return (x.abs() <= half_x) & (y.abs() <= half_y)
+
+
+def size_of(numbers: tuple[Tensor, Tensor]) -> Tensor:
+    """A bound on |D| in mm: over the grid, or over the disc of the polynomials."""
+    shape, _ = numbers
+    if shape.dim() == 2:
+        return shape.abs().max()  # the weights of a spline are positive and sum to 1
+    norms = shape.new_tensor([norm(*noll(j)) for j in range(1, len(shape) + 1)])
+    return (norms * shape.abs()).sum()
+
+
+def _spline_coefficients(heights: Tensor) -> Tensor:
+    """Coefficients (n + 2, ...) along the first axis of heights (n, ...); each feels only its surroundings."""
+    count = len(heights)
+    matrix = heights.new_tensor(_prefilter(count))
+    parts = []
+    for first in range(0, count + 2, _BLOCK):
+        near = slice(max(first - _FELT, 0), first + _BLOCK + _FELT)
+        parts.append(matrix[first : first + _BLOCK, near] @ heights[near])
+    return torch.cat(parts)
+
+
+@functools.lru_cache(maxsize=8)
+def _prefilter(count: int) -> np.ndarray:
+    """Matrix (n + 2, n) from heights at n points to the coefficients of their spline, c[k] at the point k - 1.
+
+    (c[k-1] + 4 c[k] + c[k+1])/6 = h,   the fourth differences of the first five and the last five c are 0
+    """
+    system = np.zeros((count + 2, count + 2))
+    for k in range(count):
+        system[k + 1, k : k + 3] = 1 / 6, 4 / 6, 1 / 6
+    system[0, :5] = system[-1, -5:] = 1, -4, 6, -4, 1
+    return np.linalg.inv(system)[:, 1:-1].copy()
+
+
+def _spline(c: Tensor, pitch: Tensor, x: Tensor, y: Tensor, highest: int) -> Sag:
+    x, y = torch.broadcast_tensors(x, y)
+    c, pitch = c.to(x.dtype), pitch.to(x.dtype)
+    row, weights_y = _weights(y / pitch, c.shape[0] - 2, highest)
+    column, weights_x = _weights(x / pitch, c.shape[1] - 2, highest)
+    lines = [[c[row + a, column + b] for b in range(4)] for a in range(4)]
+
+    def term(along_x: int, along_y: int) -> Tensor:
+        if along_x + along_y > highest:
+            return torch.zeros_like(x)
+        sums = [_combined(weights_x[along_x], line) for line in lines]
+        return _combined(weights_y[along_y], sums) / pitch ** (along_x + along_y)
+
+    return Sag(*(term(*orders) for orders in ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))))
+
+
+def _weights(place: Tensor, count: int, highest: int) -> tuple[Tensor, list[Sequence[Tensor]]]:
+    """First of the four coefficients (...) that a point feels, and their weights with `highest` derivatives by place.
+
+    place: (...) in pitches from the middle; beyond the edge it is held there.
+    """
+    last = 0.5 * count
+    held = place.clamp(-last, last)
+    inside = (place.detach().abs() <= last).to(place.dtype)
+    place = held + 0.5 * (count - 1)
+    cell = place.detach().floor().clamp(0, count - 2)
+    f = place - cell
+    g = 1 - f
+    weights = [(g**3 / 6, (f**2 * (3 * f - 6) + 4) / 6, (g**2 * (3 * g - 6) + 4) / 6, f**3 / 6)]
+    if highest > 0:
+        slopes = (-0.5 * g**2, f * (1.5 * f - 2), g * (2 - 1.5 * g), 0.5 * f**2)
+        weights.append([inside * w for w in slopes])
+    if highest > 1:
+        weights.append([inside * w for w in (g, 3 * f - 2, 3 * g - 2, f)])
+    return cell.long(), weights
+
+
+def _combined(weights: Sequence[Tensor], values: Sequence[Tensor]) -> Tensor:
+    """Σ w v, written out: the order of a reduction would depend on the shape of the batch."""
+    (w, *others), (v, *rest) = weights, values
+    total = w * v
+    for w, v in zip(others, rest, strict=True):
+        total = torch.addcmul(total, w, v)
+    return total
+
+
+def _zernike(c: Tensor, radius: Tensor, x: Tensor, y: Tensor, highest: int) -> Sag:
+    """Σ_m (Σ_k c_mk N P_k(t)) H_m, t = 2 r² - 1, with the harmonics H_m of `zernike.polynomials`; ∇²H = 0."""
+    c, radius = c.to(x.dtype), radius.to(x.dtype)
+    x, y = torch.broadcast_tensors(x / radius, y / radius)
+    zero, one = torch.zeros_like(x), torch.ones_like(x)
+    harmonics, radial = _harmonics(c, x, y), _radial(c, 2 * (x * x + y * y) - 1)
+    z, zx, zy, zxx, zxy, zyy = (zero,) * 6
+    for m, (p, dp, d2p) in radial.items():
+        h, hx, hy, hxx, hxy = (one, zero, zero, zero, zero) if m == 0 else harmonics[m]
+        z = z + p * h
+        if highest > 0:
+            zx = zx + 4 * x * dp * h + p * hx
+            zy = zy + 4 * y * dp * h + p * hy
+        if highest > 1:
+            both = 4 * dp * h
+            zxx = zxx + both + 16 * x * x * d2p * h + 8 * x * dp * hx + p * hxx
+            zxy = zxy + 16 * x * y * d2p * h + 4 * dp * (x * hy + y * hx) + p * hxy
+            zyy = zyy + both + 16 * y * y * d2p * h + 8 * y * dp * hy - p * hxx
+    return Sag(z, zx / radius, zy / radius, *(s / radius**2 for s in (zxx, zxy, zyy)))
+
+
+def _harmonics(c: Tensor, x: Tensor, y: Tensor) -> dict[int, tuple[Tensor, ...]]:
+    """H, H_x, H_y, H_xx, H_xy of m > 0, Re (x + iy)^m, and of -m, Im (x + iy)^m."""
+    zero, one = torch.zeros_like(x), torch.ones_like(x)
+    powers = [(one, zero)]
+    found = {}
+    for m in range(1, noll(max(len(c), 1))[0] + 1):
+        re, im = powers[-1]
+        powers.append((re * x - im * y, re * y + im * x))
+        below = powers[m - 2] if m > 1 else (zero, zero)
+        second = m * (m - 1)
+        found[m] = powers[m][0], m * re, -m * im, second * below[0], -second * below[1]
+        found[-m] = powers[m][1], m * im, m * re, second * below[1], second * below[0]
+    return found
+
+
+def _radial(c: Tensor, t: Tensor) -> dict[int, list[Tensor]]:
+    """Σ_k c N P_k^(0,|m|)(t) with two derivatives by t, for every signed m of the Noll terms 1 … J.
+
+    P_i = (α t + β) P_{i-1} - γ P_{i-2} (DLMF 18.9.2), and the same derived once and twice.
+    """
+    known: dict[int, list[tuple[Tensor, Tensor, Tensor]]] = {}
+    sums: dict[int, list[Tensor]] = {}
+    for j, coefficient in enumerate(c.unbind(0), 1):
+        n, m = noll(j)
+        size, k = abs(m), (n - abs(m)) // 2
+        _extend(known.setdefault(size, []), size, k, t)
+        total = sums.setdefault(m, [torch.zeros_like(t)] * 3)
+        sums[m] = [torch.add(s, coefficient * norm(n, m) * p) for s, p in zip(total, known[size][k], strict=True)]
+    return sums
+
+
+def _extend(found: list[tuple[Tensor, Tensor, Tensor]], m: int, k: int, t: Tensor) -> None:
+    zero = torch.zeros_like(t)
+    for i in range(len(found), k + 1):
+        if i == 0:
+            found.append((torch.ones_like(t), zero, zero))
+        elif i == 1:
+            found.append((0.5 * ((m + 2) * t - m), torch.full_like(t, 0.5 * (m + 2)), zero))
+        else:
+            a = 2 * i + m
+            below = 2 * i * (i + m) * (a - 2)
+            alpha, beta = (a - 1) * a * (a - 2) / below, -(a - 1) * m * m / below
+            gamma = 2 * (i - 1) * (i + m - 1) * a / below
+            (p, dp, d2p), (q, dq, d2q) = found[-1], found[-2]
+            slope = alpha * t + beta
+            found.append(
+                (
+                    slope * p - gamma * q,
+                    slope * dp + alpha * p - gamma * dq,
+                    slope * d2p + 2 * alpha * dp - gamma * d2q,
+                )
+            )

@@ -1,0 +1,218 @@
+"""Lens: surfaces, stop, aperture, fields and wavelengths, as one value."""
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+
+import torch
+from torch import Tensor
+
+from raytrace.maths.value import value
+from raytrace.media.glass import Glass, check_wavelengths, refractive_index
+from raytrace.system.surface import Surface
+
+#: Units of a field point by the kind of field.
+FIELD_UNITS = {
+    "angle": "degrees",
+    "object_height": "mm",
+    "paraxial_image_height": "mm",
+    "real_image_height": "mm",
+}
+
+#: How rays find the stop, in the order of OpticStudio's numbers 0, 1, 2.
+RAY_AIMING = {
+    "off": "through points of the paraxial entrance pupil",
+    "paraxial": "to points of the stop, whose radius is that of the paraxial marginal ray",
+    "real": "to points of the stop, whose radius is that of the real marginal ray",
+}
+
+#: What the number of a system aperture means.
+APERTURE_KINDS = {
+    "entrance_pupil_diameter": "mm",
+    "image_f_number": "EFL / entrance pupil diameter",
+    "working_f_number": "paraxial working F/#",
+    "object_na": "n sin θ of the marginal ray at the object",
+    "object_cone_angle": "degrees, half angle of the marginal ray at the object",
+    "float_by_stop": "mm, semi-diameter of the stop",
+}
+
+
+#: µm: wavelengths between these are traced; glasses end at 39, x-ray mirrors begin at 1e-4.
+_SHORTEST, _LONGEST = 3e-5, 100.0
+_UNITS, _LIKELY = (1e-3, 1e6), (0.1, 20.0)  # µm of a nm and of a m, and what is likely to be meant by them
+
+
+class ImplausibleWavelength(ValueError):
+    """A wavelength that no lens is for: most likely it is in another unit than µm."""
+
+
+@value
+class SystemAperture:
+    """The size of the beam: a kind of APERTURE_KINDS and its number."""
+
+    kind: str
+    value: Tensor
+
+
+@value
+class Fields:
+    """Field points of one kind (a key of FIELD_UNITS), their weights and vignetting factors.
+
+    x, y, weight: (F,) in degrees or mm.
+    vignetting: (5, F): decentre VDX, VDY, compression VCX, VCY (pupil fractions) and angle VAN (degrees), or None.
+    telecentric: chief rays parallel to the axis in object space.
+    """
+
+    kind: str
+    x: Tensor
+    y: Tensor
+    weight: Tensor
+    vignetting: Tensor | None = None
+    telecentric: bool = False
+
+
+@value
+class Lens:
+    """A sequential lens in mm and µm. `lens.surfaces[k]` is surface k of the file: 0 the object, the last the image.
+
+    surfaces: tuple of Surface; surfaces[0].thickness is the object distance (inf allowed), surfaces[-2].thickness
+        the sensor distance.
+    stop: number of the stop surface.
+    aperture, fields: SystemAperture, Fields.
+    wavelengths: (W,) µm; wavelength_weights: (W,); primary_wavelength: 0-based position in `wavelengths`.
+    name, notes: title and comment lines of the file.
+    catalogs: glass catalogs in the order of the file.
+    ray_aiming: a key of RAY_AIMING.
+    """
+
+    surfaces: tuple[Surface, ...]
+    stop: int
+    aperture: SystemAperture
+    fields: Fields
+    wavelengths: Tensor
+    wavelength_weights: Tensor
+    primary_wavelength: int = 0
+    name: str = ""
+    notes: tuple[str, ...] = ()
+    catalogs: tuple[str, ...] = ()
+    ray_aiming: str = "off"
+
+
+def with_object_distance(lens: Lens, object_distance: Tensor) -> Lens:
+    """The lens with its object at another distance, mm from surface 1; inf allowed."""
+    return _with_thickness(lens, 0, object_distance)
+
+
+def with_sensor_distance(lens: Lens, sensor_distance: Tensor) -> Lens:
+    """The lens with its sensor at another distance, mm from the last surface before the image."""
+    return _with_thickness(lens, len(lens.surfaces) - 2, sensor_distance)
+
+
+def with_wavelengths(
+    lens: Lens, wavelengths: Tensor | Sequence[float], weights: Tensor | None = None, *, where: str = ""
+) -> Lens:
+    """The lens at other wavelengths (W,) µm, the first one primary, by weights (W,), alike by default.
+
+    Those that the lens does not have yet are checked as by `check_media`, whose place `where` is.
+    """
+    wavelengths = torch.as_tensor(wavelengths, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device).reshape(-1)
+    check_media(lens, wavelengths[~torch.isin(wavelengths, lens.wavelengths)], where=where)
+    weights = torch.ones_like(wavelengths) if weights is None else weights
+    return dataclasses.replace(lens, wavelengths=wavelengths, wavelength_weights=weights, primary_wavelength=0)
+
+
+def with_field_kind(lens: Lens, kind: str) -> Lens:
+    """The lens with the same numbers for its fields, told as another kind of FIELD_UNITS."""
+    return dataclasses.replace(lens, fields=dataclasses.replace(lens.fields, kind=kind))
+
+
+def largest_field(lens: Lens) -> Tensor:
+    """The field point (2, 1) along y that is as far from the axis as the lens's outermost, in its own unit."""
+    largest = torch.hypot(lens.fields.x, lens.fields.y).amax()
+    return torch.stack([torch.zeros_like(largest), largest])[:, None]
+
+
+def name_of_field(field: Tensor) -> str:
+    """A field point (2,) in words: its y alone on the axis of x."""
+    x, y = field.tolist()
+    return f"{y:g}" if x == 0 else f"{x:g},{y:g}"
+
+
+def check_media(lens: Lens, wavelengths: Tensor, *, where: str = "") -> None:
+    """Refuse wavelengths (W,) µm at which a glass of the lens has no index; warn of glasses used outside their range.
+
+    where: the lens, to name in the message. Raises ImplausibleWavelength, also for a lens without glass, and
+    `glass.InvalidIndex`; warns `glass.OutOfRange`, once for each glass.
+    """
+    media = [surface.glass for surface in lens.surfaces[:-1]]
+    check_unit(wavelengths, media, where=where)
+    seen = set()
+    for number, medium in enumerate(media):
+        key = (medium.name, medium.catalog)
+        if medium.formula != "constant" and key not in seen:
+            seen.add(key)
+            place = f"{where}, surface {number}" if where else f"surface {number}"
+            check_wavelengths(medium, wavelengths, where=place)
+
+
+def check_unit(wavelengths: Tensor, media: Iterable[Glass] = (), *, where: str = "") -> None:
+    """Refuse wavelengths in another unit than µm: shorter than hard x-rays, or longer than any glass lets through.
+
+    media: glasses whose range, where it reaches further, is believed. Raises ImplausibleWavelength, with a guess.
+    """
+    spans = [medium.wavelength_range for medium in media if medium.wavelength_range]
+    shortest, longest = min([_SHORTEST, *(s[0] for s in spans)]), max([_LONGEST, *(s[1] for s in spans)])
+    for wavelength in wavelengths.detach().flatten().tolist():
+        if not shortest <= wavelength <= longest:
+            guesses = (wavelength * factor for factor in _UNITS)
+            guess = next((f"did you mean {g:.7g}?" for g in guesses if _LIKELY[0] <= g <= _LIKELY[1]), None)
+            raise ImplausibleWavelength(
+                f"{where}{': ' if where else ''}a wavelength of {wavelength:g} µm: expected "
+                f"{shortest:g} to {longest:g}; wavelengths are in µm" + (f"; {guess}" if guess else "")
+            )
+
+
+def _with_thickness(lens: Lens, number: int, thickness: Tensor) -> Lens:
+    surfaces = list(lens.surfaces)
+    thickness = torch.as_tensor(thickness, dtype=surfaces[number].thickness.dtype, device=lens.wavelengths.device)
+    surfaces[number] = dataclasses.replace(surfaces[number], thickness=thickness)
+    return dataclasses.replace(lens, surfaces=tuple(surfaces))
+
+
+def check(lens: Lens) -> None:
+    """Refuse a lens that cannot be traced as a whole. Raises ValueError saying what was found and what was expected."""
+    last = len(lens.surfaces) - 1
+    if lens.ray_aiming not in RAY_AIMING:
+        raise ValueError(f"ray aiming {lens.ray_aiming!r}: expected one of {', '.join(RAY_AIMING)}")
+    if last < 2:
+        raise ValueError(f"{last + 1} surfaces found; expected at least the object, one surface and the image")
+    if not 1 <= lens.stop < last:
+        raise ValueError(f"the stop is surface {lens.stop}; expected one from 1 to {last - 1}")
+    check_unit(lens.wavelengths, (surface.glass for surface in lens.surfaces))
+    if not 0 <= lens.primary_wavelength < len(lens.wavelengths):
+        raise ValueError(f"primary wavelength {lens.primary_wavelength + 1} of {len(lens.wavelengths)}")
+    if not float(lens.aperture.value) > 0:
+        raise ValueError(f"aperture {lens.aperture.kind} {float(lens.aperture.value):g}: expected a number above 0")
+    for number, surface in enumerate(lens.surfaces[1:], 1):
+        if not bool(torch.isfinite(surface.thickness)):
+            raise ValueError(f"surface {number} has thickness {float(surface.thickness)}; only the object's may be inf")
+    at_infinity = bool(torch.isinf(lens.surfaces[0].thickness))
+    if at_infinity and lens.fields.kind == "object_height":
+        raise ValueError("fields are object heights but the object is at infinity: give angles, or an object distance")
+    if at_infinity and lens.fields.telecentric:
+        raise ValueError("object space is telecentric but the object is at infinity: give an object distance")
+    if at_infinity and lens.aperture.kind in ("object_na", "object_cone_angle"):
+        raise ValueError(f"aperture {lens.aperture.kind} needs an object at a finite distance")
+    _check_cone(lens)
+    if lens.fields.kind == "angle" and bool((torch.hypot(lens.fields.x, lens.fields.y) >= 90).any()):
+        raise ValueError("field angles reach 90 degrees: rays start from the plane of the entrance pupil")
+
+
+def _check_cone(lens: Lens) -> None:
+    """Refuse a cone of light at the object that reaches a right angle with the axis."""
+    kind, number = lens.aperture.kind, float(lens.aperture.value)
+    if kind == "object_cone_angle" and number >= 90:
+        raise ValueError(f"aperture object_cone_angle {number:g} degrees: expected less than 90")
+    if kind == "object_na":
+        index = float(refractive_index(lens.surfaces[0].glass, lens.wavelengths[lens.primary_wavelength]))
+        if number >= index:
+            raise ValueError(f"aperture object_na {number:g}: expected less than the index {index:g} before surface 1")

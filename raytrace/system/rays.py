@@ -1,0 +1,29 @@
+"""Rays: the value that travels through a lens."""
+
+from torch import Tensor
+
+from raytrace.maths.value import value
+
+
+@value
+class Rays:
+    """A batch of rays in the vertex frame of one surface; any batch shape, components first.
+
+    position: (3, ...) mm, relative to the vertex of the surface the rays are at.
+    direction: (3, ...) unit vector of direction cosines (L, M, N); light travels towards +z until a mirror.
+    valid: (...) bool. False once a ray missed a surface, was totally reflected or was vignetted; never NaN. A ray
+        that missed or was totally reflected is replaced by an axial ray; a vignetted one keeps its coordinates.
+    opl: (...) mm, the *reduced* optical path: Σ n·path less the path n·T·σ of the axial ray in every gap of
+        thickness T (σ = ±1, its sign changed by every mirror), and less that of the object's distance. None when
+        the path is not asked for, and then not computed.
+    """
+
+    position: Tensor
+    direction: Tensor
+    valid: Tensor
+    opl: Tensor | None = None
+
+    @property
+    def shape(self):
+        """Batch shape of the rays."""
+        return self.direction.shape[1:]
