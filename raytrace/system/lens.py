@@ -1,7 +1,8 @@
 """Lens: surfaces, stop, aperture, fields and wavelengths, as one value."""
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+import difflib
+from collections.abc import Iterable, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -95,6 +96,99 @@ class Lens:
     notes: tuple[str, ...] = ()
     catalogs: tuple[str, ...] = ()
     ray_aiming: str = "off"
+
+    def at(
+        self,
+        *,
+        object_distance: Tensor | float | None = None,
+        sensor_distance: Tensor | float | None = None,
+        f_number: Tensor | float | None = None,
+        entrance_pupil_diameter: Tensor | float | None = None,
+        wavelengths: Tensor | Sequence[float] | None = None,
+        fields: Tensor | Sequence | None = None,
+        ray_aiming: str | None = None,
+    ) -> "Lens":
+        """The same lens under other conditions; what is None stays.
+
+        object_distance: mm from the object to surface 1, inf allowed; sensor_distance: mm from the last surface before
+        the image; f_number: image-space, EFL / entrance_pupil_diameter, which is in mm; wavelengths: (W,) µm, alike in
+        weight, the first one primary; fields: y, or (x, y), in the lens's own kind, without vignetting factors.
+        Raises ValueError for conditions that no lens has.
+        """
+        found = self
+        if object_distance is not None:
+            found = with_object_distance(found, object_distance)
+        if sensor_distance is not None:
+            found = with_sensor_distance(found, sensor_distance)
+        if f_number is not None and entrance_pupil_diameter is not None:
+            raise ValueError("f_number and entrance_pupil_diameter exclude each other: both are the size of the beam")
+        for kind, number in (("image_f_number", f_number), ("entrance_pupil_diameter", entrance_pupil_diameter)):
+            if number is not None:
+                found = dataclasses.replace(found, aperture=SystemAperture(kind, _like(number, self.aperture.value)))
+        if wavelengths is not None:
+            found = with_wavelengths(found, wavelengths)
+        if fields is not None:
+            x, y = field_points(fields, like=self.fields.y)
+            kept = dataclasses.replace(self.fields, x=x, y=y, weight=torch.ones_like(y), vignetting=None)
+            found = dataclasses.replace(found, fields=kept)
+        if ray_aiming is not None:
+            found = dataclasses.replace(found, ray_aiming=ray_aiming)
+        check(found)
+        return found
+
+    def replace(self, surface: int, **numbers) -> "Lens":
+        """The lens with other numbers of one surface: curvature, thickness, conic, coefficients, glass, …
+
+        surface: its number in the file, 0 the object; numbers: fields of Surface, or radius (mm); plain numbers, or
+        tensors that may require a gradient; glass: a Glass. Raises ValueError naming what the surface does not have.
+        """
+        if not 0 <= surface < len(self.surfaces):
+            raise ValueError(f"surface {surface}: this lens has surfaces 0 to {len(self.surfaces) - 1}")
+        surfaces = list(self.surfaces)
+        surfaces[surface] = changed(surfaces[surface], numbers, f"surface {surface}", like=self.wavelengths)
+        return dataclasses.replace(self, surfaces=tuple(surfaces))
+
+
+def changed(surface: Surface, numbers: Mapping[str, object], where: str, *, like: Tensor) -> Surface:
+    """A surface with some of its fields replaced by plain numbers, tensors or values; radius: mm, for the curvature."""
+    known = [field.name for field in dataclasses.fields(Surface)]
+    numeric = ("thickness", "curvature", "conic", "coefficients")
+    given = dict(numbers)
+    for name in given:
+        if name not in (*known, "radius"):
+            near = difflib.get_close_matches(name, [*known, "radius"], 1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise ValueError(f"{where} has no {name!r}{hint} (it has {', '.join(known)}, radius)")
+    if "radius" in given:
+        if "curvature" in given:
+            raise ValueError(f"{where}: both radius and curvature are given; leave one out")
+        radius = _like(given.pop("radius"), like)
+        if bool(radius == 0):
+            raise ValueError(f"{where}: radius 0; a plane has radius inf")
+        given["curvature"] = 1 / radius
+    return dataclasses.replace(
+        surface,
+        **{name: _like(v, like) if name in numeric and v is not None else v for name, v in given.items()},
+    )
+
+
+def field_points(fields: Tensor | Sequence, *, like: Tensor) -> Tensor:
+    """(2, F) field points of y, of pairs (x, y), or of a tensor (2, F) as it is; `like` tells dtype and device."""
+    if isinstance(fields, Tensor):
+        return fields if fields.dim() == 2 else torch.stack([torch.zeros_like(fields), fields])
+    points = [(0.0, point) if isinstance(point, (int, float)) else tuple(point) for point in fields]
+    if not points or any(len(point) != 2 for point in points):
+        raise ValueError(f"fields {fields!r}: expected numbers y, or pairs (x, y)")
+    return torch.tensor(points, dtype=like.dtype, device=like.device).T
+
+
+def _like(number: Tensor | float | Sequence, like: Tensor) -> Tensor:
+    if isinstance(number, Tensor):
+        return number
+    try:
+        return torch.as_tensor(number, dtype=like.dtype, device=like.device)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{number!r} is not a number") from error
 
 
 def with_object_distance(lens: Lens, object_distance: Tensor) -> Lens:
