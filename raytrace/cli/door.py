@@ -12,7 +12,7 @@ from torch import Tensor
 
 from raytrace.cli.options import did_you_mean
 from raytrace.files import shipped
-from raytrace.formats import FORMATS, read_lens
+from raytrace.formats import FORMATS, read_lens, shipped_lens
 from raytrace.system.lens import (
     Lens,
     SystemAperture,
@@ -35,12 +35,9 @@ def find_lens(name: str) -> Path:
         raise CommandError(f"{name}: is a directory; expected a lens file")
     if path.exists():
         return path
-    folder = shipped("lenses")
-    if path.parent in (Path(), Path("lenses")):
-        for candidate in (folder / path.name, folder / f"{path.name}.zmx"):
-            if path.name and candidate.is_file():
-                return candidate
-    names = sorted({lens.stem for lens in folder.glob("*.zmx")})
+    if found := shipped_lens(path):
+        return found
+    names = sorted({lens.stem for lens in shipped("lenses").glob("*.zmx")})
     beside = [str(file) for file in path.parent.glob("*") if file.suffix.lower() in FORMATS]
     meant = did_you_mean(name, [*names, *beside])
     raise CommandError(f"{name}: no such lens file{meant or ';'} the shipped lenses are {', '.join(names)}")

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from raytrace.files import write_atomically
+from raytrace.files import shipped, write_atomically
 from raytrace.formats import table, table_write, zemax, zemax_write
 from raytrace.formats.report import ImportReport as ImportReport
 from raytrace.formats.source import LensFileError as LensFileError
@@ -36,9 +36,9 @@ FORMATS = {
 def read_lens(path: str | os.PathLike, *, catalogs: Sequence[str | Path] = (), strict: bool = False) -> Lens:
     """The lens of a file, in mm and µm: .zmx (Zemax OpticStudio), or a prescription table .csv, .tsv, .txt.
 
-    catalogs: further glass catalogs (.agf), searched as `raytrace.media.catalog.find_glass` does. strict: raise where
-    the
-    file holds something unknown or something has to be assumed; otherwise that is one LensFileWarning.
+    path: of a file, or the name of a shipped lens, as "double_gauss". catalogs: further glass catalogs (.agf), searched
+    as `raytrace.media.catalog.find_glass` does. strict: raise where the file holds something unknown or something has
+    to be assumed; otherwise that is one LensFileWarning.
     Raises LensFileError, its subclass UnsupportedSurface, and UnknownGlass, each naming file, line and surface.
     """
     lens, report = read_lens_with_report(path, catalogs=catalogs, strict=strict)
@@ -52,10 +52,21 @@ def read_lens_with_report(
 ) -> tuple[Lens, ImportReport]:
     """As `read_lens`, with the report of what became of every keyword; its warnings are in it, and not issued."""
     path = Path(path)
+    if not path.exists():
+        path = shipped_lens(path) or path
     form = _format(path)
     lens, report = form.read(read_text(path), str(path), catalogs=tuple(catalogs), strict=strict)
     _refuse_other_units(lens, path)
     return lens, report
+
+
+def shipped_lens(name: str | os.PathLike) -> Path | None:
+    """The file of a lens that travels with the package, with or without lenses/ and .zmx; None if there is none."""
+    path, folder = Path(name), shipped("lenses")
+    if not path.name or path.parent not in (Path(), Path("lenses")):
+        return None
+    candidates = (folder / path.name, folder / f"{path.name}.zmx")
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
 def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | Path] = ()) -> None:

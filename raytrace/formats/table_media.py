@@ -25,8 +25,7 @@ def medium(cells: dict[str, str], place: Place, report: Draft) -> Glass:
 
     One index alone is constant. n_d, V_d and ΔP_gF are kept as they stand; any other set of figures is met by the model
     glass n = A + B/λ + C/λ^3.5 (`raytrace.media.glass.FORMULAS["model"]`), on the normal line of glasses where two are
-    given,
-    by least squares where more than three are.
+    given, by least squares where more than three are.
     """
     given = {name: number(cell, name.replace("_", " "), place) for name, cell in figures(cells).items()}
     indices = {name.split()[1]: value for name, value in given.items() if name.startswith("index")}

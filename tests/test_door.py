@@ -1,0 +1,125 @@
+"""The front door: a lens from plain numbers, under other conditions, and the public names."""
+
+import importlib
+import pkgutil
+import re
+import subprocess
+import sys
+
+import pandas as pd
+import pytest
+import torch
+
+import raytrace as rt
+
+ROWS = [
+    {"radius": 61.47, "thickness": 6.0, "glass": "N-BK7"},
+    {"radius": -44.64, "thickness": 2.5, "glass": "N-SF5"},
+    {"radius": -129.94, "thickness": 95.9},
+]
+
+
+def test_every_public_name_is_what_the_table_says_when_all_of_the_package_is_imported():
+    """No module may stand in a function's place: `import raytrace.x` puts x into the package."""
+    without = ("bench.peer", "bench.psf_peer", "bench.speed_peer", "__main__")  # these need the extra [bench], or run
+    for found in pkgutil.walk_packages(rt.__path__, "raytrace."):
+        if not found.name.endswith(without):
+            importlib.import_module(found.name)
+    for name, place in rt.PUBLIC.items():
+        module, _, own = place.partition(":")
+        assert getattr(rt, name) is getattr(importlib.import_module(f"raytrace.{module}"), own or name), name
+        assert not isinstance(getattr(rt, name), type(sys)), name
+
+
+def test_importing_the_package_loads_no_torch():
+    code = "import raytrace, sys; sys.exit(bool({'torch', 'pandas', 'matplotlib'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], timeout=120).returncode == 0
+
+
+def test_a_shipped_lens_is_known_by_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("cooke_triplet", "lenses/cooke_triplet.zmx", "cooke_triplet.zmx"):
+        assert float(rt.first_order(rt.read_lens(name)).effective_focal_length) == pytest.approx(101.181, abs=1e-3)
+
+
+@pytest.mark.parametrize("rows", [ROWS, pd.DataFrame(ROWS)], ids=["rows", "frame"])
+def test_a_lens_is_made_from_plain_numbers(rows):
+    lens = rt.lens(rows, stop=1, f_number=5, fields=[0, (1, 2)], wavelengths=[0.4861, 0.5876, 0.6563])
+    assert len(lens.surfaces) == 5
+    assert lens.primary_wavelength == 1
+    assert lens.fields.kind == "angle"
+    assert lens.fields.x.tolist() == [0, 1]
+    assert lens.fields.y.tolist() == [0, 2]
+    assert float(lens.surfaces[2].curvature) == pytest.approx(-1 / 44.64, rel=1e-15)
+    assert lens.surfaces[2].glass.name == "N-SF5"
+    assert lens.surfaces[3].glass is rt.AIR
+    assert float(rt.first_order(lens).f_number) == pytest.approx(5, rel=1e-12)
+
+
+def test_media_are_names_indices_or_figures():
+    rows = [
+        {"radius": 50, "thickness": 5, "glass": 1.5},
+        {"radius": float("inf"), "thickness": 5, "glass": (1.62, 36.3)},
+        {"curvature": 0.0, "thickness": -5, "glass": "mirror"},
+    ]
+    lens = rt.lens(rows, stop=1, entrance_pupil_diameter=10)
+    wavelength = torch.tensor(0.5875618, dtype=torch.float64)
+    first, second = (float(rt.refractive_index(lens.surfaces[k].glass, wavelength)) for k in (1, 2))
+    assert first == 1.5
+    assert second == pytest.approx(1.62, abs=1e-5)
+    assert lens.surfaces[3].is_mirror
+    assert lens.surfaces[2].curvature is None
+    assert lens.surfaces[3].curvature is None
+
+
+def test_a_number_is_replaced_by_a_variable():
+    curvature = torch.tensor(1 / 61.47, dtype=torch.float64, requires_grad=True)
+    lens = rt.lens(ROWS, stop=1, f_number=5)
+
+    def power(c):
+        return rt.first_order(lens.replace(1, curvature=c)).power
+
+    power(curvature).backward()
+    step = 1e-6
+    with torch.no_grad():
+        expected = (power(curvature + step) - power(curvature - step)) / (2 * step)
+    assert float(curvature.grad) == pytest.approx(float(expected), rel=1e-8)
+    assert float(lens.replace(1, radius=50.0).surfaces[1].curvature) == 1 / 50
+    assert lens.surfaces[1].curvature is not curvature
+
+
+def test_conditions_are_those_asked_for_and_the_rest_stays():
+    lens = rt.read_lens("double_gauss")
+    other = lens.at(object_distance=25e3, sensor_distance=57.0, f_number=4, wavelengths=[0.5], fields=[0, 7])
+    assert float(other.surfaces[0].thickness) == 25e3
+    assert float(other.surfaces[-2].thickness) == 57.0
+    assert float(rt.first_order(other).f_number) == pytest.approx(4, rel=1e-12)
+    assert other.wavelengths.tolist() == [0.5]
+    assert other.fields.y.tolist() == [0, 7]
+    assert other.surfaces[3] is lens.surfaces[3]
+    assert float(lens.at(entrance_pupil_diameter=20).aperture.value) == 20
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda lens: lens.replace(1, curvatur=0.1), "did you mean 'curvature'"),
+        (lambda lens: lens.replace(9, curvature=0.1), "surfaces 0 to 4"),
+        (lambda lens: lens.replace(1, radius=0), "a plane has radius inf"),
+        (lambda lens: lens.replace(1, radius=5, curvature=0.2), "leave one out"),
+        (lambda lens: lens.replace(1, thickness="thick"), "'thick' is not a number"),
+        (lambda lens: lens.at(f_number=4, entrance_pupil_diameter=3), "exclude each other"),
+        (lambda lens: lens.at(wavelengths=[550.0]), "did you mean 0.55?"),
+        (lambda lens: lens.at(fields=[(1, 2, 3)]), "pairs (x, y)"),
+        (lambda lens: rt.lens(ROWS, stop=1), "none given; expected one of f_number"),
+        (lambda lens: rt.lens(ROWS, stop=7, f_number=4), "the stop is surface 7"),
+        (lambda lens: rt.lens([], stop=1, f_number=4), "no rows"),
+        (lambda lens: rt.lens([{"radius": 5}], stop=1, f_number=4), "surface 1: no thickness"),
+        (lambda lens: rt.lens([{"radius": 5, "thickness": 1, "glas": "SF5"}], stop=1, f_number=4), "'glass'"),
+        (lambda lens: rt.lens(ROWS, stop=1, f_number=4, field_kind="angles"), "expected one of angle"),
+    ],
+)
+def test_what_makes_no_lens_is_told(call, said):
+    lens = rt.lens(ROWS, stop=1, f_number=5)
+    with pytest.raises(ValueError, match=re.escape(said)):
+        call(lens)
