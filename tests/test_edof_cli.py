@@ -8,7 +8,7 @@ import pytest
 from raytrace.cli import main
 from raytrace.studies.edof import command as wave_edof
 from raytrace.studies.edof.table import NAMES
-from raytrace.studies.edof.words import EDOF
+from raytrace.studies.edof.words import WORDS
 
 
 def run(capsys, *words):
@@ -55,6 +55,6 @@ def test_an_element_is_learned_kept_and_gone_on_with(capsys, tmp_path):
 
 
 def test_every_form_teaches():
-    for name, _, description, examples, *_ in EDOF:
+    for name, _, description, examples, *_ in WORDS:
         assert len(description) > 200
         assert f"raytrace wave {name}" in examples

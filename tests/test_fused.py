@@ -298,10 +298,10 @@ def test_transforms_other_dtypes_and_the_switch_leave_it_to_torch():
 
 PROBE = """
 import raytrace, torch
-from raytrace.trace import trace
+from raytrace.optics.trace import trace
 from raytrace.fused import library
 from raytrace.fused.choice import is_fused
-from raytrace.rays import Rays
+from raytrace.system.rays import Rays
 library.FLAGS = tuple(flag for flag in library.FLAGS if flag != "-O3")  # compiled in 2 s instead of 14 s
 lens = raytrace.read_lens({lens!r})
 count = {count}

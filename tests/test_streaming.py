@@ -362,10 +362,10 @@ MEMORY = """
 import ctypes, resource, sys, torch
 sys.path.insert(0, "tests")
 from problems import double_gauss, aspheric_singlet, vector
-from raytrace import streaming
-from raytrace.grid import grid
-from raytrace.psf.streaming import stream_psf
-from raytrace.stream_gradient import mean_square_gradient
+from raytrace.optics import streaming
+from raytrace.maths.grid import grid
+from raytrace.kernels.streaming import stream_psf
+from raytrace.optics.stream_gradient import mean_square_gradient
 import dataclasses
 
 def peak():

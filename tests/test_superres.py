@@ -35,7 +35,7 @@ from raytrace.studies.superres.experiment import (
     wide_kernels,
     world_of,
 )
-from raytrace.studies.superres.words import SUPERRES
+from raytrace.studies.superres.words import WORDS
 from raytrace.wave.psf import psf
 
 LEAVES = dead_leaves(6, size=64)
@@ -175,7 +175,7 @@ def test_colours_keep_their_axis():
     assert all(len(row.by_colour) == 2 and row.estimate.shape == (6, 2, 96, 96) for row in rows)
 
 
-@pytest.mark.parametrize("entry", SUPERRES, ids=lambda entry: entry[0])
+@pytest.mark.parametrize("entry", WORDS, ids=lambda entry: entry[0])
 def test_examples_are_arguments_that_are_taken(entry):
     name, _, _, examples, add_arguments, _ = entry
     parser = argparse.ArgumentParser()

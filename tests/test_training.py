@@ -69,7 +69,7 @@ def test_a_killed_process_leaves_a_run_that_goes_on(tmp_path):
     script = textwrap.dedent(f"""
         import sys, time
         sys.path[:0] = {PATHS!r}
-        import raytrace.design.training as training
+        import raytrace.camera.training as training
         from test_training import fit
         append = training.Run.append
         def slowly(self, rows):

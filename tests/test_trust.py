@@ -136,7 +136,7 @@ __attribute__((constructor)) static void run(void) { fclose(fopen("%s", "w")); }
 PROBE = """
 import os, sys, torch
 from raytrace.fused import choice, library
-from raytrace.rays import Rays
+from raytrace.system.rays import Rays
 one = torch.ones(3, 1, dtype=torch.float64)
 for word in sys.argv[1:]:
     name, _, value = word.partition("=")

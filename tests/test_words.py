@@ -49,8 +49,8 @@ def test_pages_have_no_private_words(page):
 
 
 def test_the_error_axis_of_learning_has_numbers():
-    from raytrace.plot.wave import focus_figure
     from raytrace.studies.focusing.experiment import Setting, learn_to_focus
+    from raytrace.studies.focusing.figures import focus_figure
 
     found = learn_to_focus(Setting(samples=16), steps=2, frames=(0, 2))
     figure = focus_figure(found, title="few steps")

@@ -22,7 +22,7 @@ def bench_wave(arguments: argparse.Namespace) -> None:
     apart = agreement(bench_scene())
     about = machine() | {"torch threads": 1}
     folder = Path(arguments.docs) if arguments.docs else None
-    page = folder / "bench.command_wave.md" if folder else None
+    page = folder / "wave_bench.md" if folder else None
     kept = page.read_text(encoding="utf-8").partition(wave_report.KEPT)[2].strip() if page and page.exists() else ""
     report = wave_report.markdown(rows, agreement=apart, about=about, repeats=arguments.repeats, kept=kept)
     if page:

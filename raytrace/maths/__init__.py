@@ -1,1 +1,1 @@
-"""maths"""
+"""Mathematics that knows no optics: safe arithmetic, values, points on the disc, pixels, Zernike polynomials."""

@@ -1,1 +1,1 @@
-"""media"""
+"""Media: dispersion formulas, glasses, catalogs."""

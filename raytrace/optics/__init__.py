@@ -1,1 +1,1 @@
-"""optics"""
+"""The verbs of geometric optics: trace, launch, aim, spot, focus, wavefront."""

@@ -1,1 +1,1 @@
-"""studies"""
+"""Experiments: each a folder with its computation, figures, pages and command. Nothing imports them."""

@@ -142,7 +142,7 @@ def _report(given: Experiment, study: Path, models: Sequence[str], seeds: Sequen
         times=tuple(times),
         figures=tuple(name for name in CAPTIONS if name in drawn),
         machine=machine(),
-        sweep=(docs / "studies.codesign.sweep_command.md").exists(),
+        sweep=(docs / "codesign_sweep.md").exists(),
         of_paper=is_of_paper(given.lens),
     )
     _write(report, drawn, docs)

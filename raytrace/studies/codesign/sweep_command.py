@@ -42,7 +42,7 @@ def sweep(arguments: argparse.Namespace) -> None:
 
 
 def _write(given: Experiment, rows: Sequence[Row], docs: Path) -> None:
-    folder, path = docs / "codesign", docs / "studies.codesign.sweep_command.md"
+    folder, path = docs / "codesign", docs / "codesign_sweep.md"
     folder.mkdir(parents=True, exist_ok=True)
     write_sweep(rows, folder / "sweep.csv")
     of_paper = is_of_paper(given.lens)

@@ -1,1 +1,1 @@
-"""studies.edof"""
+"""Extended depth of field behind a learned thin element."""

@@ -212,7 +212,7 @@ def _write_page(docs: Path, found, elements, world: World, arguments: argparse.N
     made = _figures(found, elements, world, arguments.seed)
     for name, figure in made.items():
         save(figure, folder / name)
-    page = docs / "studies.edof.command.md"
+    page = docs / "wave_edof.md"
     kept = below_the_mark(page.read_text()) if page.exists() else ""
     data = f"--data DIR --limit {arguments.limit} " if arguments.data else ""
     effort = "".join(

@@ -1,1 +1,1 @@
-"""studies.focusing"""
+"""A flat plate that learns to be a lens."""

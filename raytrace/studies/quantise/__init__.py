@@ -1,1 +1,1 @@
-"""studies.quantise"""
+"""What fabrication costs: steps of height, wrapping, errors of height."""

@@ -153,7 +153,7 @@ def _quantise_docs(arguments, kind: str, etched, steps, tolerances, document: di
     save(quantise_figure(etched, steps, tolerances), folder / "quantise.png")
     write_csv(document["levels"], folder / "quantise.csv")
     write_csv(document["tolerance"], folder / "quantise_tolerance.csv")
-    page(docs / "studies.quantise.command.md", _quantise_page(arguments, kind, etched, steps, tolerances))
+    page(docs / "wave_quantise.md", _quantise_page(arguments, kind, etched, steps, tolerances))
 
 
 def _quantise_page(arguments, kind: str, etched, steps: Sequence[Steps], tolerances: Sequence[Tolerance]) -> list[str]:

@@ -1,1 +1,1 @@
-"""studies.superres"""
+"""Pictures finer than the pixels of the sensor."""

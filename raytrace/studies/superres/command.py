@@ -193,7 +193,7 @@ def _draw(arguments, block: _Block, kind: str, noises: list[dict], blocks: Seque
             for scene, name, closed, restored, gain in _table_rows(one)
         ]  # fmt: skip
         write_csv(lines, folder / "superres.csv")
-        page(docs / "studies.superres.command.md", _superres_page(arguments, blocks, kind, noises))
+        page(docs / "wave_superres.md", _superres_page(arguments, blocks, kind, noises))
 
 
 def _superres_page(arguments, blocks: Sequence[_Block], kind: str, noises: list[dict]) -> list[str]:
