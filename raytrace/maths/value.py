@@ -1,10 +1,8 @@
 """Values: frozen dataclasses of tensors that `torch.func` and `torch.utils._pytree` can walk."""
 
 import dataclasses
-import importlib
 import types
 import typing
-from collections.abc import Callable
 
 import torch
 from torch.utils import _pytree as pytree
@@ -36,22 +34,6 @@ def value(cls: type) -> type:
     pytree.register_pytree_node(cls, flatten, unflatten, serialized_type_name=f"raytrace.{cls.__name__}")
     _VALUE_TYPES.add(cls)
     return cls
-
-
-def lent(place: str) -> Callable:
-    """A method that a value is lent by a higher room, "room.file.function": imported when first called.
-
-    Values draw themselves and print themselves as tables (`spot.plot()`, `psf.to_frame()`), but know neither figures
-    nor tables: this is the one way up, and it stands in the class where it can be seen.
-    """
-    module, function = place.rsplit(".", 1)
-
-    def method(self, *arguments, **options):
-        return getattr(importlib.import_module(f"raytrace.{module}"), function)(self, *arguments, **options)
-
-    method.__name__ = function
-    method.__doc__ = f"`raytrace.{place}` of this value."
-    return method
 
 
 def _holds_numbers(annotation: object) -> bool:
