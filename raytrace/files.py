@@ -1,10 +1,13 @@
 """Files: those that travel with the package, and how every file is written."""
 
+import csv
 import errno
+import io
+import json
 import os
 import secrets
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -51,3 +54,36 @@ def write_atomically(path: str | os.PathLike, write: Callable[[BinaryIO], None])
         if isinstance(error, OSError) and error.filename in (str(temporary), temporary):
             raise OSError(error.errno, f"cannot be written: {error.strerror}", str(path)) from error
         raise
+
+
+def write_text(path: str | os.PathLike, text: str) -> None:
+    """Write a text in UTF-8, as a whole or not at all."""
+    write_atomically(path, lambda file: file.write(text.encode()))
+
+
+def write_json(path: str | os.PathLike, document: object) -> None:
+    """Write a document as JSON, as a whole or not at all."""
+    write_text(path, json.dumps(document, indent=1))
+
+
+def write_table(path: str | os.PathLike, rows: Iterable, columns: Sequence[str] = (), **spelling) -> None:
+    """Write `table` of rows, as a whole or not at all."""
+    write_text(path, table(rows, columns, **spelling))
+
+
+def table(rows: Iterable, columns: Sequence[str] = (), *, floats: Callable[[float], object] = float) -> str:
+    """Rows of one kind as CSV under a line of headings; None is an empty cell.
+
+    rows: mappings, or values such as dataclasses, whose fields are the cells. columns: their names in order, those of
+    the first row if none are given. floats: how a number is written, as "{:.6g}".format; by default such that it comes
+    back exactly.
+    """
+    rows = list(rows)
+    columns = columns or list(rows[0] if isinstance(rows[0], Mapping) else rows[0].__dataclass_fields__)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    for row in rows:
+        cells = [row[name] if isinstance(row, Mapping) else getattr(row, name) for name in columns]
+        writer.writerow(floats(cell) if isinstance(cell, float) else cell for cell in cells)
+    return text.getvalue()
