@@ -5,7 +5,8 @@ from collections.abc import Callable, Iterable, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.analysis.frame import Tabular, axis, masked, numbered
+from raytrace.analysis.frame import axis, masked
+from raytrace.maths.result import Result
 from raytrace.maths.value import value
 from raytrace.optics.launch import launch
 from raytrace.optics.trace import media, steps
@@ -18,7 +19,7 @@ _OK = STATUS.index("ok")
 
 
 @value
-class Arrivals(Tabular):
+class Arrivals(Result):
     """Rays (3, F, W, P) on the sensor, every ray of the pupil for every field and wavelength.
 
     status: (F, W, P), place in STATUS of what befell it first; reached: (F, W, P), whether it has a place on the
@@ -47,9 +48,8 @@ class Arrivals(Tabular):
             "status": self.status,
         }
 
-    def to_frame(self):
-        """A row a ray, its status in words; x and y are empty where it is not on the sensor."""
-        return numbered(self.columns(), status=STATUS)
+    def words(self) -> dict:
+        return {"status": STATUS}
 
 
 def arrivals(

@@ -3,9 +3,10 @@
 import torch
 from torch import Tensor
 
-from raytrace.analysis.frame import Tabular, axis, masked
+from raytrace.analysis.frame import axis, masked
 from raytrace.analysis.setting import field_range, in_object_space, primary_number, unvignetted, wavelengths_of
 from raytrace.maths.numerics import dot_2, safe_divide, safe_sqrt
+from raytrace.maths.result import Result
 from raytrace.maths.value import value
 from raytrace.optics.focus import image_rays
 from raytrace.optics.launch import is_at_infinity
@@ -16,7 +17,7 @@ _NEAR_CHIEF = 1e-3  # of the pupil: close rays leave 1e-6 of the spherical aberr
 
 
 @value
-class Distortion(Tabular):
+class Distortion(Result):
     """Heights (F, W) in mm of chief rays on the sensor, and by how much they miss the ideal image.
 
     height: along the meridian of the field, positive towards +y (+x where it is the x axis), as the ray's own y.
@@ -38,7 +39,7 @@ class Distortion(Tabular):
 
 
 @value
-class FieldCurvature(Tabular):
+class FieldCurvature(Result):
     """Where close rays about the chief ray meet: (F, W) mm from the sensor, positive behind it.
 
     tangential: of rays in the plane of the field; sagittal: across it; valid: (F, W) bool.
@@ -57,7 +58,7 @@ class FieldCurvature(Tabular):
 
 
 @value
-class LateralColour(Tabular):
+class LateralColour(Result):
     """Height (F, W) in mm of each wavelength's chief ray on the sensor, less the primary wavelength's.
 
     Heights along the meridian of the field, positive towards +y (+x where it is the x axis).

@@ -6,10 +6,11 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace.analysis.frame import Tabular, axis, numbered
+from raytrace.analysis.frame import axis
 from raytrace.kernels import Psf, psf
 from raytrace.maths.grid import Grid, grid
 from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.result import Result
 from raytrace.maths.value import value
 from raytrace.optics.focus import focused
 from raytrace.optics.paraxial import first_order
@@ -37,7 +38,7 @@ _AIRY_PIXELS = 24  # pixels in the radius of the ideal ring
 
 
 @value
-class Comparison(Tabular):
+class Comparison(Result):
     """Kernels of every model on the axis, over object distance, on one sensor.
 
     psfs: of each model, kernels (D, 1, rows, columns); models: their names.
@@ -81,13 +82,12 @@ class Comparison(Tabular):
             "rays": axis(self.object_distances.new_tensor([one.rays for one in self.psfs]), 0, 2),
         }
 
-    def to_frame(self):
-        """A table with a row for every model and object distance."""
-        return numbered(self.columns(), model=self.models)
+    def words(self) -> dict:
+        return {"model": self.models}
 
 
 @value
-class Abilities(Tabular):
+class Abilities(Result):
     """What each model can represent: one number (M,) for each model and question, of the object in focus.
 
     conic: relative L1 change of the kernel when the conic of the most curved surface grows by 0.2 (aberrations).
@@ -112,9 +112,8 @@ class Abilities(Tabular):
         model = torch.arange(len(self.models), device=self.conic.device)
         return {"model": model, **{name: getattr(self, name) for name in names}}
 
-    def to_frame(self):
-        """A table with a row for every model."""
-        return numbered(self.columns(), model=self.models)
+    def words(self) -> dict:
+        return {"model": self.models}
 
 
 def common_focus(lens: Lens, focus_distance: float, *, wavelength: float | Tensor, start: str = "paraxial") -> Lens:

@@ -6,11 +6,12 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.aperture import ExitPupil, exit_pupil
-from raytrace.analysis.frame import Tabular, axis
+from raytrace.analysis.frame import axis
 from raytrace.analysis.setting import refuse_dark, scene_of, wavelength_weights, wavelengths_of
 from raytrace.budget import RAY_BYTES, afford, piece
 from raytrace.kernels.dft import phasor
 from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.result import Result
 from raytrace.maths.value import value
 from raytrace.optics.focus import image_rays
 from raytrace.optics.paraxial import first_order
@@ -22,7 +23,7 @@ _RINGS_PER_STEP = 16
 
 
 @value
-class EncircledEnergy(Tabular):
+class EncircledEnergy(Result):
     """Share (F, K) of the light that reaches the sensor within radii (K,) mm of the centroid (2, F) mm of the rays.
 
     fields: (2, F); kind: "diffraction" or "geometric".

@@ -3,9 +3,10 @@
 import torch
 from torch import Tensor
 
-from raytrace.analysis.frame import Tabular, axis, masked
+from raytrace.analysis.frame import axis, masked
 from raytrace.analysis.setting import scene_of
 from raytrace.maths.pupil import fan as pupil_fan
+from raytrace.maths.result import Result
 from raytrace.maths.value import value
 from raytrace.optics.wavefront import Wavefront, wavefront
 from raytrace.system.lens import Lens
@@ -15,7 +16,7 @@ REFERENCES = ("primary", "own")
 
 
 @value
-class Fan(Tabular):
+class Fan(Result):
     """Aberration over the pupil of every field and wavelength.
 
     tangential: (F, W, P) over pupil y at x = 0; sagittal: (F, W, P) over pupil x at y = 0; 0 where no ray arrives.

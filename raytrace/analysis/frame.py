@@ -1,40 +1,7 @@
-"""Results as tables: every analysis names its columns, and one row is one number of its curves. Loads pandas."""
+"""What the columns of analyses are made of: axes of one common shape, and values that are not there."""
 
-import abc
-from collections.abc import Sequence
-
-import numpy as np
-import pandas as pd
 import torch
 from torch import Tensor
-
-from raytrace.maths.numerics import broadcast_shape
-
-
-class Tabular(abc.ABC):
-    """A result that can be written as a table."""
-
-    __slots__ = ()
-
-    @abc.abstractmethod
-    def columns(self) -> dict[str, Tensor]:
-        """Columns by name, broadcast against one another; NaN where no ray arrives."""
-
-    def to_frame(self) -> pd.DataFrame:
-        """A table with a row for every point of every curve."""
-        return pd.DataFrame(flat(self.columns()))
-
-
-def flat(columns: dict[str, Tensor]) -> dict[str, np.ndarray]:
-    """Columns as flat arrays of one length, in the order of their common shape."""
-    shape = broadcast_shape(*(column.shape for column in columns.values()))
-    return {name: column.detach().cpu().expand(shape).reshape(-1).numpy() for name, column in columns.items()}
-
-
-def numbered(columns: dict[str, Tensor], **names: Sequence[str]) -> pd.DataFrame:
-    """A table in which the numbers of some columns, 0 and up, are replaced by names."""
-    frame = pd.DataFrame(flat(columns))
-    return frame.assign(**{name: [words[number] for number in frame[name]] for name, words in names.items()})
 
 
 def axis(values: Tensor, place: int, axes: int) -> Tensor:

@@ -4,9 +4,10 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.chief import chief_points
-from raytrace.analysis.frame import Tabular, axis, masked
+from raytrace.analysis.frame import axis, masked
 from raytrace.analysis.setting import field_range, in_object_space, unvignetted
 from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.result import Result
 from raytrace.maths.value import value
 from raytrace.optics.launch import is_at_infinity
 from raytrace.system.lens import Lens
@@ -17,7 +18,7 @@ _NEAR_AXIS = (
 
 
 @value
-class GridDistortion(Tabular):
+class GridDistortion(Result):
     """Chief rays (2, W, N, N) mm on the sensor, of a grid of object points along y (rows) and x (columns).
 
     actual: where they land; ideal: where they would without distortion, by the linear map of rays close to the axis.

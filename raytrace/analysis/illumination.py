@@ -5,11 +5,12 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace.analysis.frame import Tabular, axis
+from raytrace.analysis.frame import axis
 from raytrace.analysis.setting import field_range, scene_of, wavelength_weights
 from raytrace.maths import zernike
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.result import Result
 from raytrace.maths.value import value
 from raytrace.optics.wavefront import wavefront
 from raytrace.system.lens import Lens
@@ -20,7 +21,7 @@ _TERMS = 45  # Zernike terms (to degree 8) of the map from the pupil to directio
 
 
 @value
-class RelativeIllumination(Tabular):
+class RelativeIllumination(Result):
     """illumination: (F,), 1 on the axis; projected_solid_angle: (F,) sr; fields: (2, F)."""
 
     illumination: Tensor

@@ -3,9 +3,10 @@
 import torch
 from torch import Tensor
 
-from raytrace.analysis.frame import Tabular, axis, masked
+from raytrace.analysis.frame import axis, masked
 from raytrace.analysis.setting import field_range
 from raytrace.maths.numerics import dot
+from raytrace.maths.result import Result
 from raytrace.maths.value import value
 from raytrace.optics.launch import launch
 from raytrace.optics.trace import media, steps
@@ -16,7 +17,7 @@ _LOWER, _CHIEF, _UPPER = range(3)
 
 
 @value
-class Incidence(Tabular):
+class Incidence(Result):
     """Angles (F, W, 3, K) in degrees at surfaces 1 … K, the last of them the sensor.
 
     angle: between the normal of the surface and the ray in front of it, in the plane of the field: positive where the

@@ -3,8 +3,9 @@
 import torch
 from torch import Tensor
 
-from raytrace.analysis.frame import Tabular, axis, masked
+from raytrace.analysis.frame import axis, masked
 from raytrace.maths.numerics import safe_divide
+from raytrace.maths.result import Result
 from raytrace.maths.value import value
 from raytrace.optics.focus import image_rays
 from raytrace.system.lens import Lens
@@ -13,7 +14,7 @@ _NEAR_AXIS = 1e-4  # of the pupil: the ray that stands for the centre leaves 1e-
 
 
 @value
-class LongitudinalAberration(Tabular):
+class LongitudinalAberration(Result):
     """Crossings (W, P) with the axis, mm along z from the sensor, of rays at heights `pupil` (P,) from 0 to 1.
 
     The first one is the paraxial focus of each wavelength. valid: (W, P) bool, whether there is a crossing;

@@ -6,12 +6,13 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.aperture import MARGIN, exit_pupil
-from raytrace.analysis.frame import Tabular, axis
+from raytrace.analysis.frame import axis
 from raytrace.analysis.setting import primary_number, refuse_dark, scene_of, wavelength_weights, wavelengths_of
 from raytrace.budget import RAY_BYTES, piece
 from raytrace.kernels.dft import phasor, rings_and_arms
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.result import Result
 from raytrace.maths.value import value
 from raytrace.optics.focus import image_rays
 from raytrace.optics.paraxial import first_order
@@ -23,7 +24,7 @@ _LEAST_RINGS, _MOST_RAYS = 24, 100_000
 
 
 @value
-class Mtf(Tabular):
+class Mtf(Result):
     """Modulation of all wavelengths together, by field and spatial frequency.
 
     tangential, sagittal: (F, K), of patterns that vary along y and along x.
@@ -50,7 +51,7 @@ class Mtf(Tabular):
 
 
 @value
-class ThroughFocusMtf(Tabular):
+class ThroughFocusMtf(Result):
     """Modulation at one frequency over sensor distances: tangential, sagittal (S, F); sensor_distances: (S,) mm.
 
     frequency: cycles/mm; fields: (2, F); kind: "diffraction" or "geometric".

@@ -6,10 +6,11 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.fans import REFERENCES
-from raytrace.analysis.frame import Tabular, axis
+from raytrace.analysis.frame import axis
 from raytrace.analysis.setting import field_range, scene_of, wavelength_weights
 from raytrace.maths.numerics import safe_sqrt
 from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.result import Result
 from raytrace.maths.value import value
 from raytrace.optics.focus import image_rays
 from raytrace.optics.spot import spot, spot_of_points
@@ -21,7 +22,7 @@ QUANTITIES = ("wavefront", "spot")
 
 
 @value
-class RmsOverField(Tabular):
+class RmsOverField(Result):
     """RMS of every field: `rms` (F, W) of each wavelength, `polychromatic` (F,) of all by their weights.
 
     Of the wavefront: waves about the mean; of the spot: mm about the centroid. nan where no light arrives.

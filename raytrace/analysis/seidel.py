@@ -16,7 +16,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from raytrace.analysis.frame import Tabular, axis
+from raytrace.analysis.frame import axis
+from raytrace.maths.result import Result
 from raytrace.maths.value import value
 from raytrace.optics.launch import paraxial_field
 from raytrace.optics.paraxial import FirstOrder, first_order, marginal_ray, signed, vertex_curvature
@@ -26,7 +27,7 @@ from raytrace.system.surface import Surface
 
 
 @value
-class Seidel(Tabular):
+class Seidel(Result):
     """Contributions (J, F, K) of surfaces 1 … K to J aberrations of F fields; their sums over K are the lens's.
 
     names: of the aberrations; kind: a key of KINDS, which says what they are; unit: "mm" or "waves".

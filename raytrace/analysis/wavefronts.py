@@ -5,11 +5,12 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from raytrace.analysis.frame import Tabular, axis
+from raytrace.analysis.frame import axis
 from raytrace.analysis.setting import scene_of
 from raytrace.budget import RAY_BYTES, afford, piece
 from raytrace.kernels.diffraction import strehl
 from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.result import Result
 from raytrace.maths.value import value
 from raytrace.optics.scene import Scene
 from raytrace.optics.wavefront import peak_to_valley, rms, wavefront, zernike_coefficients
@@ -22,7 +23,7 @@ _BY_FIELD = ("opd", "valid", "coefficients", "rms", "peak_to_valley", "strehl")
 
 
 @value
-class WavefrontMap(Tabular):
+class WavefrontMap(Result):
     """The wavefront of every field and wavelength.
 
     opd: (F, W, N, N) waves at pupil points y (rows) and x (columns) of `pupil` (N,), 0 where `valid` is False.

@@ -14,10 +14,11 @@ from raytrace.bench import less_work, speed, speed_report
 from raytrace.bench.figure_speed import speed_figure
 from raytrace.bench.limit import Built, build
 from raytrace.bench.speed_own import three_aspheres
-from raytrace.cli.door import number, print_json, say
+from raytrace.cli.door import print_json, say
 from raytrace.cli.progress import Bar, Lines, progress
 from raytrace.files import write_atomically
 from raytrace.fused import NoCompiler
+from raytrace.maths.result import number
 from raytrace.pages import machine
 
 

@@ -7,9 +7,10 @@ from pathlib import Path
 from raytrace import plot
 from raytrace.bench import wave_report
 from raytrace.bench.wave import agreement, bench_scene, entrants, measure, target
-from raytrace.cli.door import number, print_json
+from raytrace.cli.door import print_json
 from raytrace.cli.progress import progress
 from raytrace.files import write_atomically
+from raytrace.maths.result import number
 from raytrace.pages import machine
 from raytrace.plot.wave import bench_figure
 

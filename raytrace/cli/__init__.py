@@ -43,6 +43,15 @@ class _Parser(argparse.ArgumentParser):
         print(f"raytrace: error: {message}; see `{self.prog} --help`", file=sys.stderr)
         raise SystemExit(2)
 
+    def _parse_optional(self, arg_string):
+        """An option may also be spelled as the keyword of its verb: --fields for --field."""
+        name, sign, value = arg_string.partition("=")
+        if name not in self._option_string_actions and name.startswith("--"):
+            keyword = name[2:].replace("-", "_")
+            known = next((a for a in self._actions if a.option_strings and a.dest == keyword), None)
+            arg_string = arg_string if known is None else known.option_strings[-1] + sign + value
+        return super()._parse_optional(arg_string)
+
     def parse_known_args(self, args=None, namespace=None):
         found, unknown = super().parse_known_args(args, namespace)
         option = next((word for word in unknown if word.startswith("-")), None)
@@ -88,7 +97,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         arguments = build_parser().parse_args(argv)
     except SystemExit as stop:  # argparse printed its help or its usage error
         return stop.code if isinstance(stop.code, int) else 2
-    module, function = arguments.run.rsplit(".", 1)
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         warnings.showwarning = _shower()
@@ -97,11 +105,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 importlib.import_module("raytrace.cli.progress").heartbeat(arguments.command),
                 importlib.import_module("raytrace.budget").within(getattr(arguments, "max_bytes", None)),
             ):
-                run = getattr(importlib.import_module(f"raytrace.{module}"), function)
-                if getattr(arguments, "object_distance", None) and not arguments.distances_together:
-                    each_distance(run, arguments)
-                else:
-                    run(arguments)
+                _run(arguments)
         except KeyboardInterrupt:
             return _fail("interrupted", 130)
         except BrokenPipeError:
@@ -120,6 +124,18 @@ def main(argv: Sequence[str] | None = None) -> int:
                 f"{kind}: {_one_line(error)} (a defect of raytrace; RAYTRACE_TRACEBACK=1 shows where, please report)", 1
             )
     return 0
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    if not isinstance(arguments.run, str):
+        importlib.import_module("raytrace.cli.run").carry_out(arguments.run, arguments)
+        return
+    module, function = arguments.run.rsplit(".", 1)
+    run = getattr(importlib.import_module(f"raytrace.{module}"), function)
+    if getattr(arguments, "object_distances", None) and not arguments.distances_together:
+        each_distance(run, arguments)
+    else:
+        run(arguments)
 
 
 def script() -> None:

@@ -11,7 +11,7 @@ from raytrace.system.lens import FIELD_UNITS, name_of_field
 def seidel(arguments: argparse.Namespace) -> None:
     """Third-order aberrations by surface and their sums."""
     lens = open_lens(arguments)
-    fields = field_points(lens, arguments) if arguments.field else None
+    fields = field_points(lens, arguments) if arguments.fields else None
     found = analysis.seidel(lens, fields=fields, kind=arguments.told)
     if arguments.json:
         document = {"analysis": "seidel", "kind": found.kind, "unit": found.unit}
@@ -49,7 +49,7 @@ def longitudinal(arguments: argparse.Namespace) -> None:
 def grid(arguments: argparse.Namespace) -> None:
     """Grid distortion: the text is a map in per cent, top row first; the JSON has the points."""
     lens = open_lens(arguments)
-    wavelengths = lens.wavelengths if arguments.wavelength else None
+    wavelengths = lens.wavelengths if arguments.wavelengths else None
     found = analysis.grid_distortion(lens, wavelengths=wavelengths, size=arguments.points)
     if arguments.json:
         summary = {"wavelength": found.wavelengths, "largest": found.largest()}
@@ -69,8 +69,8 @@ def grid(arguments: argparse.Namespace) -> None:
 
 def incidence(arguments: argparse.Namespace) -> None:
     """Angles of incidence on the sensor, or with --surfaces on every surface."""
-    lens, fields = opened(arguments) if arguments.field else (open_lens(arguments), None)
-    wavelengths = lens.wavelengths if arguments.wavelength else None
+    lens, fields = opened(arguments) if arguments.fields else (open_lens(arguments), None)
+    wavelengths = lens.wavelengths if arguments.wavelengths else None
     found = analysis.incidence(lens, fields=fields, wavelengths=wavelengths, size=arguments.samples)
     if arguments.json:
         print_json({"analysis": "incidence", "results": rows(found.columns()), "summary": rows(found.on_sensor())})
@@ -84,7 +84,7 @@ def incidence(arguments: argparse.Namespace) -> None:
 
 def rms(arguments: argparse.Namespace) -> None:
     """RMS over the field: a row for each field, the wavelengths beside one another."""
-    lens, fields = opened(arguments) if arguments.field else (open_lens(arguments), None)
+    lens, fields = opened(arguments) if arguments.fields else (open_lens(arguments), None)
     rule = {"quantity": "spot" if arguments.spot else "wavefront", "reference": arguments.reference}
     found = analysis.rms_over_field(lens, fields=fields, size=arguments.samples, **rule)
     if arguments.json:

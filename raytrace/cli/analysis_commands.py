@@ -7,12 +7,11 @@ import torch
 from torch import Tensor
 
 from raytrace import analysis
-from raytrace.analysis.frame import Tabular, flat
-from raytrace.cli.door import CommandError, field_points, number, open_lens, print_json, say
+from raytrace.cli.door import CommandError, field_points, open_lens, print_json, say
 from raytrace.cli.reach import check_reach, refuse_empty
-from raytrace.cli.spots import cell
 from raytrace.maths import zernike
 from raytrace.maths.numerics import broadcast_shape
+from raytrace.maths.result import Result, cell, flat, number
 from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
 
 _UNITS = {
@@ -131,7 +130,7 @@ def opened(arguments: argparse.Namespace, *, every: bool = False) -> tuple[Lens,
 
 def over_field(arguments: argparse.Namespace, analyse: Callable, figure: str) -> None:
     """Report an analysis at the fields of --field, else at --samples fields; its figure is drawn through many."""
-    lens, fields = opened(arguments) if arguments.field else (open_lens(arguments), None)
+    lens, fields = opened(arguments) if arguments.fields else (open_lens(arguments), None)
     found = analyse(lens, fields=fields, size=arguments.samples)
     refuse_empty(arguments, lens, found)
     line = None if fields is None else _line(fields)
@@ -153,13 +152,13 @@ def _line(fields: Tensor) -> Tensor:
 def report(
     arguments,
     lens: Lens,
-    found: Tabular,
+    found: Result,
     figure: str,
     *,
     every: int = 1,
     unit: str = "",
     summary: dict[str, Tensor] | None = None,
-    dense: Tabular | None = None,
+    dense: Result | None = None,
     **options,
 ) -> None:
     """Print the result as JSON, or every so many-th row of its table; save the figure of it, or of the dense one."""
@@ -171,7 +170,7 @@ def report(
     draw(arguments, lens, found if dense is None else dense, figure, **options)
 
 
-def draw(arguments, lens: Lens, found: Tabular, figure: str, **options) -> None:
+def draw(arguments, lens: Lens, found: Result, figure: str, **options) -> None:
     """Save the figure of that name in `raytrace.plot`, if --plot asks for it."""
     if arguments.plot:
         from raytrace import plot

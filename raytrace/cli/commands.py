@@ -1,10 +1,7 @@
 """The commands of `raytrace`: their words, their arguments, and what runs them. Imports no torch."""
 
-import argparse
-from collections.abc import Callable
-from dataclasses import dataclass
-
 from raytrace.cli.analysis_table import ANALYSES
+from raytrace.cli.command import Command
 from raytrace.cli.options import (
     aperture,
     catalog,
@@ -29,18 +26,6 @@ from raytrace.cli.options import (
 )
 from raytrace.cli.studies import words
 from raytrace.cli.wave_table import WAVE
-
-
-@dataclass(frozen=True)
-class Command:
-    """One command: its words on the help page, its arguments, and the function that runs it ("module.function")."""
-
-    name: str
-    summary: str
-    description: str
-    examples: str
-    add_arguments: Callable[[argparse.ArgumentParser], None]
-    run: str
 
 
 def _info(parser):

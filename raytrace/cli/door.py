@@ -3,7 +3,6 @@
 import argparse
 import dataclasses
 import json
-import math
 import sys
 from pathlib import Path
 
@@ -47,14 +46,14 @@ def open_lens(arguments: argparse.Namespace) -> Lens:
     """Read the lens and set the conditions that the arguments name."""
     path = find_lens(arguments.lens)
     lens = read_lens(path, catalogs=catalogs(arguments))
-    wavelengths = getattr(arguments, "wavelength", None)
+    wavelengths = getattr(arguments, "wavelengths", None)
     if wavelengths:
         lens = with_wavelengths(lens, wavelengths, where=str(path))
     if getattr(arguments, "f_number", None):
         lens = _with_aperture(lens, "image_f_number", arguments.f_number)
     if getattr(arguments, "entrance_pupil_diameter", None):
         lens = _with_aperture(lens, "entrance_pupil_diameter", arguments.entrance_pupil_diameter)
-    distance = getattr(arguments, "object_distance", None)
+    distance = getattr(arguments, "object_distances", None)
     if isinstance(distance, float):
         lens = with_object_distance(lens, distance)
     if getattr(arguments, "sensor_distance", None) is not None:
@@ -83,7 +82,7 @@ def catalogs(arguments: argparse.Namespace) -> tuple[Path, ...]:
 
 def field_points(lens: Lens, arguments: argparse.Namespace, *, on_axis: bool = False) -> Tensor:
     """(2, F) field points: those of --field, else the axis alone or the lens's own."""
-    given = getattr(arguments, "field", None)
+    given = getattr(arguments, "fields", None)
     if given:
         for angle in (angle for point in given for angle in point):
             if lens.fields.kind == "angle" and abs(angle) >= 90:
@@ -111,19 +110,6 @@ def refuse_suffix(option: str, path: str | None, known: tuple[str, ...]) -> None
     """Raise CommandError for the name of a file, if one is given, with another suffix than the known ones."""
     if path and Path(path).suffix.lower() not in known:
         raise CommandError(f"{option} {path}: expected a name that ends in {', '.join(filter(None, known))}")
-
-
-def number(value) -> float | None:
-    """A number for JSON; null for what is undefined, infinite or not there."""
-    if value is None:
-        return None
-    value = float(value)
-    return value + 0.0 if math.isfinite(value) else None  # + 0.0 makes -0 a 0
-
-
-def numbers(values: Tensor) -> list:
-    """A tensor as nested lists of numbers for JSON."""
-    return [number(entry) if entry.dim() == 0 else numbers(entry) for entry in values.detach()]
 
 
 def print_json(document: dict) -> None:

@@ -6,20 +6,10 @@ import warnings
 import torch
 from torch import Tensor
 
-from raytrace.cli.door import (
-    CommandError,
-    catalogs,
-    field_points,
-    find_lens,
-    number,
-    numbers,
-    open_lens,
-    primary,
-    print_json,
-    say,
-)
+from raytrace.cli.door import CommandError, catalogs, field_points, find_lens, open_lens, primary, print_json, say
 from raytrace.cli.spots import pupil_points, warn_of_losses
 from raytrace.formats import read_lens, write_lens
+from raytrace.maths.result import number, numbers
 from raytrace.optics.focus import focus as best_focus
 from raytrace.optics.focus import focus_of_mean_radius, image_rays, is_behind, mean_rms_radius
 from raytrace.optics.paraxial import first_order, paraxial_image_distance
@@ -29,9 +19,9 @@ from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field, with_object_d
 def focus(arguments: argparse.Namespace) -> None:
     """Best sensor distance, before and after."""
     lens = open_lens(arguments)
-    distances = arguments.object_distance or [float(lens.surfaces[0].thickness)]
+    distances = arguments.object_distances or [float(lens.surfaces[0].thickness)]
     fields = field_points(lens, arguments, on_axis=True)
-    wavelengths = lens.wavelengths if arguments.wavelength else primary(lens)[None]
+    wavelengths = lens.wavelengths if arguments.wavelengths else primary(lens)[None]
     points, weights = pupil_points(arguments)
     _check_weights(arguments, distances, fields, wavelengths)
     rule = {

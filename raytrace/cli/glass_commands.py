@@ -5,7 +5,8 @@ import re
 
 import torch
 
-from raytrace.cli.door import catalogs, number, print_json
+from raytrace.cli.door import catalogs, print_json
+from raytrace.maths.result import number
 from raytrace.media.catalog import edition, find_glass
 from raytrace.media.glass import LINES, abbe_number, check_wavelengths, mil_glass, nd, refractive_index
 from raytrace.system.lens import check_unit

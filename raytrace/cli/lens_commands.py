@@ -7,18 +7,9 @@ from pathlib import Path
 
 import torch
 
-from raytrace.cli.door import (
-    catalogs,
-    field_points,
-    find_lens,
-    number,
-    numbers,
-    open_lens,
-    print_json,
-    refuse_untraceable,
-    say,
-)
+from raytrace.cli.door import catalogs, field_points, find_lens, open_lens, print_json, refuse_untraceable, say
 from raytrace.formats import LensFileWarning, read_lens_with_report, write_lens
+from raytrace.maths.result import number, numbers
 from raytrace.optics.f_number import real_working_f_number
 from raytrace.optics.paraxial import first_order, vertex_curvature
 from raytrace.optics.trace import media

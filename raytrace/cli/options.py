@@ -177,6 +177,7 @@ def max_bytes(parser: argparse.ArgumentParser) -> None:
 def object_distance(group, several: str, *, default: list[float] | None = None) -> None:
     group.add_argument(
         "--object-distance",
+        dest="object_distances",
         metavar="MM",
         type=positive,
         nargs="+",
@@ -197,13 +198,19 @@ def aperture(group) -> None:
 
 def wavelength(group) -> None:
     group.add_argument(
-        "--wavelength", metavar="UM", type=positive_finite, nargs="+", help="wavelengths in µm; the first is primary"
+        "--wavelength",
+        dest="wavelengths",
+        metavar="UM",
+        type=positive_finite,
+        nargs="+",
+        help="wavelengths in µm; the first is primary",
     )
 
 
 def fields(parser: argparse.ArgumentParser, *, default: str = "") -> None:
     parser.add_argument(
         "--field",
+        dest="fields",
         metavar="F",
         type=field_point,
         nargs="+",

@@ -8,13 +8,14 @@ from torch import Tensor
 
 from raytrace.analysis import PIXEL, SIZE, Abilities, Comparison, abilities, common_focus
 from raytrace.analysis import compare as compare_models
-from raytrace.cli.door import CommandError, field_points, number, numbers, open_lens, primary, print_json, say
-from raytrace.cli.spots import cell, warn_of_losses
+from raytrace.cli.door import CommandError, field_points, open_lens, primary, print_json, say
+from raytrace.cli.spots import warn_of_losses
 from raytrace.files import write_atomically
 from raytrace.kernels import NotConverged, Psf, close_up, default_center
 from raytrace.kernels import psf as compute
 from raytrace.maths.grid import Grid, grid
 from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.result import cell, number, numbers
 from raytrace.optics.focus import NoImage, real_image_distance
 from raytrace.optics.paraxial import first_order
 from raytrace.shards import Share, processes
@@ -30,7 +31,7 @@ def psf(arguments: argparse.Namespace) -> None:
 def _psf(arguments: argparse.Namespace, share: Share) -> None:
     lens = open_lens(arguments)
     fields = field_points(lens, arguments)
-    distances = arguments.object_distance or [float(lens.surfaces[0].thickness)]
+    distances = arguments.object_distances or [float(lens.surfaces[0].thickness)]
     rays_are_shared = arguments.model == "gaussian" or (arguments.model == "drt" and arguments.rays)
     if share.processes > 1 and len(distances) * fields.shape[1] * len(lens.wavelengths) == 1 and not rays_are_shared:
         say(f"a single kernel of {arguments.model} is not cut: each of the {share.processes} processes computes it")
@@ -40,7 +41,7 @@ def _psf(arguments: argparse.Namespace, share: Share) -> None:
         fields=fields,
         object_distances=lens.wavelengths.new_tensor(distances),
         grid=_pixels(lens, arguments),
-        center=arguments.center or default_center(fields if arguments.field else None),
+        center=arguments.center or default_center(fields if arguments.fields else None),
         tol=arguments.tol,
         rays=arguments.rays,
         normalise=arguments.normalise,
@@ -222,8 +223,8 @@ _WHOLE = ("parameters", "rays")
 def compare(arguments: argparse.Namespace) -> None:
     """The models side by side over object distance, and what each of them can represent, in numbers."""
     lens = open_lens(arguments)
-    wavelength = primary(lens) if arguments.wavelength else 0.53
-    distances = lens.wavelengths.new_tensor(arguments.object_distance)
+    wavelength = primary(lens) if arguments.wavelengths else 0.53
+    distances = lens.wavelengths.new_tensor(arguments.object_distances)
     try:
         lens = common_focus(lens, arguments.focus_distance, wavelength=wavelength, start=arguments.start)
         real_image_distance(lens, distances)

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis import Distortion, FieldCurvature, LateralColour, RelativeIllumination
-from raytrace.analysis.frame import Tabular, flat
 from raytrace.cli.door import CommandError, primary, say
 from raytrace.maths.pupil import hexapolar
+from raytrace.maths.result import Result, flat
 from raytrace.optics.losses import beam_hint, losses
 from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
 
@@ -42,13 +42,13 @@ def _help(arguments: argparse.Namespace, lens: Lens) -> str:
     """What to do about a field out of reach."""
     if hint := beam_hint(lens):
         return f"{hint}; see --f-number and --entrance-pupil-diameter"
-    if getattr(arguments, "field", None):
+    if getattr(arguments, "fields", None):
         largest = float(torch.hypot(lens.fields.x, lens.fields.y).amax())
         return f"the lens's own fields go to {largest:g} {FIELD_UNITS[lens.fields.kind]}, give --field within"
     return "give other fields by --field, a smaller beam by --f-number or --entrance-pupil-diameter"
 
 
-def refuse_empty(arguments: argparse.Namespace, lens: Lens, found: Tabular) -> None:
+def refuse_empty(arguments: argparse.Namespace, lens: Lens, found: Result) -> None:
     """Raise CommandError for a result that shows nothing, with the cause and the option that helps."""
     columns = found.columns()
     if isinstance(found, LateralColour) and len(found.wavelengths) < 2:
@@ -58,7 +58,7 @@ def refuse_empty(arguments: argparse.Namespace, lens: Lens, found: Tabular) -> N
             f"{one:g} µm; give several by --wavelength"
         )
     on_axis = isinstance(found, _OVER_FIELD) and not bool(found.fields.any())
-    if on_axis and (isinstance(found, Distortion | LateralColour) or arguments.plot or not arguments.field):
+    if on_axis and (isinstance(found, Distortion | LateralColour) or arguments.plot or not arguments.fields):
         raise CommandError(
             f"{arguments.lens}: nothing to show over the field: all fields are on the axis; give others by --field"
         )

@@ -15,9 +15,9 @@ def each_distance(run: Callable[[argparse.Namespace], None], arguments: argparse
     Text has a heading a distance; JSON is one document {"results_by_object_distance": [{"object_distance", …}, …]},
     null for infinity; a file NAME.png becomes NAME_25000mm.png. One distance alone changes nothing of this.
     """
-    distances = arguments.object_distance
+    distances = arguments.object_distances
     if len(distances) == 1:
-        return run(argparse.Namespace(**{**vars(arguments), "object_distance": distances[0]}))
+        return run(argparse.Namespace(**{**vars(arguments), "object_distances": distances[0]}))
     documents = []
     for distance in distances:
         one = _at(arguments, distance)
@@ -36,7 +36,7 @@ def each_distance(run: Callable[[argparse.Namespace], None], arguments: argparse
 def _at(arguments: argparse.Namespace, distance: float) -> argparse.Namespace:
     """The arguments for one distance, with files named by it."""
     suffix = "_" + _words(distance).replace(" ", "")
-    one = argparse.Namespace(**{**vars(arguments), "object_distance": distance, "suffix": suffix})
+    one = argparse.Namespace(**{**vars(arguments), "object_distances": distance, "suffix": suffix})
     for name in ("plot", "output"):
         if getattr(one, name, None):
             path = Path(getattr(one, name))

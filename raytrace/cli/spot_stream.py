@@ -4,10 +4,11 @@ import argparse
 
 from torch import Tensor
 
-from raytrace.cli.door import CommandError, field_points, number, open_lens, print_json, ray_aiming
+from raytrace.cli.door import CommandError, field_points, open_lens, print_json, ray_aiming
 from raytrace.cli.progress import progress
 from raytrace.cli.spots import spot_cells, spot_entry, warn_of_losses
 from raytrace.maths import pupil
+from raytrace.maths.result import number
 from raytrace.optics.streaming import MAX_BYTES, StreamedSpot, stream_spots
 from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
 

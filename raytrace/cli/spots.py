@@ -1,13 +1,13 @@
 """What the commands about spots share: points of the pupil, and how a field and a spot are told."""
 
 import argparse
-import math
 
 import torch
 from torch import Tensor
 
-from raytrace.cli.door import CommandError, number, numbers, say
+from raytrace.cli.door import CommandError, say
 from raytrace.maths import pupil
+from raytrace.maths.result import cell, number, numbers
 from raytrace.optics.losses import beam_hint, losses
 from raytrace.optics.spot import Spot
 from raytrace.optics.streaming import StreamedSpot
@@ -48,14 +48,6 @@ def spot_cells(spots: Spot | StreamedSpot, at: tuple[int, ...]) -> str:
     x, y = spots.centroid[(slice(None), *at)].tolist()
     radii = (1000 * float(radius[at]) for radius in (spots.rms_radius, spots.geometric_radius))
     return " ".join([*(cell(v, ">13.7f") for v in (x, y)), *(cell(v, ">10.4f") for v in radii)])
-
-
-def cell(value: float, form: str) -> str:
-    """A number in a table, or - of the same width where there is none."""
-    if not math.isfinite(value):
-        return f"{'-':>{len(f'{0.0:{form}}')}}"
-    shown = f"{value:{form}}"
-    return shown if float(shown) else f"{0.0:{form}}"  # what rounds to 0 has no sign
 
 
 def warn_of_losses(

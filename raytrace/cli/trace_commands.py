@@ -13,15 +13,15 @@ def trace(arguments: argparse.Namespace) -> None:
     """Rays of a table, or the chief and marginal rays of the fields, surface by surface."""
     lens = open_lens(arguments)
     if arguments.rays is not None:
-        if arguments.object_distance or arguments.field:
+        if arguments.object_distances or arguments.fields:
             say("warning: --object-distance and --field change nothing: the rays of a table begin where it says")
         batches, total = ray_table.read(arguments.rays, lens)
     else:
         batches, total, unaimed = ray_table.chief_and_marginal(
             lens,
-            object_distances=arguments.object_distance or [float(lens.surfaces[0].thickness)],
+            object_distances=arguments.object_distances or [float(lens.surfaces[0].thickness)],
             fields=field_points(lens, arguments),
-            wavelengths=lens.wavelengths if arguments.wavelength else primary(lens)[None],
+            wavelengths=lens.wavelengths if arguments.wavelengths else primary(lens)[None],
             ray_aiming=ray_aiming(arguments),
         )
         if unaimed:

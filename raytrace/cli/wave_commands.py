@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from raytrace import plot
-from raytrace.cli.door import number, print_json, refuse_suffix, say
+from raytrace.cli.door import print_json, refuse_suffix, say
 from raytrace.cli.progress import progress
 from raytrace.cli.wave_setup import elements, kernels, scene
 from raytrace.files import write_atomically
 from raytrace.maths.grid import Grid, centres
+from raytrace.maths.result import number
 from raytrace.plot import wave as figures
 from raytrace.plot.style import object_text
 from raytrace.wave.caustic import caustic

@@ -1,20 +1,34 @@
-"""Prescriptions as pandas tables, in and out. This module alone of the package loads pandas."""
+"""Results and prescriptions as pandas tables. This module alone of the library loads pandas."""
 
 from collections.abc import Sequence
+from os import PathLike
 from pathlib import Path
 
 import pandas as pd
 
+from raytrace.files import write_atomically
 from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, Place
 from raytrace.formats.table import build
 from raytrace.formats.table_text import Table, add_metadata, add_row, header
 from raytrace.formats.table_write import header as header_lines
 from raytrace.formats.table_write import rows
+from raytrace.maths.result import Result, flat
 from raytrace.system.lens import Lens
 
 _NUMERIC = ("curvature", "thickness", "conic", "semi_diameter")
 _PLACE = Place("DataFrame")
+
+
+def frame_of(result: Result) -> pd.DataFrame:
+    """A result as a table: a row for every point of every curve."""
+    frame = pd.DataFrame(flat(result.columns()))
+    return frame.assign(**{name: [words[number] for number in frame[name]] for name, words in result.words().items()})
+
+
+def save(result: Result, path: str | PathLike) -> None:
+    """Write a result's table as .csv, as a whole or not at all."""
+    write_atomically(path, lambda file: result.to_frame().to_csv(file, index=False))
 
 
 def to_frame(lens: Lens, *, catalogs: Sequence[Path] = ()) -> pd.DataFrame:

@@ -16,8 +16,10 @@ def value(cls: type) -> type:
     Tensors, values and tuples of values are its children; every other field (names, flags, `None`) is structure, so
     that `torch.func.vmap`, `jacfwd` and `tree_map` see only numbers. There is no generated `==` (it would raise on
     tensors) and no validation on construction (it would break `vmap`): wrong input is refused at the doors.
+    A class that says itself how it is shown keeps its `__repr__`.
     """
-    cls = dataclasses.dataclass(frozen=True, eq=False, slots=True)(cls)
+    shown = cls.__repr__ is object.__repr__
+    cls = dataclasses.dataclass(frozen=True, eq=False, slots=True, repr=shown)(cls)
     fields = dataclasses.fields(cls)
     numeric = {field.name for field in fields if _holds_numbers(field.type)}
 

@@ -15,18 +15,10 @@ from tqdm import tqdm
 
 from raytrace.camera.network import PRESETS, RedNetShape, faster_precision
 from raytrace.camera.training import NotFinite, Record, read_json
-from raytrace.cli.door import (
-    CommandError,
-    catalogs,
-    field_points,
-    find_lens,
-    number,
-    open_lens,
-    refuse_untraceable,
-    say,
-)
+from raytrace.cli.door import CommandError, catalogs, field_points, find_lens, open_lens, refuse_untraceable, say
 from raytrace.formats import FORMATS
 from raytrace.formats.pictures import Pictures, dead_leaves, files, read, split
+from raytrace.maths.result import number
 from raytrace.optics.focus import NoImage
 from raytrace.optics.paraxial import paraxial_image_distance
 from raytrace.shards import share
@@ -106,10 +98,10 @@ def settings_of(arguments: argparse.Namespace, begun: Path) -> Settings:
     for words in ("vary", "bounds"):
         if getattr(arguments, words):
             given[words] = " ".join(getattr(arguments, words))
-    if arguments.field:
-        if any(x for x, _ in arguments.field):
+    if arguments.fields:
+        if any(x for x, _ in arguments.fields):
             raise CommandError("--field X,Y: co-design takes field points along y, --field Y")
-        given["fields"] = tuple(y for _, y in arguments.field)
+        given["fields"] = tuple(y for _, y in arguments.fields)
     given |= _light(arguments)
     if arguments.precision == "auto":
         shape = RedNetShape(given["depth"], given["width"])
@@ -120,10 +112,10 @@ def settings_of(arguments: argparse.Namespace, begun: Path) -> Settings:
 def _light(arguments: argparse.Namespace) -> dict[str, tuple[float, ...]]:
     """Wavelengths and weights by the options: those given, or the file's own, its primary one first."""
     if not arguments.file_wavelengths:
-        wavelengths = tuple(arguments.wavelength or Settings.wavelengths)
+        wavelengths = tuple(arguments.wavelengths or Settings.wavelengths)
         weights = tuple(arguments.wavelength_weights or [1.0] * len(wavelengths))
         return {"wavelengths": wavelengths, "wavelength_weights": weights}
-    if arguments.wavelength or arguments.wavelength_weights:
+    if arguments.wavelengths or arguments.wavelength_weights:
         raise CommandError("--file-wavelengths takes the file's own: leave out --wavelength and --wavelength-weights")
     lens = open_lens(argparse.Namespace(lens=arguments.lens, catalog=arguments.catalog))
     order = sorted(range(len(lens.wavelengths)), key=lambda k: k != lens.primary_wavelength)

@@ -1,0 +1,117 @@
+"""What every command does: open the lens, call the verb once, print or save what it gives."""
+
+import argparse
+import inspect
+import math
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+
+import raytrace
+from raytrace.cli.door import CommandError, open_lens, print_json, say
+from raytrace.cli.progress import progress
+from raytrace.maths.result import Result
+
+#: Options that are for the runner: they set the lens, or say where the result goes. A verb that has one gets it too.
+_RUNNERS = (
+    *("command", "subcommand", "run", "lens", "catalog", "json", "plot", "output", "suffix", "max_bytes"),
+    *("object_distances", "distances_together", "sensor_distance", "wavelengths"),
+    *("f_number", "entrance_pupil_diameter"),
+)
+_DRAWING = "plot_"  # options of the figure begin with it: --log, dest="plot_log"
+
+
+def carry_out(command: ModuleType, arguments: argparse.Namespace) -> None:
+    """Run a command; its verb gets every option as the keyword of the same name.
+
+    Several object distances go to the verb where it takes `object_distances`, else one result follows the other.
+    """
+    run = getattr(command, "run", None) or partial(_verb_of_lens, command)
+    distances = getattr(arguments, "object_distances", None)
+    if not distances or takes(command, "object_distances"):
+        present(run(arguments), arguments)
+        return
+    documents = []
+    for distance, one in _each(arguments, distances):
+        if len(distances) > 1 and not arguments.json:
+            print(f"object at {_words(distance)}", flush=True)
+        found = run(one)
+        save(found, one)
+        if arguments.json:
+            place = {} if len(distances) == 1 else {"object_distance": distance if math.isfinite(distance) else None}
+            documents.append({**place, **found.document()})
+        else:
+            print(found)
+    if arguments.json:
+        print_json(documents[0] if len(distances) == 1 else {"results_by_object_distance": documents})
+
+
+def takes(command: ModuleType, keyword: str) -> bool:
+    """Whether the verb of a command has a keyword."""
+    return keyword in inspect.signature(verb_of(command)).parameters
+
+
+def verb_of(command: ModuleType) -> Callable:
+    """The public function that a command calls."""
+    return getattr(raytrace, getattr(command, "VERB", command.__name__.rpartition(".")[2]))
+
+
+def options_of(command: ModuleType, arguments: argparse.Namespace) -> dict:
+    """The options of a command line as keywords of its verb; what was not given is left to the verb."""
+    given = {name: value for name, value in vars(arguments).items() if value is not None}
+    wanted = {
+        name: value
+        for name, value in given.items()
+        if not name.startswith(_DRAWING) and (name not in _RUNNERS or takes(command, name))
+    }
+    if takes(command, "progress"):
+        wanted["progress"] = partial(progress, what=arguments.command)
+    return wanted
+
+
+def _verb_of_lens(command: ModuleType, arguments: argparse.Namespace) -> Result:
+    """What the verb says of the lens; its errors begin with the name of the lens, as every error does."""
+    lens = open_lens(arguments)
+    try:
+        return verb_of(command)(lens, **options_of(command, arguments))
+    except ValueError as error:
+        raise CommandError(f"{arguments.lens}: {error}") from error
+
+
+def present(found: Result | None, arguments: argparse.Namespace) -> None:
+    """Save a result where --plot and -o ask for it, then print it, as text or as JSON."""
+    if found is None:
+        return
+    save(found, arguments)
+    if getattr(arguments, "json", False):
+        print_json(found.document())
+    else:
+        print(found)
+
+
+def save(found: Result, arguments: argparse.Namespace) -> None:
+    """The figure of --plot and the data of -o."""
+    drawing = {
+        name.removeprefix(_DRAWING): value for name, value in vars(arguments).items() if name.startswith(_DRAWING)
+    }
+    for option, write in (("plot", partial(found.plot, **drawing)), ("output", found.save)):
+        if path := getattr(arguments, option, None):
+            write(path)
+            say(f"written: {path}")
+
+
+def _each(arguments: argparse.Namespace, distances: list[float]) -> Iterator[tuple[float, argparse.Namespace]]:
+    """The arguments for each object distance, with files named by it where there are several."""
+    for distance in distances:
+        suffix = "" if len(distances) == 1 else "_" + _words(distance).replace(" ", "")
+        one = {**vars(arguments), "object_distances": distance, "suffix": suffix}
+        for name in ("plot", "output"):
+            if suffix and one.get(name):
+                path = Path(one[name])
+                one[name] = str(path.with_name(path.stem + suffix + path.suffix))
+        yield distance, argparse.Namespace(**one)
+
+
+def _words(distance: float) -> str:
+    return f"{repr(distance).removesuffix('.0')} mm" if math.isfinite(distance) else "infinity"

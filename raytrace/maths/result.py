@@ -1,0 +1,103 @@
+"""Results: what a verb gives, as numbers, as a table, as text, as a document for JSON and as a figure."""
+
+import importlib
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+from torch import Tensor
+
+from raytrace.maths.numerics import broadcast_shape
+
+
+def lent(place: str):
+    """A method that a higher room lends to a value: `place` is "room.file.function", imported when it is called.
+
+    The only way up in the house. Called on an instance it gets the instance first, as any method.
+    """
+
+    def method(self, *arguments, **options):
+        return called(place)(self, *arguments, **options)
+
+    method.__doc__ = f"See `raytrace.{place}`."
+    return method
+
+
+def called(place: str):
+    """The function "room.file.function" of this package."""
+    module, function = place.rsplit(".", 1)
+    return getattr(importlib.import_module(f"raytrace.{module}"), function)
+
+
+class Result:
+    """What every verb's result can do; a class of results names its columns, and its figure if it has one.
+
+    columns: a table; to_frame: the same for pandas; document: what `--json` writes; str: what the command prints;
+    plot: the figure; save: what `-o` writes.
+    """
+
+    __slots__ = ()
+
+    #: The function that draws it, "plot.file.function"(result, **options) -> Figure.
+    FIGURE: ClassVar[str] = ""
+
+    def columns(self) -> dict[str, Tensor]:
+        """Columns by name, broadcast against one another; nan where no ray arrives."""
+        raise NotImplementedError(f"{type(self).__name__} is no table")
+
+    def words(self) -> dict[str, Sequence[str]]:
+        """What the numbers of a column, 0 and up, stand for, by the name of the column."""
+        return {}
+
+    to_frame = lent("formats.frame.frame_of")
+    save = lent("formats.frame.save")
+
+    def document(self) -> dict:
+        """The result for JSON: plain numbers, null for what is undefined."""
+        return {"results": rows(self.columns())}
+
+    def plot(self, path=None, **options):
+        """The figure (matplotlib), also saved under `path` (.png, .pdf, .svg) if one is given."""
+        if not self.FIGURE:
+            raise TypeError(f"{type(self).__name__} has no figure")
+        figure = called(self.FIGURE)(self, **options)
+        if path is not None:
+            called("plot.style.save")(figure, path)
+        return figure
+
+    def __repr__(self) -> str:
+        return str(self)
+
+
+def flat(columns: dict[str, Tensor]) -> dict[str, np.ndarray]:
+    """Columns as flat arrays of one length, in the order of their common shape."""
+    shape = broadcast_shape(*(column.shape for column in columns.values()))
+    return {name: column.detach().cpu().expand(shape).reshape(-1).numpy() for name, column in columns.items()}
+
+
+def rows(columns: dict[str, Tensor]) -> list[dict]:
+    """Columns as a list of rows for JSON."""
+    table = flat(columns)
+    return [dict(zip(table, map(number, row), strict=True)) for row in zip(*table.values(), strict=True)]
+
+
+def number(value) -> float | None:
+    """A number for JSON; null for what is undefined, infinite or not there."""
+    if value is None:
+        return None
+    value = float(value)
+    return value + 0.0 if math.isfinite(value) else None  # + 0.0 makes -0 a 0
+
+
+def numbers(values: Tensor) -> list:
+    """A tensor as nested lists of numbers for JSON."""
+    return [number(entry) if entry.dim() == 0 else numbers(entry) for entry in values.detach()]
+
+
+def cell(value: float, form: str) -> str:
+    """A number in a table of text, or - of the same width where there is none."""
+    if not math.isfinite(value):
+        return f"{'-':>{len(f'{0.0:{form}}')}}"
+    shown = f"{value:{form}}"
+    return shown if float(shown) else f"{0.0:{form}}"  # what rounds to 0 has no sign
