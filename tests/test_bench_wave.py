@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from raytrace.bench import wave as bench
+from raytrace.bench.figure_wave import bench_figure
 from raytrace.bench.wave import ERROR, SITZMANN, WaveRow, agreement, bench_scene, gradient, measure, reference, target
 from raytrace.bench.wave_report import KEPT, markdown, table
-from raytrace.plot.wave import bench_figure
 
 SMALL = 64  # pixels of 3.69 µm: all of the blur but its rim
 

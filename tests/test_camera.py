@@ -13,7 +13,6 @@ import torch
 from raytrace.camera.camera import Camera
 from raytrace.camera.image import blur
 from raytrace.camera.network import RedNet, RedNetShape
-from raytrace.camera.spectral import camera_error, even_distances, optimise_closed_form, out_of_focus, power_spectrum
 from raytrace.camera.training import Run, Share
 from raytrace.camera.variables import BadVariables, Variables
 from raytrace.files import shipped
@@ -24,6 +23,13 @@ from raytrace.maths.grid import grid
 from raytrace.optics.conjugates import distance_in_focus, sensor_range
 from raytrace.optics.focus import NoImage, best_focus
 from raytrace.optics.paraxial import first_order, paraxial_image_distance
+from raytrace.studies.codesign.closed_form import (
+    camera_error,
+    even_distances,
+    optimise_closed_form,
+    out_of_focus,
+    power_spectrum,
+)
 from raytrace.studies.codesign.experiment import (
     Batches,
     Outcome,

@@ -9,7 +9,6 @@ import math
 import pytest
 import torch
 
-from raytrace.camera.spectral import even_distances, optimise_closed_form, power_spectrum
 from raytrace.files import shipped
 from raytrace.formats import read_lens
 from raytrace.formats.pictures import dead_leaves
@@ -18,6 +17,7 @@ from raytrace.optics.focus import best_focus
 from raytrace.optics.paraxial import first_order
 from raytrace.studies.codesign import optima
 from raytrace.studies.codesign.claims import claims, is_of_paper
+from raytrace.studies.codesign.closed_form import even_distances, optimise_closed_form, power_spectrum
 from raytrace.studies.codesign.experiment import Outcome, Settings, batch, camera, lens_at_start
 from raytrace.studies.codesign.figures import _marks
 from raytrace.studies.codesign.optima import Optimum, closed_form, closed_forms, scan, write_optima

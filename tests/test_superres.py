@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from raytrace.camera.deconvolve import errors, mean_square_error, psnr
-from raytrace.camera.superresolution import coarse_image, least_error
 from raytrace.formats.pictures import dead_leaves
 from raytrace.studies.edof.world import periodic, scene, spectrum, transfer
 from raytrace.studies.superres.experiment import (
@@ -35,6 +34,7 @@ from raytrace.studies.superres.experiment import (
     wide_kernels,
     world_of,
 )
+from raytrace.studies.superres.inversion import coarse_image, least_error
 from raytrace.studies.superres.words import WORDS
 from raytrace.wave.psf import psf
 

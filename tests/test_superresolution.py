@@ -7,7 +7,8 @@ import torch
 
 from raytrace.camera.deconvolve import blind_filter, errors, mean_square_error, power_law, psnr, restore, within
 from raytrace.camera.image import blur, transfer_functions, visible
-from raytrace.camera.superresolution import (
+from raytrace.formats.pictures import dead_leaves
+from raytrace.studies.superres.inversion import (
     bicubic,
     coarse_image,
     coarse_transfer,
@@ -19,7 +20,6 @@ from raytrace.camera.superresolution import (
     least_error,
     superresolve,
 )
-from raytrace.formats.pictures import dead_leaves
 
 
 def draws(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> torch.Tensor:

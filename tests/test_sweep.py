@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from raytrace.camera.spectral import power_spectrum
 from raytrace.cli import main
 from raytrace.files import shipped
 from raytrace.formats import read_lens
 from raytrace.formats.pictures import dead_leaves
 from raytrace.studies.codesign import sweep as module
 from raytrace.studies.codesign import words as codesign_table
+from raytrace.studies.codesign.closed_form import power_spectrum
 from raytrace.studies.codesign.experiment import Settings
 from raytrace.studies.codesign.figures import sweep_figure
 from raytrace.studies.codesign.optima import closed_form

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+import rayleigh
 import torch
 from problems import scalar, vector
 
@@ -12,7 +13,7 @@ from raytrace.kernels.dft import bessel_j1, integrate
 from raytrace.maths.grid import grid
 from raytrace.media.catalog import find_glass
 from raytrace.media.glass import constant, index
-from raytrace.wave import propagate, pupil, radial, rayleigh
+from raytrace.wave import propagate, pupil, radial
 from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike
 from raytrace.wave.psf import psf
 from raytrace.wave.scene import WaveScene, excess

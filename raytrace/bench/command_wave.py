@@ -6,13 +6,13 @@ from pathlib import Path
 
 from raytrace import plot
 from raytrace.bench import wave_report
+from raytrace.bench.figure_wave import bench_figure
 from raytrace.bench.wave import agreement, bench_scene, entrants, measure, target
 from raytrace.cli.door import print_json
 from raytrace.cli.progress import progress
 from raytrace.files import write_atomically
 from raytrace.maths.result import number
 from raytrace.pages import machine
-from raytrace.plot.wave import bench_figure
 
 
 def bench_wave(arguments: argparse.Namespace) -> None:

@@ -8,12 +8,12 @@ import math
 from pathlib import Path
 
 from raytrace.camera.limits import Limits
-from raytrace.camera.spectral import power_spectrum
 from raytrace.cli.door import CommandError, print_json, say
 from raytrace.cli.options import did_you_mean
 from raytrace.files import write_atomically
 from raytrace.formats import FORMATS, read_lens, write_lens
 from raytrace.shards import processes, share
+from raytrace.studies.codesign.closed_form import power_spectrum
 from raytrace.studies.codesign.experiment import LENS, STEPS, Outcome, variables
 from raytrace.studies.codesign.optima import Optimum, closed_form
 from raytrace.studies.codesign.optima import document as optimum_document

@@ -19,10 +19,8 @@ import torch
 from torch import Tensor
 
 from raytrace.camera.camera import Camera
-from raytrace.camera.descent import NoOptimum
 from raytrace.camera.limits import parse_range
 from raytrace.camera.network import RedNet, RedNetShape
-from raytrace.camera.spectral import optimise_closed_form, out_of_focus, power_spectrum
 from raytrace.camera.training import DamagedRun, Record, Run, Share, read_json, train
 from raytrace.camera.variables import Variables, parse_bounds
 from raytrace.files import write_atomically
@@ -31,6 +29,8 @@ from raytrace.formats.pictures import Pictures, crop, draws
 from raytrace.maths.grid import grid
 from raytrace.optics.conjugates import distance_in_focus, paraxial_image
 from raytrace.optics.focus import best_focus, focused, real_image_distance
+from raytrace.studies.codesign.closed_form import optimise_closed_form, out_of_focus, power_spectrum
+from raytrace.studies.descent import NoOptimum
 from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance, with_wavelengths
 
 _SAMPLE = 10  # last number of the key of what a sample draws

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from raytrace.camera.camera import Camera
-from raytrace.camera.spectral import camera_error, even_distances, optimise_closed_form
 from raytrace.files import write_atomically
 from raytrace.optics.conjugates import distance_in_focus, paraxial_image
 from raytrace.optics.focus import best_focus
+from raytrace.studies.codesign.closed_form import camera_error, even_distances, optimise_closed_form
 from raytrace.studies.codesign.experiment import Settings, camera
 from raytrace.studies.codesign.study import AFTER_PARAXIAL
 from raytrace.system.lens import Lens

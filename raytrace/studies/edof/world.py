@@ -16,10 +16,10 @@ import torch
 from torch import Tensor, nn
 
 from raytrace.camera.deconvolve import blind_error, blind_filter, errors, power_spectrum, psnr, wiener
-from raytrace.camera.descent import NoOptimum, minimise
 from raytrace.camera.image import transfer_functions
 from raytrace.formats.pictures import Pictures, draws
 from raytrace.maths.grid import grid
+from raytrace.studies.descent import NoOptimum, minimise
 from raytrace.wave.element import Element, Rings
 from raytrace.wave.plan import plan
 from raytrace.wave.psf import WavePsf, psf

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from raytrace.camera.deconvolve import psnr
-from raytrace.camera.superresolution import least_error
 from raytrace.cli.door import print_json, say
 from raytrace.cli.progress import progress
 from raytrace.files import write_atomically
@@ -33,6 +32,7 @@ from raytrace.studies.superres.experiment import (
     world_of,
 )
 from raytrace.studies.superres.experiment import kernels as kernels_of
+from raytrace.studies.superres.inversion import least_error
 
 _NOISES = (0.0003, 0.001, 0.003, 0.01, 0.03)
 

@@ -1,6 +1,6 @@
 """Super-resolution by a phase element: pictures finer than the sensor's pixels, from one exposure.
 
-A sensor pixel covers s × s pixels of the picture (`superresolution`). Two ways to use the element are compared:
+A sensor pixel covers s × s pixels of the picture (`inversion`). Two ways to use the element are compared:
 
     full frame    the scene fills the sensor: a kernel can only choose which of the s² aliases of a frequency is seen;
                   learned by the closed-form error of the best linear inversion, over Noll's polynomials on a lens
@@ -20,9 +20,13 @@ import torch
 from torch import Tensor
 
 from raytrace.camera.deconvolve import mean_square_error, psnr
-from raytrace.camera.descent import minimise
 from raytrace.camera.phase import PhaseVariables
-from raytrace.camera.superresolution import (
+from raytrace.formats.pictures import Pictures, draws
+from raytrace.media.catalog import find_glass
+from raytrace.media.glass import index
+from raytrace.studies.descent import minimise
+from raytrace.studies.edof.world import World, scene, spectrum
+from raytrace.studies.superres.inversion import (
     bicubic,
     coarse_transfer,
     inversion,
@@ -32,10 +36,6 @@ from raytrace.camera.superresolution import (
     joint_superresolve,
     superresolve,
 )
-from raytrace.formats.pictures import Pictures, draws
-from raytrace.media.catalog import find_glass
-from raytrace.media.glass import index
-from raytrace.studies.edof.world import World, scene, spectrum
 from raytrace.wave.aim import aim
 from raytrace.wave.baselines import baseline
 from raytrace.wave.element import Element, Pixels, Zernike
