@@ -1,6 +1,9 @@
 """The front door: a lens from plain numbers, under other conditions, and the public names."""
 
+import argparse
 import importlib
+import inspect
+import json
 import pkgutil
 import re
 import subprocess
@@ -11,6 +14,9 @@ import pytest
 import torch
 
 import raytrace as rt
+from raytrace.cli import main
+from raytrace.cli import run as runner
+from raytrace.cli.commands import COMMANDS
 
 ROWS = [
     {"radius": 61.47, "thickness": 6.0, "glass": "N-BK7"},
@@ -123,3 +129,34 @@ def test_what_makes_no_lens_is_told(call, said):
     lens = rt.lens(ROWS, stop=1, f_number=5)
     with pytest.raises(ValueError, match=re.escape(said)):
         call(lens)
+
+
+# -- one verb, one door ------------------------------------------------------------------------------------------------
+
+#: Commands that are a verb, each in a file of its own.
+VERBS = [command for command in COMMANDS if not isinstance(command.run, str)]
+OF_A_LENS = [command for command in VERBS if not hasattr(command.run, "run")]
+
+
+def options_of(command) -> set[str]:
+    parser = argparse.ArgumentParser(add_help=False)
+    command.add_arguments(parser)
+    return {action.dest for action in parser._actions}
+
+
+@pytest.mark.parametrize("command", VERBS, ids=lambda command: command.name)
+def test_a_command_has_the_options_of_its_verb(command):
+    keywords = inspect.signature(runner.verb_of(command.run)).parameters
+    own = {name for name in options_of(command) if not name.startswith("plot_")} - {*runner._RUNNERS}
+    assert own <= {*keywords}
+    assert runner.verb_of(command.run).__doc__
+
+
+@pytest.mark.parametrize("command", OF_A_LENS, ids=lambda command: command.name)
+def test_a_command_prints_what_its_verb_gives(command, capsys):
+    assert main([command.name, "cooke_triplet", "--json"]) == 0
+    printed = capsys.readouterr().out
+    found = runner.verb_of(command.run)(rt.read_lens("cooke_triplet"))
+    assert json.loads(printed) == found.document()
+    assert main([command.name, "cooke_triplet"]) == 0
+    assert capsys.readouterr().out == f"{found}\n"
