@@ -22,7 +22,7 @@ from raytrace.media.catalog import find_glass
 from raytrace.optics.launch import launch, stop_radius
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.trace import media, steps, trace
-from raytrace.optics.wavefront import peak_to_valley, rms, wavefront
+from raytrace.optics.wavefront import peak_to_valley, rms, wavefront_of
 from raytrace.system.lens import FIELD_UNITS, RAY_AIMING, Fields, Lens, SystemAperture
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Aperture, Surface
@@ -169,7 +169,7 @@ def points_of(case: dict) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def front_of(case: dict):
-    return wavefront(scene_of(lens_of(case), fields_of(case), waves_of(case)), *points_of(case))
+    return wavefront_of(scene_of(lens_of(case), fields_of(case), waves_of(case)), *points_of(case))
 
 
 def flat(*parts: torch.Tensor) -> list[float]:

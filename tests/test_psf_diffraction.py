@@ -13,7 +13,7 @@ from raytrace.kernels.dft import Aliased, EmptyPupil, fft_psf, huygens, phasor, 
 from raytrace.maths.grid import grid
 from raytrace.maths.pupil import gauss_rings
 from raytrace.optics.scene import scene
-from raytrace.optics.wavefront import rms, wavefront, without
+from raytrace.optics.wavefront import rms, wavefront_of, without
 from raytrace.system.lens import with_sensor_distance
 from raytrace.system.surface import Aperture
 
@@ -36,7 +36,7 @@ def gauss(sensor=57.8817685, **others):
 
 
 def chief(s):
-    return wavefront(s, torch.zeros(2, 1, dtype=torch.float64)).centre[:2].detach()
+    return wavefront_of(s, torch.zeros(2, 1, dtype=torch.float64)).centre[:2].detach()
 
 
 def test_airy_disc():
@@ -156,7 +156,7 @@ def test_energy_is_the_transmitted_fraction(angle):
     )
     result = diffraction.kernels(s, grid(0.02, 11, chief(s)))
     points, weights = gauss_rings(60, 240)
-    passed = wavefront(s, points, weights).energy.sum()
+    passed = wavefront_of(s, points, weights).energy.sum()
     assert 0.3 < passed < 0.8
     assert abs(result.kernel.sum() - passed) < 0.015
 
@@ -166,7 +166,7 @@ def test_strehl_is_marechals_for_small_aberrations(diameter):
     """exp(-(2πσ)²) with σ the RMS OPD without tilt, off axis; 1 % of the loss and more at larger loss."""
     s = scene_of(gauss(57.6, aperture=("entrance_pupil_diameter", diameter)), 5.0, 25e3)
     points, weights = gauss_rings(12)
-    front = wavefront(s, points, weights)
+    front = wavefront_of(s, points, weights)
     opd = without(front, 3)
     sigma = torch.sqrt((weights * opd**2).sum(-1)) / 0.53e-3
     expected = torch.exp(-((2 * math.pi * sigma) ** 2))
@@ -179,7 +179,7 @@ def test_strehl_is_marechals_for_small_aberrations(diameter):
 def test_geometric_limit():
     """16 waves out of focus the wave's encircled energy is the rays' within 2 %; its rays have their covariance."""
     s = scene_of(gauss(59.5, aperture=("entrance_pupil_diameter", 20.0)), 0.0, 25e3)
-    front = wavefront(s, *gauss_rings(200, 4))
+    front = wavefront_of(s, *gauss_rings(200, 4))
     rays = torch.linalg.vector_norm(front.landing[:, 0, 0, 0], dim=0)
     pitch = float(rays.max()) / 35
     result = diffraction.kernels(s, grid(pitch, 81))

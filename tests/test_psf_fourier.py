@@ -12,7 +12,7 @@ from raytrace.kernels.dft import bessel_j0
 from raytrace.maths.grid import grid
 from raytrace.optics.paraxial import first_order, paraxial_image_distance
 from raytrace.optics.scene import scene
-from raytrace.optics.wavefront import wavefront
+from raytrace.optics.wavefront import wavefront_of
 from raytrace.system.lens import with_sensor_distance
 
 WAVE = 0.53e-3  # mm
@@ -153,7 +153,7 @@ def test_geometric_limit():
 @pytest.mark.parametrize("distance", [25e3, math.inf])
 def test_chief_ray_is_that_of_a_narrow_real_field(distance):
     s = scene_of(57.88, 0.01, distance)
-    real = wavefront(s, torch.zeros(2, 1, dtype=torch.float64)).centre[:2]
+    real = wavefront_of(s, torch.zeros(2, 1, dtype=torch.float64)).centre[:2]
     assert (fourier.paraxial(s).chief - real).abs().max() < 1 * problems.NANOMETRE
 
 

@@ -17,7 +17,7 @@ from raytrace.maths.value import to
 from raytrace.media.glass import constant
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.scene import Scene, scene
-from raytrace.optics.wavefront import wavefront
+from raytrace.optics.wavefront import wavefront_of
 from raytrace.system.lens import Lens, with_sensor_distance
 from raytrace.system.surface import Aperture
 
@@ -50,7 +50,7 @@ def light_at(model: str, s: Scene) -> torch.Tensor:
     """(2,) mm, where the chief ray of a scene of one kernel lands."""
     if model == "fourier":
         return fourier.paraxial(s).chief.reshape(2).detach()
-    return wavefront(s, torch.zeros(2, 1, dtype=torch.float64)).centre[:2].reshape(2).detach()
+    return wavefront_of(s, torch.zeros(2, 1, dtype=torch.float64)).centre[:2].reshape(2).detach()
 
 
 # Contract -------------------------------------------------------------------------------------------------------------
@@ -93,7 +93,7 @@ def test_polychromatic_kernel_is_the_weighted_sum(model):
 def test_energy_is_the_transmitted_share():
     """Of an aperture that clips the beam, by 10,000 rays; the window misses the tail of the rings, 2/(π v) = 1 %."""
     s = scene_of(slow(stop=2.0), 3.0, 25e3)
-    share = float(wavefront(s, *gauss_rings(50, 200)).energy.sum())
+    share = float(wavefront_of(s, *gauss_rings(50, 200)).energy.sum())
     assert 0.2 < share < 0.8
     found = psf(slow(stop=2.0), "wave", fields=field(3.0), grid=grid(0.025, 11), center="chief",
                 object_distances=number([25e3]), tol=1e-2)  # fmt: skip

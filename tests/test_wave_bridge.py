@@ -15,7 +15,7 @@ from raytrace.media.glass import constant
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.scene import cross_scene, scene
 from raytrace.optics.trace import media, trace_surfaces
-from raytrace.optics.wavefront import wavefront
+from raytrace.optics.wavefront import wavefront_of
 from raytrace.system import departure
 from raytrace.system.lens import Lens, with_sensor_distance
 from raytrace.system.surface import sag_at
@@ -127,7 +127,7 @@ def test_traced_wavefront_is_the_path_of_the_thin_element_and_the_term_it_leaves
     coefficients = singlet()
     pupil = torch.stack([torch.linspace(0.02, 1, 20, dtype=torch.float64), torch.zeros(20, dtype=torch.float64)])
     view = scene(traced(coefficients, 1000.0), AXIS, vector(1000.0), vector(0.55))
-    opd = wavefront(view, pupil).opd[0, 0, 0] / WAVE
+    opd = wavefront_of(view, pupil).opd[0, 0, 0] / WAVE
     assert opd.abs().max() < 1e-3
     paths = []
     for shape in (coefficients, thin(coefficients)):
@@ -202,7 +202,7 @@ def test_a_height_map_of_pixels_is_traced_as_the_powers_it_samples():
             substrate=0.5 if isinstance(element.profile, EvenPowers) else 0.0,
         )
         view = scene(lens_, AXIS, vector(1000.0), vector(0.55))
-        landed.append(wavefront(view, pupil))
+        landed.append(wavefront_of(view, pupil))
     assert (landed[1].landing - landed[0].landing).abs().max() < 1e-5
     prism = (PMMA - 1) * 1e-3 * 35.5
     assert float(landed[2].centre[1]) == pytest.approx(prism, rel=2e-3)
@@ -225,7 +225,7 @@ def test_a_height_map_is_filtered_once_however_often_it_is_traced(monkeypatch):
             wavelengths=vector(0.55),
         )
         view = scene(lens_, AXIS, vector(700.0), vector(0.55))
-        return sum((wavefront(view, pupil).landing ** 2).sum() for _ in range(2))
+        return sum((wavefront_of(view, pupil).landing ** 2).sum() for _ in range(2))
 
     free = heights.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(landed(free), free)
@@ -251,7 +251,7 @@ def view_of(system: Lens, y: float = 0.0):
 
 def window(view, pitch=0.002, size=15):
     """About the chief ray, off the axis."""
-    centre = wavefront(view, AXIS).centre[:2, 0, 0, 0].detach()
+    centre = wavefront_of(view, AXIS).centre[:2, 0, 0, 0].detach()
     return grid(scalar(pitch), size, centre)
 
 

@@ -12,7 +12,7 @@ from raytrace.maths.numerics import dot
 from raytrace.maths.pupil import gauss_rings
 from raytrace.optics.scene import scene, trace_scene
 from raytrace.optics.spot import EmptySpot
-from raytrace.optics.wavefront import mean_opd, peak_to_valley, rms, wavefront, without, zernike_coefficients
+from raytrace.optics.wavefront import mean_opd, peak_to_valley, rms, wavefront_of, without, zernike_coefficients
 from raytrace.system.lens import with_sensor_distance
 from raytrace.system.surface import Aperture
 
@@ -32,7 +32,7 @@ def perfect(sensor, **others):
 
 
 def test_a_perfect_lens_has_no_opd():
-    front = wavefront(perfect(50.0), POINTS, WEIGHTS)
+    front = wavefront_of(perfect(50.0), POINTS, WEIGHTS)
     assert front.opd.abs().max() < 1e-11 * WAVE
     assert front.radius[0, 0, 0] > 0
     assert abs(front.energy.sum() - 1) < 1e-14
@@ -43,7 +43,7 @@ def test_the_sphere_reaches_from_the_pupil_s_plane_along_the_chief_ray(angle):
     """The exit pupil is the stop itself, 50 mm before the sensor: R = 50 mm / cos of the chief ray."""
     lens = problems.lens([problems.surface(0.01, 5.0, 1.5), problems.surface(None, 50.0)], stop=2)
     s = scene(lens, vector(0.0, angle)[:, None], vector(math.inf), lens.wavelengths)
-    front = wavefront(s, POINTS, WEIGHTS)
+    front = wavefront_of(s, POINTS, WEIGHTS)
     centre_ray = trace_scene(s, torch.zeros(2, 1, dtype=torch.float64))
     assert front.radius.item() == pytest.approx(50.0 / centre_ray.direction[2].item(), rel=1e-12)
 
@@ -54,7 +54,7 @@ def test_defocus_of_a_perfect_lens():
     Light of the upper half has crossed the axis and lands below: its path shortens towards the top.
     """
     shift = 1e-3
-    front = wavefront(perfect(50.0 + shift), POINTS, WEIGHTS)
+    front = wavefront_of(perfect(50.0 + shift), POINTS, WEIGHTS)
     _, _, N = front.direction[:, 0, 0, 0]
     assert (front.opd[0, 0, 0] + shift * (1 - N)).abs().max() < 1e-4 * shift * (1 - N).max()
     c = zernike_coefficients(front, 11)[0, 0, 0]
@@ -65,7 +65,7 @@ def test_defocus_of_a_perfect_lens():
 @pytest.mark.parametrize("angle", [0.0, 10.0])
 def test_any_object_distance_keeps_its_digits(angle):
     """From 10¹² mm the wave is the plane one but for its curvature r²/2D over the pupil, 3e-7 waves; 1e-10 of noise."""
-    far, infinite = (wavefront(gauss([d], (angle,)), POINTS, WEIGHTS) for d in (1e12, math.inf))
+    far, infinite = (wavefront_of(gauss([d], (angle,)), POINTS, WEIGHTS) for d in (1e12, math.inf))
     difference = far.opd - infinite.opd
     assert difference.abs().max() < 3e-7 * WAVE
     if angle == 0:
@@ -75,16 +75,16 @@ def test_any_object_distance_keeps_its_digits(angle):
 
 def test_opd_does_not_change_with_the_batch():
     distances, angles = (1e4, 25e3), (0.0, 10.0)
-    together = wavefront(gauss(distances, angles), POINTS, WEIGHTS)
+    together = wavefront_of(gauss(distances, angles), POINTS, WEIGHTS)
     assert together.opd.shape == (2, 2, 1, 256)
     for d, distance in enumerate(distances):
         for f, angle in enumerate(angles):
-            alone = wavefront(gauss([distance], (angle,)), POINTS, WEIGHTS)
+            alone = wavefront_of(gauss([distance], (angle,)), POINTS, WEIGHTS)
             assert (together.opd[d, f] - alone.opd[0, 0]).abs().max() < 1e-11 * WAVE
 
 
 def test_removing_terms_and_statistics():
-    front = wavefront(gauss([25e3], (0.0, 10.0)), POINTS, WEIGHTS)
+    front = wavefront_of(gauss([25e3], (0.0, 10.0)), POINTS, WEIGHTS)
     c = zernike_coefficients(front, 37)
     assert (without(front, 1) - (front.opd - mean_opd(front)[..., None])).abs().max() < 1e-12
     fewer = [torch.sqrt((WEIGHTS * without(front, n) ** 2).sum(-1)) for n in (1, 3, 4)]
@@ -101,7 +101,7 @@ def test_rays_land_where_the_slope_of_the_opd_says():
     step = 1e-4
     base = torch.tensor([[0.0, 0.3, -0.5], [0.6, -0.4, 0.2]], dtype=torch.float64)
     shifted = torch.cat([base + torch.tensor([[0.0], [s]]) for s in (-step, step)], 1)
-    middle, ends = (wavefront(gauss([25e3], (7.0,), 57.7), p) for p in (base, shifted))
+    middle, ends = (wavefront_of(gauss([25e3], (7.0,), 57.7), p) for p in (base, shifted))
     low, high = slice(0, 3), slice(3, 6)
     slope = (ends.opd[..., high] - ends.opd[..., low]) / (2 * step)
     turn = (ends.direction[:2, ..., high] - ends.direction[:2, ..., low]) / (2 * step)
@@ -119,7 +119,7 @@ def test_vignetting_and_a_blocked_chief_ray():
     for angle in (0.0, 5.0):
         field = vector(0.0, angle)[:, None]
         free, front = (
-            wavefront(scene(x, field, vector(25e3), x.wavelengths), POINTS, WEIGHTS) for x in (lens, blocked)
+            wavefront_of(scene(x, field, vector(25e3), x.wavelengths), POINTS, WEIGHTS) for x in (lens, blocked)
         )
         assert 0.2 < front.energy.sum() < 0.7
         assert (torch.where(front.valid, front.opd - free.opd, 0.0) == 0).all()
@@ -136,7 +136,7 @@ def test_a_field_without_light_has_no_wavefront_and_leaves_the_others_their_deri
     bent = dataclasses.replace(lens, surfaces=tuple(surfaces))
     fields = torch.tensor([[0.0, 0.0], [0.0, 85.0]], dtype=torch.float64)
     both, one = (
-        wavefront(scene(bent, f, vector(25e3), bent.wavelengths), POINTS, WEIGHTS) for f in (fields, fields[:, :1])
+        wavefront_of(scene(bent, f, vector(25e3), bent.wavelengths), POINTS, WEIGHTS) for f in (fields, fields[:, :1])
     )
     for measure in (rms, peak_to_valley):
         assert measure(both)[0, :, 0].isnan().tolist() == [False, True]
@@ -152,7 +152,7 @@ def test_a_field_without_light_has_no_wavefront_and_leaves_the_others_their_deri
 def test_vignetting_factors_shrink_the_beam_and_its_light():
     factors = torch.tensor([[0.0], [0.1], [0.2], [0.3], [0.0]], dtype=torch.float64)
     s = gauss([25e3], (10.0,), field=problems.fields("angle", (10.0,), vignetting=factors))
-    assert abs(wavefront(s, POINTS, WEIGHTS).energy.sum() - 0.8 * 0.7) < 1e-12
+    assert abs(wavefront_of(s, POINTS, WEIGHTS).energy.sum() - 0.8 * 0.7) < 1e-12
 
 
 def test_a_plane_reference_for_a_telecentric_lens():
@@ -161,7 +161,7 @@ def test_a_plane_reference_for_a_telecentric_lens():
     surfaces = [problems.surface(None, front_focus), problems.surface(0.04, 0.0, 1.5), problems.surface(0.0, 48.0)]
     lens = problems.lens(surfaces, aperture=("entrance_pupil_diameter", 4.0))
     s = scene(lens, vector(0.0, 3.0)[:, None], vector(math.inf), lens.wavelengths)
-    front = wavefront(s, POINTS, WEIGHTS)
+    front = wavefront_of(s, POINTS, WEIGHTS)
     assert front.radius.abs().min() > 1e12
     assert torch.isfinite(front.opd).all()
     assert (dot(front.direction, front.direction) - 1).abs().max() < 1e-14
@@ -176,7 +176,7 @@ def test_gradients_with_a_vignetted_ray():
         ]
         lens = problems.lens(surfaces, aperture=("entrance_pupil_diameter", 5.0))
         s = scene(lens, vector(0.0, 5.0)[:, None], vector(1e12), lens.wavelengths)
-        front = wavefront(s, *gauss_rings(4))
+        front = wavefront_of(s, *gauss_rings(4))
         return rms(front), zernike_coefficients(front, 6), front.opd, front.direction[:2]
 
     start = [torch.tensor(t, dtype=torch.float64, requires_grad=True) for t in (0.02, 66.0)]
@@ -187,7 +187,7 @@ def test_light_through_a_small_part_of_the_pupil_tells_no_coefficients():
     """Not numbers of 1e14 waves; the RMS, which needs no polynomials, stays."""
     lens = problems.double_gauss(aperture=("image_f_number", 0.5))
     fast, slow = (
-        wavefront(scene(x, vector(0.0, 0.0)[:, None], vector(25e3), x.wavelengths), *gauss_rings(14, 56))
+        wavefront_of(scene(x, vector(0.0, 0.0)[:, None], vector(25e3), x.wavelengths), *gauss_rings(14, 56))
         for x in (lens, problems.double_gauss())
     )
     assert fast.valid.sum() > 37

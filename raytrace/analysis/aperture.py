@@ -13,7 +13,7 @@ from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import value
 from raytrace.optics.scene import Scene, beam_share
-from raytrace.optics.wavefront import wavefront
+from raytrace.optics.wavefront import wavefront_of
 from raytrace.system.lens import name_of_field
 
 _PROBE = 10, 40
@@ -48,7 +48,7 @@ def exit_pupil(scene: Scene, *, size: int | None = None) -> ExitPupil:
     """
     like = {"dtype": scene.wavelengths.dtype, "device": scene.wavelengths.device}
     points, weights = gauss_rings(*_PROBE, **like)
-    probe = wavefront(scene, points, weights)
+    probe = wavefront_of(scene, points, weights)
     enough = (probe.usable.sum(-1) >= 2 * _TERMS) & probe.valid.any(-1)
     refuse_dark(scene.lens, scene.fields, scene.wavelengths, enough[0], "wave on the sensor")
     waves_per = 1e3 * probe.index / probe.wavelength  # n/λ, 1/mm
@@ -105,7 +105,7 @@ def _cells(scene: Scene, map_to_pupil: Tensor, ell: Tensor, m: Tensor, *, size: 
     share = (0.5 + safe_divide(1 - radius, 2 / size * slope)).clamp(0.0, 1.0)
     share = torch.where(radius < 0.5, 1.0, share)
     density = (by_l[0] * by_m[1] - by_l[1] * by_m[0]).abs()
-    traced = wavefront(scene, pupil * ((1 - 1e-9) / radius.clamp_min(1.0)))
+    traced = wavefront_of(scene, pupil * ((1 - 1e-9) / radius.clamp_min(1.0)))
     share = torch.where(traced.valid, share, 0.0)
     field = share * safe_sqrt(density) * phasor(traced.opd / (1e-3 * traced.wavelength)[:, None])
     return field, share * density

@@ -8,7 +8,7 @@ from raytrace.analysis.setting import scene_of
 from raytrace.maths.pupil import fan as pupil_fan
 from raytrace.maths.result import Result
 from raytrace.maths.value import value
-from raytrace.optics.wavefront import Wavefront, wavefront
+from raytrace.optics.wavefront import Wavefront, wavefront_of
 from raytrace.system.lens import Lens
 
 #: Whose sphere an OPD is measured on.
@@ -80,7 +80,7 @@ def _front(lens: Lens, fields: Tensor | None, wavelengths: Tensor | None, size: 
     like = {"dtype": lens.wavelengths.dtype, "device": lens.wavelengths.device}
     points = torch.cat([pupil_fan(size, along, **like)[0] for along in "yx"], 1)
     primary = lens.wavelengths[lens.primary_wavelength] if reference == "primary" else None
-    return wavefront(scene_of(lens, fields, wavelengths), points, reference=primary)
+    return wavefront_of(scene_of(lens, fields, wavelengths), points, reference=primary)
 
 
 def _fan(lens, fields, front: Wavefront, along_y: Tensor, along_x: Tensor, quantity: str) -> Fan:

@@ -12,7 +12,7 @@ from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.result import Result
 from raytrace.maths.value import value
-from raytrace.optics.wavefront import wavefront
+from raytrace.optics.wavefront import wavefront_of
 from raytrace.system.lens import Lens
 
 _RINGS = 24, 96
@@ -52,7 +52,7 @@ def relative_illumination(
     like = {"dtype": lens.wavelengths.dtype, "device": lens.wavelengths.device}
     points, weights = gauss_rings(*_RINGS, **like)
     view = scene_of(lens, torch.cat([torch.zeros_like(fields[:, :1]), fields], 1), wavelengths)
-    front = wavefront(view, points, weights)
+    front = wavefront_of(view, points, weights)
     orders = [zernike.noll(j) for j in range(1, _TERMS + 1)]
     basis = zernike.polynomials(orders, *points)
     # Where light comes through a small part of the pupil alone, the slopes of the map are not known from it.

@@ -14,7 +14,7 @@ from raytrace.maths.result import Result
 from raytrace.maths.value import value
 from raytrace.optics.focus import image_rays
 from raytrace.optics.spot import spot, spot_of_points
-from raytrace.optics.wavefront import rms, wavefront
+from raytrace.optics.wavefront import rms, wavefront_of
 from raytrace.system.lens import Lens
 
 _RINGS = 10, 40
@@ -85,9 +85,9 @@ def rms_over_field(
         return RmsOverField(spot(rays, weights).rms_radius, whole, None, fields, wavelengths, quantity, reference)
     view = scene_of(lens, fields, wavelengths)
     waves = 1e-3 * wavelengths
-    each = rms(wavefront(view, points, weights))[0] / waves
+    each = rms(wavefront_of(view, points, weights))[0] / waves
     primary = lens.wavelengths[lens.primary_wavelength]
-    joint = each if reference == "own" else rms(wavefront(view, points, weights, reference=primary))[0] / waves
+    joint = each if reference == "own" else rms(wavefront_of(view, points, weights, reference=primary))[0] / waves
     together = (shares * joint * joint).sum(-1)
     return RmsOverField(
         rms=each,

@@ -13,7 +13,7 @@ from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.result import Result
 from raytrace.maths.value import value
 from raytrace.optics.scene import Scene
-from raytrace.optics.wavefront import peak_to_valley, rms, wavefront, zernike_coefficients
+from raytrace.optics.wavefront import peak_to_valley, rms, wavefront_of, zernike_coefficients
 from raytrace.system.lens import Lens
 
 _RINGS = 14, 56
@@ -104,9 +104,9 @@ def wavefront_map(
 def _map_of(view: Scene, size: int, terms: int, numbering: str) -> WavefrontMap:
     like = {"dtype": view.wavelengths.dtype, "device": view.wavelengths.device}
     line, inside, points = _grid(size, **like)
-    drawn = wavefront(view, points)
-    dense = drawn if size == _GRID else wavefront(view, _grid(_GRID, **like)[2])
-    front = wavefront(view, *gauss_rings(*_RINGS, **like))
+    drawn = wavefront_of(view, points)
+    dense = drawn if size == _GRID else wavefront_of(view, _grid(_GRID, **like)[2])
+    front = wavefront_of(view, *gauss_rings(*_RINGS, **like))
     wave = 1e-3 * view.wavelengths
     opd = drawn.opd.new_zeros(*drawn.opd.shape[1:3], size, size)
     opd[..., inside] = drawn.opd[0] / wave[:, None]

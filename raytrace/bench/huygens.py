@@ -17,7 +17,7 @@ from raytrace.kernels.dft import huygens, sub_pixels
 from raytrace.maths.grid import Grid
 from raytrace.maths.pupil import gauss_rings, square
 from raytrace.optics.scene import Scene, trace_scene
-from raytrace.optics.wavefront import Wavefront, wavefront
+from raytrace.optics.wavefront import Wavefront, wavefront_of
 
 _TERMS = 2**21  # wavelets × points that are added at once
 _STEP = 1e-4  # of the pupil radius, for Ω
@@ -46,7 +46,7 @@ def direct_sum(scene: Scene, grid: Grid, sampling: Sampling) -> tuple[Tensor, in
     """Kernel (rows, columns) of a scene of shape (1, 1, 1), and the number of rays."""
     like = scene.lens.surfaces[-2].thickness
     points, weights = rule(scene, sampling, like)
-    front = wavefront(scene, points, weights)
+    front = wavefront_of(scene, points, weights)
     amplitude = torch.sqrt(front.energy * weights * math.pi * solid_angle(scene, points))[0, 0, 0]
     lit = amplitude > 0
     pupil = (-front.radius * front.direction)[:, 0, 0, 0][:, lit]
@@ -109,7 +109,7 @@ def _bisect(passes, clear: Tensor, dark: Tensor) -> Tensor:
 def solid_angle(scene: Scene, points: Tensor) -> Tensor:
     """|∂(L, M)/∂(p_x, p_y)| (P,) at pupil points, by central differences of traced directions."""
     steps = points.new_tensor([[_STEP, 0.0], [-_STEP, 0.0], [0.0, _STEP], [0.0, -_STEP]])
-    ends = wavefront(scene, torch.cat([points + step[:, None] for step in steps], 1)).direction[:2, 0, 0, 0]
+    ends = wavefront_of(scene, torch.cat([points + step[:, None] for step in steps], 1)).direction[:2, 0, 0, 0]
     right, left, up, down = ends.unflatten(1, (4, -1)).unbind(1)
     (a, b), (c, d) = (right - left) / (2 * _STEP), (up - down) / (2 * _STEP)
     return (a * d - b * c).abs()

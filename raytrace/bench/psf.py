@@ -25,7 +25,7 @@ from raytrace.maths.grid import Grid
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to
 from raytrace.optics.scene import Kernels, Scene
-from raytrace.optics.wavefront import wavefront
+from raytrace.optics.wavefront import wavefront_of
 from raytrace.system.lens import Lens
 
 RAYS_ERROR = 0.01  # that random rays are brought to
@@ -153,7 +153,7 @@ def truth_of(case: Case, say: Callable[[str], object] = lambda words: None) -> T
 
 def wave_sampling(scene: Scene, grid: Grid) -> tuple[int, int, int]:
     """Rings, arms and nodes across a pixel that the wave model takes at order 0, from the phase over the pupil."""
-    front = wavefront(scene, *gauss_rings(8, 32))
+    front = wavefront_of(scene, *gauss_rings(8, 32))
     offset = torch.linalg.vector_norm(grid.centre - front.centre[:2, 0, 0, 0])
     reach = float(offset + grid.pitch * math.hypot(grid.rows, grid.columns) / 2)
     L, M = front.direction[:2, 0, 0, 0]

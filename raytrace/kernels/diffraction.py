@@ -38,7 +38,7 @@ from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to, value
 from raytrace.optics.scene import Kernels, Scene, trace_scene
-from raytrace.optics.wavefront import Wavefront, wavefront
+from raytrace.optics.wavefront import Wavefront, wavefront_of
 from raytrace.shards import everywhere, largest
 
 _MOST_RAYS = 400_000  # rays of one kernel; beyond, the phase is refused
@@ -89,7 +89,7 @@ def waves(scene: Scene, reach: Tensor | float, *, order: int = 0) -> Waves:
 def _waves(scene: Scene, probe: Wavefront, reach: Tensor | float, order: int) -> Waves:
     fold = symmetry(scene)
     pupil, weights = _rays(scene, probe, fold, phase_along_radius(probe, reach), order)
-    front = wavefront(scene, pupil, weights)
+    front = wavefront_of(scene, pupil, weights)
     solid = math.pi * weights * _jacobian(_direction_map(probe), pupil)
     return Waves(safe_sqrt(front.energy * solid), front, fold)
 
@@ -168,7 +168,7 @@ def _field_kernels(scene: Scene, grid: Grid, order: int) -> Kernels:
 def _probe(scene: Scene) -> Wavefront:
     """A few hundred rays that find the blur, the map of directions and so the sampling."""
     points, weights = gauss_rings(*_PROBE, dtype=scene.wavelengths.dtype, device=scene.wavelengths.device)
-    return wavefront(scene, points, weights)
+    return wavefront_of(scene, points, weights)
 
 
 def _moments(light: Waves) -> tuple[Tensor, Tensor]:

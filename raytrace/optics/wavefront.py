@@ -78,7 +78,7 @@ def towards_centre(rays: Rays, centre: Tensor, radius: Tensor) -> Tensor:
     return safe_sqrt(1 - dot(across, across)) * rays.direction - across
 
 
-def wavefront(
+def wavefront_of(
     scene: Scene, pupil: Tensor, weights: Tensor | None = None, *, reference: Tensor | None = None
 ) -> Wavefront:
     """The wavefront of a scene at pupil points, on the sphere about the chief ray's point of the sensor.

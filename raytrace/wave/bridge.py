@@ -38,7 +38,7 @@ from raytrace.optics.launch import rays_of_field
 from raytrace.optics.scene import Scene, symmetry
 from raytrace.optics.trace import media, trace_surfaces
 from raytrace.optics.vignetting import vignette
-from raytrace.optics.wavefront import Wavefront, wavefront
+from raytrace.optics.wavefront import Wavefront, wavefront_of
 from raytrace.system.departure import GridSag, ZernikeSag, numbers, sag_of, spline
 from raytrace.system.lens import Fields, Lens, SystemAperture, with_object_distance
 from raytrace.system.surface import Surface, sag_at
@@ -167,7 +167,7 @@ def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: i
 def _field_kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, order: int) -> tuple[int, Tensor]:
     """Rays and kernel (D, 1, W, rows, columns) of one field; without elements those of `psf.diffraction`."""
     like = {"dtype": scene.wavelengths.dtype, "device": scene.wavelengths.device}
-    probe = wavefront(scene, *gauss_rings(*_PROBE, **like))
+    probe = wavefront_of(scene, *gauss_rings(*_PROBE, **like))
     centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))) - probe.centre[:2]
     local = Grid(grid.pitch, grid.rows, grid.columns, centre)
     cutoff = 2e3 * float((half_spread(probe) * probe.index / probe.wavelength).max())
@@ -243,7 +243,7 @@ def _reach_of_elements(scene: Scene, probe: Wavefront, elements: tuple[Element, 
         return 0.0
     with torch.no_grad():
         points = _disc(torch.ones_like(scene.wavelengths[0]))
-        front = wavefront(scene, points)
+        front = wavefront_of(scene, points)
         stop = torch.where(front.usable, _at_stop(scene, points), 0.0)
         beam = torch.linalg.vector_norm(stop, dim=0).max()
         _refuse_wide(beam, elements)
