@@ -172,14 +172,52 @@ def changed(surface: Surface, numbers: Mapping[str, object], where: str, *, like
     )
 
 
-def field_points(fields: Tensor | Sequence, *, like: Tensor) -> Tensor:
-    """(2, F) field points of y, of pairs (x, y), or of a tensor (2, F) as it is; `like` tells dtype and device."""
+def field_points(fields: Tensor | Sequence | float | None, *, like: "Lens | Tensor") -> Tensor:
+    """(2, F) field points of a y, of several y or pairs (x, y), or of a tensor (2, F) as it is; None: the lens's own.
+
+    like: the lens whose kind of field it is, or a tensor that tells dtype and device. Raises ValueError.
+    """
+    if isinstance(like, Lens):
+        if fields is None:
+            return torch.stack([like.fields.x, like.fields.y])
+        found = field_points(fields, like=like.fields.y)
+        return found if isinstance(fields, Tensor) else _below_90_degrees(like, found)
     if isinstance(fields, Tensor):
         return fields if fields.dim() == 2 else torch.stack([torch.zeros_like(fields), fields])
-    points = [(0.0, point) if isinstance(point, (int, float)) else tuple(point) for point in fields]
+    listed = fields if isinstance(fields, Iterable) else [fields]
+    points = [(0.0, point) if isinstance(point, (int, float)) else tuple(point) for point in listed]
     if not points or any(len(point) != 2 for point in points):
         raise ValueError(f"fields {fields!r}: expected numbers y, or pairs (x, y)")
     return torch.tensor(points, dtype=like.dtype, device=like.device).T
+
+
+def _below_90_degrees(lens: Lens, fields: Tensor) -> Tensor:
+    for angle in fields.T.flatten().tolist() if lens.fields.kind == "angle" else ():
+        if abs(angle) >= 90:
+            raise ValueError(
+                f"field {angle:g}: a field angle is below 90 degrees, for rays start from the plane of the entrance "
+                "pupil"
+            )
+    return fields
+
+
+def vector(numbers: Tensor | Iterable[Tensor | float] | float, *, like: Lens) -> Tensor:
+    """(n,) of a number or several, in the dtype and on the device of a lens; tensors keep their graph."""
+    if isinstance(numbers, Tensor):
+        return numbers.reshape(-1)
+    listed = [*numbers] if isinstance(numbers, Iterable) else [numbers]
+    if not listed:
+        raise ValueError("expected a number, or several; found none")
+    return torch.stack([_like(number, like.wavelengths) for number in listed])
+
+
+def wavelengths_of(lens: Lens, wavelengths: Tensor | Iterable[float] | float | None) -> Tensor:
+    """The wavelengths (W,) µm: the lens's own, or those given, checked as by `check_media`."""
+    if wavelengths is None:
+        return lens.wavelengths
+    found = vector(wavelengths, like=lens)
+    check_media(lens, found)
+    return found
 
 
 def _like(number: Tensor | float | Sequence, like: Tensor) -> Tensor:
@@ -265,11 +303,9 @@ def check_unit(wavelengths: Tensor, media: Iterable[Glass] = (), *, where: str =
             )
 
 
-def _with_thickness(lens: Lens, number: int, thickness: Tensor) -> Lens:
-    surfaces = list(lens.surfaces)
-    thickness = torch.as_tensor(thickness, dtype=surfaces[number].thickness.dtype, device=lens.wavelengths.device)
-    surfaces[number] = dataclasses.replace(surfaces[number], thickness=thickness)
-    return dataclasses.replace(lens, surfaces=tuple(surfaces))
+def _with_thickness(lens: Lens, number: int, thickness: Tensor | float) -> Lens:
+    like = lens.surfaces[number].thickness.dtype
+    return lens.replace(number, thickness=torch.as_tensor(thickness, dtype=like, device=lens.wavelengths.device))
 
 
 def check(lens: Lens) -> None:

@@ -16,12 +16,14 @@ class Rays:
     opl: (...) mm, the *reduced* optical path: Σ n·path less the path n·T·σ of the axial ray in every gap of
         thickness T (σ = ±1, its sign changed by every mirror), and less that of the object's distance. None when
         the path is not asked for, and then not computed.
+    wavelength: µm, broadcast against the batch shape; None where what traces the rays is told it.
     """
 
     position: Tensor
     direction: Tensor
     valid: Tensor
     opl: Tensor | None = None
+    wavelength: Tensor | None = None
 
     @property
     def shape(self):

@@ -5,17 +5,13 @@ from collections.abc import Callable, Iterable, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.analysis.frame import axis, masked
-from raytrace.maths.result import Result
+from raytrace.maths.result import Result, axis, masked
 from raytrace.maths.value import value
 from raytrace.optics.launch import launch
-from raytrace.optics.trace import media, steps
-from raytrace.system.lens import Lens
+from raytrace.optics.losses import STATUS, fates
+from raytrace.optics.trace import media
+from raytrace.system.lens import Lens, field_points
 from raytrace.system.rays import Rays
-
-#: What became of a ray, by its number in `Arrivals.status`.
-STATUS = ("ok", "vignetted", "miss", "tir", "unaimed")
-_OK = STATUS.index("ok")
 
 
 @value
@@ -25,6 +21,7 @@ class Arrivals(Result):
     status: (F, W, P), place in STATUS of what befell it first; reached: (F, W, P), whether it has a place on the
     sensor, as a vignetted ray that goes on may have. weight: (W, P), 1 in all for a field.
     pupil: (2, P); fields: (2, F); wavelengths: (W,) µm.
+    The table has a row a ray, its status in words; x and y are empty where it is not on the sensor.
     """
 
     rays: Rays
@@ -65,7 +62,7 @@ def arrivals(
 
     fields, ray_aiming: as for `launch`; progress: goes over the fields one by one, as a bar does.
     """
-    fields = torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields
+    fields = field_points(fields, like=lens)
     each = [_field(lens, pupil, field[:, None], ray_aiming) for field in progress(fields.unbind(1))]
     joined = Rays(
         torch.cat([rays.position for rays, *_ in each], 1),
@@ -81,11 +78,7 @@ def arrivals(
 def _field(lens: Lens, pupil: Tensor, field: Tensor, ray_aiming: str | None) -> tuple[Rays, Tensor, Tensor]:
     """Rays (3, 1, W, P) of one field (2, 1) on the sensor, their status, and whether they reach it."""
     rays = launch(lens, pupil, fields=field, ray_aiming=ray_aiming)
-    reached, status = rays.valid, torch.where(rays.valid, _OK, STATUS.index("unaimed"))
-    for crossing in steps(lens.surfaces[1:], rays, indices=media(lens, lens.wavelengths[:, None])):
-        fates = {"miss": crossing.missed, "tir": crossing.totally_reflected, "vignetted": crossing.clipped}
-        for name, fate in fates.items():
-            status = torch.where((status == _OK) & fate, STATUS.index(name), status)
+    reached = rays.valid
+    for crossing, status in fates(lens.surfaces[1:], rays, media(lens, lens.wavelengths[:, None])):
         reached = reached & ~crossing.missed & ~crossing.totally_reflected
-        rays = crossing.rays
-    return rays, status, reached
+    return crossing.rays, status, reached
