@@ -37,6 +37,8 @@ PUBLIC = {
     # rays
     "FirstOrder": "optics.paraxial",
     "Rays": "system.rays",
+    "LostRays": "optics.losses",
+    "OutOfReach": "optics.losses",
     "Spot": "optics.spot",
     "first_order": "optics.paraxial",
     "gauss_rings": "maths.pupil",
@@ -44,6 +46,7 @@ PUBLIC = {
     "hit_jacobian": "optics.jacobian",
     "paraxial_image_distance": "optics.paraxial",
     "prepare": "fused",
+    "rays": "optics.launch",
     "sobol": "maths.pupil",
     "to": "maths.value",
     "tracing": "fused",

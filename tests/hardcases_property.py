@@ -12,8 +12,8 @@ from hardcases_scene import CASES, OUTPUTS, Scene
 from torch.testing import assert_close
 
 from raytrace.fused import engine
-from raytrace.optics.trace import start, trace_surfaces
-from raytrace.system.rays import Rays
+from raytrace.optics.trace import trace_surfaces
+from raytrace.system.rays import Rays, start
 
 SYSTEMS = {case["id"]: case for case in CASES if case["kind"] == "trace"}
 SCALE = 2.0**20

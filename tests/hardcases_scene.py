@@ -13,8 +13,8 @@ import torch
 from raytrace.maths.numerics import dot, unit
 from raytrace.media.glass import AIR, MIRROR, constant
 from raytrace.optics.launch import rays_from_infinity, rays_from_point
-from raytrace.optics.trace import axial_path, start, steps
-from raytrace.system.rays import Rays
+from raytrace.optics.trace import axial_path, steps
+from raytrace.system.rays import Rays, start
 from raytrace.system.surface import Aperture, Surface
 
 ORACLE = Path(__file__).parent / "oracles" / "hardcases.json.gz"

@@ -21,7 +21,7 @@ from raytrace.media import glass
 from raytrace.media.catalog import find_glass
 from raytrace.optics.launch import launch, stop_radius
 from raytrace.optics.paraxial import first_order
-from raytrace.optics.trace import media, steps, trace
+from raytrace.optics.trace import media, steps, trace_lens
 from raytrace.optics.wavefront import peak_to_valley, rms, wavefront_of
 from raytrace.system.lens import FIELD_UNITS, RAY_AIMING, Fields, Lens, SystemAperture
 from raytrace.system.rays import Rays
@@ -262,12 +262,13 @@ def spot(case):
     """
     lens, fields = lens_of(case), fields_of(case)
     primary = lens.wavelengths[lens.primary_wavelength][None]
-    chief = trace(lens, launch(lens, fields.new_zeros(2, 1), fields=fields, wavelengths=primary), primary).position[:2]
+    rays = launch(lens, fields.new_zeros(2, 1), fields=fields, wavelengths=primary)
+    chief = trace_lens(lens, rays, primary).position[:2]
     off = []
     shares = lens.wavelength_weights / lens.wavelength_weights.max()
     for wavelength, share in zip(lens.wavelengths, shares.tolist(), strict=True):
         points = pupil.hexapolar(case["rings"] * share**0.5, dtype=torch.float64)[0]
-        rays = trace(lens, launch(lens, points, fields=fields, wavelengths=wavelength[None]), wavelength)
+        rays = trace_lens(lens, launch(lens, points, fields=fields, wavelengths=wavelength[None]), wavelength)
         off.append(1000 * (rays.position[:2] - chief)[:, :, 0])
     off = torch.cat(off, -1)
     x, y = torch.sqrt((off * off).mean(-1))

@@ -19,7 +19,7 @@ from raytrace.optics.focus import image_rays
 from raytrace.optics.launch import launch
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.spot import EmptySpot
-from raytrace.optics.trace import trace
+from raytrace.optics.trace import trace_lens
 from raytrace.system.lens import Lens, with_sensor_distance
 
 WAVELENGTH = 0.55e-3  # mm
@@ -253,7 +253,7 @@ def test_heights_of_chief_rays_have_the_sign_of_the_trace(kind, distance, aiming
     lens = problems.double_gauss(object_distance=distance, field=field, wavelengths=(0.5876, 0.45), ray_aiming=aiming)
     points = torch.stack([field.x, field.y])
     found = analysis.distortion(lens, fields=points)
-    chief = trace(lens, launch(lens, torch.zeros(2, 1, dtype=torch.float64)), lens.wavelengths[:, None])
+    chief = trace_lens(lens, launch(lens, torch.zeros(2, 1, dtype=torch.float64)), lens.wavelengths[:, None])
     x, y = chief.position[:2, :, :, 0]
     meridian = torch.stack([y[0], y[1], x[2], (2 * y[3] - x[3]) / math.sqrt(5)])
     assert (found.height - meridian).abs().max() <= 1e-12  # mm

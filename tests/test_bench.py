@@ -13,7 +13,7 @@ from raytrace.cli import main
 from raytrace.files import shipped
 from raytrace.formats import read_lens
 from raytrace.media.glass import MIRROR, constant
-from raytrace.optics.trace import trace, trace_surfaces
+from raytrace.optics.trace import trace_lens, trace_surfaces
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface
 
@@ -109,7 +109,7 @@ def test_gradient_about_a_fixed_centroid_is_that_of_the_spot():
     lens = read_lens(shipped("lenses") / "cooke_triplet.zmx")
     rays = field_rays(lens, 40)
     moving, leaves = with_leaves(lens)
-    x, y, _ = trace(moving, rays, lens.wavelengths[lens.primary_wavelength]).position
+    x, y, _ = trace_lens(moving, rays, lens.wavelengths[lens.primary_wavelength]).position
     centroid = torch.stack([x.mean(), y.mean()])
     fixed = torch.autograd.grad(squared_radius(x, y, centroid.detach()), leaves, retain_graph=True)
     free = torch.autograd.grad(squared_radius(x, y, centroid), leaves)

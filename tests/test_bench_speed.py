@@ -27,7 +27,7 @@ from raytrace.fused import NoCompiler, tracing
 from raytrace.maths.value import to
 from raytrace.optics.focus import spot_parabola
 from raytrace.optics.reuse import Memo, trace_bundle
-from raytrace.optics.trace import trace, trace_surfaces
+from raytrace.optics.trace import trace_lens, trace_surfaces
 from raytrace.system.rays import Rays
 
 #: What `raytrace bench speed --json` is read for.
@@ -75,7 +75,7 @@ def compared(limit, lens, rays):
     """Largest distance of position and direction, where both come through; and that the same rays do."""
     lens, rays = to(lens, dtype=limit.dtype), to(rays, dtype=limit.dtype)
     with torch.no_grad(), tracing("eager"):
-        expected = trace(lens, rays, lens.wavelengths[lens.primary_wavelength])
+        expected = trace_lens(lens, rays, lens.wavelengths[lens.primary_wavelength])
     found = limit.trace(rays)
     assert torch.equal(found.valid, expected.valid)
     alive = expected.valid
@@ -123,7 +123,7 @@ def test_lost_rays_are_lost_in_the_safe_limit_too(built, dtype):
     assert bool(torch.isfinite(found.position).all())
     assert 0.05 < float(found.valid.double().mean()) < 0.6
     with torch.no_grad(), tracing("eager"):
-        expected = trace(lens, rays, lens.wavelengths[0])
+        expected = trace_lens(lens, rays, lens.wavelengths[0])
     differ = int((found.valid ^ expected.valid).sum())
     assert differ == 0 if dtype == torch.float64 else differ < 5
     both, bound = found.valid & expected.valid, AGREES[dtype] if dtype == torch.float64 else 0.05

@@ -9,14 +9,15 @@ from problems import double_gauss, fields, lens, surface, vector, vignetting_ape
 from raytrace.media.glass import MIRROR, refractive_index, sellmeier
 from raytrace.optics.launch import launch
 from raytrace.optics.paraxial import first_order
-from raytrace.optics.trace import media, start, steps, trace
+from raytrace.optics.trace import media, steps, trace_lens
 from raytrace.system.lens import check
+from raytrace.system.rays import start
 
 CENTRE = torch.zeros(2, 1, dtype=torch.float64)
 
 
 def chief(system, **options):
-    return trace(system, launch(system, CENTRE, **options), system.wavelengths[:, None]).position[:, :, 0, 0]
+    return trace_lens(system, launch(system, CENTRE, **options), system.wavelengths[:, None]).position[:, :, 0, 0]
 
 
 def test_positive_field_angle_goes_up_and_images_up_for_infinity():
@@ -52,7 +53,7 @@ def test_x_fields_are_x():
 
 
 def test_positive_curvature_has_its_centre_behind_the_surface_and_positive_power_in_glass():
-    out = trace(
+    out = trace_lens(
         lens([surface(0.02, 100.0, 1.5)]),
         start(vector(0.0, 5.0, 0.0)[:, None], vector(0.0, 0.0, 1.0)[:, None]),
         vector(0.55),
@@ -76,7 +77,7 @@ def test_stop_and_surface_numbers_are_those_of_the_file():
 
 def test_semi_diameter_alone_never_clips():
     narrow = lens([surface(0.02, 5.0, 1.5, semi_diameter=1.0), surface(None, 50.0, semi_diameter=1.0)])
-    assert trace(narrow, launch(narrow, vector(0.0, 1.0).reshape(2, 1)), narrow.wavelengths[0]).valid.all()
+    assert trace_lens(narrow, launch(narrow, vector(0.0, 1.0).reshape(2, 1)), narrow.wavelengths[0]).valid.all()
 
 
 def test_vignetted_ray_keeps_its_coordinates_and_a_missed_one_ends():
@@ -91,13 +92,13 @@ def test_vignetted_ray_keeps_its_coordinates_and_a_missed_one_ends():
     assert crossings[0].missed.tolist() == [False, True]
     last = crossings[-1].rays
     assert not last.valid.any()
-    assert torch.equal(last.position[:, 0], trace(free, rays, free.wavelengths[0]).position[:, 0])
+    assert torch.equal(last.position[:, 0], trace_lens(free, rays, free.wavelengths[0]).position[:, 0])
     assert last.position[:, 1].tolist() == [0.0, 0.0, 0.0]
 
 
 def test_thickness_behind_a_mirror_is_negative_and_light_comes_back():
     system = lens([surface(None, 10.0), surface(-0.01, -50.0, MIRROR)], stop=2)
-    out = trace(system, launch(system, vector(0.0, 0.1).reshape(2, 1)), system.wavelengths[0])
+    out = trace_lens(system, launch(system, vector(0.0, 0.1).reshape(2, 1)), system.wavelengths[0])
     assert out.direction[2] < 0
     assert out.position[2] == 0
 

@@ -18,8 +18,9 @@ from raytrace.formats import UnsupportedSurface, read_lens
 from raytrace.media.catalog import UnknownGlass
 from raytrace.media.glass import constant, refractive_index
 from raytrace.optics.paraxial import first_order
-from raytrace.optics.trace import start, steps
+from raytrace.optics.trace import steps
 from raytrace.system.lens import Lens
+from raytrace.system.rays import start
 
 CORPUS = Path(__file__).parents[2] / "shared" / "corpus"
 RIGHT, REFUSED, WRONG = "loaded and right", "refused by name", "wrong"

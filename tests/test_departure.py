@@ -17,8 +17,9 @@ from raytrace.maths.value import to
 from raytrace.optics.launch import launch
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.scene import scene, symmetry
-from raytrace.optics.trace import media, start, steps, trace
+from raytrace.optics.trace import media, steps, trace_lens
 from raytrace.system.departure import GridSag, ZernikeSag, covers, numbers, sag_of, spline
+from raytrace.system.rays import start
 from raytrace.system.surface import intersect, normal, sag, sag_at
 
 RADIUS = vector(4.0)[0]
@@ -319,7 +320,7 @@ def test_a_departure_is_not_round_whatever_its_numbers():
         found = psf(astigmatic, model, fields=axis, grid=grid(0.02, 21), order=2)
         xx, _, yy = found.covariance[:, 0, 0]
         assert xx / yy > 1.2 or yy / xx > 1.2
-    rays = trace(astigmatic, launch(astigmatic, vector(0, 1, 1, 0).reshape(2, 2), fields=axis), vector(0.55))
+    rays = trace_lens(astigmatic, launch(astigmatic, vector(0, 1, 1, 0).reshape(2, 2), fields=axis), vector(0.55))
     assert rays.position[1, 0, 0, 0].abs() > 0.01
     assert (rays.position[1, 0, 0, 0].abs() - rays.position[0, 0, 0, 1].abs()).abs() > 0.005
 
@@ -351,4 +352,4 @@ def test_media_and_dummies_do_not_care():
     idle = lens([dataclasses.replace(surface(None, 5.0), departure=bumpy()), surface(None, 5.0)])
     rays = launch(idle, points(5, 0.5))
     assert len(media(idle, idle.wavelengths[0])) == 4
-    assert torch.equal(trace(idle, rays, idle.wavelengths[0]).direction, rays.direction)
+    assert torch.equal(trace_lens(idle, rays, idle.wavelengths[0]).direction, rays.direction)

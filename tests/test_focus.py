@@ -10,16 +10,16 @@ from problems import double_gauss, lens, scalar, surface, vector
 from raytrace.maths import pupil
 from raytrace.media.glass import MIRROR
 from raytrace.optics.focus import (
-    focus,
     focus_moments,
     focus_of_mean_radius,
+    focus_of_rms,
     image_rays,
     mean_rms_radius,
     spot_parabola,
     through_focus,
 )
 from raytrace.optics.paraxial import first_order
-from raytrace.optics.spot import EmptySpot, spot
+from raytrace.optics.spot import EmptySpot, spot_of
 from raytrace.system.lens import with_object_distance, with_sensor_distance
 from raytrace.system.surface import Aperture
 
@@ -29,12 +29,12 @@ AXIS = torch.zeros(2, 1, dtype=torch.float64)
 
 def rms(system, **options):
     """Mean square radius over fields and wavelengths of a lens as it stands, retraced."""
-    return spot(image_rays(system, POINTS, **options), WEIGHTS).mean_square_radius
+    return spot_of(image_rays(system, POINTS, **options), WEIGHTS).mean_square_radius
 
 
 def test_double_gauss_at_25_metres_as_published():
     system = double_gauss(object_distance=25000.0)
-    found = focus(system, POINTS, WEIGHTS, fields=AXIS)
+    found = focus_of_rms(system, POINTS, WEIGHTS, fields=AXIS)
     assert found.item() == pytest.approx(57.66201, abs=6e-6)  # mm: half of the last digit printed
     best = rms(with_sensor_distance(system, found), fields=AXIS).sqrt()
     paraxial = rms(with_sensor_distance(system, 57.8817685209), fields=AXIS).sqrt()
@@ -45,7 +45,7 @@ def test_double_gauss_at_25_metres_as_published():
 @pytest.mark.parametrize("distance", [math.inf, 25000.0, 500.0])
 def test_closed_form_is_the_minimum_of_the_retraced_radius(distance):
     system = double_gauss(object_distance=distance)
-    found = focus(system, POINTS, WEIGHTS)
+    found = focus_of_rms(system, POINTS, WEIGHTS)
     mean = [rms(with_sensor_distance(system, found + step)).sum().item() for step in (-0.01, 0.0, 0.01)]
     vertex = 0.01 * 0.5 * (mean[0] - mean[2]) / (mean[0] - 2 * mean[1] + mean[2])
     # The parabola is exact; the vertex of three points has the rounding of the mean squares over their differences.
@@ -60,7 +60,7 @@ def test_sensor_in_glass_is_focused_by_the_rays_in_the_glass(glass, curvature):
         [surface(0.02, 5.0, 1.6), surface(-0.02, 30.0), surface(curvature, 12.0, glass)],
         aperture=("entrance_pupil_diameter", 15.0),
     )
-    found = focus(system, POINTS, WEIGHTS)
+    found = focus_of_rms(system, POINTS, WEIGHTS)
     mean = [rms(with_sensor_distance(system, found + step)).sum().item() for step in (-0.01, 0.0, 0.01)]
     assert abs(0.01 * 0.5 * (mean[0] - mean[2]) / (mean[0] - 2 * mean[1] + mean[2])) <= 1e-9  # mm
 
@@ -68,7 +68,7 @@ def test_sensor_in_glass_is_focused_by_the_rays_in_the_glass(glass, curvature):
 def test_behind_an_odd_number_of_mirrors():
     """Sensor distances are negative there, and so is the one found."""
     mirror = lens([surface(-0.01, -49.0, MIRROR)], aperture=("entrance_pupil_diameter", 5.0))
-    found = focus(mirror, POINTS, WEIGHTS, fields=AXIS)
+    found = focus_of_rms(mirror, POINTS, WEIGHTS, fields=AXIS)
     assert found.item() == pytest.approx(-50.0, abs=0.02)
     mean = [rms(with_sensor_distance(mirror, found + step), fields=AXIS).sum().item() for step in (-0.01, 0.0, 0.01)]
     assert abs(0.01 * 0.5 * (mean[0] - mean[2]) / (mean[0] - 2 * mean[1] + mean[2])) <= 1e-9  # mm
@@ -77,7 +77,7 @@ def test_behind_an_odd_number_of_mirrors():
 def test_several_distances_fields_and_weights():
     system = double_gauss()
     weights = {"distance_weights": [1.0, 3.0], "field_weights": vector(2.0, 0.0, 1.0)}
-    found = focus(system, POINTS, WEIGHTS, object_distances=[math.inf, 25000.0], **weights)
+    found = focus_of_rms(system, POINTS, WEIGHTS, object_distances=[math.inf, 25000.0], **weights)
 
     def merit(s):
         total = 0.0
@@ -92,7 +92,7 @@ def test_several_distances_fields_and_weights():
 
 def test_result_does_not_depend_on_where_the_sensor_stood():
     system = double_gauss()
-    found = [focus(with_sensor_distance(system, s), POINTS, WEIGHTS).item() for s in (1.0, 58.5, 90.0)]
+    found = [focus_of_rms(with_sensor_distance(system, s), POINTS, WEIGHTS).item() for s in (1.0, 58.5, 90.0)]
     assert max(found) - min(found) <= 1e-11  # mm
 
 
@@ -101,7 +101,7 @@ def test_through_focus_is_the_parabola_of_the_moments():
     cov, var = focus_moments(rays, WEIGHTS)
     shifts = torch.linspace(-1, 1, 9, dtype=torch.float64)
     spots = through_focus(rays, shifts, WEIGHTS)
-    here = spot(rays, WEIGHTS).mean_square_radius
+    here = spot_of(rays, WEIGHTS).mean_square_radius
     expected = here + 2 * shifts[:, None, None] * cov + shifts[:, None, None] ** 2 * var
     assert torch.allclose(spots.mean_square_radius, expected, rtol=1e-10, atol=1e-16)
 
@@ -110,7 +110,7 @@ def test_perfect_lens_focuses_in_its_focus():
     hyperbolic = lens(
         [surface(None, 10.0, 1.5), surface(-1 / 25, 47.0, conic=-2.25)], aperture=("entrance_pupil_diameter", 30.0)
     )
-    found = focus(hyperbolic, POINTS, WEIGHTS)
+    found = focus_of_rms(hyperbolic, POINTS, WEIGHTS)
     assert found.item() == pytest.approx(50.0, abs=1e-12)
 
 
@@ -121,7 +121,7 @@ def test_derivative_by_curvature_is_that_of_differences(number):
     def sensor(c):
         changed = dataclasses.replace(system.surfaces[number], curvature=c)
         surfaces = (*system.surfaces[:number], changed, *system.surfaces[number + 1 :])
-        return focus(dataclasses.replace(system, surfaces=surfaces), POINTS, WEIGHTS)
+        return focus_of_rms(dataclasses.replace(system, surfaces=surfaces), POINTS, WEIGHTS)
 
     c = system.surfaces[number].curvature.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(sensor(c), c)
@@ -136,7 +136,7 @@ def test_derivative_by_object_distance_tends_to_newtons():
     """ds/dD = -(f/x)² for a small pupil."""
     system = double_gauss(aperture=("entrance_pupil_diameter", 0.1))
     D = scalar(5000.0).requires_grad_()
-    found = focus(with_object_distance(system, D), POINTS, WEIGHTS, fields=AXIS)
+    found = focus_of_rms(with_object_distance(system, D), POINTS, WEIGHTS, fields=AXIS)
     data = first_order(with_object_distance(system, 5000.0))
     assert torch.autograd.grad(found, D)[0].item() == pytest.approx(-(data.magnification**2).item(), rel=1e-5)
 
@@ -146,7 +146,7 @@ def test_all_rays_lost_is_no_focus_and_no_derivative_by_the_lens():
     points = torch.tensor([[0.9, -0.9], [0.0, 0.0]], dtype=torch.float64)
     c = blind.surfaces[1].curvature.clone().requires_grad_()
     surfaces = (blind.surfaces[0], dataclasses.replace(blind.surfaces[1], curvature=c), *blind.surfaces[2:])
-    found = focus(dataclasses.replace(blind, surfaces=surfaces), points, torch.ones(2, dtype=torch.float64))
+    found = focus_of_rms(dataclasses.replace(blind, surfaces=surfaces), points, torch.ones(2, dtype=torch.float64))
     assert found.isnan()
     assert torch.autograd.grad(found, c)[0].item() == 0.0
 
@@ -166,10 +166,10 @@ LOST = vector(0.0, 85.0).reshape(2, 1)  # degrees: no ray of the double Gauss ar
 def test_focus_leaves_a_field_without_rays_out_or_refuses_it():
     system = double_gauss(object_distance=25000.0)
     both = torch.cat([AXIS, LOST], 1)
-    found = focus(system, POINTS, WEIGHTS, fields=both)
-    assert found.item() == focus(system, POINTS, WEIGHTS, fields=AXIS).item()
+    found = focus_of_rms(system, POINTS, WEIGHTS, fields=both)
+    assert found.item() == focus_of_rms(system, POINTS, WEIGHTS, fields=AXIS).item()
     with pytest.raises(EmptySpot, match="no ray reaches 1 of 2 spots"):
-        focus(system, POINTS, WEIGHTS, fields=both, empty="error")
+        focus_of_rms(system, POINTS, WEIGHTS, fields=both, empty="error")
 
 
 def test_no_ray_or_one_ray_has_no_focus_and_no_derivative():
@@ -177,11 +177,11 @@ def test_no_ray_or_one_ray_has_no_focus_and_no_derivative():
     system = with_sensor_distance(system, system.surfaces[-2].thickness.clone().requires_grad_())
     for points, fields in ((POINTS, LOST), (POINTS[:, :1], AXIS)):
         weights = torch.ones_like(points[0])
-        found = focus(system, points, weights, fields=fields)
+        found = focus_of_rms(system, points, weights, fields=fields)
         assert found.isnan()
         assert torch.autograd.grad(found, system.surfaces[-2].thickness)[0] == 0
         with pytest.raises(EmptySpot):
-            focus(system, points, weights, fields=fields, empty="error")
+            focus_of_rms(system, points, weights, fields=fields, empty="error")
         with pytest.raises(EmptySpot):
             focus_of_mean_radius(system, points, weights, fields=fields)
 
@@ -194,7 +194,7 @@ def test_moments_and_parabola_of_a_lost_spot_are_nan():
 
 def test_mean_rms_radius_is_what_focus_makes_least():
     system, distances = double_gauss(), [10000.0, 50000.0]
-    best = focus(system, POINTS, WEIGHTS, fields=AXIS, object_distances=distances)
+    best = focus_of_rms(system, POINTS, WEIGHTS, fields=AXIS, object_distances=distances)
     radii = [
         mean_rms_radius(moved, POINTS, WEIGHTS, fields=AXIS, object_distances=distances)
         for moved in (with_sensor_distance(system, best + step) for step in (-0.01, 0.0, 0.01))

@@ -15,13 +15,13 @@ import torch
 
 from raytrace import plot
 from raytrace.analysis import distortion, opd_fan, ray_fan
-from raytrace.analysis.arrivals import STATUS, arrivals
 from raytrace.cli import build_parser
 from raytrace.cli.door import find_lens
 from raytrace.cli.options import PICTURES, data_file, did_you_mean, picture_file
 from raytrace.formats import read_lens
 from raytrace.maths.pupil import hexapolar
-from raytrace.optics.losses import losses
+from raytrace.optics.arrivals import arrivals
+from raytrace.optics.losses import LOST, STATUS, losses
 
 #: Options whose form differs between commands, and why.
 DIFFERENT = {
@@ -141,9 +141,9 @@ def test_fates_of_a_ray_table_are_those_that_rays_are_counted_by():
     field = torch.tensor([[0.0, 0.0], [80.0, 25.0]], dtype=torch.float64)
     points, weights = hexapolar(4)
     found, lost = arrivals(lens, points, weights, fields=field), losses(lens, points, fields=field)
-    for name, key in (("vignetted", "vignetted"), ("miss", "missed"), ("tir", "totally_reflected")):
+    for place, name in enumerate(LOST):
         counted = (found.status == STATUS.index(name)).sum(-1)
-        assert counted.tolist() == getattr(lost, key).sum(0).tolist(), name
+        assert counted.tolist() == lost.lost[place].sum(0).tolist(), name
     assert not (found.status[0] == 0).any()
     assert torch.equal(found.rays.valid, found.status == 0)
     shown = found.to_frame()

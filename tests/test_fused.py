@@ -23,9 +23,9 @@ from raytrace.maths.value import to
 from raytrace.media.glass import MIRROR
 from raytrace.optics.jacobian import hit_jacobian
 from raytrace.optics.launch import launch
-from raytrace.optics.trace import media, start, trace, trace_surfaces
+from raytrace.optics.trace import media, trace_lens, trace_surfaces
 from raytrace.system.departure import ZernikeSag
-from raytrace.system.rays import Rays
+from raytrace.system.rays import Rays, start
 from raytrace.system.surface import Aperture
 
 LENSES = sorted(path for path in shipped("lenses").iterdir() if path.suffix == ".zmx")
@@ -91,7 +91,7 @@ def test_shipped_lenses_are_traced_as_by_torch(path, dtype):
     system = to(read_lens(path), dtype=dtype)
     with torch.no_grad(), tracing("eager"):
         rays = launch(system, sobol(301)[0].to(dtype))
-    fused, eager = both(lambda: trace(system, rays, system.wavelengths[:, None]))
+    fused, eager = both(lambda: trace_lens(system, rays, system.wavelengths[:, None]))
     size = max(float(s.thickness.abs()) for s in system.surfaces[1:])
     assert_same_rays(fused, eager, CLOSE[dtype], max(size, 10.0))
     assert eager.valid.any()
@@ -102,7 +102,7 @@ def test_shipped_lenses_are_traced_as_by_torch(path, dtype):
 def test_every_kind_of_surface_and_of_loss(dtype, with_path):
     system, rays = to(EVERYTHING, dtype=dtype), some_rays(dtype=dtype)
     rays = rays if with_path else dataclasses.replace(rays, opl=None)
-    fused, eager = both(lambda: trace(system, rays, system.wavelengths[0]))
+    fused, eager = both(lambda: trace_lens(system, rays, system.wavelengths[0]))
     assert 20 < int((~eager.valid).sum()) < 600
     assert_same_rays(fused, eager, 10 * CLOSE[dtype])
 
@@ -204,7 +204,7 @@ def test_gradients_of_gradients_pass_through_the_eager_trace():
         surfaces[1] = dataclasses.replace(surfaces[1], curvature=curvature)
         surfaces[2] = dataclasses.replace(surfaces[2], thickness=thickness)
         changed = dataclasses.replace(system, surfaces=tuple(surfaces))
-        return trace(changed, rays, system.wavelengths[0]).position[:2]
+        return trace_lens(changed, rays, system.wavelengths[0]).position[:2]
 
     arguments = system.surfaces[1].curvature.clone().requires_grad_(), scalar(0.5).requires_grad_()
     with tracing("fused"):
@@ -227,9 +227,9 @@ def test_a_ray_does_not_depend_on_its_neighbours_nor_gradients_on_threads():
             torch.set_num_threads(before)
 
     with tracing("fused"):
-        together = trace(EVERYTHING, rays, wavelength)
+        together = trace_lens(EVERYTHING, rays, wavelength)
         chosen = torch.tensor([0, 1, 15, 16, 17, 50, 255, 256, 300, 39_999])
-        alone = trace(EVERYTHING, Rays(*(x[..., chosen] for x in leaves_of_rays(rays))), wavelength)
+        alone = trace_lens(EVERYTHING, Rays(*(x[..., chosen] for x in leaves_of_rays(rays))), wavelength)
         for part, whole in zip(leaves_of_rays(alone), leaves_of_rays(together), strict=True):
             assert torch.equal(part, whole[..., chosen])
         for one, two in zip(gradient(1), gradient(2), strict=True):
@@ -273,7 +273,7 @@ def test_surfaces_with_a_departure_are_traced_between_compiled_ones():
     bump = ZernikeSag(vector(0.0, 0.0, 0.0, 1e-3, 2e-3), scalar(10.0))
     surfaces = [*EVERYTHING.surfaces[1:4], surface(0.01, 2.0, 1.5, departure=bump), *EVERYTHING.surfaces[4:]]
     system = dataclasses.replace(EVERYTHING, surfaces=(EVERYTHING.surfaces[0], *surfaces))
-    fused, eager = both(lambda: trace(system, some_rays(), system.wavelengths[0]))
+    fused, eager = both(lambda: trace_lens(system, some_rays(), system.wavelengths[0]))
     assert_same_rays(fused, eager, 1e-12)
 
 
@@ -298,10 +298,10 @@ def test_transforms_other_dtypes_and_the_switch_leave_it_to_torch():
 
 PROBE = """
 import raytrace, torch
-from raytrace.optics.trace import trace
+from raytrace.optics.trace import trace_lens
 from raytrace.fused import library
 from raytrace.fused.choice import is_fused
-from raytrace.system.rays import Rays
+from raytrace.system.rays import Rays, start
 library.FLAGS = tuple(flag for flag in library.FLAGS if flag != "-O3")  # compiled in 2 s instead of 14 s
 lens = raytrace.read_lens({lens!r})
 count = {count}
@@ -309,7 +309,7 @@ like = torch.zeros(3, count, dtype=torch.float64)
 like[2] = 1.0
 rays = Rays(0 * like, like, torch.ones(count, dtype=torch.bool))
 with torch.no_grad():
-    trace(lens, rays, lens.wavelengths[0])
+    trace_lens(lens, rays, lens.wavelengths[0])
 print(is_fused(Rays(like[:, :1], like[:, :1], rays.valid[:1]), lens.wavelengths, 1))
 """
 

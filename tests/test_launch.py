@@ -18,7 +18,7 @@ from raytrace.optics.launch import (
     stop_radius,
 )
 from raytrace.optics.paraxial import first_order
-from raytrace.optics.trace import media, trace, trace_surfaces
+from raytrace.optics.trace import media, trace_lens, trace_surfaces
 from raytrace.system.lens import with_object_distance
 
 POINTS, _ = pupil.hexapolar(2)
@@ -95,7 +95,7 @@ def test_path_counts_from_the_object_point():
 
 def test_object_at_1e12_mm_is_one_at_infinity():
     near, far = double_gauss(object_distance=1e12), double_gauss()
-    one, other = (trace(s, launch(s, POINTS), s.wavelengths[:, None]) for s in (near, far))
+    one, other = (trace_lens(s, launch(s, POINTS), s.wavelengths[:, None]) for s in (near, far))
     assert (one.position - other.position).abs().max() <= 2e-8  # mm: f²/D = 1e-8
 
 
@@ -117,7 +117,7 @@ def test_every_kind_of_field(kind, heights, distance, aiming):
     rays = launch(system, CENTRE, ray_aiming=aiming)
     assert rays.valid.all()
     if kind == "real_image_height":
-        hit = trace(system, rays, system.wavelengths[:, None]).position[1].flatten()
+        hit = trace_lens(system, rays, system.wavelengths[:, None]).position[1].flatten()
         assert hit.tolist() == pytest.approx(list(heights), abs=1e-10)  # mm
     if kind == "angle" and aiming == "off":
         assert torch.atan2(rays.direction[1], rays.direction[2]).rad2deg().flatten().tolist() == pytest.approx(
@@ -134,7 +134,7 @@ def test_every_kind_of_field(kind, heights, distance, aiming):
 def test_real_image_height_finds_the_angle_that_lands_there(aiming, angle):
     """Of a fisheye: chief rays from 75° need to be followed from the axis. Where none comes, rays are lost."""
     system = fisheye(field=fields("angle", (angle,)), ray_aiming=aiming)
-    height = trace(system, launch(system, CENTRE), system.wavelengths[:, None]).position[1].item()
+    height = trace_lens(system, launch(system, CENTRE), system.wavelengths[:, None]).position[1].item()
     c = system.surfaces[1].curvature.clone().requires_grad_()
     first = dataclasses.replace(system.surfaces[1], curvature=c)
     system = dataclasses.replace(
@@ -176,7 +176,7 @@ def test_paraxial_image_height_of_infinity_is_that_of_a_small_field():
             system.surfaces[-1],
         ),
     )
-    hit = trace(focused, launch(focused, CENTRE), focused.wavelengths[:, None]).position[1]
+    hit = trace_lens(focused, launch(focused, CENTRE), focused.wavelengths[:, None]).position[1]
     assert hit.item() == pytest.approx(1e-4, rel=1e-8)
 
 
@@ -296,7 +296,7 @@ def test_virtual_object():
     t = (60.0 - rays.position[2]) / rays.direction[2]
     hit = rays.position[:2] + t * rays.direction[:2]
     assert hit.abs().max() <= 1e-12
-    out = trace(system, rays, system.wavelengths[:, None])
+    out = trace_lens(system, rays, system.wavelengths[:, None])
     crossing = -out.position[1] * out.direction[2] / out.direction[1]
     image = first_order(system).paraxial_image_distance - 30.0
     assert torch.nanmean(crossing[..., 1:]).item() == pytest.approx(image.item(), rel=0.05)
@@ -361,7 +361,7 @@ def test_derivatives_of_launched_rays(name, aiming):
             system = dataclasses.replace(base, aperture=dataclasses.replace(base.aperture, value=15.0 * x))
         field = torch.stack([scalar(0.0), 8.0 * (x if name == "field" else scalar(1.0))])[:, None]
         rays = launch(system, points, fields=field, ray_aiming=aiming)
-        return trace(system, rays, system.wavelengths[:, None]).position[:2].flatten()
+        return trace_lens(system, rays, system.wavelengths[:, None]).position[:2].flatten()
 
     x = scalar(1.0).requires_grad_()
     found = torch.stack([torch.autograd.grad(y, x, retain_graph=True)[0] for y in image(x)])

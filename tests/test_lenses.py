@@ -10,7 +10,7 @@ import torch
 from raytrace.formats import read_lens
 from raytrace.optics.launch import launch
 from raytrace.optics.paraxial import first_order
-from raytrace.optics.trace import media, steps, trace
+from raytrace.optics.trace import media, steps, trace_lens
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
 
@@ -199,7 +199,7 @@ def test_every_field_reaches_the_image(lens):
     """
     angle = 2 * math.pi * torch.arange(24, dtype=torch.float64) / 24
     rays = launch(lens, torch.stack([angle.cos(), angle.sin()]))
-    rays = trace(lens, rays, lens.wavelengths[:, None])
+    rays = trace_lens(lens, rays, lens.wavelengths[:, None])
     assert bool(rays.valid.all()), f"rays lost at each field: {(~rays.valid).sum(dim=(1, 2)).tolist()}"
     expected = first_order(lens).effective_focal_length * torch.tan(torch.deg2rad(lens.fields.y))
     found = rays.position[1, :, lens.primary_wavelength].mean(dim=-1)
@@ -236,4 +236,4 @@ def _on_axis(lens: Lens, pupil: list[float]) -> Rays:
 
 
 def _at_image(lens: Lens, pupil: list[float]) -> Rays:
-    return trace(lens, _on_axis(lens, pupil), lens.wavelengths[lens.primary_wavelength])
+    return trace_lens(lens, _on_axis(lens, pupil), lens.wavelengths[lens.primary_wavelength])

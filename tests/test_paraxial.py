@@ -15,8 +15,9 @@ from raytrace.formats import read_lens, write_lens
 from raytrace.media.glass import MIRROR
 from raytrace.optics.f_number import real_working_f_number
 from raytrace.optics.paraxial import first_order, paraxial_image_distance, signed, system_matrix
-from raytrace.optics.trace import media, start, trace, trace_surfaces
+from raytrace.optics.trace import media, trace_lens, trace_surfaces
 from raytrace.system.lens import with_object_distance
+from raytrace.system.rays import start
 
 INF = math.inf
 
@@ -116,7 +117,7 @@ def test_pupils_are_images_of_the_stop(stop):
         system.surfaces[1 : stop + 1], rays, indices=media(system, system.wavelengths[0])[: stop + 1]
     )
     assert abs(at_stop.position[1].item()) <= 1e-12  # mm; third order: slope³ · 100 mm
-    last = trace(system, rays, system.wavelengths[0])
+    last = trace_lens(system, rays, system.wavelengths[0])
     crossing = -last.position[1] * last.direction[2] / last.direction[1]
     assert crossing.item() == pytest.approx(data.exit_pupil_position.item(), rel=1e-6)
     ratio = data.exit_pupil_diameter / data.entrance_pupil_diameter

@@ -15,7 +15,7 @@ from raytrace import plot
 from raytrace.formats import read_lens
 from raytrace.maths.pupil import fan, gauss_rings
 from raytrace.media.glass import constant
-from raytrace.optics.focus import focus, image_rays
+from raytrace.optics.focus import focus_of_rms, image_rays
 from raytrace.optics.paraxial import first_order, paraxial_image_distance
 from raytrace.optics.spot import spot_of_points
 from raytrace.plot import outline, style
@@ -280,7 +280,7 @@ def test_curve_passes_through_the_spot_of_the_moved_sensor_and_its_minimum_is_th
     axis = torch.zeros(2, 1, dtype=torch.float64)
     figure = plot.through_focus_curve(lens, fields=axis, pupil=(points, weights))
     curve = max(figure.axes[0].lines, key=lambda line: len(line.get_xdata()))
-    best = float(focus(lens, points, weights, fields=axis))
+    best = float(focus_of_rms(lens, points, weights, fields=axis))
     lowest = curve.get_xdata()[np.argmin(curve.get_ydata())]
     assert abs(lowest - best) < 2 * np.diff(curve.get_xdata())[0]
     assert "57.6620 mm, 7.075 µm" in words(figure)  # as an independent calculation has it
@@ -311,7 +311,7 @@ def test_focus_report_prints_the_sensor_and_the_spot_before_and_after(double_gau
     points, weights = gauss_rings(6)
     axis = torch.zeros(2, 1, dtype=torch.float64)
     after = with_sensor_distance(
-        double_gauss, focus(double_gauss, points, weights, object_distances=[25000.0], fields=axis)
+        double_gauss, focus_of_rms(double_gauss, points, weights, object_distances=[25000.0], fields=axis)
     )
     figure = plot.focus_report(double_gauss, after, object_distances=25000.0)
     text = words(figure)

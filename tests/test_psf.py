@@ -13,7 +13,7 @@ from raytrace.kernels import EmptyPsf, NotConverged, psf
 from raytrace.maths.grid import Grid, grid
 from raytrace.optics.launch import launch
 from raytrace.optics.paraxial import first_order
-from raytrace.optics.trace import trace
+from raytrace.optics.trace import trace_lens
 from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
 from raytrace.system.surface import Aperture
 
@@ -138,7 +138,7 @@ def test_centre_of_the_window_is_an_absolute_place_on_the_sensor(model):
 def test_chief_is_the_landing_point_of_the_chief_ray_and_centroid_the_mean_of_the_light():
     lens = with_object_distance(double_gauss(), 1e4)
     options = {"fields": field(0.0, 14.0), "object_distances": number([1e4]), "grid": grid(0.01, 5)}
-    rays = trace(lens, launch(lens, number([[0.0], [0.0]]), fields=field(0.0, 14.0)), lens.wavelengths[:, None])
+    rays = trace_lens(lens, launch(lens, number([[0.0], [0.0]]), fields=field(0.0, 14.0)), lens.wavelengths[:, None])
     chief = psf(lens, "gaussian", center="chief", **options)
     torch.testing.assert_close(chief.grid.centre[:, 0], rays.position[:2, :, 0, 0], atol=1e-12, rtol=0)
     centroid = psf(lens, "gaussian", center="centroid", tol=1e-6, **options)
@@ -183,7 +183,9 @@ def test_energy_is_the_transmitted_share(model):
     """Of an aperture that clips the beam; the last of 4,000 rays along a radius that passes says how much."""
     lens = with_object_distance(double_gauss(stop=9.0), 1e4)
     radius = torch.linspace(0, 1, 4001, dtype=torch.float64)
-    rays = trace(lens, launch(lens, torch.stack([0 * radius, radius]), fields=field(0.0)), lens.wavelengths[:, None])
+    rays = trace_lens(
+        lens, launch(lens, torch.stack([0 * radius, radius]), fields=field(0.0)), lens.wavelengths[:, None]
+    )
     share = float(radius[rays.valid.flatten()].max()) ** 2
     assert 0.1 < share < 0.9
     with warnings.catch_warnings():

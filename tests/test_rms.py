@@ -13,7 +13,7 @@ from raytrace.files import shipped
 from raytrace.formats import read_lens
 from raytrace.maths import pupil
 from raytrace.optics.focus import image_rays
-from raytrace.optics.spot import spot
+from raytrace.optics.spot import spot_of
 from raytrace.system.surface import Aperture
 
 TRIPLET = read_lens(shipped("lenses") / "cooke_triplet.zmx")
@@ -47,7 +47,7 @@ def test_spots_are_those_of_the_rays():
     system = double_gauss(wavelengths=(0.53, 0.6))
     rule = pupil.gauss_rings(6)
     found = rms_over_field(system, fields=own_fields(system), quantity="spot", pupil=rule)
-    expected = spot(image_rays(system, rule[0]), rule[1])
+    expected = spot_of(image_rays(system, rule[0]), rule[1])
     torch.testing.assert_close(found.rms, expected.rms_radius)
     torch.testing.assert_close(found.polychromatic[0], (expected.rms_radius[0] ** 2).mean().sqrt())
     apart = (expected.centroid[:, 2, 0] - expected.centroid[:, 2, 1]).norm()

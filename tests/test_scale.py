@@ -18,8 +18,8 @@ from torch.testing import assert_close
 from raytrace.fused import engine
 from raytrace.media.glass import AIR, constant
 from raytrace.optics.jacobian import hit_jacobian
-from raytrace.optics.trace import refract, start, trace_surfaces
-from raytrace.system.rays import Rays
+from raytrace.optics.trace import refract, trace_surfaces
+from raytrace.system.rays import Rays, start
 from raytrace.system.surface import Surface
 
 LENGTHS = {"x", "y", "z", "opl"}

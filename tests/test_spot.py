@@ -14,7 +14,7 @@ from raytrace.files import shipped
 from raytrace.formats import read_lens
 from raytrace.maths import pupil
 from raytrace.optics.focus import image_rays
-from raytrace.optics.spot import EmptySpot, spot, spot_of_points
+from raytrace.optics.spot import EmptySpot, spot_of, spot_of_points
 from raytrace.system.rays import Rays
 
 ROUNDING = 2.0**-53
@@ -184,7 +184,7 @@ def test_spot_of_rays_ignores_lost_ones():
     position = tensor([[0.0, 1.0, 77.0], [0.0, 0.0, 77.0], [0.0, 0.0, 0.0]])
     direction = torch.zeros_like(position)
     direction[2] = 1.0
-    found = spot(Rays(position, direction, torch.tensor([True, True, False])))
+    found = spot_of(Rays(position, direction, torch.tensor([True, True, False])))
     assert found.centroid.tolist() == [0.5, 0.0]
     assert found.rms_radius == found.geometric_radius == 0.5
 
@@ -215,7 +215,7 @@ def test_the_command_takes_equal_weights_about_the_chief_ray(capsys):
         found.append(json.loads(capsys.readouterr().out))
     lens = read_lens(shipped("lenses") / "cooke_triplet.zmx")
     fields = torch.stack([lens.fields.x, lens.fields.y])
-    expected = spot(image_rays(lens, pupil.hexapolar(6)[0]), about=chief_reference(lens, fields))
+    expected = spot_of(image_rays(lens, pupil.hexapolar(6)[0]), about=chief_reference(lens, fields))
     radii = tensor([entry["rms_radius"] for entry in found[1]["results"]]).reshape(3, 3)
     torch.testing.assert_close(radii, expected.rms_radius, rtol=1e-12, atol=0)
     assert found[0]["reference"] == "centroid"

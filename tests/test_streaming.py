@@ -18,10 +18,10 @@ from raytrace.maths.grid import grid
 from raytrace.maths.value import to
 from raytrace.optics import streaming
 from raytrace.optics.launch import launch
-from raytrace.optics.spot import EmptySpot, spot
+from raytrace.optics.spot import EmptySpot, spot_of
 from raytrace.optics.stream_gradient import mean_square_gradient, stream_gradient
 from raytrace.optics.streaming import Moments, chunk_size, merge, moments, pupil_chunks, shot, stream_spot, stream_spots
-from raytrace.optics.trace import trace
+from raytrace.optics.trace import trace_lens
 from raytrace.system.lens import with_object_distance
 from raytrace.system.surface import Aperture
 
@@ -160,7 +160,7 @@ def test_moments_of_nothing_leave_others_alone():
 def test_spot_is_that_of_all_rays_at_once(make, distance):
     system = with_object_distance(make(), distance)
     points, weights = pupil.sobol(3000, seed=4)
-    whole = spot(trace(system, launch(system, points, wavelengths=COLOURS), COLOURS[:, None]), weights)
+    whole = spot_of(trace_lens(system, launch(system, points, wavelengths=COLOURS), COLOURS[:, None]), weights)
     found = stream_spot(
         system, 3000, seed=4, wavelengths=COLOURS, max_bytes=SMALL * (9 if make is aspheric_singlet else 1)
     )
@@ -188,9 +188,9 @@ def test_spot_of_all_wavelengths():
     weights = vector(1.0, 3.0)
     points, equal = pupil.sobol(2000)
     system = double_gauss()
-    rays = trace(system, launch(system, points, wavelengths=COLOURS), COLOURS[:, None])
+    rays = trace_lens(system, launch(system, points, wavelengths=COLOURS), COLOURS[:, None])
     found = stream_spots(system, 2000, wavelengths=COLOURS, wavelength_weights=weights, max_bytes=SMALL)[1]
-    whole = spot(dataclasses.replace(rays, position=rays.position.flatten(2), valid=rays.valid.flatten(1)),
+    whole = spot_of(dataclasses.replace(rays, position=rays.position.flatten(2), valid=rays.valid.flatten(1)),
                  (weights[:, None] * equal).flatten())  # fmt: skip
     assert float((found.centroid - whole.centroid).abs().max()) < PICOMETRE
     assert torch.allclose(found.rms_radius, whole.rms_radius, rtol=1e-9, atol=0)
@@ -202,7 +202,7 @@ def test_largest_distance_of_many_rays_lies_between_what_is_told(monkeypatch):
     monkeypatch.setattr(streaming, "_PILOT", 64)
     system = double_gauss()
     points, weights = pupil.sobol(5000)
-    exact = spot(trace(system, launch(system, points), system.wavelengths[:, None]), weights).geometric_radius
+    exact = spot_of(trace_lens(system, launch(system, points), system.wavelengths[:, None]), weights).geometric_radius
     found = stream_spot(system, 5000, max_bytes=SMALL)
     assert bool((found.geometric_radius <= exact * (1 + 1e-9)).all())
     assert bool((exact <= found.geometric_bound * (1 + 1e-9)).all())
@@ -212,7 +212,7 @@ def test_largest_distance_of_many_rays_lies_between_what_is_told(monkeypatch):
 def test_rim_counts_for_the_largest_distance_alone():
     system = double_gauss()
     points, weights = pupil.with_rim(*pupil.sobol(500))
-    whole = spot(trace(system, launch(system, points), system.wavelengths[:, None]), weights)
+    whole = spot_of(trace_lens(system, launch(system, points), system.wavelengths[:, None]), weights)
     found = stream_spot(system, 500, rim=72)
     assert torch.allclose(found.geometric_radius, whole.geometric_radius, rtol=1e-9, atol=0)
     assert torch.allclose(found.rms_radius, whole.rms_radius, rtol=1e-9, atol=0)
@@ -305,8 +305,8 @@ def test_gradient_is_that_of_all_rays_at_once(distance):
     leaves = [*curvatures, scale, idle]
     system = with_object_distance(bent(curvatures, scale), distance)
     points, weights = pupil.sobol(1000)
-    rays = trace(system, launch(system, points, wavelengths=COLOURS), COLOURS[:, None])
-    merit = spot(rays, weights).mean_square_radius.mean()
+    rays = trace_lens(system, launch(system, points, wavelengths=COLOURS), COLOURS[:, None])
+    merit = spot_of(rays, weights).mean_square_radius.mean()
     exact = torch.autograd.grad(merit, leaves[:-1], retain_graph=True)
     value, found = mean_square_gradient(system, leaves, 1000, wavelengths=COLOURS, max_bytes=256 * 10_000)
     assert float(value) == pytest.approx(float(merit.detach()), rel=1e-9)

@@ -25,8 +25,8 @@ from raytrace.maths.numerics import dot
 from raytrace.maths.value import to
 from raytrace.media.glass import MIRROR, sellmeier
 from raytrace.optics.launch import launch, rays_from_infinity, rays_from_point
-from raytrace.optics.trace import axial_path, media, reflect, refract, start, steps, trace, trace_surfaces
-from raytrace.system.rays import Rays
+from raytrace.optics.trace import axial_path, media, reflect, refract, steps, trace_lens, trace_surfaces
+from raytrace.system.rays import Rays, start
 from raytrace.system.surface import normal
 
 ROUNDING = 2.0**-53
@@ -111,7 +111,7 @@ def test_fresnel_plate_displaces_and_does_not_turn():
     direction = torch.stack([torch.zeros(4).double(), torch.sin(angle), torch.cos(angle)])
     rays = start(torch.zeros(3, 4, dtype=torch.float64), direction, torch.zeros(4, dtype=torch.float64))
     plate = lens([surface(None, 10.0, 1.5), surface(None, 5.0)])
-    out = trace(plate, rays, plate.wavelengths[0])
+    out = trace_lens(plate, rays, plate.wavelengths[0])
     inner = torch.asin(torch.sin(angle) / 1.5)
     expected = 10 * torch.tan(inner) + 5 * torch.tan(angle)
     assert (out.direction - direction).abs().max() <= 30 * ROUNDING  # N = 0.07: twice 1/N of a rounding
@@ -127,7 +127,7 @@ def test_ball_lens_has_its_closed_form():
     radius, n = 10.0, 1.5
     h = vector(0.0, 1e-9, 3.0, 6.6, 9.9)
     ball = lens([surface(1 / radius, 2 * radius, n), surface(-1 / radius, 50.0)])
-    out = trace(ball, parallel(h), ball.wavelengths[0])
+    out = trace_lens(ball, parallel(h), ball.wavelengths[0])
     deviation = 2 * (torch.asin(h / radius) - torch.asin(h / (n * radius)))
     assert (torch.atan2(-out.direction[1], out.direction[2]) - deviation).abs().max() <= 20 * ROUNDING
 
@@ -139,7 +139,7 @@ def test_dummy_surfaces_and_equal_indices_change_nothing():
     rest = surface(None, 14.253 - 4.0)
     split = dataclasses.replace(plain, surfaces=(*surfaces[:5], air, rest, *surfaces[6:]))
     rays = parallel([0.0, 5.0, -16.0])
-    one, other = trace(plain, rays, plain.wavelengths[0]), trace(split, rays, plain.wavelengths[0])
+    one, other = trace_lens(plain, rays, plain.wavelengths[0]), trace_lens(split, rays, plain.wavelengths[0])
     assert (one.position - other.position).abs().max() <= 100 * FEMTOMETRE
     total = [x.opl + axial_path(s.surfaces[1:], media(s, s.wavelengths[0])) for x, s in ((one, plain), (other, split))]
     assert (total[0] - total[1]).abs().max() <= 100 * FEMTOMETRE
@@ -147,7 +147,7 @@ def test_dummy_surfaces_and_equal_indices_change_nothing():
 
 def test_zero_thickness_and_repeated_vertices():
     thin = lens([surface(0.02, 0.0, 1.5), surface(-0.02, 0.0), surface(None, 0.0), surface(None, 50.0)])
-    out = trace(thin, parallel([0.0, 1e-3, 5.0]), thin.wavelengths[0])
+    out = trace_lens(thin, parallel([0.0, 1e-3, 5.0]), thin.wavelengths[0])
     assert out.valid.all()
     assert abs(out.position[1, 1].item()) <= 1e-6  # mm: f = 50 mm, third-order blur of a 1 µm beam
 
@@ -156,7 +156,7 @@ def test_start_in_the_middle_of_a_lens():
     system = double_gauss()
     indices = media(system, system.wavelengths[0])
     rays = parallel([0.0, 5.0, -16.0])
-    whole = trace(system, rays, system.wavelengths[0])
+    whole = trace_lens(system, rays, system.wavelengths[0])
     front = trace_surfaces(system.surfaces[1:7], rays, indices=indices[:7])
     x, y, z = front.position
     moved = dataclasses.replace(front, position=torch.stack([x, y, z - system.surfaces[6].thickness]), opl=None)
@@ -183,7 +183,7 @@ def test_all_rays_lost_gives_zero_gradients():
     system = double_gauss()
     numbers = leaves(system)
     rays = parallel([500.0, 1e6, -300.0])
-    out = trace(with_leaves(system, numbers), rays, system.wavelengths[0])
+    out = trace_lens(with_leaves(system, numbers), rays, system.wavelengths[0])
     assert not out.valid.any()
     for gradient in torch.autograd.grad(
         out.position.sum() + out.direction.sum() + out.opl.sum(), numbers, allow_unused=True
@@ -242,7 +242,7 @@ def test_first_and_second_derivatives_of_every_number_with_lost_rays(number):
         changed = torch.utils._pytree.tree_unflatten(numbers, structure)
         surfaces = (*LOSSY.surfaces[: 1 + number], changed, *LOSSY.surfaces[2 + number :])
         system = dataclasses.replace(LOSSY, surfaces=surfaces)
-        out = trace(system, start(position, direction, torch.zeros_like(position[0])), LOSSY.wavelengths[0])
+        out = trace_lens(system, start(position, direction, torch.zeros_like(position[0])), LOSSY.wavelengths[0])
         return torch.cat([out.position[:2], out.direction, out.opl[None]])
 
     given = (rays.position.clone().requires_grad_(), rays.direction.clone().requires_grad_())
@@ -255,7 +255,7 @@ def test_first_and_second_derivatives_of_every_number_with_lost_rays(number):
 def image_height(curvature, thickness, terms, rays=None):
     front = surface(curvature, thickness, 1.53, conic=scalar(-0.4), coefficients=terms, semi_diameter=9.0)
     system = lens([front, surface(-0.02, 30.0, conic=0.5)])
-    return trace(system, rays or parallel([0.0, 1.0, 4.0, 30.0]), system.wavelengths[0]).position[1]
+    return trace_lens(system, rays or parallel([0.0, 1.0, 4.0, 30.0]), system.wavelengths[0]).position[1]
 
 
 POINT = (scalar(0.02), scalar(5.0), vector(2e-3, -1e-5, 2e-8))
@@ -278,9 +278,9 @@ def test_vmap_over_whole_lenses():
     )
     stacked = torch.utils._pytree.tree_map(lambda *x: torch.stack(x), *lenses)
     rays = parallel([0.0, 5.0, -16.0])
-    found = torch.func.vmap(lambda system: trace(system, rays, system.wavelengths[0]).position)(stacked)
+    found = torch.func.vmap(lambda system: trace_lens(system, rays, system.wavelengths[0]).position)(stacked)
     for i, system in enumerate(lenses):
-        assert torch.equal(found[i], trace(system, rays, system.wavelengths[0]).position)
+        assert torch.equal(found[i], trace_lens(system, rays, system.wavelengths[0]).position)
 
 
 def test_forward_and_reverse_jacobians_agree_and_the_hessian_is_symmetric():
@@ -301,8 +301,10 @@ def test_forward_and_reverse_jacobians_agree_and_the_hessian_is_symmetric():
 
 def compiled_equals_eager(backend: str, system):
     rays = parallel([0.0, 1.0, 4.0, 300.0])
-    call = torch.compile(lambda system, rays, w: trace(system, rays, w), fullgraph=True, backend=backend, dynamic=False)
-    found, expected = call(system, rays, system.wavelengths[0]), trace(system, rays, system.wavelengths[0])
+    call = torch.compile(
+        lambda system, rays, w: trace_lens(system, rays, w), fullgraph=True, backend=backend, dynamic=False
+    )
+    found, expected = call(system, rays, system.wavelengths[0]), trace_lens(system, rays, system.wavelengths[0])
     assert torch.equal(found.valid, expected.valid)
     # A compiler may contract a·b + c into one rounding.
     tolerance = 0.0 if backend == "aot_eager" else 1 * PICOMETRE
@@ -340,8 +342,8 @@ def test_float32_follows_float64(build):
     system = build()
     narrow = to(system, dtype=torch.float32)
     heights = [0.0, 1.0, -3.5, 300.0]
-    one = trace(system, parallel(heights), system.wavelengths[0])
-    other = trace(narrow, parallel(heights, torch.float32), narrow.wavelengths[0])
+    one = trace_lens(system, parallel(heights), system.wavelengths[0])
+    other = trace_lens(narrow, parallel(heights, torch.float32), narrow.wavelengths[0])
     assert other.position.dtype == other.direction.dtype == other.opl.dtype == torch.float32
     assert torch.equal(one.valid, other.valid)
     # A dozen surfaces of roundings of 6e-8 of lengths of 100 mm.
@@ -353,21 +355,21 @@ def test_autocast_does_not_touch_the_trace():
     system = double_gauss()
     rays = parallel([0.0, 5.0])
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        found = trace(system, rays, system.wavelengths[0])
-    assert torch.equal(found.position, trace(system, rays, system.wavelengths[0]).position)
+        found = trace_lens(system, rays, system.wavelengths[0])
+    assert torch.equal(found.position, trace_lens(system, rays, system.wavelengths[0]).position)
 
 
 def test_fields_wavelengths_and_pupil_together_equal_one_at_a_time():
     flint = sellmeier([1.34, 0.2, 0.93], [0.0099, 0.0447, 111.9])
     system = double_gauss(glasses=(flint, flint, flint), wavelengths=(0.45, 0.53, 0.65))
     points, _ = pupil.hexapolar(2)
-    whole = trace(system, launch(system, points), system.wavelengths[:, None])
+    whole = trace_lens(system, launch(system, points), system.wavelengths[:, None])
     assert whole.position.shape == (3, 3, 3, 19)
     for f in range(3):
         field = torch.stack([system.fields.x[f : f + 1], system.fields.y[f : f + 1]])
         for w in range(3):
             wavelength = system.wavelengths[w : w + 1]
-            alone = trace(system, launch(system, points, fields=field, wavelengths=wavelength), wavelength)
+            alone = trace_lens(system, launch(system, points, fields=field, wavelengths=wavelength), wavelength)
             assert torch.equal(alone.position[:, 0, 0], whole.position[:, f, w])
             assert torch.equal(alone.opl[0, 0], whole.opl[f, w])
 
@@ -380,10 +382,10 @@ def test_wavelengths_against_rays_of_fewer_axes(count):
     system = lens([surface(0.02, 5.0, flint), surface(-0.02, 50.0, conic=-0.2)])
     rays = parallel([0.0, 1.0, 2.0, 3.0, 30.0])
     wavelengths = torch.linspace(0.4, 0.7, count, dtype=torch.float64)
-    found = trace(system, rays, wavelengths[:, None])
+    found = trace_lens(system, rays, wavelengths[:, None])
     assert found.position.shape == (3, count, 5)
     for i, wavelength in enumerate(wavelengths):
-        alone = trace(system, rays, wavelength)
+        alone = trace_lens(system, rays, wavelength)
         assert torch.equal(found.position[:, i], alone.position)
         assert torch.equal(found.opl[i], alone.opl)
         assert torch.equal(found.valid[i], alone.valid)
@@ -402,9 +404,9 @@ def test_population_against_rays_of_fewer_axes(count, which):
         first = dataclasses.replace(system.surfaces[1], **{which: value})
         return dataclasses.replace(system, surfaces=(system.surfaces[0], first, *system.surfaces[2:]))
 
-    found = trace(changed((scale * number)[:, None]), rays, system.wavelengths[0])
+    found = trace_lens(changed((scale * number)[:, None]), rays, system.wavelengths[0])
     for i in range(count):
-        alone = trace(changed(scale[i] * number), rays, system.wavelengths[0])
+        alone = trace_lens(changed(scale[i] * number), rays, system.wavelengths[0])
         assert torch.equal(found.position[:, i], alone.position)
 
 
@@ -419,11 +421,11 @@ def test_start_of_positions_and_directions_of_different_axes():
 def test_odd_and_even_numbers_of_mirrors():
     """A Mangin-free pair: light comes back after one mirror and goes on after two; indices stay positive."""
     one = lens([surface(-0.01, -50.0, MIRROR)])
-    out = trace(one, parallel([0.0, 1.0]), one.wavelengths[0])
+    out = trace_lens(one, parallel([0.0, 1.0]), one.wavelengths[0])
     assert (out.direction[2] < 0).all()
     assert abs(out.position[1, 1].item()) <= 1e-4  # mm: h³/4R² of spherical aberration at f
     two = lens([surface(-0.01, -30.0, MIRROR), surface(-0.02, 80.0, MIRROR)])
-    out = trace(two, parallel([0.0, 1.0]), two.wavelengths[0])
+    out = trace_lens(two, parallel([0.0, 1.0]), two.wavelengths[0])
     assert (out.direction[2] > 0).all()
     assert all(n > 0 for n in media(two, two.wavelengths[0]))
 
@@ -432,7 +434,7 @@ def test_second_surface_mirror_keeps_the_glass():
     mangin = lens([surface(None, 10.0, 1.5), surface(None, -10.0, MIRROR), surface(None, -20.0)])
     direction = torch.stack([vector(0.0), vector(0.5), vector(math.sqrt(0.75))])
     rays = start(torch.zeros(3, 1, dtype=torch.float64), direction)
-    out = trace(mangin, rays, mangin.wavelengths[0])
+    out = trace_lens(mangin, rays, mangin.wavelengths[0])
     inner = math.asin(0.5 / 1.5)
     assert out.position[1].item() == pytest.approx(20 * math.tan(inner) + 20 * math.tan(math.asin(0.5)), rel=1e-14)
     assert [n.item() for n in media(mangin, mangin.wavelengths[0])] == [1.0, 1.5, 1.5, 1.0, 1.0]
@@ -451,13 +453,13 @@ def test_path_between_images_is_the_same_for_all_rays():
 
 def test_a_plane_on_an_input_that_needs_no_gradient_makes_no_graph():
     system = double_gauss()
-    assert not trace(system, parallel([1.0]), system.wavelengths[0]).position.requires_grad
+    assert not trace_lens(system, parallel([1.0]), system.wavelengths[0]).position.requires_grad
 
 
 def test_inputs_are_not_changed():
     rays = lossy_rays()
     copies = [rays.position.clone(), rays.direction.clone(), rays.valid.clone(), rays.opl.clone()]
-    trace(LOSSY, rays, LOSSY.wavelengths[0])
+    trace_lens(LOSSY, rays, LOSSY.wavelengths[0])
     for a, b in zip((rays.position, rays.direction, rays.valid, rays.opl), copies, strict=True):
         assert torch.equal(a, b)
 

@@ -10,7 +10,7 @@ from torch.utils import _pytree as pytree
 
 from raytrace.maths.value import to
 from raytrace.media.glass import AIR
-from raytrace.optics.trace import trace
+from raytrace.optics.trace import trace_lens
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
 
@@ -53,7 +53,7 @@ def test_to_float32_converts_every_floating_tensor_and_traces():
     rays = Rays(
         torch.tensor([[0.0], [2.0], [0.0]]), torch.tensor([[0.0], [0.0], [1.0]]), torch.ones(1, dtype=torch.bool)
     )
-    out = trace(lens, rays, lens.wavelengths)
+    out = trace_lens(lens, rays, lens.wavelengths)
     assert out.position.dtype == out.direction.dtype == torch.float32
     assert to(rays, dtype=torch.float64).valid.dtype == torch.bool
     assert to(rays, dtype=torch.float64).opl is None

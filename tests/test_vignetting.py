@@ -11,8 +11,8 @@ from raytrace.files import shipped
 from raytrace.formats import read_lens
 from raytrace.maths import pupil
 from raytrace.optics.launch import launch
-from raytrace.optics.spot import spot
-from raytrace.optics.trace import trace
+from raytrace.optics.spot import spot_of
+from raytrace.optics.trace import trace_lens
 from raytrace.optics.vignetting import vignette
 
 POINTS, _ = pupil.hexapolar(2)
@@ -127,6 +127,6 @@ def test_close_fields_of_the_cooke_triplet_have_close_spots():
     lens = read_lens(shipped("lenses") / "cooke_triplet.zmx")
     points, weights = pupil.gauss_rings(6, 12)
     field = torch.tensor([[0.0, 0.0], [8.39, 8.4]], dtype=torch.float64)
-    rays = trace(lens, launch(lens, points, fields=field), lens.wavelengths[:, None])
-    radius = spot(rays, weights).rms_radius
+    rays = trace_lens(lens, launch(lens, points, fields=field), lens.wavelengths[:, None])
+    radius = spot_of(rays, weights).rms_radius
     assert (radius[0] / radius[1] - 1).abs().max() <= 5e-3

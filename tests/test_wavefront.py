@@ -9,7 +9,7 @@ from test_trace import rays_of_problem
 
 from raytrace.maths import pupil
 from raytrace.optics.launch import launch
-from raytrace.optics.trace import media, trace, trace_surfaces
+from raytrace.optics.trace import media, trace_lens, trace_surfaces
 from raytrace.optics.wavefront import path_to_reference_sphere
 
 WAVE = 0.55e-3  # mm
@@ -34,7 +34,7 @@ def test_path_does_not_depend_on_where_the_rays_are_taken():
     behind = dataclasses.replace(here, surfaces=tuple(surfaces))
     results = []
     for system, z in ((here, 0.0), (behind, 18.5)):
-        rays = trace(system, launch(system, points), system.wavelengths[:, None])
+        rays = trace_lens(system, launch(system, points), system.wavelengths[:, None])
         centre = vector(0.0, 0.0, z).reshape(3, 1, 1, 1)
         W = path_to_reference_sphere(rays, centre, scalar(100.0), media(system, system.wavelengths[:, None])[-1])
         results.append(W[0] - W[0, :, :1])
@@ -46,7 +46,7 @@ def test_opd_gives_back_the_transverse_aberration():
     system = lens([surface(0.02, 5.0, 1.5), surface(-0.01, 60.0)])
     height = torch.linspace(0.0, 1.0, 41, dtype=torch.float64)
     points = torch.stack([torch.zeros_like(height), height])
-    rays = trace(system, launch(system, points), system.wavelengths[:, None])
+    rays = trace_lens(system, launch(system, points), system.wavelengths[:, None])
     radius = scalar(60.0)
     W = path_to_reference_sphere(rays, torch.zeros(3, 1, 1, 1, dtype=torch.float64), radius, scalar(1.0))[0, 0]
     y, direction, epsilon = rays.position[1, 0, 0], rays.direction[:, 0, 0], rays.position[1, 0, 0]
@@ -64,7 +64,7 @@ def test_no_subtraction_of_long_paths():
     for distance in (float("inf"), 1e12):
         system = double_gauss(object_distance=distance)
         rays = launch(system, points, fields=torch.zeros(2, 1, dtype=torch.float64))
-        last = trace(system, rays, system.wavelengths[:, None])
+        last = trace_lens(system, rays, system.wavelengths[:, None])
         W = path_to_reference_sphere(last, torch.zeros(3, 1, 1, 1, dtype=torch.float64), scalar(100.0), scalar(1.0))
         found.append(W - W[..., :1])
     assert ((found[0] - found[1]) / WAVE).abs().max() <= 1e-6  # waves: h²/2D = 1.4e-10 mm of sagitta

@@ -2,7 +2,6 @@
 
 | call                                      | what it shows                                                  |
 |-------------------------------------------|----------------------------------------------------------------|
-| arrivals                                  | where every ray of a spot meets the sensor                     |
 | ray_fan, opd_fan                          | aberrations along the two sections of the pupil                |
 | wavefront_map                             | OPD over the pupil, Noll's Zernike coefficients                |
 | mtf, mtf_through_focus                    | modulation, of diffraction or of rays                          |
@@ -17,8 +16,6 @@
 | compare, abilities                        | PSF models side by side, and what each of them can represent   |
 """
 
-from raytrace.analysis.arrivals import Arrivals as Arrivals
-from raytrace.analysis.arrivals import arrivals as arrivals
 from raytrace.analysis.chief import Distortion as Distortion
 from raytrace.analysis.chief import FieldCurvature as FieldCurvature
 from raytrace.analysis.chief import LateralColour as LateralColour

@@ -3,10 +3,9 @@
 import torch
 from torch import Tensor
 
-from raytrace.analysis.frame import axis, masked
 from raytrace.analysis.setting import field_range, in_object_space, primary_number, unvignetted, wavelengths_of
 from raytrace.maths.numerics import dot_2, safe_divide, safe_sqrt
-from raytrace.maths.result import Result
+from raytrace.maths.result import Result, axis, masked
 from raytrace.maths.value import value
 from raytrace.optics.focus import image_rays
 from raytrace.optics.launch import is_at_infinity

@@ -6,11 +6,10 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace.analysis.frame import axis
 from raytrace.kernels import Psf, psf
 from raytrace.maths.grid import Grid, grid
 from raytrace.maths.numerics import safe_divide, safe_sqrt
-from raytrace.maths.result import Result
+from raytrace.maths.result import Result, axis
 from raytrace.maths.value import value
 from raytrace.optics.focus import focused
 from raytrace.optics.paraxial import first_order

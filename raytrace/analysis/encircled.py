@@ -6,12 +6,11 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.aperture import ExitPupil, exit_pupil
-from raytrace.analysis.frame import axis
 from raytrace.analysis.setting import refuse_dark, scene_of, wavelength_weights, wavelengths_of
 from raytrace.budget import RAY_BYTES, afford, piece
 from raytrace.kernels.dft import phasor
 from raytrace.maths.numerics import safe_divide, safe_sqrt
-from raytrace.maths.result import Result
+from raytrace.maths.result import Result, axis
 from raytrace.maths.value import value
 from raytrace.optics.focus import image_rays
 from raytrace.optics.paraxial import first_order

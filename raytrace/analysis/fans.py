@@ -3,10 +3,9 @@
 import torch
 from torch import Tensor
 
-from raytrace.analysis.frame import axis, masked
 from raytrace.analysis.setting import scene_of
 from raytrace.maths.pupil import fan as pupil_fan
-from raytrace.maths.result import Result
+from raytrace.maths.result import Result, axis, masked
 from raytrace.maths.value import value
 from raytrace.optics.wavefront import Wavefront, wavefront_of
 from raytrace.system.lens import Lens

@@ -5,12 +5,11 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace.analysis.frame import axis
 from raytrace.analysis.setting import field_range, scene_of, wavelength_weights
 from raytrace.maths import zernike
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
-from raytrace.maths.result import Result
+from raytrace.maths.result import Result, axis
 from raytrace.maths.value import value
 from raytrace.optics.wavefront import wavefront_of
 from raytrace.system.lens import Lens

@@ -3,10 +3,9 @@
 import torch
 from torch import Tensor
 
-from raytrace.analysis.frame import axis, masked
 from raytrace.analysis.setting import field_range
 from raytrace.maths.numerics import dot
-from raytrace.maths.result import Result
+from raytrace.maths.result import Result, axis, masked
 from raytrace.maths.value import value
 from raytrace.optics.launch import launch
 from raytrace.optics.trace import media, steps

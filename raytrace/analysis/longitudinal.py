@@ -3,9 +3,8 @@
 import torch
 from torch import Tensor
 
-from raytrace.analysis.frame import axis, masked
 from raytrace.maths.numerics import safe_divide
-from raytrace.maths.result import Result
+from raytrace.maths.result import Result, axis, masked
 from raytrace.maths.value import value
 from raytrace.optics.focus import image_rays
 from raytrace.system.lens import Lens

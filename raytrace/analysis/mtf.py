@@ -6,18 +6,17 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.aperture import MARGIN, exit_pupil
-from raytrace.analysis.frame import axis
 from raytrace.analysis.setting import primary_number, refuse_dark, scene_of, wavelength_weights, wavelengths_of
 from raytrace.budget import RAY_BYTES, piece
 from raytrace.kernels.dft import phasor, rings_and_arms
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.pupil import gauss_rings
-from raytrace.maths.result import Result
+from raytrace.maths.result import Result, axis
 from raytrace.maths.value import value
 from raytrace.optics.focus import image_rays
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.scene import Scene
-from raytrace.optics.spot import spot
+from raytrace.optics.spot import spot_of
 from raytrace.system.lens import Lens, with_sensor_distance
 
 _LEAST_RINGS, _MOST_RAYS = 24, 100_000
@@ -132,7 +131,7 @@ def frequency_range(lens: Lens, size: int, *, fields: Tensor | None = None) -> T
     half the cutoff of diffraction at the most; not differentiated."""
     with torch.no_grad():
         rays = image_rays(lens, gauss_rings(6)[0], fields=fields)
-        radius = spot(rays, gauss_rings(6)[1]).rms_radius
+        radius = spot_of(rays, gauss_rings(6)[1]).rms_radius
         sharpest = torch.where(rays.valid.any(-1), radius, torch.inf).amin() * 0.5**0.5
         top = torch.minimum(0.5 * cutoff(lens, lens.wavelengths[lens.primary_wavelength]), 2 / sharpest)
     return top * torch.linspace(0, 1, size, dtype=top.dtype, device=top.device)

@@ -6,14 +6,13 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.fans import REFERENCES
-from raytrace.analysis.frame import axis
 from raytrace.analysis.setting import field_range, scene_of, wavelength_weights
 from raytrace.maths.numerics import safe_sqrt
 from raytrace.maths.pupil import gauss_rings
-from raytrace.maths.result import Result
+from raytrace.maths.result import Result, axis
 from raytrace.maths.value import value
 from raytrace.optics.focus import image_rays
-from raytrace.optics.spot import spot, spot_of_points
+from raytrace.optics.spot import spot_of, spot_of_points
 from raytrace.optics.wavefront import rms, wavefront_of
 from raytrace.system.lens import Lens
 
@@ -82,7 +81,7 @@ def rms_over_field(
         rays = image_rays(lens, points, fields=fields, wavelengths=wavelengths)
         joint = (shares[:, None] * weights).flatten()
         whole = spot_of_points(rays.position[:2].flatten(2), rays.valid.flatten(1), joint).rms_radius
-        return RmsOverField(spot(rays, weights).rms_radius, whole, None, fields, wavelengths, quantity, reference)
+        return RmsOverField(spot_of(rays, weights).rms_radius, whole, None, fields, wavelengths, quantity, reference)
     view = scene_of(lens, fields, wavelengths)
     waves = 1e-3 * wavelengths
     each = rms(wavefront_of(view, points, weights))[0] / waves

@@ -16,8 +16,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from raytrace.analysis.frame import axis
-from raytrace.maths.result import Result
+from raytrace.maths.result import Result, axis
 from raytrace.maths.value import value
 from raytrace.optics.launch import paraxial_field
 from raytrace.optics.paraxial import FirstOrder, first_order, marginal_ray, signed, vertex_curvature

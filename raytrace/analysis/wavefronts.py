@@ -5,12 +5,11 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from raytrace.analysis.frame import axis
 from raytrace.analysis.setting import scene_of
 from raytrace.budget import RAY_BYTES, afford, piece
 from raytrace.kernels.diffraction import strehl
 from raytrace.maths.pupil import gauss_rings
-from raytrace.maths.result import Result
+from raytrace.maths.result import Result, axis
 from raytrace.maths.value import value
 from raytrace.optics.scene import Scene
 from raytrace.optics.wavefront import peak_to_valley, rms, wavefront_of, zernike_coefficients

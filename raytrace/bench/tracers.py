@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.value import to
-from raytrace.optics.trace import axial_path, media, trace
+from raytrace.optics.trace import axial_path, media, trace_lens
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
 
@@ -49,12 +49,12 @@ class Own:
 
     def forward(self, rays: Rays) -> tuple[Tensor, Tensor | None]:
         with torch.no_grad():
-            end = trace(self.lens, self._with_path(rays), self.wavelength)
+            end = trace_lens(self.lens, self._with_path(rays), self.wavelength)
         return end.position[:2], end.opl
 
     def gradient(self, rays: Rays, centroid: Tensor) -> Tensor:
         lens, leaves = with_leaves(self.lens)
-        end = trace(lens, self._with_path(rays), self.wavelength)
+        end = trace_lens(lens, self._with_path(rays), self.wavelength)
         return torch.stack(torch.autograd.grad(squared_radius(*end.position[:2], centroid), leaves))
 
     def full_path(self, reduced: Tensor) -> Tensor:

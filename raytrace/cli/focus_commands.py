@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from raytrace.cli.door import CommandError, catalogs, field_points, find_lens, open_lens, primary, print_json, say
-from raytrace.cli.spots import pupil_points, warn_of_losses
+from raytrace.cli.spots import pupil_points
 from raytrace.formats import read_lens, write_lens
 from raytrace.maths.result import number, numbers
-from raytrace.optics.focus import focus as best_focus
-from raytrace.optics.focus import focus_of_mean_radius, image_rays, is_behind, mean_rms_radius
+from raytrace.optics.focus import focus_of_mean_radius, focus_of_rms, image_rays, is_behind, mean_rms_radius
+from raytrace.optics.losses import warn_of_losses
 from raytrace.optics.paraxial import first_order, paraxial_image_distance
 from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field, with_object_distance, with_sensor_distance
 
@@ -36,7 +36,7 @@ def focus(arguments: argparse.Namespace) -> None:
     paraxial = paraxial_image_distance(lens, before.new_tensor(distances))
     if not bool(torch.isfinite(paraxial).all()):
         raise CommandError(f"{arguments.lens}: the lens is afocal for this object distance; there is no focus to find")
-    rms = best_focus(lens, points, weights, **rule)
+    rms = focus_of_rms(lens, points, weights, **rule)
     _tell_losses(arguments, lens, points, rule)
     if not bool(torch.isfinite(rms)):
         raise CommandError(f"{arguments.lens}: one ray, or parallel rays, have no focus; give more --rings or --points")
@@ -88,7 +88,7 @@ def _tell_losses(arguments: argparse.Namespace, lens: Lens, points: Tensor, rule
         trial = with_object_distance(lens, distance)
         valid = image_rays(trial, points, fields=rule["fields"], wavelengths=rule["wavelengths"]).valid
         at = f"object at {distance:g} mm, " if len(rule["object_distances"]) > 1 else ""
-        warn_of_losses(trial, rule["fields"], points, ~valid.any(-1), wavelengths=rule["wavelengths"], at=at)
+        warn_of_losses(trial, points, ~valid.any(-1), fields=rule["fields"], wavelengths=rule["wavelengths"], at=at)
         arrived.append(float(valid.double().mean()))
     lost = 1 - sum(arrived) / len(arrived)
     if lost == 1:

@@ -9,7 +9,6 @@ from torch import Tensor
 from raytrace.analysis import PIXEL, SIZE, Abilities, Comparison, abilities, common_focus
 from raytrace.analysis import compare as compare_models
 from raytrace.cli.door import CommandError, field_points, open_lens, primary, print_json, say
-from raytrace.cli.spots import warn_of_losses
 from raytrace.files import write_atomically
 from raytrace.kernels import NotConverged, Psf, close_up, default_center
 from raytrace.kernels import psf as compute
@@ -17,6 +16,7 @@ from raytrace.maths.grid import Grid, grid
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.result import cell, number, numbers
 from raytrace.optics.focus import NoImage, real_image_distance
+from raytrace.optics.losses import warn_of_losses
 from raytrace.optics.paraxial import first_order
 from raytrace.shards import Share, processes
 from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field, with_object_distance
@@ -72,7 +72,7 @@ def _warn(lens: Lens, fields: Tensor, distances: list[float], found: Psf) -> Non
         at = f"object at {distance:g} mm, " if len(distances) > 1 else ""
         trial = with_object_distance(lens, distance)
         of_each = dark if dark.dim() > 1 else dark[:, None].expand(-1, len(lens.wavelengths))
-        warn_of_losses(trial, fields, points, of_each, at=at)
+        warn_of_losses(trial, points, of_each, fields=fields, at=at)
 
 
 def _pixels(lens: Lens, arguments: argparse.Namespace) -> Grid:

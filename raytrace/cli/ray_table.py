@@ -14,9 +14,9 @@ import torch
 
 from raytrace.cli.door import CommandError, primary
 from raytrace.optics.launch import launch
-from raytrace.optics.trace import axial_path, media, start, steps
+from raytrace.optics.trace import axial_path, media, steps
 from raytrace.system.lens import Lens, check_media, with_object_distance
-from raytrace.system.rays import Rays
+from raytrace.system.rays import Rays, start
 
 COLUMNS = ("x", "y", "z", "l", "m", "n")
 OUTPUT = ("ray", "surface", *COLUMNS, "opl", "status")

@@ -6,15 +6,15 @@ import dataclasses
 import torch
 from torch import Tensor
 
-from raytrace.analysis import Arrivals, arrivals, chief_reference
-from raytrace.analysis.arrivals import STATUS
+from raytrace.analysis import chief_reference
 from raytrace.cli.door import field_points, open_lens, print_json, ray_aiming, refuse_suffix, say
 from raytrace.cli.progress import progress
-from raytrace.cli.spots import pupil_points, spot_cells, spot_entry, warn_of_losses
+from raytrace.cli.spots import pupil_points, spot_cells, spot_entry
 from raytrace.files import write_atomically
 from raytrace.maths import pupil
-from raytrace.optics.spot import Spot, spot_of_points
-from raytrace.optics.spot import spot as spot_of
+from raytrace.optics.arrivals import Arrivals, arrivals
+from raytrace.optics.losses import STATUS, warn_of_losses
+from raytrace.optics.spot import Spot, spot_of, spot_of_points
 from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
 
 
@@ -47,7 +47,7 @@ def spot(arguments: argparse.Namespace) -> None:
         aiming = ray_aiming(arguments) or lens.ray_aiming
         about = chief_reference(dataclasses.replace(lens, ray_aiming=aiming), fields)
     spots = spot_of(found.rays, weights, about=about)
-    warn_of_losses(lens, fields, points, spots.rms_radius.isnan(), aiming=ray_aiming(arguments))
+    warn_of_losses(lens, points, spots.rms_radius.isnan(), fields=fields, ray_aiming=ray_aiming(arguments))
     if arguments.plot:
         from raytrace import plot
 

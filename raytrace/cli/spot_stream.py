@@ -6,9 +6,10 @@ from torch import Tensor
 
 from raytrace.cli.door import CommandError, field_points, open_lens, print_json, ray_aiming
 from raytrace.cli.progress import progress
-from raytrace.cli.spots import spot_cells, spot_entry, warn_of_losses
+from raytrace.cli.spots import spot_cells, spot_entry
 from raytrace.maths import pupil
 from raytrace.maths.result import number
+from raytrace.optics.losses import warn_of_losses
 from raytrace.optics.streaming import MAX_BYTES, StreamedSpot, stream_spots
 from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
 
@@ -35,7 +36,7 @@ def spot(arguments: argparse.Namespace) -> None:
             progress=bar.update,
         )
     points = pupil.sobol(min(arguments.rays, _TRIED))[0]
-    warn_of_losses(lens, fields, points, each.rays == 0, aiming=ray_aiming(arguments))
+    warn_of_losses(lens, points, each.rays == 0, fields=fields, ray_aiming=ray_aiming(arguments))
     if arguments.json:
         print_json(_document(lens, fields, each))
     else:

@@ -2,16 +2,13 @@
 
 import argparse
 
-import torch
 from torch import Tensor
 
-from raytrace.cli.door import CommandError, say
+from raytrace.cli.door import CommandError
 from raytrace.maths import pupil
 from raytrace.maths.result import cell, number, numbers
-from raytrace.optics.losses import beam_hint, losses
 from raytrace.optics.spot import Spot
 from raytrace.optics.streaming import StreamedSpot
-from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
 
 _RINGS = 12
 _IN_RINGS = ("gauss", "hexapolar")
@@ -48,35 +45,3 @@ def spot_cells(spots: Spot | StreamedSpot, at: tuple[int, ...]) -> str:
     x, y = spots.centroid[(slice(None), *at)].tolist()
     radii = (1000 * float(radius[at]) for radius in (spots.rms_radius, spots.geometric_radius))
     return " ".join([*(cell(v, ">13.7f") for v in (x, y)), *(cell(v, ">10.4f") for v in radii)])
-
-
-def warn_of_losses(
-    lens: Lens,
-    fields: Tensor,
-    points: Tensor,
-    dark: Tensor,
-    *,
-    wavelengths: Tensor | None = None,
-    aiming: str | None = None,
-    at: str = "",
-) -> None:
-    """One line for every field that loses all its rays at a wavelength, where and why; what to do about a wide beam.
-
-    dark: (F, W), at which of the wavelengths (W,), the lens's by default; points: (2, P) of the pupil, through which
-    rays are traced once more; at: what else is told of the place, as the object distance.
-    """
-    if not bool(dark.any()):
-        return
-    number = torch.nonzero(dark.any(1))[:, 0]
-    wavelengths = lens.wavelengths if wavelengths is None else wavelengths
-    found = losses(lens, points, fields=fields[:, number], wavelengths=wavelengths, ray_aiming=aiming)
-    for place, f in enumerate(number.tolist()):
-        said: dict[str, list[str]] = {}
-        for w, wavelength in enumerate(wavelengths.tolist()):
-            if bool(dark[f, w]):
-                said.setdefault(found.words(place, w), []).append(f"{wavelength:g}")
-        for words, colours in said.items():
-            unit = FIELD_UNITS[lens.fields.kind]
-            say(f"warning: {at}field {name_of_field(fields[:, f])} {unit}, {', '.join(colours)} µm: {words}")
-    if hint := beam_hint(lens):
-        say(f"warning: {hint}; see --f-number and --entrance-pupil-diameter")

@@ -22,7 +22,7 @@ from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.value import value
 from raytrace.optics.scene import Kernels, Scene, beam_share, cross_scene, trace_scene
-from raytrace.optics.spot import spot
+from raytrace.optics.spot import spot_of
 from raytrace.shards import Share, total
 from raytrace.system.surface import Aperture
 
@@ -263,7 +263,7 @@ def _kernels_of_points(scene: Scene, grid: Grid, count: int, sampling: Callable,
     energy = torch.where(traced.valid, weights, 0.0).expand(*scene.shape, -1)
     points = torch.where(traced.valid, traced.position[:2], 0.0).expand(2, *scene.shape, -1)
     kernel = splat_smooth(grid, points, energy, width=width) if width else histogram(grid, points, energy)
-    light = spot(traced, weights)
+    light = spot_of(traced, weights)
     found = torch.where(light.rays > 0, light.centroid, 0.0)
     part = safe_divide(energy, energy.sum(-1, keepdim=True))
     x, y = torch.where(energy > 0, points - found[..., None], 0.0)

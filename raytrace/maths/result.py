@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from raytrace.maths.numerics import broadcast_shape
@@ -74,6 +75,16 @@ def flat(columns: dict[str, Tensor]) -> dict[str, np.ndarray]:
     """Columns as flat arrays of one length, in the order of their common shape."""
     shape = broadcast_shape(*(column.shape for column in columns.values()))
     return {name: column.detach().cpu().expand(shape).reshape(-1).numpy() for name, column in columns.items()}
+
+
+def axis(values: Tensor, place: int, axes: int) -> Tensor:
+    """A vector (n,) as axis number `place` of so many `axes`: a column of a table."""
+    return values.reshape(*(-1 if i == place else 1 for i in range(axes)))
+
+
+def masked(values: Tensor, valid: Tensor) -> Tensor:
+    """Values, nan where invalid: for tables and figures only, never before a derivative."""
+    return torch.where(valid, values, torch.nan)
 
 
 def rows(columns: dict[str, Tensor]) -> list[dict]:

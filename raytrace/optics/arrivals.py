@@ -81,4 +81,5 @@ def _field(lens: Lens, pupil: Tensor, field: Tensor, ray_aiming: str | None) -> 
     reached = rays.valid
     for crossing, status in fates(lens.surfaces[1:], rays, media(lens, lens.wavelengths[:, None])):
         reached = reached & ~crossing.missed & ~crossing.totally_reflected
-    return crossing.rays, status, reached
+        found = crossing.rays, status, reached
+    return found

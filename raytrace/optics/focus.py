@@ -17,7 +17,7 @@ from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.pupil import gauss_rings
 from raytrace.optics.launch import launch
 from raytrace.optics.paraxial import paraxial_image_distance
-from raytrace.optics.spot import EmptySpot, Spot, spot, spot_of_points, where_lit
+from raytrace.optics.spot import EmptySpot, Spot, spot_of, spot_of_points, where_lit
 from raytrace.optics.trace import media, trace_surfaces
 from raytrace.system.lens import Lens, with_object_distance, with_sensor_distance
 from raytrace.system.rays import Rays
@@ -51,7 +51,7 @@ def focus_moments(rays: Rays, weights: Tensor | None = None, *, empty: str = "na
     """cov(x, m) in mm and var(m), x the hits and m = (L, M)/N the slopes, over the last axis of rays (3, ..., P).
 
     The mean square radius on a sensor moved by s is its value at 0 plus 2 s cov + s² var. weights: (P,) or (..., P);
-    empty: what those of a spot without rays are, see `spot`.
+    empty: what those of a spot without rays are, see `spot_of`.
     """
     points, slopes = _points_and_slopes(rays)
     weights = torch.ones_like(points[0]) if weights is None else weights.expand(points.shape[1:])
@@ -68,16 +68,16 @@ def spot_parabola(rays: Rays, weights: Tensor | None = None, *, empty: str = "na
     """Q0 mm², Q1 mm, Q2 of the mean square radius Q0 + 2 s Q1 + s² Q2 on a sensor moved by s mm; each (...).
 
     rays: (3, ..., P) as `image_rays` gives them. Once they are traced, a step of an optimisation of the sensor distance
-    is this polynomial, whatever the number of rays. empty: as for `spot`.
+    is this polynomial, whatever the number of rays. empty: as for `spot_of`.
     """
-    here = spot(rays, weights, empty=empty)
+    here = spot_of(rays, weights, empty=empty)
     return here.mean_square_radius, *focus_moments(rays, weights)
 
 
 def through_focus(rays: Rays, shifts: Tensor, weights: Tensor | None = None, *, empty: str = "nan") -> Spot:
     """Spots (S, ...) on the sensor moved by each of the shifts (S,) mm; rays: (3, ..., P) on the sensor.
 
-    empty: as for `spot`.
+    empty: as for `spot_of`.
     """
     points, slopes = _points_and_slopes(rays)
     shifts = shifts.reshape(-1, *(1,) * (points.dim() - 1))
@@ -85,7 +85,7 @@ def through_focus(rays: Rays, shifts: Tensor, weights: Tensor | None = None, *, 
     return spot_of_points(moved, rays.valid.expand(moved.shape[1:]), weights, empty=empty)
 
 
-def focus(
+def focus_of_rms(
     lens: Lens,
     pupil: Tensor,
     weights: Tensor,
@@ -130,12 +130,12 @@ def focus(
 def focus_of_mean_radius(lens: Lens, pupil: Tensor, weights: Tensor, **scene) -> Tensor:
     """Sensor distance (scalar, mm) of least mean distance of the hits from the centroid of their spot.
 
-    Arguments as for `focus`, from where the search begins. Rays in image space are straight: they are traced once, on
-    the sensor as it stands, and what its rim clips there stays clipped. Not differentiated.
+    Arguments as for `focus_of_rms`, from where the search begins. Rays in image space are straight: they are traced
+    once, on the sensor as it stands, and what its rim clips there stays clipped. Not differentiated.
     Raises EmptySpot where there is no focus of the rays, ValueError as `focus_of_merit`.
     """
     with torch.no_grad():
-        start = focus(lens, pupil, weights, **scene)
+        start = focus_of_rms(lens, pupil, weights, **scene)
         bundles = list(_bundles(lens, pupil, **scene))
     if not bool(torch.isfinite(start)):
         raise EmptySpot("no ray reaches the image, or all are parallel: there is no focus")
@@ -156,13 +156,13 @@ def focus_of_mean_radius(lens: Lens, pupil: Tensor, weights: Tensor, **scene) ->
 def mean_rms_radius(lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = "nan", **scene) -> Tensor:
     """√ of the weighted mean of the mean square radii (scalar, mm) over object distances × fields × wavelengths.
 
-    Arguments as for `focus`, which minimises it; spots without rays are left out, and it is nan if none is left, or,
-    with empty = "error", raises EmptySpot.
+    Arguments as for `focus_of_rms`, which minimises it; spots without rays are left out, and it is nan if none is left,
+    or, with empty = "error", raises EmptySpot.
     """
     total = sum_of_shares = torch.zeros_like(lens.surfaces[-2].thickness)
     for rays, share in _bundles(lens, pupil, **scene):
         lit = _lit(rays, weights)
-        square = spot(rays, weights, empty=empty).mean_square_radius
+        square = spot_of(rays, weights, empty=empty).mean_square_radius
         total = total + torch.where(lit, share * square, 0.0).sum()
         sum_of_shares = sum_of_shares + torch.where(lit, share, 0.0).sum()
     return where_lit(sum_of_shares > 0, safe_sqrt(safe_divide(total, sum_of_shares)), empty=empty)[0]
@@ -200,7 +200,7 @@ def best_focus(lens: Lens) -> Tensor:
     Raises EmptySpot where no ray arrives.
     """
     axis, weights = lens.wavelengths.new_zeros(2, 1), lens.wavelength_weights
-    return focus(lens, *gauss_rings(_RINGS), fields=axis, wavelength_weights=weights, empty="error")
+    return focus_of_rms(lens, *gauss_rings(_RINGS), fields=axis, wavelength_weights=weights, empty="error")
 
 
 def real_image_distance(lens: Lens, object_distances: Tensor) -> Tensor:

@@ -7,23 +7,48 @@ of the real marginal ray.
 
 import dataclasses
 import warnings
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from raytrace.maths.numerics import broadcast_shape, dot, dot_2, safe_divide, safe_sqrt, unit
+from raytrace.maths.pupil import gauss_rings
 from raytrace.media import glass
 from raytrace.optics.aiming import aim_at_image, aim_at_stop, at_stop
 from raytrace.optics.paraxial import FirstOrder, first_order
-from raytrace.optics.trace import start
 from raytrace.optics.vignetting import vignette
-from raytrace.system.lens import RAY_AIMING, Lens
-from raytrace.system.rays import Rays
+from raytrace.system.lens import RAY_AIMING, Lens, field_points, wavelengths_of
+from raytrace.system.rays import Rays, start
 from raytrace.system.surface import sag
 
 
 class MarginalRayLost(UserWarning):
     """The real marginal ray does not reach the stop, whose size it was to tell."""
+
+
+def rays(
+    lens: Lens,
+    *,
+    fields: Tensor | Sequence | None = None,
+    pupil: Tensor | tuple[Tensor, Tensor] | None = None,
+    wavelengths: Tensor | Sequence[float] | None = None,
+    ray_aiming: str | None = None,
+) -> Rays:
+    """Rays (3, F, W, P) of every field, wavelength and pupil point in front of surface 1, each with its wavelength.
+
+    fields: y, or (x, y), or (2, F) in the lens's own kind of field; wavelengths: µm; both by default the lens's own.
+    pupil: points (2, P) of the unit disc, or a rule (points, weights), as `gauss_rings(6)` (default); ray_aiming: a key
+    of RAY_AIMING, by default the lens's own. Raises ValueError for what is none of these.
+    """
+    pupil = (
+        gauss_rings(dtype=lens.surfaces[-2].thickness.dtype, device=lens.wavelengths.device) if pupil is None else pupil
+    )
+    points = pupil if isinstance(pupil, Tensor) else pupil[0]
+    wavelengths = wavelengths_of(lens, wavelengths)
+    fields = field_points(fields, like=lens)
+    found = launch(lens, points, fields=fields, wavelengths=wavelengths, ray_aiming=ray_aiming)
+    return dataclasses.replace(found, wavelength=wavelengths[:, None])
 
 
 def launch(
@@ -40,7 +65,7 @@ def launch(
     their vignetting factors (other fields get those that `raytrace.optics.vignetting` interpolates);
     wavelengths: (W,) µm, by default those of the lens; ray_aiming: a key of RAY_AIMING, by default the lens's.
     """
-    fields = torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields
+    fields = field_points(fields, like=lens)
     wavelengths = lens.wavelengths if wavelengths is None else wavelengths
     vignetted = vignette(lens, fields[:, :, None, None], pupil)
     field, wavelength = fields[:, :, None, None], wavelengths[:, None]

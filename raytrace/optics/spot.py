@@ -34,7 +34,7 @@ class EmptySpot(ValueError):
     """No ray of a spot arrives: it has no centroid and no radius."""
 
 
-def spot(rays: Rays, weights: Tensor | None = None, *, about: Tensor | None = None, empty: str = "nan") -> Spot:
+def spot_of(rays: Rays, weights: Tensor | None = None, *, about: Tensor | None = None, empty: str = "nan") -> Spot:
     """Spot of rays (3, ..., P) over their last axis, invalid ones left out; weights: (P,) or (..., P), 1 by default.
 
     about: (2, ...) mm, from where radii count, the centroid by default. Equally weighted hexapolar rays about the
@@ -48,7 +48,7 @@ def spot(rays: Rays, weights: Tensor | None = None, *, about: Tensor | None = No
 def spot_of_points(
     points: Tensor, valid: Tensor, weights: Tensor | None = None, *, about: Tensor | None = None, empty: str = "nan"
 ) -> Spot:
-    """Spot of points (2, ..., P) mm; `about` and `empty` as for `spot`.
+    """Spot of points (2, ..., P) mm; `about` and `empty` as for `spot_of`.
 
     One point is subtracted before the mean is formed, so that a spot of 1 pm 1 m off the axis keeps its digits; a spot
     of one ray has radius 0 and gradient 0.

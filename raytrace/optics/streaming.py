@@ -310,7 +310,7 @@ def stream_spots(
 
     fields: (2, F) and wavelengths: (W,) µm as for `launch`; sampling: "sobol" or "random"; rim: so many rays on the rim
     count for the largest radius alone, as in `pupil.with_rim`; max_bytes: of memory beside what the process has;
-    progress: called with the number of rays traced since the last call; empty: as for `spot`. No derivatives.
+    progress: called with the number of rays traced since the last call; empty: as for `spot_of`. No derivatives.
     """
     shots, shape, weights = shots_of(lens, rays, fields, wavelengths, wavelength_weights, ray_aiming)
     like = lens.surfaces[-2].thickness

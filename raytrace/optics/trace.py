@@ -15,7 +15,7 @@ from torch import Tensor
 from raytrace.fused.choice import is_fused
 from raytrace.fused.run import trace_compiled
 from raytrace.fused.structure import is_expressible
-from raytrace.maths.numerics import dot, unit, with_batch_axes
+from raytrace.maths.numerics import dot
 from raytrace.maths.value import value
 from raytrace.media import glass
 from raytrace.system.lens import Lens
@@ -273,30 +273,12 @@ def _same_medium(a: glass.Glass, b: glass.Glass) -> bool:
     return a is b or (a.formula == b.formula and a.coefficients is b.coefficients)
 
 
-def trace(lens: Lens, rays: Rays, wavelength: Tensor) -> Rays:
+def trace_lens(lens: Lens, rays: Rays, wavelength: Tensor) -> Rays:
     """Trace rays from the frame of surface 1 to the image surface.
 
     wavelength: µm, broadcast against the batch shape of the rays. Returns the rays in the frame of the image.
     """
     return trace_surfaces(lens.surfaces[1:], rays, indices=media(lens, wavelength))
-
-
-def start(position: Tensor, direction: Tensor, opl: Tensor | None = None) -> Rays:
-    """Rays from points and directions of any length; what is not finite or has no direction is lost from the start.
-
-    position, direction: (3, ...) mm and any unit; opl: (...) mm or None.
-    """
-    axes = max(position.dim(), direction.dim()) - 1
-    position, direction = torch.broadcast_tensors(with_batch_axes(position, axes), with_batch_axes(direction, axes))
-    usable = torch.isfinite(position).all(0) & torch.isfinite(direction).all(0) & (direction != 0).any(0)
-    axis = torch.zeros_like(direction)
-    axis[2] = 1.0
-    return Rays(
-        position=torch.where(usable, position, 0.0),
-        direction=unit(torch.where(usable, direction, axis)),
-        valid=usable,
-        opl=opl if opl is None else torch.where(usable, opl, 0.0),
-    )
 
 
 def axial_path(surfaces: Sequence[Surface], indices: Sequence[Tensor], side: int = 1) -> Tensor:

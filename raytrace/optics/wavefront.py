@@ -150,12 +150,12 @@ def _reference_sphere(scene: Scene, rays: Rays, usable: Tensor) -> tuple[Tensor,
 
 
 def mean_opd(wavefront: Wavefront, *, empty: str = "nan") -> Tensor:
-    """Mean OPD (D, F, W) in mm over the light that arrives; empty: what it is where none does, see `spot`."""
+    """Mean OPD (D, F, W) in mm over the light that arrives; empty: what it is where none does, see `spot_of`."""
     return where_lit(_is_lit(wavefront), (_share(wavefront) * wavefront.opd).sum(-1), empty=empty)[0]
 
 
 def rms(wavefront: Wavefront, *, empty: str = "nan") -> Tensor:
-    """RMS of the OPD about its mean (D, F, W), mm; empty: what it is where no light arrives, see `spot`."""
+    """RMS of the OPD about its mean (D, F, W), mm; empty: what it is where no light arrives, see `spot_of`."""
     share = _share(wavefront)
     centred = torch.where(wavefront.valid, wavefront.opd - (share * wavefront.opd).sum(-1, keepdim=True), 0.0)
     return where_lit(_is_lit(wavefront), safe_sqrt((share * centred * centred).sum(-1)), empty=empty)[0]
@@ -176,7 +176,7 @@ def zernike_coefficients(
 
     numbering: "noll", of polynomials that are 1 in RMS, or "fringe", of polynomials that are 1 at the rim.
     empty: what they are where the light fills too little of the entrance pupil to tell them apart (a fit would enlarge
-    the least deviation ten thousand times, as in the middle 0.55 of the radius), see `spot`.
+    the least deviation ten thousand times, as in the middle 0.55 of the radius), see `spot_of`.
     Raises ValueError for another numbering.
     """
     if numbering not in zernike.NUMBERINGS:

@@ -1,7 +1,9 @@
 """Rays: the value that travels through a lens."""
 
+import torch
 from torch import Tensor
 
+from raytrace.maths.numerics import unit, with_batch_axes
 from raytrace.maths.value import value
 
 
@@ -29,3 +31,21 @@ class Rays:
     def shape(self):
         """Batch shape of the rays."""
         return self.direction.shape[1:]
+
+
+def start(position: Tensor, direction: Tensor, opl: Tensor | None = None) -> Rays:
+    """Rays from points and directions of any length; what is not finite or has no direction is lost from the start.
+
+    position, direction: (3, ...) mm and any unit; opl: (...) mm or None.
+    """
+    axes = max(position.dim(), direction.dim()) - 1
+    position, direction = torch.broadcast_tensors(with_batch_axes(position, axes), with_batch_axes(direction, axes))
+    usable = torch.isfinite(position).all(0) & torch.isfinite(direction).all(0) & (direction != 0).any(0)
+    axis = torch.zeros_like(direction)
+    axis[2] = 1.0
+    return Rays(
+        position=torch.where(usable, position, 0.0),
+        direction=unit(torch.where(usable, direction, axis)),
+        valid=usable,
+        opl=opl if opl is None else torch.where(usable, opl, 0.0),
+    )

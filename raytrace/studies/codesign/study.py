@@ -20,8 +20,8 @@ from raytrace.files import write_atomically
 from raytrace.formats.pictures import Pictures
 from raytrace.maths.pupil import gauss_rings
 from raytrace.optics.launch import launch
-from raytrace.optics.spot import spot
-from raytrace.optics.trace import trace
+from raytrace.optics.spot import spot_of
+from raytrace.optics.trace import trace_lens
 from raytrace.studies.codesign.experiment import STEPS, Outcome, Settings, batch, outcome
 from raytrace.studies.codesign.experiment import camera as camera_at_start
 from raytrace.system.lens import Lens, with_object_distance
@@ -146,9 +146,9 @@ def blur_diameters(lens: Lens, distances: Tensor) -> Tensor:
     found = []
     for distance in distances:
         own = with_object_distance(lens, distance)
-        rays = trace(own, launch(own, pupil, fields=axis), own.wavelengths[:, None])
+        rays = trace_lens(own, launch(own, pupil, fields=axis), own.wavelengths[:, None])
         share = own.wavelength_weights / own.wavelength_weights.sum()
-        found.append(2 * (share * spot(rays, weights).mean_square_radius[0]).sum().sqrt())
+        found.append(2 * (share * spot_of(rays, weights).mean_square_radius[0]).sum().sqrt())
     return torch.stack(found)
 
 
