@@ -33,6 +33,22 @@ def read_bytes(path: str | os.PathLike, most: int) -> bytes:
         raise OSError(errno.EINVAL, str(error), str(path)) from error
 
 
+def encoding(content: bytes) -> str:
+    """How a text is encoded that does not say so: UTF-16 by its mark or its zeros, UTF-8, else Latin-1."""
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return "utf-16"
+    # Lens and glass files are mostly ASCII: in UTF-16 without its mark every second byte of the beginning is zero.
+    head = content[: min(len(content), 512) // 2 * 2]
+    for found, zeros in (("utf-16-le", head[1::2].count(0)), ("utf-16-be", head[0::2].count(0))):
+        if head and zeros > 0.4 * len(head):
+            return found
+    try:
+        content.decode("utf-8")
+    except UnicodeDecodeError:
+        return "latin-1"
+    return "utf-8"
+
+
 def write_atomically(path: str | os.PathLike, write: Callable[[BinaryIO], None]) -> None:
     """Replace a file as a whole or not at all: `write` fills a temporary file beside it, which is then renamed.
 

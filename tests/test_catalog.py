@@ -31,7 +31,7 @@ from raytrace.media.catalog import (
     shipped_folder,
     write_agf,
 )
-from raytrace.media.dispersion import AGF_FORMULAS
+from raytrace.media.formulas import BY_NUMBER
 from raytrace.media.glass import constant, index, listing_error, refractive_index
 
 #: Glasses of which their catalog lists no nd and Vd (infrared materials, and crystals that are opaque at the d line,
@@ -334,7 +334,7 @@ def test_shipped_files_are_plain_agf():
         for line in lines:
             if line.startswith("NM"):
                 assert re.fullmatch(r"NM \S+ \d+ \d{6} \S+ \S+ 0 (-1|[0-4]) -1", line)
-                assert int(line.split()[2]) in AGF_FORMULAS
+                assert int(line.split()[2]) in BY_NUMBER
             if line.startswith("CD"):
                 assert len(line.split()) == 11
 

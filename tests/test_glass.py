@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.autograd import gradcheck, gradgradcheck
 
-from raytrace.media.dispersion import AGF_FORMULAS, COEFFICIENT_COUNTS, FORMULAS
+from raytrace.media.formulas import BY_NUMBER, FORMULAS
 from raytrace.media.glass import (
     AIR,
     LINES,
@@ -70,10 +70,10 @@ def test_slope_is_the_derivative_of_the_definition(case):
 
 
 def test_every_formula_has_a_case():
-    assert {case["formula"] for case in DISPERSION} == set(FORMULAS) == set(COEFFICIENT_COUNTS)
-    assert list(AGF_FORMULAS) == list(range(1, 14))
-    assert AGF_FORMULAS[4] == "sellmeier_2"
-    assert AGF_FORMULAS[13] == "extended_3"
+    assert {case["formula"] for case in DISPERSION} == set(FORMULAS)
+    assert list(BY_NUMBER) == list(range(1, 14))
+    assert BY_NUMBER[4] == "sellmeier_2"
+    assert BY_NUMBER[13] == "extended_3"
 
 
 @pytest.mark.parametrize("formula", FORMULAS)
@@ -172,7 +172,7 @@ def test_a_term_of_no_strength_has_no_pole():
 )
 @settings(max_examples=300, deadline=None)
 def test_whatever_the_numbers_the_index_is_positive_or_zero_and_its_gradient_zero_there(formula, numbers, wavelength):
-    coefficients = float64(numbers[: COEFFICIENT_COUNTS[formula]], requires_grad=True)
+    coefficients = float64(numbers[: FORMULAS[formula].count], requires_grad=True)
     wavelengths = float64([wavelength], requires_grad=True)
     n = refractive_index(Glass("", formula, coefficients), wavelengths)
     assert torch.isfinite(n).all()

@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from raytrace.media.catalog import find_glass
-from raytrace.media.glass import index
-from raytrace.media.glass_table import from_table
+from raytrace.media.glass import from_table, index
 
 LINES = torch.tensor([0.4358, 0.4861, 0.5461, 0.5876, 0.6563, 0.7065, 0.8521], dtype=torch.float64)
 

@@ -15,8 +15,7 @@ from raytrace.cli.options import did_you_mean
 from raytrace.cli.progress import progress
 from raytrace.maths.grid import grid
 from raytrace.media.catalog import find_glass
-from raytrace.media.glass import Glass, check_wavelengths
-from raytrace.media.glass_table import from_table
+from raytrace.media.glass import Glass, check_wavelengths, from_table
 from raytrace.system.lens import check_unit
 from raytrace.wave.aim import Aim
 from raytrace.wave.aim import aim as aim_of

@@ -6,6 +6,8 @@ import stat
 from pathlib import Path
 from typing import NamedTuple
 
+from raytrace.files import encoding
+
 #: Larger files are refused before they are read; the largest real lens files are a few hundred kB.
 MAX_BYTES = 16 * 2**20
 
@@ -83,11 +85,11 @@ def decode(content: bytes, place: Place) -> str:
     """Bytes to text by the rules of `read_text`."""
     if not content.strip():
         raise LensFileError("is empty", place)
-    encoding = _encoding(content)
+    found = encoding(content)
     try:
-        text = content.decode(encoding)
+        text = content.decode(found)
     except UnicodeDecodeError as error:
-        message = f"is not valid {encoding.upper()} at byte {error.start}: damaged or cut off; save it again as UTF-8"
+        message = f"is not valid {found.upper()} at byte {error.start}: damaged or cut off; save it again as UTF-8"
         raise LensFileError(message, place) from error
     text = text.removeprefix("\ufeff").rstrip("\x1a\x00 \t\r\n") + "\n"
     found = _NOT_TEXT.search(text)
@@ -101,22 +103,6 @@ def decode(content: bytes, place: Place) -> str:
         found = f"{len(lines)} lines, the longest of {max(map(len, lines))} characters"
         raise LensFileError(f"{found}; more than any lens file ({MAX_LINES}, {MAX_LINE})", place)
     return text
-
-
-def _encoding(content: bytes) -> str:
-    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return "utf-16"
-    # Lens files are mostly ASCII, so in UTF-16 without its mark every second byte of the beginning is zero.
-    head = content[: min(len(content), 512) // 2 * 2]
-    if head and head[1::2].count(0) > 0.4 * len(head):
-        return "utf-16-le"
-    if head and head[0::2].count(0) > 0.4 * len(head):
-        return "utf-16-be"
-    try:
-        content.decode("utf-8")
-    except UnicodeDecodeError:
-        return "latin-1"
-    return "utf-8"
 
 
 def number(text: str, what: str, place: Place) -> float:

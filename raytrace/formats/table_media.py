@@ -4,7 +4,7 @@ import numpy as np
 
 from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, Place, number, shown
-from raytrace.media.dispersion import MODEL_LINES
+from raytrace.media.formulas import MODEL_LINES
 from raytrace.media.glass import AIR, LINES, Glass, constant, model_glass
 
 #: What an empty or undispersed medium's Abbe number is written as.
@@ -24,7 +24,7 @@ def medium(cells: dict[str, str], place: Place, report: Draft) -> Glass:
     """The medium of a row without a named glass; air where no figure is given.
 
     One index alone is constant. n_d, V_d and ΔP_gF are kept as they stand; any other set of figures is met by the model
-    glass n = A + B/λ + C/λ^3.5 (`raytrace.media.glass.FORMULAS["model"]`), on the normal line of glasses where two are
+    glass n = A + B/λ + C/λ^3.5 (`raytrace.media.formulas`), on the normal line of glasses where two are
     given, by least squares where more than three are.
     """
     given = {name: number(cell, name.replace("_", " "), place) for name, cell in figures(cells).items()}

@@ -1,6 +1,5 @@
 """AGF, the file format of glass catalogs: a Catalog from a file and back."""
 
-import codecs
 import math
 import re
 import warnings
@@ -10,14 +9,14 @@ from pathlib import Path
 from types import MappingProxyType
 
 import torch
-from torch import Tensor
 
-from raytrace.files import read_bytes, write_atomically
-from raytrace.media.dispersion import AGF_FORMULAS, COEFFICIENT_COUNTS
+from raytrace.files import encoding, read_bytes, write_text
+from raytrace.media.formulas import BY_NUMBER, FORMULAS
 from raytrace.media.glass import Glass
 
 _STATUSES = {0: "standard", 1: "preferred", 2: "obsolete", 3: "special", 4: "melt"}
-_NUMERIC = ("CD", "TD", "ED", "MD", "OD", "LD", "IT")
+#: Records of numbers, by rank in the order in which a glass is written.
+_NUMERIC = {"ED": 0, "CD": 1, "TD": 2, "MD": 2, "OD": 2, "LD": 3, "IT": 4}
 _KEYWORDS = ("CC", "NM", "GC", *_NUMERIC)
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?", re.ASCII)
 _LARGEST_FILE = 64 * 2**20
@@ -64,34 +63,15 @@ def read_text(path: str | Path) -> str:
         content = read_bytes(path, _LARGEST_FILE)
     except OSError as error:
         raise CatalogError(f"{path}: cannot be read ({error.strerror or error}); expected a glass catalog") from error
-    return decode(content, path)
-
-
-def decode(content: bytes, path: str | Path) -> str:
-    """Text of a file that does not say how it is encoded: by its byte-order mark, else by where its zeros lie."""
-    sample = content[:4096]
-    half = max(len(sample) // 2, 1)
-    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        encoding = "utf-16"
-    elif sample[1::2].count(0) > 0.4 * half:
-        encoding = "utf-16-le"
-    elif sample[0::2].count(0) > 0.4 * half:
-        encoding = "utf-16-be"
-    else:
-        encoding = "utf-8-sig"
+    found = encoding(content)
     try:
-        text = content.decode(encoding)
+        text = content.decode(found).removeprefix("\ufeff").rstrip("\x1a\0")  # end-of-file marks of old programs
     except UnicodeDecodeError as error:
-        if encoding != "utf-8-sig":
-            raise CatalogError(f"{path}: damaged {encoding.upper()} text at byte {error.start}; cut off?") from error
-        text = content.decode("latin-1")
-    text = text.rstrip("\x1a\0")  # end-of-file marks of old programs
+        raise CatalogError(f"{path}: damaged {found.upper()} text at byte {error.start}; cut off?") from error
     binary = re.search(r"[\0-\x08\x0e-\x1f]", text)
     if binary:
         line = text.count("\n", 0, binary.start()) + 1
-        raise CatalogError(
-            f"{path}:{line}: found binary data (byte {ord(binary[0]):#04x}), expected the text of an AGF"
-        )
+        raise _fault(path, line, f"binary data (byte {ord(binary[0]):#04x})", "the text of an AGF")
     return text
 
 
@@ -166,16 +146,21 @@ def _glass(block: Sequence[tuple[int, str, str]], catalog: str, path: Path) -> G
         raise _fault(path, line, f"NM {rest[:40]}", "NM name formula code nd Vd …", "is the line cut off?")
     name = words[0]
     number, nd_listed, abbe_listed, *flags = _numbers([words[1], *words[3:7]], path, line, blanks=True)
-    formula = AGF_FORMULAS.get(number)
+    formula = BY_NUMBER.get(number)
     if formula is None:
         raise _fault(path, line, f"dispersion formula {words[1]} for {name}", "1 to 13, as the AGF format numbers them")
+    line, text = _only(block, "CD", name, path)
+    coefficients, count = _numbers(text.split(), path, line), FORMULAS[formula].count
+    if len(coefficients) < count:
+        found, expected = f"{len(coefficients)} coefficients for {name}", f"at least {count} for formula {formula}"
+        raise _fault(path, line, found, expected, "is the line cut off?")
     comment = "\n".join(text for _, keyword, text in block if keyword == "GC" and text)
     listing = re.search(r"\balternatives: *([^;\n]+)", comment)
     unlisted = nd_listed <= 0 or (nd_listed == 1 and abbe_listed == 0)  # what catalogs write where nd is not known
     return Glass(
         name=name,
         formula=formula,
-        coefficients=_coefficients(block, name, formula, path),
+        coefficients=torch.tensor(coefficients[:count], dtype=torch.float64),
         catalog=catalog,
         wavelength_range=_wavelength_range(block, name, path),
         status=_STATUSES.get(flags[1], "") if len(flags) > 1 else "",
@@ -187,18 +172,9 @@ def _glass(block: Sequence[tuple[int, str, str]], catalog: str, path: Path) -> G
         records=tuple(
             (keyword, _numbers(text.split(), path, line, blanks=True))
             for line, keyword, text in block
-            if keyword in ("ED", "TD", "MD", "OD", "IT") and text
+            if keyword in _NUMERIC.keys() - {"CD", "LD"} and text
         ),
     )
-
-
-def _coefficients(block: Sequence[tuple[int, str, str]], name: str, formula: str, path: Path) -> Tensor:
-    line, text = _only(block, "CD", name, path)
-    numbers, count = _numbers(text.split(), path, line), COEFFICIENT_COUNTS[formula]
-    if len(numbers) < count:
-        expected = f"at least {count} for formula {formula}"
-        raise _fault(path, line, f"{len(numbers)} coefficients for {name}", expected, "is the line cut off?")
-    return torch.tensor(numbers[:count], dtype=torch.float64)
 
 
 def _wavelength_range(block: Sequence[tuple[int, str, str]], name: str, path: Path) -> tuple[float, float] | None:
@@ -250,8 +226,7 @@ def write_agf(catalog: Catalog, path: str | Path) -> None:
 
     Raises ValueError for a glass that the format cannot hold (its formula, or a blank in its name).
     """
-    content = format_agf(catalog).encode()
-    write_atomically(path, lambda file: file.write(content))
+    write_text(path, format_agf(catalog))
 
 
 def format_agf(catalog: Catalog) -> str:
@@ -263,31 +238,20 @@ def format_agf(catalog: Catalog) -> str:
 
 
 def _glass_lines(name: str, glass: Glass) -> list[str]:
-    numbers = {formula: number for number, formula in AGF_FORMULAS.items()}
-    if glass.formula not in numbers or len(name.split()) != 1:
+    number = FORMULAS[glass.formula].number if glass.formula in FORMULAS else None
+    if number is None or len(name.split()) != 1:
         raise ValueError(f"glass {name!r} with formula {glass.formula!r} cannot be written as AGF")
     n, v = (1.0, 0.0) if glass.nd_listed is None else (glass.nd_listed, glass.abbe_listed)
     code = f"{round(n * 1000) % 1000:03d}{round(v * 10) % 1000:03d}"
     status = next((number for number, status in _STATUSES.items() if status == glass.status), -1)
     coefficients = glass.coefficients.tolist()
-    coefficients += [0.0] * (10 - len(coefficients))
-    span = glass.wavelength_range or (0.0, 0.0)
-    before = [_record(*record) for record in glass.records if record[0] == "ED"]
-    after = [_record(*record) for record in glass.records if record[0] in ("TD", "MD", "OD")]
-    transmissions = [_record(*record) for record in glass.records if record[0] == "IT"]
+    figures = [("CD", coefficients + [0.0] * (10 - len(coefficients))), ("LD", glass.wavelength_range or (0.0, 0.0))]
+    records = sorted([*glass.records, *figures], key=lambda record: _NUMERIC[record[0]])
     return [
-        f"NM {name} {numbers[glass.formula]} {code} {_spell(n)} {_spell(v)} 0 {status} -1",
+        f"NM {name} {number} {code} {_spell(n)} {_spell(v)} 0 {status} -1",
         *[f"GC {comment}" for comment in glass.comment.split("\n") if comment],
-        *before,
-        _record("CD", coefficients),
-        *after,
-        _record("LD", span),
-        *transmissions,
+        *[" ".join([keyword, *map(_spell, numbers)]) for keyword, numbers in records],
     ]
-
-
-def _record(keyword: str, numbers: Sequence[float]) -> str:
-    return " ".join([keyword, *map(_spell, numbers)])
 
 
 def _spell(number: float) -> str:

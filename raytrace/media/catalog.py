@@ -18,9 +18,10 @@ import os
 import re
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 
@@ -31,32 +32,13 @@ from raytrace.media.agf import CatalogWarning as CatalogWarning
 from raytrace.media.agf import read_agf as read_agf
 from raytrace.media.agf import read_text
 from raytrace.media.agf import write_agf as write_agf
-from raytrace.media.glass import Glass, refractive_index
+from raytrace.media.glass import LINES, Glass, refractive_index
 
 #: Shipped catalogs in the order they are searched: the makers by how often lens files name them, then collections,
 #: then the makers of few glasses; BIREFRINGENT last, for its names stand for one ray of a crystal.
 SHIPPED = (
-    "SCHOTT",
-    "OHARA",
-    "HOYA",
-    "CDGM",
-    "HIKARI",
-    "SUMITA",
-    "LZOS",
-    "CORNING",
-    "INFRARED",
-    "MISC",
-    "HERAEUS",
-    "TOPAS",
-    "ZEON",
-    "ARTON",
-    "LIGHTPATH",
-    "RPO",
-    "UMICORE",
-    "ISUZU",
-    "ARCHER",
-    "RAD_HARD",
-    "BIREFRINGENT",
+    *("SCHOTT", "OHARA", "HOYA", "CDGM", "HIKARI", "SUMITA", "LZOS", "CORNING", "INFRARED", "MISC", "HERAEUS", "TOPAS"),
+    *("ZEON", "ARTON", "LIGHTPATH", "RPO", "UMICORE", "ISUZU", "ARCHER", "RAD_HARD", "BIREFRINGENT"),
 )
 #: Further names that lens files give to a shipped catalog.
 CATALOG_NAMES = {"NIKON": "HIKARI", "NIKON-HIKARI": "HIKARI", "NIKON_HIKARI": "HIKARI"}
@@ -76,15 +58,18 @@ class AmbiguousGlass(UserWarning):
     """A name stands for different glasses in two catalogs, and the lens file does not say which."""
 
 
+def _at(where: str) -> str:
+    return f"{where}: " if where else ""
+
+
 class UnknownGlass(LookupError):
     """No catalog holds the name. Carries `name`, `where` and `suggestions`, a tuple of (glass, catalog)."""
 
     def __init__(self, name: str, where: str, suggestions: tuple[tuple[str, str], ...], searched: Sequence[str]):
         self.name, self.where, self.suggestions = name, where, suggestions
-        place = f"{where}: " if where else ""
         near = ", ".join(f"{glass} ({catalog})" for glass, catalog in suggestions)
         super().__init__(
-            f"{place}unknown glass {name!r}; no catalog of {', '.join(searched)} holds it. "
+            f"{_at(where)}unknown glass {name!r}; no catalog of {', '.join(searched)} holds it. "
             + (f"Nearest names: {near}. " if near else "No name comes near. ")
             + f"Correct the name, or give the AGF file that defines it (--catalog FILE or {ENVIRONMENT})."
         )
@@ -129,14 +114,11 @@ def edition(glass: Glass) -> tuple[str, ...]:
     parts = [part.strip() for part in glass.comment.split(";")]
     told = [part for part in parts if "sources agree" in part or "deviate by" in part]
     if not told:
-        return (
-            f"{glass.catalog}: {glass.comment}" if glass.comment else f"{glass.catalog} does not state its edition",
-        )
-    found = ["date not stated; " + "; ".join(told)]
+        own = f": {glass.comment}" if glass.comment else " does not state its edition"
+        return (glass.catalog + own,)
     newer = OLDER_EDITIONS.get((glass.catalog, glass.listed_name or glass.name))
-    if newer:
-        found.append(f"older than {newer[0]}, whose indices differ by up to {newer[1]:.1e}")
-    return tuple(found)
+    older = [f"older than {newer[0]}, whose indices differ by up to {newer[1]:.1e}"] if newer else []
+    return ("date not stated; " + "; ".join(told), *older)
 
 
 def missing_catalogs(catalogs: Sequence[str], *, user: Sequence[str | Path] = ()) -> tuple[str, ...]:
@@ -183,11 +165,20 @@ def shipped_catalog(name: str) -> Catalog:
 
 def load(path: str | Path) -> Catalog:
     """The catalog of an AGF file, parsed again only when the file has changed. Raises CatalogError."""
-    return _load(*_version(Path(path)))
+    path = Path(path)
+    try:
+        state = path.stat()
+    except OSError as error:
+        raise CatalogError(f"{path}: cannot be read ({error.strerror}); expected a glass catalog (AGF)") from error
+    return _load(path.resolve(), state.st_mtime_ns, state.st_size)
 
 
-@dataclass(frozen=True)
-class Alias:
+@lru_cache(maxsize=64)
+def _load(path: Path, modified: int, size: int) -> Catalog:
+    return read_agf(path)
+
+
+class Alias(NamedTuple):
     """Another spelling of a glass, and why it is the same glass."""
 
     glass: str
@@ -199,25 +190,10 @@ class Alias:
 def aliases() -> dict[str, Alias]:
     """The alias table, by name in capitals."""
     with (shipped_folder() / "ALIASES.csv").open(encoding="utf-8", newline="") as file:
-        return {
-            row["alias"].upper(): Alias(row["glass"], row["catalog"], row["reason"]) for row in csv.DictReader(file)
-        }
+        return {row.pop("alias").upper(): Alias(**row) for row in csv.DictReader(file)}
 
 
 # -- the rest ---------------------------------------------------------------------------------------------------------
-
-
-def _version(path: Path) -> tuple[Path, int, int]:
-    try:
-        state = path.stat()
-    except OSError as error:
-        raise CatalogError(f"{path}: cannot be read ({error.strerror}); expected a glass catalog (AGF)") from error
-    return path.resolve(), state.st_mtime_ns, state.st_size
-
-
-@lru_cache(maxsize=64)
-def _load(path: Path, modified: int, size: int) -> Catalog:
-    return read_agf(path)
 
 
 @lru_cache(maxsize=64)
@@ -244,9 +220,8 @@ def _warn_if_ambiguous(candidates: Sequence[Glass], where: str) -> None:
     glass, *others = candidates
     rivals = [f"{other.catalog} by {gap:.1e}" for other in others if (gap := _difference(glass, other)) > SAME_INDEX]
     if rivals:
-        place = f"{where}: " if where else ""
         message = (
-            f"{place}{glass.listed_name} is taken from {glass.catalog}, but another glass has this name in other "
+            f"{_at(where)}{glass.listed_name} is taken from {glass.catalog}, but another glass has this name in other "
             f"catalogs (index differs in {', '.join(rivals)}); name the catalog in the lens file"
         )
         warnings.warn(message, AmbiguousGlass, stacklevel=3)
@@ -255,9 +230,8 @@ def _warn_if_ambiguous(candidates: Sequence[Glass], where: str) -> None:
 def _difference(one: Glass, other: Glass) -> float:
     """Largest difference of two indices in the range they share, or at the d line if they share none."""
     spans = [glass.wavelength_range for glass in (one, other) if glass.wavelength_range]
-    shortest = max((span[0] for span in spans), default=0.5875618)
-    longest = min((span[1] for span in spans), default=0.5875618)
+    shortest, longest = max((span[0] for span in spans), default=1.0), min((span[1] for span in spans), default=0.0)
     if shortest > longest:
-        shortest = longest = 0.5875618
+        shortest = longest = LINES["d"]
     wavelengths = torch.linspace(shortest, longest, 9, dtype=torch.float64)
     return float((refractive_index(one, wavelengths) - refractive_index(other, wavelengths)).abs().max())

@@ -1,4 +1,4 @@
-"""Glass: media by their dispersion formulas (`dispersion.py`), and the door where a wavelength is refused.
+"""Glass: media by their dispersion formulas (`formulas.py`), and the door where a wavelength is refused.
 
 Two ways to an index, on purpose:
 
@@ -20,27 +20,13 @@ from torch import Tensor
 
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.value import value
-from raytrace.media.dispersion import FORMULAS
+from raytrace.media.formulas import FORMULAS
 
 #: Spectral lines, µm (ISO 7944 and the neighbours that catalogs list).
-LINES = {
-    "i": 0.3650146,
-    "h": 0.4046561,
-    "g": 0.4358343,
-    "F'": 0.4799914,
-    "F": 0.4861327,
-    "e": 0.5460740,
-    "d": 0.5875618,
-    "D": 0.5892938,
-    "C'": 0.6438469,
-    "C": 0.6562725,
-    "r": 0.7065188,
-    "s": 0.8521100,
-    "t": 1.0139800,
-}
+LINES = {"i": 0.3650146, "h": 0.4046561, "g": 0.4358343, "F'": 0.4799914, "F": 0.4861327, "e": 0.5460740}
+LINES |= {"d": 0.5875618, "D": 0.5892938, "C'": 0.6438469, "C": 0.6562725, "r": 0.7065188, "s": 0.8521100}
+LINES |= {"t": 1.0139800}
 
-#: Wavelengths, µm, outside which no formula is evaluated: powers down to λ⁻¹² and their derivatives stay finite inside.
-_SHORTEST, _LONGEST = 1e-20, 1e12
 #: Relative slack at the ends of a wavelength range: a few float32 spacings.
 _RANGE_SLACK = 1e-6
 
@@ -101,12 +87,14 @@ def refractive_index(glass: Glass, wavelength: Tensor) -> Tensor:
     coefficients = glass.coefficients.to(device=wavelength.device, dtype=torch.float64)
     count, *batch = coefficients.shape
     coefficients = coefficients.reshape(count, *[1] * (exact.dim() - len(batch)), *batch)
-    if glass.formula == "constant":  # air is half of all media: no formula, no wavelength
-        n = FORMULAS["constant"](coefficients, exact)
+    formula = FORMULAS[glass.formula]
+    if formula.wavelengths is None:  # air is half of all media: no formula, no wavelength
+        n = formula.index(coefficients, exact)
         return torch.where((n > 0) & (n < torch.inf), n, 0.0).to(wavelength.dtype)
+    shortest, longest = formula.wavelengths
     finite = coefficients.abs() < torch.inf
-    usable = (exact > _SHORTEST) & (exact < _LONGEST) & finite.all(0)
-    n = FORMULAS[glass.formula](torch.where(finite, coefficients, 0.0), torch.where(usable, exact, 1.0))
+    usable = (exact > shortest) & (exact < longest) & finite.all(0)
+    n = formula.index(torch.where(finite, coefficients, 0.0), torch.where(usable, exact, 1.0))
     return torch.where(usable & (n > 0) & (n < torch.inf), n, 0.0).to(wavelength.dtype)
 
 
@@ -182,21 +170,23 @@ def constant(index: float | Tensor, name: str = "") -> Glass:
     return Glass(name, "constant", torch.as_tensor(index, dtype=torch.float64).reshape(1))
 
 
+#: Sellmeier's formulas of three, four and five terms.
+_SELLMEIER = ("sellmeier_1", "sellmeier_3", "sellmeier_5")
+
+
 def sellmeier(strengths: Tensor | Sequence[float], poles: Tensor | Sequence[float], name: str = "", **known) -> Glass:
     """The glass n² = 1 + Σ_i B_i λ²/(λ² - C_i): strengths B_i and poles C_i (µm²), (m, ...) with m ≤ 5.
 
     known: further fields of Glass, such as `wavelength_range`.
     """
     b, c = (torch.as_tensor(part, dtype=torch.float64) for part in (strengths, poles))
-    terms = next((terms for terms in (3, 4, 5) if terms >= b.shape[0]), None)
-    if b.shape[:1] != c.shape[:1] or terms is None:
+    formula = next((name for name in _SELLMEIER if FORMULAS[name].count >= 2 * b.shape[0]), None)
+    if b.shape[:1] != c.shape[:1] or formula is None:
         raise ValueError(f"expected as many strengths as poles and at most 5, found {b.shape[0]} and {c.shape[0]}")
     b, c = torch.broadcast_tensors(b, c)
     pairs = torch.stack([b, c], 1).flatten(0, 1)
-    padding = pairs.new_zeros(2 * terms - pairs.shape[0], *pairs.shape[1:])
-    return Glass(
-        name, {3: "sellmeier_1", 4: "sellmeier_3", 5: "sellmeier_5"}[terms], torch.cat([pairs, padding]), **known
-    )
+    padding = pairs.new_zeros(FORMULAS[formula].count - pairs.shape[0], *pairs.shape[1:])
+    return Glass(name, formula, torch.cat([pairs, padding]), **known)
 
 
 def model_glass(nd: float | Tensor, vd: float | Tensor, dpgf: float | Tensor = 0.0, *, name: str = "") -> Glass:
@@ -220,6 +210,32 @@ def mil_glass(code: str) -> Glass:
     if len(code) != 6 or not (code.isascii() and code.isdigit()):
         raise ValueError(f"a MIL glass code is six digits, as 517642 for nd = 1.517 and Vd = 64.2; found {code!r}")
     return model_glass(float(f"1.{code[:3]}"), float(f"{code[3:5]}.{code[5]}"), name=code)
+
+
+#: Powers of λ in Schott's formula, the first m of which m measured indices decide, and where each stands in it.
+_SCHOTT_POWERS, _SCHOTT_PLACES = (0, -2, 2, -4, -6, -8), (0, 2, 1, 3, 4, 5)
+
+
+def from_table(
+    wavelengths: Sequence[float] | Tensor, indices: Sequence[float] | Tensor, *, name: str = "table"
+) -> Glass:
+    """The glass n² = a₀ + a₂ λ⁻² + a₁ λ² + a₃ λ⁻⁴ + … through indices (m,) at wavelengths (m,) µm.
+
+    Up to six indices are met exactly, more by least squares. Differentiable in the indices.
+    Raises ValueError for lists of unequal length, for equal wavelengths and for numbers that are none.
+    """
+    w, n = (torch.as_tensor(part, dtype=torch.float64) for part in (wavelengths, indices))
+    if w.dim() != 1 or w.shape != n.shape or not len(w):
+        raise ValueError(f"{n.numel()} indices at {w.numel()} wavelengths: expected one each")
+    if not bool((w > 0).all() & torch.isfinite(w).all() & (n > 0).all() & torch.isfinite(n).all()):
+        raise ValueError(f"wavelengths {w.tolist()} µm and indices {n.tolist()}: expected finite, positive numbers")
+    if len(torch.unique(w)) < len(w):
+        raise ValueError(f"a wavelength stands twice in {w.tolist()}: expected one index for each")
+    terms = min(len(w), len(_SCHOTT_POWERS))
+    basis = torch.stack([w**power for power in _SCHOTT_POWERS[:terms]], -1)
+    found = torch.linalg.lstsq(basis, (n * n)[:, None]).solution[:, 0]
+    coefficients = found.new_zeros(6).index_put((torch.tensor(_SCHOTT_PLACES[:terms]),), found)
+    return Glass(name, "schott", coefficients, wavelength_range=(float(w.min()), float(w.max())))
 
 
 def normal_line_deviation(glass: Glass) -> Tensor:

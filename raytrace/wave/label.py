@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from raytrace.files import write_atomically
-from raytrace.media.dispersion import COEFFICIENT_COUNTS
+from raytrace.media.formulas import FORMULAS
 from raytrace.media.glass import Glass
 from raytrace.wave.element import Element
 from raytrace.wave.exchange import HeightMapError, write_heights
@@ -63,7 +63,7 @@ def read_label(path: str | os.PathLike) -> Label | None:
     try:
         found = json.loads(file.read_text(encoding="utf-8"))
         coefficients = torch.tensor(found["coefficients"], dtype=torch.float64)
-        if COEFFICIENT_COUNTS[found["formula"]] != len(coefficients):
+        if FORMULAS[found["formula"]].count != len(coefficients):
             raise ValueError(f"{len(coefficients)} coefficients of {found['formula']}")
         span = found["wavelength_range"]
         numbers = {key: float(found[key]) for key in ("design_wavelength", "pitch", "aperture")}

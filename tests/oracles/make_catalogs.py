@@ -25,16 +25,16 @@ from pathlib import Path
 import torch
 
 from raytrace.media.agf import Catalog, write_agf
-from raytrace.media.dispersion import AGF_FORMULAS, COEFFICIENT_COUNTS
+from raytrace.media.formulas import BY_NUMBER, FORMULAS
 from raytrace.media.glass import LINES, Glass, normal_line_deviation, refractive_index
 
 TITLE = "{name}: dispersion coefficients that agree in two or more public sources; each glass names them in its comment"
 
 
 def glass(row: dict[str, str], alternatives: list[str]) -> Glass:
-    formula = AGF_FORMULAS[int(row["formula"])]
+    formula = BY_NUMBER[int(row["formula"])]
     numbers = [float(word) for word in row["coefficients"].split()]
-    count = COEFFICIENT_COUNTS[formula]
+    count = FORMULAS[formula].count
     if any(numbers[count:]):
         raise SystemExit(f"{row['catalog']} {row['glass']}: more coefficients than formula {formula} takes")
     numbers = (numbers + [0.0] * count)[:count]

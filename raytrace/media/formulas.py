@@ -1,11 +1,11 @@
-"""Dispersion: the formulas of glass catalogs, n of coefficients and wavelength, 0 where there is no real index.
+"""Formulas: n of coefficients and wavelength, 0 where there is no real index; a row of FORMULAS each.
 
-The thirteen formulas of the AGF glass catalog format, numbered as there, a constant index and the model glass of lens
-files; each takes coefficients (m, ...) and wavelengths (...) µm, float64.
+The thirteen dispersion formulas of the AGF glass catalog format, a constant index and the model glass of lens files.
 """
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -139,31 +139,47 @@ def _model(coefficients: Tensor, wavelength: Tensor) -> Tensor:
     return nd + b * (1.0 / wavelength - 1 / _D) + c * (wavelength**-3.5 - _D**-3.5)
 
 
-#: Key -> function of (coefficients (m, ...), wavelength (...) µm), float64, giving n.
-FORMULAS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+class Formula(NamedTuple):
+    """A dispersion formula.
+
+    coefficients: their names. index: function of (coefficients (m, ...), wavelength (...) µm), float64, giving n.
+    number: of the formula in an AGF file. wavelengths: µm, outside which it is not evaluated, so that powers down to
+    λ⁻¹² and their derivatives stay finite; None where the wavelength does not count.
+    """
+
+    coefficients: str
+    index: Callable[[Tensor, Tensor], Tensor]
+    number: int | None = None
+    wavelengths: tuple[float, float] | None = (1e-20, 1e12)
+
+    @property
+    def count(self) -> int:
+        """How many coefficients it takes."""
+        return len(self.coefficients.split())
+
+
+#: Every formula by the name that `Glass.formula` holds.
+FORMULAS = {
     # n² = a0 + a1 λ² + a2 λ⁻² + a3 λ⁻⁴ + a4 λ⁻⁶ + a5 λ⁻⁸
-    "schott": partial(_laurent, (0, 1), (2, 3, 4, 5)),
-    "sellmeier_1": _sellmeier,
-    "herzberger": _herzberger,
-    "sellmeier_2": _sellmeier_2,
-    "conrady": _conrady,
-    "sellmeier_3": _sellmeier,
-    "handbook_1": _handbook_1,
-    "handbook_2": _handbook_2,
-    "sellmeier_4": _sellmeier_4,
+    "schott": Formula("a0 a1 a2 a3 a4 a5", partial(_laurent, (0, 1), (2, 3, 4, 5)), 1),
+    "sellmeier_1": Formula("K1 L1 K2 L2 K3 L3", _sellmeier, 2),
+    "herzberger": Formula("A B C D E F", _herzberger, 3),
+    "sellmeier_2": Formula("A B1 λ1 B2 λ2", _sellmeier_2, 4),
+    "conrady": Formula("n0 A B", _conrady, 5),
+    "sellmeier_3": Formula("K1 L1 K2 L2 K3 L3 K4 L4", _sellmeier, 6),
+    "handbook_1": Formula("A B C D", _handbook_1, 7),
+    "handbook_2": Formula("A B C D", _handbook_2, 8),
+    "sellmeier_4": Formula("A B C D E", _sellmeier_4, 9),
     # the Schott formula continued by a6 λ⁻¹⁰ + a7 λ⁻¹²
-    "extended": partial(_laurent, (0, 1), (2, 3, 4, 5, 6, 7)),
-    "sellmeier_5": _sellmeier,
+    "extended": Formula("a0 a1 a2 a3 a4 a5 a6 a7", partial(_laurent, (0, 1), (2, 3, 4, 5, 6, 7)), 10),
+    "sellmeier_5": Formula("K1 L1 K2 L2 K3 L3 K4 L4 K5 L5", _sellmeier, 11),
     # the Schott formula continued by a6 λ⁴ + a7 λ⁶
-    "extended_2": partial(_laurent, (0, 1, 6, 7), (2, 3, 4, 5)),
+    "extended_2": Formula("a0 a1 a2 a3 a4 a5 a6 a7", partial(_laurent, (0, 1, 6, 7), (2, 3, 4, 5)), 12),
     # n² = a0 + a1 λ² + a2 λ⁴ + a3 λ⁻² + … + a8 λ⁻¹²
-    "extended_3": partial(_laurent, (0, 1, 2), (3, 4, 5, 6, 7, 8)),
-    "constant": _constant,
-    "model": _model,
+    "extended_3": Formula("a0 a1 a2 a3 a4 a5 a6 a7 a8", partial(_laurent, (0, 1, 2), (3, 4, 5, 6, 7, 8)), 13),
+    "constant": Formula("n", _constant, wavelengths=None),
+    "model": Formula("nd Vd ΔPgF", _model),
 }
 
-#: Number in an AGF file -> key of FORMULAS, which begins with the thirteen in that order.
-AGF_FORMULAS = dict(zip(range(1, 14), FORMULAS, strict=False))
-
-#: Number of coefficients of each formula, in the order of FORMULAS.
-COEFFICIENT_COUNTS = dict(zip(FORMULAS, (6, 6, 6, 5, 3, 8, 4, 4, 5, 8, 10, 8, 9, 1, 3), strict=True))
+#: The same by the number in an AGF file.
+BY_NUMBER = {formula.number: name for name, formula in FORMULAS.items() if formula.number}
