@@ -8,7 +8,7 @@ import torch
 from problems import surface
 from torch.autograd import gradcheck, gradgradcheck
 
-from raytrace.system.asphere import sag_and_derivatives
+from raytrace.system.shapes import EVEN, sag_and_derivatives
 from raytrace.system.surface import intersect, sag
 
 ROUNDING = 2.0**-53
@@ -167,8 +167,8 @@ def test_nested_vmap():
 def test_operator_passes_the_checks_of_torch_library():
     p = tensor([[0.0, 1.0], [0.5, 2.0], [-1.0, 0.0]])
     d = tensor([[0.0, 0.0], [0.0, 0.0], [1.0, 1.0]])
-    arguments = (p, d, tensor(0.02), tensor(-1.0), tensor([0.0, 1e-5]), math.inf)
-    torch.library.opcheck(torch.ops.raytrace.asphere_root.default, arguments)
+    arguments = (p, d, tensor(0.02), tensor(-1.0), tensor([0.0, 1e-5]), EVEN, [], "", math.inf)
+    torch.library.opcheck(torch.ops.raytrace.first_crossing.default, arguments)
 
 
 def test_empty_batch_and_no_hits():

@@ -18,8 +18,9 @@ from raytrace.optics.launch import launch
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.scene import scene, symmetry
 from raytrace.optics.trace import media, steps, trace_lens
-from raytrace.system.departure import GridSag, ZernikeSag, covers, numbers, sag_of, spline
+from raytrace.system.departure import GridSag, ZernikeSag, spline
 from raytrace.system.rays import start
+from raytrace.system.shapes import Relief, relief
 from raytrace.system.surface import intersect, normal, sag, sag_at
 
 RADIUS = vector(4.0)[0]
@@ -75,7 +76,7 @@ ALL = {
 @pytest.mark.parametrize("departure", [bumpy(), sampled(wavy, 12)], ids=["zernike", "grid"])
 def test_slopes_are_the_derivatives_of_the_sag(departure):
     x, y = points(50).requires_grad_().unbind()
-    found = sag_of(numbers(departure), x, y)
+    found = relief(departure).sag(x, y)
     of_x, of_y = torch.autograd.grad(found.z.sum(), (x, y), create_graph=True)
     of_xx, of_xy = torch.autograd.grad(of_x.sum(), (x, y), retain_graph=True)
     (of_yy,) = torch.autograd.grad(of_y.sum(), y)
@@ -89,7 +90,7 @@ def test_zernike_sag_is_the_sum_of_the_polynomials():
     coefficients = torch.linspace(-1, 1, 136, dtype=torch.float64)
     orders = [zernike.noll(j) for j in range(1, 137)]
     expected = torch.tensordot(coefficients, zernike.polynomials(orders, x / RADIUS, y / RADIUS), 1)
-    found = sag_of(numbers(ZernikeSag(coefficients, RADIUS)), x, y).z
+    found = relief(ZernikeSag(coefficients, RADIUS)).sag(x, y).z
     assert (found - expected).abs().max() < 1e-13 * coefficients.abs().sum()
 
 
@@ -99,9 +100,9 @@ def test_spline_passes_through_its_heights_and_its_error_falls_with_the_fourth_p
     for size in (16, 32, 64):
         departure = sampled(wavy, size)
         line = (torch.arange(size, dtype=torch.float64) - 0.5 * (size - 1)) * departure.pitch
-        at = sag_of(numbers(departure), line.expand(size, size), line[:, None].expand(size, size)).z
+        at = relief(departure).sag(line.expand(size, size), line[:, None].expand(size, size)).z
         assert (at - departure.heights).abs().max() < 1e-15
-        errors.append(float((sag_of(numbers(departure), x, y).z - wavy(x, y)).abs().max()))
+        errors.append(float((relief(departure).sag(x, y).z - wavy(x, y)).abs().max()))
     assert errors[0] / errors[1] > 10
     assert errors[1] / errors[2] > 12
     assert errors[2] < 4e-6  # mm; near the rim one-sided: 1.3 h⁴ of a fourth derivative of 0.07
@@ -113,26 +114,26 @@ def test_cubics_are_splines_exactly():
 
     x, y = points(100, 4.0)
     departure = sampled(cubic, 9)
-    assert (sag_of(numbers(departure), x, y).z - cubic(x, y)).abs().max() < 1e-13
+    assert (relief(departure).sag(x, y).z - cubic(x, y)).abs().max() < 1e-13
 
 
 def test_large_grids_are_filtered_in_parts_as_in_one_go():
     heights = torch.rand(300, 5, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    small = numbers(GridSag(heights[:60], vector(1.0)[0]))[0]
-    large = numbers(GridSag(heights, vector(1.0)[0]))[0]
+    small = relief(GridSag(heights[:60], vector(1.0)[0])).numbers[0]
+    large = relief(GridSag(heights, vector(1.0)[0])).numbers[0]
     assert (small[:20] - large[:20]).abs().max() < 1e-14  # the far end is 40 points away: (2 - √3)^40
     line = torch.arange(300, dtype=torch.float64) - 149.5
-    at = sag_of((large, vector(1.0)[0]), torch.zeros(300, dtype=torch.float64), line).z
+    at = Relief("SplineSag", (large, vector(1.0)[0])).sag(torch.zeros(300, dtype=torch.float64), line).z
     assert (at - heights[:, 2]).abs().max() < 1e-14
 
 
 def test_rows_are_y_and_columns_x():
     heights = torch.zeros(6, 7, dtype=torch.float64)
     heights[0, 5] = 1.0  # the smallest y, near the largest x
-    shape = numbers(GridSag(heights, vector(0.5)[0]))
-    assert float(sag_of(shape, vector(1.0), vector(-1.25)).z) == pytest.approx(1.0)
-    assert bool(covers(shape, vector(1.74), vector(1.49)))
-    assert not bool(covers(shape, vector(1.0), vector(1.51)))
+    shape = relief(GridSag(heights, vector(0.5)[0]))
+    assert float(shape.sag(vector(1.0), vector(-1.25)).z) == pytest.approx(1.0)
+    assert bool(shape.covers(vector(1.74), vector(1.49)))
+    assert not bool(shape.covers(vector(1.0), vector(1.51)))
 
 
 def test_a_spline_found_once_is_the_grid_bit_for_bit_with_its_gradients():
@@ -151,7 +152,7 @@ def test_a_spline_found_once_is_the_grid_bit_for_bit_with_its_gradients():
 
 def test_a_grid_of_three_heights_is_refused():
     with pytest.raises(ValueError, match="3 × 5 heights"):
-        numbers(GridSag(torch.zeros(3, 5, dtype=torch.float64), RADIUS))
+        relief(GridSag(torch.zeros(3, 5, dtype=torch.float64), RADIUS))
 
 
 def beyond(front, departure_free, tolerance):

@@ -162,7 +162,8 @@ FORBIDDEN_CALLS = {"item": "synchronises with the host", "numpy": "leaves the gr
 PHYSICS = [
     "maths.numerics",
     "system.surface",
-    "system.asphere",
+    "system.search",
+    "system.shapes",
     "optics.trace",
     "optics.paraxial",
     "optics.aiming",

@@ -14,7 +14,7 @@ from raytrace.maths.value import to
 from raytrace.media.glass import MIRROR
 from raytrace.optics.launch import launch
 from raytrace.optics.trace import media, trace_surfaces
-from raytrace.system import asphere
+from raytrace.system import search
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Aperture
 
@@ -25,7 +25,7 @@ READS = {
 }  # fmt: skip
 COPIES = {"_to_copy", "copy_", "to"}
 #: Operators of this package, and what each runs where no mode can see it.
-OWN = {"asphere_root": asphere.search}
+OWN = {"first_crossing": search.search}
 
 
 class HostReads(TorchDispatchMode):
@@ -65,7 +65,7 @@ def clipped():
     edges = [
         Aperture("circular", (0.0, 15.0)),
         Aperture("rectangular", (12.0, 12.0)),
-        Aperture("elliptical", (9.0, 10.0), obscures=True),
+        Aperture("elliptic", (9.0, 10.0), obscures=True),
     ]
     surfaces = list(found.surfaces)
     for k, edge in zip((1, 6, 11), edges, strict=True):
@@ -185,7 +185,7 @@ def test_search_of_an_asphere_reads_nothing_back_off_the_cpu(monkeypatch):
     found = []
     for early in (True, False):
         if not early:
-            monkeypatch.setattr(asphere, "_reads_are_free", lambda tensor: False)
+            monkeypatch.setattr(search, "_reads_are_free", lambda tensor: False)
         system, rays, indices = prepared(strong_asphere())
         with tracing("eager"), HostReads() as reads:
             end = forward_and_backward(system, rays, indices)
@@ -201,7 +201,7 @@ def test_search_of_an_asphere_reads_nothing_back_off_the_cpu(monkeypatch):
 def test_search_of_an_asphere_needs_no_numbers_off_the_cpu():
     shapes = {"foot": (3, 5), "direction": (3, 5), "curvature": (), "conic": (), "coefficients": (3,)}
     given = {name: torch.empty(shape, dtype=torch.float64, device="meta") for name, shape in shapes.items()}
-    t, met = asphere.search(**given, rim=9.0)
+    t, met = search.search(**given, kind="even asphere", numbers=[], departure="", rim=9.0)
     assert t.shape == met.shape == (5,)
 
 

@@ -19,10 +19,10 @@ from torch import Tensor
 from raytrace.maths.result import Result, axis
 from raytrace.maths.value import value
 from raytrace.optics.launch import paraxial_field
-from raytrace.optics.paraxial import FirstOrder, first_order, marginal_ray, signed, vertex_curvature
+from raytrace.optics.paraxial import FirstOrder, first_order, marginal_ray, signed
 from raytrace.optics.trace import media
 from raytrace.system.lens import Lens, largest_field
-from raytrace.system.surface import Surface
+from raytrace.system.surface import Surface, vertex_curvature
 
 
 @value

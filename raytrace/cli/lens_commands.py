@@ -11,9 +11,10 @@ from raytrace.cli.door import catalogs, field_points, find_lens, open_lens, prin
 from raytrace.formats import LensFileWarning, read_lens_with_report, write_lens
 from raytrace.maths.result import number, numbers
 from raytrace.optics.f_number import real_working_f_number
-from raytrace.optics.paraxial import first_order, vertex_curvature
+from raytrace.optics.paraxial import first_order
 from raytrace.optics.trace import media
 from raytrace.system.lens import FIELD_UNITS, Lens, check_media
+from raytrace.system.surface import vertex_curvature
 
 #: Lines of `raytrace info`: words, entry of FirstOrder (and the real working F/#), unit.
 FIRST_ORDER_LINES = (

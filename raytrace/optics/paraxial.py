@@ -10,9 +10,8 @@ from torch import Tensor
 
 from raytrace.maths.value import value
 from raytrace.optics.trace import media
-from raytrace.system.departure import numbers, sag_of
 from raytrace.system.lens import Lens, largest_field
-from raytrace.system.surface import Surface
+from raytrace.system.surface import Surface, vertex_curvature
 
 
 @value
@@ -57,20 +56,6 @@ class FirstOrder:
     petzval_radius: Tensor
     front_principal_plane: Tensor
     rear_principal_plane: Tensor
-
-
-def vertex_curvature(surface: Surface) -> Tensor:
-    """c + 2 a₁ + (D_xx + D_yy)/2 in 1/mm: the r² term of an asphere bends the vertex like a curvature.
-
-    A departure D may bend it differently along x and y: this is the mean. Its tilt at the vertex is left out.
-    """
-    total = torch.zeros_like(surface.thickness) if surface.curvature is None else surface.curvature
-    total = total if surface.coefficients is None else total + 2 * surface.coefficients[0]
-    if surface.departure is None:
-        return total
-    centre = torch.zeros_like(surface.thickness)
-    bend = sag_of(numbers(surface.departure), centre, centre)
-    return total + 0.5 * (bend.xx + bend.yy)
 
 
 def signed(surfaces: Sequence[Surface], indices: Sequence[Tensor]) -> list[Tensor]:

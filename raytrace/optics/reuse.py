@@ -22,6 +22,7 @@ from raytrace.optics.trace import Crossing, media, steps, trace_surfaces
 from raytrace.optics.vignetting import vignette
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.rays import Rays
+from raytrace.system.surface import SHAPE
 
 _NODES = 10  # object distances that are traced in place of a range
 _CLOSE = 1e-9  # mm and direction cosines: what interpolated rays may err by
@@ -177,7 +178,7 @@ def _unvaried(lens: Lens, indices: Sequence[Tensor]) -> int:
     """How many surfaces after the object lie before the first that a variable moves, bends or stands behind."""
     for count, surface in enumerate(lens.surfaces[1:]):
         gap = lens.surfaces[count].thickness if count else None
-        shape = surface.curvature, surface.conic, surface.coefficients, surface.departure
+        shape = [getattr(surface, name) for name in SHAPE]
         numbers = pytree.tree_leaves((gap, shape, *indices[count : count + 2]))
         if any(isinstance(number, Tensor) and number.requires_grad for number in numbers):
             return count

@@ -12,6 +12,7 @@ from raytrace.optics.trace import Crossing
 from raytrace.optics.vignetting import vignette
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.rays import Rays
+from raytrace.system.surface import is_round
 
 
 class EmptyPsf(ValueError):
@@ -124,9 +125,9 @@ def symmetry(scene: Scene) -> str:
 
     "round": symmetric about the axis, a meridian of the pupil stands for all of it; "mirror": symmetric in x, the half
     of x > 0 stands for the other. Fields and vignetting factors to be differentiated have none: moving one breaks it;
-    nor has a lens with a departure, whatever its numbers are.
+    nor has a lens with a surface of a kind that is not round, whatever its numbers are.
     """
-    if any(surface.departure is not None for surface in scene.lens.surfaces):
+    if not all(is_round(surface) for surface in scene.lens.surfaces):
         return "none"
     apertures = [aperture for surface in scene.lens.surfaces for aperture in surface.apertures]
     moving = [scene.fields, scene.lens.fields.vignetting, *(c for aperture in apertures for c in aperture.centre)]

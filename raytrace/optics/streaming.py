@@ -21,6 +21,7 @@ from raytrace.optics.spot import where_lit
 from raytrace.optics.trace import media, trace_surfaces
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
+from raytrace.system.surface import is_searched
 
 MAX_BYTES = 256 * 2**20
 _CHUNK = {"cpu": 2**15}  # rays whose temporaries stay in the caches of a core
@@ -222,7 +223,7 @@ def chunk_size(shot: Shot, max_bytes: int, *, kept: int = 0, recorded: bool = Fa
 def bytes_per_ray(shot: Shot, *, recorded: bool = False) -> int:
     """Bytes of temporaries a ray takes at most; all rays of an asphere may need its bracketed search."""
     surfaces = shot.lens.surfaces
-    aspheric = sum(s.coefficients is not None or s.departure is not None for s in surfaces)
+    aspheric = sum(map(is_searched, surfaces))
     total = _BYTES_OF_TRACE + (_BYTES_OF_SEARCH if aspheric else 0)
     if recorded:
         total += _BYTES_OF_RECORDED_SURFACE * (len(surfaces) + aspheric)

@@ -4,8 +4,8 @@
     SplineSag    the same by its coefficients c, found once
     ZernikeSag   D = Σ_j c_j Z_j(x/R, y/R), Noll's polynomials
 
-Slopes and second derivatives are written out, and autograd may differentiate them further. Everything a search needs
-of a departure is two tensors, its `numbers`: those of all kinds pass through one operator.
+Slopes and second derivatives are written out, and autograd may differentiate them further. What rays need of a
+departure are its numbers, its tensors in float64: the functions of each kind are its row in `shapes`.
 """
 
 import functools
@@ -68,18 +68,6 @@ class Sag(NamedTuple):
     yy: Tensor
 
 
-def numbers(departure: Departure) -> tuple[Tensor, Tensor]:
-    """What `sag_of` needs, in float64: spline coefficients (rows + 2, columns + 2) and pitch, or (J,) and the radius.
-
-    Raises ValueError for a grid of fewer than 4 × 4 heights.
-    """
-    if isinstance(departure, ZernikeSag):
-        return departure.coefficients.double(), departure.radius.double()
-    if isinstance(departure, GridSag):
-        departure = spline(departure)
-    return departure.coefficients.double(), departure.pitch.double()
-
-
 def spline(grid: GridSag) -> SplineSag:
     """The spline of a grid, in float64: what is traced many times is filtered once, gradients to the heights included.
 
@@ -92,28 +80,23 @@ def spline(grid: GridSag) -> SplineSag:
     return SplineSag(_spline_coefficients(_spline_coefficients(heights).T).T, grid.pitch.double())
 
 
-def sag_of(numbers: tuple[Tensor, Tensor], x: Tensor, y: Tensor, *, highest: int = 2) -> Sag:
-    """The departure of these `numbers` at points (...) mm; a grid's goes on beyond its edge with the height there."""
-    shape, scale = numbers
-    return (_spline if shape.dim() == 2 else _zernike)(shape, scale, x, y, highest)
-
-
-def covers(numbers: tuple[Tensor, Tensor], x: Tensor, y: Tensor) -> Tensor:
-    """Whether there is a surface at points (...) mm."""
-    shape, pitch = numbers
-    if shape.dim() == 1:
-        return torch.ones_like(x, dtype=torch.bool)
-    half_y, half_x = (0.5 * (count - 2) * pitch for count in shape.shape)
+def spline_covers(numbers: Sequence[Tensor], x: Tensor, y: Tensor) -> Tensor:
+    """Whether points (...) mm lie on the grid."""
+    c, pitch = numbers
+    half_y, half_x = (0.5 * (count - 2) * pitch for count in c.shape)
     return (x.abs() <= half_x) & (y.abs() <= half_y)
 
 
-def size_of(numbers: tuple[Tensor, Tensor]) -> Tensor:
-    """A bound on |D| in mm: over the grid, or over the disc of the polynomials."""
-    shape, _ = numbers
-    if shape.dim() == 2:
-        return shape.abs().max()  # the weights of a spline are positive and sum to 1
-    norms = shape.new_tensor([norm(*noll(j)) for j in range(1, len(shape) + 1)])
-    return (norms * shape.abs()).sum()
+def spline_size(numbers: Sequence[Tensor]) -> Tensor:
+    """A bound on |D| over the grid: the weights of a spline are positive and sum to 1."""
+    return numbers[0].abs().max()
+
+
+def zernike_size(numbers: Sequence[Tensor]) -> Tensor:
+    """A bound on |D| over the disc."""
+    c = numbers[0]
+    norms = c.new_tensor([norm(*noll(j)) for j in range(1, len(c) + 1)])
+    return (norms * c.abs()).sum()
 
 
 def _spline_coefficients(heights: Tensor) -> Tensor:
@@ -140,9 +123,10 @@ def _prefilter(count: int) -> np.ndarray:
     return np.linalg.inv(system)[:, 1:-1].copy()
 
 
-def _spline(c: Tensor, pitch: Tensor, x: Tensor, y: Tensor, highest: int) -> Sag:
+def spline_sag(numbers: Sequence[Tensor], x: Tensor, y: Tensor, highest: int) -> Sag:
+    """The spline at points (...) mm; beyond its edge with the height there."""
     x, y = torch.broadcast_tensors(x, y)
-    c, pitch = c.to(x.dtype), pitch.to(x.dtype)
+    c, pitch = (number.to(x.dtype) for number in numbers)
     row, weights_y = _weights(y / pitch, c.shape[0] - 2, highest)
     column, weights_x = _weights(x / pitch, c.shape[1] - 2, highest)
     lines = [[c[row + a, column + b] for b in range(4)] for a in range(4)]
@@ -186,9 +170,9 @@ def _combined(weights: Sequence[Tensor], values: Sequence[Tensor]) -> Tensor:
     return total
 
 
-def _zernike(c: Tensor, radius: Tensor, x: Tensor, y: Tensor, highest: int) -> Sag:
+def zernike_sag(numbers: Sequence[Tensor], x: Tensor, y: Tensor, highest: int) -> Sag:
     """Σ_m (Σ_k c_mk N P_k(t)) H_m, t = 2 r² - 1, with the harmonics H_m of `zernike.polynomials`; ∇²H = 0."""
-    c, radius = c.to(x.dtype), radius.to(x.dtype)
+    c, radius = (number.to(x.dtype) for number in numbers)
     x, y = torch.broadcast_tensors(x / radius, y / radius)
     zero, one = torch.zeros_like(x), torch.ones_like(x)
     harmonics, radial = _harmonics(c, x, y), _radial(c, 2 * (x * x + y * y) - 1)

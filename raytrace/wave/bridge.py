@@ -39,8 +39,9 @@ from raytrace.optics.scene import Scene, symmetry
 from raytrace.optics.trace import media, trace_surfaces
 from raytrace.optics.vignetting import vignette
 from raytrace.optics.wavefront import Wavefront, wavefront_of
-from raytrace.system.departure import GridSag, ZernikeSag, numbers, sag_of, spline
+from raytrace.system.departure import GridSag, ZernikeSag, spline
 from raytrace.system.lens import Fields, Lens, SystemAperture, with_object_distance
+from raytrace.system.shapes import relief
 from raytrace.system.surface import Surface, sag_at
 from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike, is_radial, path, profile_height
 
@@ -124,13 +125,13 @@ def surfaces_of(element: Element, *, substrate: Tensor | float = 0.0) -> tuple[S
         back = dataclasses.replace(back, coefficients=profile.coefficients)
     elif isinstance(profile, Zernike):
         departure = ZernikeSag(profile.coefficients, element.radius)
-        centre = sag_of(numbers(departure), zero, zero, highest=0).z
+        centre = relief(departure).sag(zero, zero, highest=0).z
         piston = torch.nn.functional.pad(centre[None], (0, len(profile.coefficients) - 1))
         departure = ZernikeSag(profile.coefficients - piston, element.radius)
         back = dataclasses.replace(back, departure=departure)
     else:
         departure = spline(GridSag(profile.heights, profile.pitch))
-        centre = sag_of(numbers(departure), zero, zero, highest=0).z
+        centre = relief(departure).sag(zero, zero, highest=0).z
         # The weights of a spline sum to 1: less everywhere as at the axis. Found once, however often it is traced.
         departure = dataclasses.replace(departure, coefficients=departure.coefficients - centre)
         back = dataclasses.replace(back, departure=departure)

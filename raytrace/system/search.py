@@ -1,90 +1,77 @@
-"""Even asphere: its sag with derivatives, and the first crossing of a ray with it, found robustly.
+"""Search: the first crossing of a ray with a surface that is more than a conic, found robustly.
 
 A strong asphere may be crossed several times (gull wings), and Newton's method alone can settle on a wrong crossing
-or on none. `asphere_root` runs Newton from the base conic, accepts by a residual relative to the size of the terms,
+or on none. `first_crossing` runs Newton from the base conic, accepts by a residual relative to the size of the terms,
 and sends the few rays that fail to a bracketed search. It is one opaque operator, so that `torch.func` and
 `torch.compile` accept the data-dependent search inside; derivatives are attached by the caller.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import broadcast_shape, polynomial, with_batch_axes
+from raytrace.maths.numerics import broadcast_shape, with_batch_axes
+from raytrace.system.shapes import EVEN, Relief, sag_and_derivatives, size_of_terms
 
 _NEWTON_STEPS = 24
 _BISECTIONS = 64
 _SAMPLES = 96
 _ACCEPTED_RESIDUAL = 64.0  # units of the rounding error of the terms of F
 
-#: (x, y) -> D, D_x, D_y (...) of what a sag has beside the asphere, and a bound on |D|.
-Extra = tuple[Callable[[Tensor, Tensor], Sequence[Tensor]], Tensor]
-
-
-def sag_and_derivatives(
-    u: Tensor,
-    curvature: Tensor | None,
-    conic: Tensor | None,
-    coefficients: Tensor | None,
-    highest: int = 2,
-    *,
-    along: Tensor | float = 1.0,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """S(u), dS/du, d²S/du² v² with u = r² (...) in mm²; derivatives above the `highest` asked for stay 0.
-
-    along: v, by whose square the second derivative comes multiplied: c³ alone leaves the range of numbers before any
-    length or curvature does. Beyond the edge of a closed conic its radicand is held at 0+.
-
-    S = c u/(1+w) + Σ_j a_j u^j,  w = √(1 - (1+k) c² u);  dS = c/2w + …;  d²S = (1+k) c³/4w³ + …
-    """
-    S = dS = d2S = torch.zeros_like(u)
-    if curvature is not None:
-        c = curvature
-        shape = 1.0 if conic is None else 1 + conic
-        radicand = 1 - shape * (c * (c * u))  # also its derivatives stay in range: neither c² nor r² c̄
-        w = torch.sqrt(torch.where(radicand > 0, radicand, torch.finfo(u.dtype).tiny))
-        S = c * u / (1 + w)
-        if highest > 0:
-            dS = 0.5 * c / w
-        if highest > 1:
-            tilt = c * along / w
-            d2S = 0.25 * shape * c / w * tilt * tilt
-    if coefficients is not None:
-        S = S + u * polynomial(coefficients, u)
-        if highest > 0:
-            order = torch.arange(1, len(coefficients) + 1, dtype=coefficients.dtype, device=coefficients.device)
-            order = order.reshape(-1, *(1,) * (coefficients.dim() - 1))
-            first = order * coefficients
-            dS = dS + polynomial(first, u)
-            if highest > 1:
-                d2S = d2S + polynomial(((order - 1) * first)[1:], u) * along * along
-    return S, dS, d2S
-
-
 # An operator by the lower door of torch.library: `torch.library.custom_op` would load the compiler at its first call.
 torch.library.define(
-    "raytrace::asphere_root",
-    "(Tensor foot, Tensor direction, Tensor curvature, Tensor conic, Tensor coefficients, float rim)"
-    " -> (Tensor, Tensor)",
+    "raytrace::first_crossing",
+    "(Tensor foot, Tensor direction, Tensor curvature, Tensor conic, Tensor coefficients, str kind, Tensor[] numbers,"
+    " str departure, float rim) -> (Tensor, Tensor)",
 )
 
 
-def asphere_root(
-    foot: Tensor, direction: Tensor, curvature: Tensor, conic: Tensor, coefficients: Tensor, rim: float
+def first_crossing(
+    foot: Tensor,
+    direction: Tensor,
+    curvature: Tensor,
+    conic: Tensor,
+    coefficients: Tensor,
+    rim: float,
+    *,
+    kind: str = EVEN,
+    relief: Relief | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Path t (...) from `foot` to the first crossing with the asphere, and whether there is one (...).
+    """Path t (...) from `foot` to the first crossing with the surface, and whether there is one (...).
 
-    foot, direction: (3, ...); curvature, conic: (...); coefficients: (m, ...); rim: mm, semi-diameter within which
-    the first crossing is wanted (inf: the whole sag); a crossing outside the rim is taken only if there is none in it.
-    Worked in float64 also for float32 rays; not differentiated: hand it detached tensors.
+    foot, direction: (3, ...); curvature, conic: (...); coefficients: (m, ...) of this kind; rim: mm, semi-diameter
+    within which the first crossing is wanted (inf: the whole sag); a crossing outside the rim is taken only if there is
+    none in it. Worked in float64 also for float32 rays; not differentiated: hand it detached tensors.
     """
-    return torch.ops.raytrace.asphere_root(foot, direction, curvature, conic, coefficients, rim)
+    numbers, departure = ([], "") if relief is None else ([number.detach() for number in relief.numbers], relief.kind)
+    find = torch.ops.raytrace.first_crossing
+    return find(foot, direction, curvature, conic, coefficients, kind, numbers, departure, rim)
 
 
-@torch.library.impl("raytrace::asphere_root", "CompositeExplicitAutograd")
-def _(foot: Tensor, direction: Tensor, curvature: Tensor, conic: Tensor, coefficients: Tensor, rim: float):
-    return search(foot, direction, curvature, conic, coefficients, rim)
+@torch.library.register_fake("raytrace::first_crossing")
+def _(foot, direction, curvature, conic, coefficients, kind, numbers, departure, rim):
+    batch = broadcast_shape(foot.shape[1:], direction.shape[1:], curvature.shape, conic.shape, coefficients.shape[1:])
+    return foot.new_empty(batch), foot.new_empty(batch, dtype=torch.bool)
+
+
+@torch.library.register_vmap("raytrace::first_crossing")
+def _(info, in_dims, foot, direction, curvature, conic, coefficients, kind, numbers, departure, rim):
+    """Move the mapped axis in front of the batch axes; departures that differ are gone through one by one."""
+    tensors, find = (foot, direction, curvature, conic, coefficients), torch.ops.raytrace.first_crossing
+    dims = in_dims[6] if departure else []
+    if all(dim is None for dim in dims):
+        return find(*_aligned(tensors, in_dims[:5]), kind, numbers, departure, rim), (0, 0)
+
+    def part(given, dims, i: int) -> list[Tensor]:
+        return [x if dim is None else x.select(dim, i) for x, dim in zip(given, dims, strict=True)]
+
+    each = [
+        find(*part(tensors, in_dims[:5], i), kind, part(numbers, dims, i), departure, rim)
+        for i in range(info.batch_size)
+    ]
+    return tuple(torch.stack(found) for found in zip(*each, strict=True)), (0, 0)
 
 
 def search(
@@ -93,10 +80,13 @@ def search(
     curvature: Tensor,
     conic: Tensor,
     coefficients: Tensor,
+    kind: str,
+    numbers: Sequence[Tensor],
+    departure: str,
     rim: float,
-    extra: Extra | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """What `asphere_root` does, outside of transforms; with `extra`, on a sag that is not symmetric about the axis."""
+    """What the operator does, outside of transforms."""
+    relief = Relief(departure, numbers) if departure else None
     batch = broadcast_shape(foot.shape[1:], direction.shape[1:], curvature.shape, conic.shape, coefficients.shape[1:])
     p, d = _expand(foot.double(), batch).reshape(3, -1), _expand(direction.double(), batch).reshape(3, -1)
     c, k = curvature.double().expand(batch).reshape(-1), conic.double().expand(batch).reshape(-1)
@@ -104,22 +94,27 @@ def search(
     # A coefficient axis without batch is kept short: `polynomial` broadcasts it.
     a = coefficients[:, None] if coefficients.dim() == 1 else _expand(coefficients, batch).flatten(1)
 
-    t, residual_small, forward, radius = _newton(p, d, c, k, a, _start(p, d, c, k, rim), extra)
+    rays = _Rays(p, d, c, k, a, rim, kind, relief, None if relief is None else relief.size())
+    t, residual_small, forward, radius = _newton(rays, _start(rays))
     converged = residual_small & forward
     good = converged & (radius <= rim)
     if not _reads_are_free(t):
-        t_few, found = _bracketed(p, d, c, k, a, rim, extra)
+        t_few, found = _bracketed(rays)
         t = torch.where(good | ~found, t, t_few)
         good = good | found | converged
     elif not bool(good.all()):
         few = ~good
-        subset = a if a.shape[1] == 1 else a[:, few]
-        t_few, found = _bracketed(p[:, few], d[:, few], c[few], k[few], subset, rim, extra)
+        t_few, found = _bracketed(rays.of(few))
         t = t.clone()
         t[few] = torch.where(found, t_few, t[few])
         good[few] = found | converged[few]
+    if relief is not None:
+        good = good & relief.covers(p[0] + t * d[0], p[1] + t * d[1])
     t = torch.where(good, t, 0.0)
     return t.reshape(batch).to(foot.dtype), good.reshape(batch).clone()
+
+
+torch.library.impl("raytrace::first_crossing", "CompositeExplicitAutograd")(search)
 
 
 def _reads_are_free(tensor: Tensor) -> bool:
@@ -136,19 +131,7 @@ def _expand(x: Tensor, batch: torch.Size) -> Tensor:
     return with_batch_axes(x, len(batch)).expand(x.shape[0], *batch)
 
 
-@torch.library.register_fake("raytrace::asphere_root")
-def _(foot, direction, curvature, conic, coefficients, rim):
-    batch = broadcast_shape(foot.shape[1:], direction.shape[1:], curvature.shape, conic.shape, coefficients.shape[1:])
-    return foot.new_empty(batch), foot.new_empty(batch, dtype=torch.bool)
-
-
-@torch.library.register_vmap("raytrace::asphere_root")
-def _(info, in_dims, foot, direction, curvature, conic, coefficients, rim):
-    """Move the mapped axis in front of the batch axes, and give every mapped argument the same batch rank."""
-    return asphere_root(*aligned((foot, direction, curvature, conic, coefficients), in_dims[:5]), rim), (0, 0)
-
-
-def aligned(tensors: Sequence[Tensor], in_dims: Sequence[int | None]) -> list[Tensor]:
+def _aligned(tensors: Sequence[Tensor], in_dims: Sequence[int | None]) -> list[Tensor]:
     """Foot, direction, curvature, conic, coefficients with the mapped axis in front of all batch axes."""
     leading = (1, 1, 0, 0, 1)  # component or term axis before the batch axes
     mapped = [dim is not None for dim in in_dims]
@@ -162,8 +145,33 @@ def aligned(tensors: Sequence[Tensor], in_dims: Sequence[int | None]) -> list[Te
     return found
 
 
-def _start(p: Tensor, d: Tensor, c: Tensor, k: Tensor, rim: float) -> Tensor:
+class _Rays(NamedTuple):
+    """Rays (n,) in float64 and the surface they look for: foot, direction, c, k, coefficients (m, n or 1), rim, kind, D
+    and a bound on |D|."""
+
+    p: Tensor
+    d: Tensor
+    c: Tensor
+    k: Tensor
+    a: Tensor
+    rim: float
+    kind: str
+    relief: Relief | None
+    size: Tensor | None
+
+    def of(self, few: Tensor) -> "_Rays":
+        """Some of them."""
+        a = self.a if self.a.shape[1] == 1 else self.a[:, few]
+        return self._replace(p=self.p[:, few], d=self.d[:, few], c=self.c[few], k=self.k[few], a=a)
+
+    def sag(self, u: Tensor, highest: int) -> tuple[Tensor, Tensor, Tensor]:
+        """The sag without D at r² (..., n)."""
+        return sag_and_derivatives(u, self.c, self.k, self.a, highest, kind=self.kind)
+
+
+def _start(rays: _Rays) -> Tensor:
     """The base conic's crossing if it lies inside the rim, else the vertex plane's, else the foot."""
+    p, d, c, k, _, rim, *_ = rays
     N = d[2]
     flat = N.abs() > 1e-6
     plane = torch.where(flat, -p[2] / torch.where(flat, N, 1.0), 0.0)
@@ -180,45 +188,46 @@ def _start(p: Tensor, d: Tensor, c: Tensor, k: Tensor, rim: float) -> Tensor:
     return torch.where(usable & (radius <= rim), t, plane)
 
 
-def _residual(p, d, c, k, a, t, extra=None):
+def _residual(rays: _Rays, t: Tensor):
     """F = z - S(r²), F' = dF/dt, the rounding scale of F, and r² at t."""
+    p, d, c, k, a, _, kind, relief, size = rays
     x, y, z = p[0] + t * d[0], p[1] + t * d[1], p[2] + t * d[2]
     u = x * x + y * y
-    S, dS, _ = sag_and_derivatives(u, c, k, a, 1)
+    S, dS, _ = rays.sag(u, 1)
     radial = x * d[0] + y * d[1]
-    scale = z.abs() + (c * u).abs() + u * polynomial(a.abs(), u) + p[2].abs() + (t * d[2]).abs()
+    scale = z.abs() + (c * u).abs() + size_of_terms(u, a, kind) + p[2].abs() + (t * d[2]).abs()
     scale = scale + 2 * dS.abs() * (u + radial.abs() * t.abs())
     inside_domain = 1 - (1 + k) * (c * (c * u)) > 0
     F, dF = z - S, d[2] - 2 * dS * radial
-    if extra is not None:
-        (D, D_x, D_y), bound = extra[0](x, y), extra[1]
+    if relief is not None:
+        D, D_x, D_y, *_ = relief.sag(x, y, highest=1)
         F, dF = F - D, dF - (D_x * d[0] + D_y * d[1])
-        scale = scale + bound + (D_x.abs() + D_y.abs()) * (x.abs() + y.abs() + t.abs())
+        scale = scale + size + (D_x.abs() + D_y.abs()) * (x.abs() + y.abs() + t.abs())
     return F, dF, scale, u, inside_domain
 
 
-def _newton(p, d, c, k, a, t, extra=None):
+def _newton(rays: _Rays, t: Tensor):
     """Newton's method with each ray frozen once converged, so that no ray's result depends on its neighbours."""
-    rounding = torch.finfo(p.dtype).eps
+    rounding = torch.finfo(t.dtype).eps
     active = torch.ones_like(t, dtype=torch.bool)
     for _ in range(_NEWTON_STEPS):
-        F, dF, scale, _, _ = _residual(p, d, c, k, a, t, extra)
+        F, dF, scale, _, _ = _residual(rays, t)
         usable = (dF != 0) & torch.isfinite(F)
         step = torch.where(usable, F / torch.where(usable, dF, 1.0), 0.0)
         t = torch.where(active, t - step, t)
         active = active & usable & (F.abs() > rounding * scale)
         if _reads_are_free(t) and not bool(active.any()):
             break
-    F, dF, scale, u, inside_domain = _residual(p, d, c, k, a, t, extra)
+    F, dF, scale, u, inside_domain = _residual(rays, t)
     small = (F.abs() <= _ACCEPTED_RESIDUAL * rounding * scale) & inside_domain & torch.isfinite(t)
-    forward = dF * torch.where(d[2] < 0, -1.0, 1.0) > 0
+    forward = dF * torch.where(rays.d[2] < 0, -1.0, 1.0) > 0
     return t, small, forward, torch.sqrt(u)
 
 
-def _bracketed(p, d, c, k, a, rim, extra=None):
+def _bracketed(rays: _Rays):
     """First crossing in the direction of propagation on the stretch of ray inside rim and sag range (1-D batch)."""
+    p, (L, M, N), c, k, a, rim, *_ = rays
     big = torch.finfo(p.dtype).max ** 0.48  # its square is a number
-    L, M, N = d
     closed = (1 + k) * c * c
     edge = torch.where(closed > 0, torch.rsqrt(torch.where(closed > 0, closed, 1.0)), big)
     reach = 4 * (torch.sqrt(p[0] ** 2 + p[1] ** 2) + p[2].abs())  # with neither rim nor edge: about the foot
@@ -239,9 +248,9 @@ def _bracketed(p, d, c, k, a, rim, extra=None):
 
     # … and between the lowest and the highest sag.
     fraction = torch.linspace(0, 1, 65, dtype=p.dtype, device=p.device)[:, None]
-    heights = sag_and_derivatives((fraction * radius) ** 2 * (1 - 1e-7), c, k, a[:, None] if a.dim() == 2 else a)[0]
+    heights = rays._replace(a=a[:, None]).sag((fraction * radius) ** 2 * (1 - 1e-7), 0)[0]
     margin = (heights.amax(0) - heights.amin(0)) * 0.05 + torch.finfo(p.dtype).tiny
-    margin = margin if extra is None else margin + extra[1]
+    margin = margin if rays.size is None else margin + rays.size
     low, high = heights.amin(0) - margin, heights.amax(0) + margin
     steep = N.abs() > 1e-9
     safe_N = torch.where(steep, N, 1.0)
@@ -252,11 +261,11 @@ def _bracketed(p, d, c, k, a, rim, extra=None):
 
     s = torch.where(N < 0, -1.0, 1.0).to(N.dtype)
     width = (last - first) / _SAMPLES
-    before = s * _residual(p, d, c, k, a, first, extra)[0]
+    before = s * _residual(rays, first)[0]
     left, found = first, torch.zeros_like(possible)
     for i in range(1, _SAMPLES + 1):
         t = first + i * width
-        after = s * _residual(p, d, c, k, a, t, extra)[0]
+        after = s * _residual(rays, t)[0]
         crossing = (before <= 0) & (after > 0) & ~found
         left = torch.where(crossing, t - width, left)
         found = found | crossing
@@ -264,9 +273,9 @@ def _bracketed(p, d, c, k, a, rim, extra=None):
     right = left + width
     for _ in range(_BISECTIONS):
         middle = 0.5 * (left + right)
-        below = s * _residual(p, d, c, k, a, middle, extra)[0] <= 0
+        below = s * _residual(rays, middle)[0] <= 0
         left, right = torch.where(below, middle, left), torch.where(below, right, middle)
     t = 0.5 * (left + right)
-    t_polished, small, forward, _ = _newton(p, d, c, k, a, t, extra)
+    t_polished, small, forward, _ = _newton(rays, t)
     stayed = small & forward & ((t_polished - t).abs() <= width.abs())
     return torch.where(stayed, t_polished, t), found & possible

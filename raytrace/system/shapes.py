@@ -1,0 +1,164 @@
+"""Shapes: one row for every kind of sag, which holds all that the rest of the package knows of the kind.
+
+    z = c r²/(1 + √(1 - (1+k) c² r²)) + Σ_j a_j v^j + D(x, y)
+
+KINDS tells what v is, by `Surface.kind`; DEPARTURES tells D, by the class of `Surface.departure`. A new kind is a new
+row: rays, derivatives, first order, variables, figures, files and, with its v in fused/sags.h, the compiled trace read
+it.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+from torch.utils._pytree import tree_leaves
+
+from raytrace.maths.numerics import polynomial
+from raytrace.system import departure as own
+from raytrace.system.departure import Departure, Sag
+
+EVEN = "even asphere"
+
+
+@dataclasses.dataclass(frozen=True)
+class Kind:
+    """A kind of rotationally symmetric terms Σ_j a_j v^j, j = 1, 2, …
+
+    step: v = r^step near the vertex, so that a_j belongs to r^(step j) and is named for it; mm^(1 - step j).
+    argument: u = r² and a factor f -> v, dv/du, f² d²v/du²; None: v is u itself.
+    zemax: TYPE of a .zmx file, where PARM j is a_j up to `parameters`; None: no file holds it.
+    words: what a table's column "type" may say beside the name, without blanks; none: the terms themselves tell.
+    code: the kind in fused/sags.h, which traces up to `compiled` terms; None: traced by torch alone.
+    """
+
+    name: str
+    step: int = 2
+    argument: Callable[[Tensor, Tensor | float], tuple[Tensor, Tensor, Tensor]] | None = None
+    zemax: str | None = None
+    parameters: int = 8
+    words: tuple[str, ...] = ()
+    code: int | None = None
+    compiled: int = 16
+
+    def term(self, coefficients: Tensor | None, power: int) -> Tensor | float:
+        """The coefficient (...) of r^power, 0 where there is none."""
+        j, rest = divmod(power, self.step)
+        return 0.0 if coefficients is None or rest or j > len(coefficients) else coefficients[j - 1]
+
+
+KINDS = {kind.name: kind for kind in (Kind(EVEN, zemax="EVENASPH", words=("evenasph",), code=3),)}
+
+
+@dataclasses.dataclass(frozen=True)
+class DepartureKind:
+    """A kind of D(x, y), by functions of its `numbers`: float64 tensors, found once for every meeting with rays.
+
+    sag: numbers, x, y (...) mm, highest derivative -> `Sag`; size: numbers -> bound on |D| mm, by which a crossing is
+    bracketed; covers: numbers, x, y -> where there is a surface; prepare: to the departure whose tensors are the
+    numbers; is_round: about the axis.
+    """
+
+    sag: Callable[[Sequence[Tensor], Tensor, Tensor, int], Sag]
+    size: Callable[[Sequence[Tensor]], Tensor]
+    covers: Callable[[Sequence[Tensor], Tensor, Tensor], Tensor] = lambda numbers, x, y: torch.ones_like(
+        x, dtype=torch.bool
+    )
+    prepare: Callable = lambda departure: departure
+    is_round: bool = False
+
+
+DEPARTURES = {
+    "GridSag": DepartureKind(own.spline_sag, own.spline_size, own.spline_covers, prepare=own.spline),
+    "SplineSag": DepartureKind(own.spline_sag, own.spline_size, own.spline_covers),
+    "ZernikeSag": DepartureKind(own.zernike_sag, own.zernike_size),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Relief:
+    """A departure made ready for rays: its row, by the name of its class, and its numbers."""
+
+    kind: str
+    numbers: Sequence[Tensor]
+
+    def sag(self, x: Tensor, y: Tensor, *, highest: int = 2) -> Sag:
+        """D (...) mm and derivatives up to the `highest`; a grid's goes on beyond its edge with the height there."""
+        return DEPARTURES[self.kind].sag(self.numbers, x, y, highest)
+
+    def covers(self, x: Tensor, y: Tensor) -> Tensor:
+        """Whether there is a surface at points (...) mm."""
+        return DEPARTURES[self.kind].covers(self.numbers, x, y)
+
+    def size(self) -> Tensor:
+        """A bound on |D| in mm."""
+        return DEPARTURES[self.kind].size(self.numbers)
+
+
+def relief(departure: Departure) -> Relief:
+    """A departure made ready. Raises ValueError for a grid of fewer than 4 × 4 heights."""
+    name = type(departure).__name__
+    return Relief(name, [number.double() for number in tree_leaves(DEPARTURES[name].prepare(departure))])
+
+
+def sag_and_derivatives(
+    u: Tensor,
+    curvature: Tensor | None,
+    conic: Tensor | None,
+    coefficients: Tensor | None,
+    highest: int = 2,
+    *,
+    along: Tensor | float = 1.0,
+    kind: str = EVEN,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """S(u), dS/du, d²S/du² v² with u = r² (...) in mm²; derivatives above the `highest` asked for stay 0.
+
+    along: v, by whose square the second derivative comes multiplied: c³ alone leaves the range of numbers before any
+    length or curvature does. Beyond the edge of a closed conic its radicand is held at 0+.
+
+    S = c u/(1+w) + Σ_j a_j v^j,  w = √(1 - (1+k) c² u);  dS = c/2w + …;  d²S = (1+k) c³/4w³ + …
+    """
+    S = dS = d2S = torch.zeros_like(u)
+    if curvature is not None:
+        c = curvature
+        shape = 1.0 if conic is None else 1 + conic
+        radicand = 1 - shape * (c * (c * u))  # also its derivatives stay in range: neither c² nor r² c̄
+        w = torch.sqrt(torch.where(radicand > 0, radicand, torch.finfo(u.dtype).tiny))
+        S = c * u / (1 + w)
+        if highest > 0:
+            dS = 0.5 * c / w
+        if highest > 1:
+            tilt = c * along / w
+            d2S = 0.25 * shape * c / w * tilt * tilt
+    if coefficients is not None:
+        P, dP, d2P = _terms(u, coefficients, highest, along, KINDS[kind].argument)
+        S = S + P
+        dS = dS if dP is None else dS + dP
+        d2S = d2S if d2P is None else d2S + d2P
+    return S, dS, d2S
+
+
+def _terms(u: Tensor, coefficients: Tensor, highest: int, along: Tensor | float, argument: Callable | None):
+    """Σ_j a_j v^j with its derivatives by u, the second one multiplied by along²; None above the highest."""
+    v, dv, d2v = (u, None, None) if argument is None else argument(u, along)
+    P = v * polynomial(coefficients, v)
+    if highest == 0:
+        return P, None, None
+    order = torch.arange(1, len(coefficients) + 1, dtype=coefficients.dtype, device=coefficients.device)
+    order = order.reshape(-1, *(1,) * (coefficients.dim() - 1))
+    first = order * coefficients
+    by_v = polynomial(first, v)
+    dP = by_v if dv is None else by_v * dv
+    if highest == 1:
+        return P, dP, None
+    second = polynomial(((order - 1) * first)[1:], v)
+    if dv is None:
+        return P, dP, second * along * along
+    return P, dP, second * (dv * along) * (dv * along) + by_v * d2v
+
+
+def size_of_terms(u: Tensor, coefficients: Tensor, kind: str = EVEN) -> Tensor:
+    """Σ_j |a_j| v^j (...): what the terms add up from, by which their rounding is judged."""
+    argument = KINDS[kind].argument
+    v = u if argument is None else argument(u, 1.0)[0]
+    return v * polynomial(coefficients.abs(), v)
