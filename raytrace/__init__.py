@@ -47,8 +47,10 @@ PUBLIC = {
     "paraxial_image_distance": "optics.paraxial",
     "prepare": "fused",
     "rays": "optics.launch",
+    "read_rays": "formats.ray_table",
     "sobol": "maths.pupil",
     "to": "maths.value",
+    "trace": "optics.traced",
     "tracing": "fused",
     # images and analyses
     "Memo": "optics.reuse",

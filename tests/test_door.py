@@ -17,6 +17,10 @@ import raytrace as rt
 from raytrace.cli import main
 from raytrace.cli import run as runner
 from raytrace.cli.commands import COMMANDS
+from raytrace.optics.launch import launch
+from raytrace.optics.spot import spot_of
+from raytrace.optics.trace import trace_lens
+from raytrace.system.lens import field_points
 
 ROWS = [
     {"radius": 61.47, "thickness": 6.0, "glass": "N-BK7"},
@@ -129,6 +133,50 @@ def test_what_makes_no_lens_is_told(call, said):
     lens = rt.lens(ROWS, stop=1, f_number=5)
     with pytest.raises(ValueError, match=re.escape(said)):
         call(lens)
+
+
+# -- rays --------------------------------------------------------------------------------------------------------------
+
+
+def test_rays_are_launched_traced_and_tabled():
+    lens = rt.read_lens("cooke_triplet")
+    rays = rt.rays(lens, fields=[0, 14], pupil=rt.gauss_rings(6))
+    assert rays.shape == (2, 3, 144)
+    end = rt.trace(lens, rays)
+    same = launch(lens, rt.gauss_rings(6)[0], fields=field_points([0, 14], like=lens))
+    kept = trace_lens(lens, same, rays.wavelength)
+    assert torch.equal(end.position, kept.position)
+    assert torch.equal(end.opl, kept.opl)
+    assert float(spot_of(end).rms_radius[0, 0]) > 0  # what a trace gives is rays
+    table = end.to_frame()
+    assert [*table] == ["ray", "surface", "x", "y", "z", "l", "m", "n", "opl", "status"]
+    last = table[table.surface == len(lens.surfaces) - 1]
+    assert last.y.to_numpy() == pytest.approx(end.position[1].flatten()[rays.valid.flatten()].numpy(), abs=1e-12)
+    assert {*table.status} <= {"ok", "vignetted"}
+
+
+@pytest.mark.parametrize("words", ["", "--field 0 3,14 --object-distance 25000 inf --wavelength 0.5"])
+def test_the_command_trace_writes_the_table_of_the_verb(words, capsys, tmp_path):
+    given = {"fields": [0, (3, 14)], "object_distances": [25e3, float("inf")], "wavelengths": [0.5]}
+    words, keywords = words.split(), given if words else {}
+    lens = rt.read_lens("double_gauss").at(wavelengths=keywords.get("wavelengths"))  # they are conditions, too
+    found = rt.trace(lens, **keywords)
+    assert main(["trace", "double_gauss", *words]) == 0
+    assert capsys.readouterr().out == f"{found}\n"
+    assert main(["trace", "double_gauss", *words, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == found.document()
+    found.save(tmp_path / "rays.csv")
+    assert (tmp_path / "rays.csv").read_text() == f"{found}\n"
+
+
+def test_a_table_of_rays_is_traced_by_its_name(tmp_path):
+    (tmp_path / "rays.csv").write_text("x,y,z,l,m,n,wavelength\n0,5,-5,0,0,1,0.55\n0,500,-5,0,0,1,0.6\n")
+    lens = rt.read_lens("double_gauss")
+    found = rt.trace(lens, tmp_path / "rays.csv")
+    assert found.valid.tolist() == [True, False]
+    assert found.lost() == [{"surface": 1, "status": "miss", "rays": 1}]
+    same = rt.trace(lens, rt.read_rays(tmp_path / "rays.csv", lens))
+    assert str(same) == str(found)
 
 
 # -- one verb, one door ------------------------------------------------------------------------------------------------

@@ -46,7 +46,7 @@ COMMANDS = re.compile(r"cli(\.|$)|studies\.\w+\.command$")
 #: What only these files may import.
 RESERVED = {
     "matplotlib": (r"plot", r"studies\.\w+\.(\w+_)?figures", r"bench\.figure_\w+"),
-    "pandas": (r"formats\.frame", r"cli", r"bench"),
+    "pandas": (r"formats\.(frame|ray_table)", r"cli", r"bench"),
     "tqdm": (r"cli", r"studies\.codesign\.setup", r"bench"),
     "optiland": (r"bench",),
 }

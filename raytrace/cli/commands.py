@@ -107,21 +107,6 @@ def _focus(parser):
     output(parser, "lens file to write with the new sensor distance")
 
 
-def _trace(parser):
-    lens(parser)
-    parser.add_argument(
-        "--rays",
-        metavar="CSV",
-        type=file_name,
-        help="rays to trace: columns x,y,z,l,m,n in the frame of surface 1, optional wavelength; "
-        "by default the chief and marginal rays of every field",
-    )
-    output(parser, "table to write (.csv); default: standard output")
-    conditions(parser, several="rays from each")
-    fields(parser)
-    ray_aiming(parser)
-
-
 def _psf(parser):
     lens(parser)
     parser.add_argument(
@@ -290,20 +275,7 @@ COMMANDS = (
         _focus,
         "cli.focus_commands.focus",
     ),
-    Command(
-        "trace",
-        "trace rays of a table, surface by surface",
-        "Trace rays and write one row per ray and surface: ray,surface,x,y,z,l,m,n,opl,status in each surface's own "
-        "frame, direction after the surface, opl the optical path from the given start. status: ok, miss, tir, "
-        "vignetted. A vignetted ray keeps its coordinates; a missed or totally reflected one ends with an empty row. "
-        "Chief and marginal rays, at the primary wavelength or those of --wavelength, are named in further columns: "
-        "object_distance,field_x,field_y,wavelength,pupil_x,pupil_y.",
-        """examples:
-  raytrace trace double_gauss --field 0 14 0,-7
-  raytrace trace lens.zmx --rays rays.csv -o traced.csv""",
-        _trace,
-        "cli.trace_commands.trace",
-    ),
+    Command.of("cli.trace"),
     Command(
         "psf",
         "point spread functions by five models",

@@ -27,7 +27,7 @@ def carry_out(command: ModuleType, arguments: argparse.Namespace) -> None:
 
     Several object distances go to the verb where it takes `object_distances`, else one result follows the other.
     """
-    run = getattr(command, "run", None) or partial(_verb_of_lens, command)
+    run = getattr(command, "run", None) or partial(verb_of_lens, command)
     distances = getattr(arguments, "object_distances", None)
     if not distances or takes(command, "object_distances"):
         present(run(arguments), arguments)
@@ -59,7 +59,7 @@ def verb_of(command: ModuleType) -> Callable:
 
 def options_of(command: ModuleType, arguments: argparse.Namespace) -> dict:
     """The options of a command line as keywords of its verb; what was not given is left to the verb."""
-    given = {name: value for name, value in vars(arguments).items() if value is not None}
+    given = {name: value for name, value in vars(arguments).items() if value is not None and name != "lens"}
     wanted = {
         name: value
         for name, value in given.items()
@@ -70,7 +70,7 @@ def options_of(command: ModuleType, arguments: argparse.Namespace) -> dict:
     return wanted
 
 
-def _verb_of_lens(command: ModuleType, arguments: argparse.Namespace) -> Result:
+def verb_of_lens(command: ModuleType, arguments: argparse.Namespace) -> Result:
     """What the verb says of the lens; its errors begin with the name of the lens, as every error does."""
     lens = open_lens(arguments)
     try:

@@ -165,8 +165,8 @@ def _part_of_field(lens: Lens, field: Tensor, fraction: float) -> Tensor:
 
 
 def with_ray_aiming(lens: Lens, ray_aiming: str | None) -> Lens:
-    """The lens with another kind of ray aiming, a key of RAY_AIMING; its own where that is None. Raises ValueError."""
-    if ray_aiming is None or ray_aiming == lens.ray_aiming:
+    """The lens with another kind of ray aiming, a key of RAY_AIMING; its own where that is None or "file"."""
+    if ray_aiming in (None, "file", lens.ray_aiming):
         return lens
     if ray_aiming not in RAY_AIMING:
         raise ValueError(f"ray aiming {ray_aiming!r}: expected one of {', '.join(RAY_AIMING)}")

@@ -6,6 +6,11 @@ from torch import Tensor
 from raytrace.maths.numerics import unit, with_batch_axes
 from raytrace.maths.value import value
 
+#: Columns of a table of rays: mm in the frame of a surface, and direction cosines.
+COLUMNS = ("x", "y", "z", "l", "m", "n")
+#: Columns of a table of traced rays, a row for every surface that a ray reaches.
+TRACED = ("ray", "surface", *COLUMNS, "opl", "status")
+
 
 @value
 class Rays:
