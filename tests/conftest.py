@@ -1,11 +1,14 @@
-"""Settings of all tests: hypothesis draws the same examples in every run, and parallel workers take a core each."""
+"""What all tests share: settings (hypothesis draws the same examples in every run), and fixtures."""
 
+import json
 import os
+from typing import NamedTuple
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is loaded: threads of workers would hinder each other
 
 import pytest
+import torch
 from hypothesis import settings
 
 from raytrace.cli import main
@@ -29,15 +32,69 @@ def engine(request):
         yield name
 
 
+class Outcome(NamedTuple):
+    """What became of a command line."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def document(self) -> dict:
+        """The one JSON document on standard output, read strictly: no NaN, no Infinity, nothing after it."""
+        return json.loads(self.out, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+
+    @property
+    def error(self) -> str:
+        """The message of a command that failed: one line, nothing on standard output."""
+        assert self.code in (1, 2), self
+        assert self.out == ""
+        lines = [line for line in self.err.splitlines() if not line.startswith("raytrace: warning: ")]
+        assert len(lines) == 1, self.err
+        assert lines[0].startswith("raytrace: error: ")
+        assert "a defect of raytrace" not in lines[0]
+        assert "Traceback" not in self.err
+        return lines[0]
+
+
 @pytest.fixture
-def command(capsys, tmp_path, monkeypatch):
+def command_line(capsys, tmp_path, monkeypatch):
     """Run a command line in an empty folder: exit code, standard output, standard error."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("RAYTRACE_TRACEBACK", raising=False)
+    for name in ("RAYTRACE_CATALOGS", "RAYTRACE_TRACEBACK"):
+        monkeypatch.delenv(name, raising=False)
 
-    def call(*arguments):
+    def call(*arguments) -> Outcome:
         capsys.readouterr()
         code = main([*map(str, arguments)])
-        return code, *capsys.readouterr()
+        return Outcome(code, *capsys.readouterr())
 
     return call
+
+
+@pytest.fixture
+def run(command_line):
+    """The same by its short name; where `command` is a word that is run, too."""
+    return command_line
+
+
+@pytest.fixture
+def command(command_line):
+    """The same; `run` then is a subcommand."""
+    return command_line
+
+
+@pytest.fixture
+def threads():
+    """Threads of torch as they were, whatever the test sets."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture
+def same_threads():
+    """A command may set them for a while, and must leave as many as there were."""
+    before = torch.get_num_threads()
+    yield
+    assert torch.get_num_threads() == before, "another number of threads was left behind"

@@ -8,6 +8,7 @@ import math
 from decimal import Decimal, getcontext
 
 import torch
+from problems import floats
 
 from raytrace.kernels.pixels import gaussian_pixels
 from raytrace.maths.grid import Grid
@@ -104,7 +105,7 @@ def check_pixel_gradients(pixel: float, gradients, leaves, expected: dict, place
 def check_spot(case: dict) -> float:
     """Centroid, mean square, RMS and their gradients; returns the worst error over its gate."""
     data, expected = case["data"], case["expected"]
-    points = torch.tensor([numbers(data["x"]), numbers(data["y"])], dtype=torch.float64, requires_grad=True)
+    points = torch.tensor([floats(data["x"]), floats(data["y"])], dtype=torch.float64, requires_grad=True)
     valid = torch.tensor(data["valid"])
     spot = spot_of_points(points, valid, torch.tensor(data["weight"], dtype=torch.float64))
     gradients = {
@@ -144,7 +145,3 @@ def check_spot(case: dict) -> float:
             assert error <= gate, f"derivative of {name}: {g} for {wanted}"
             worst = max(worst, error / gate if gate else 0.0)
     return worst
-
-
-def numbers(values: list) -> list[float]:
-    return [float(v) for v in values]

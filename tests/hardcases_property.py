@@ -9,6 +9,7 @@ import copy
 import pytest
 import torch
 from hardcases_scene import CASES, OUTPUTS, Scene
+from problems import turned
 from torch.testing import assert_close
 
 from raytrace.fused import engine
@@ -97,9 +98,6 @@ def turning_rays_by_90_degrees_turns_results(case):
     scene = Scene(case, torch.float64, shared=True)
     position, direction = raw(case, scene)
     plain = traced(scene, position, direction)
-
-    def turned(v):
-        return torch.stack([-v[1], v[0], v[2]])
 
     found = traced(scene, turned(position), turned(direction))
     expected = Rays(turned(plain.position), turned(plain.direction), plain.valid, plain.opl)

@@ -10,7 +10,9 @@ from decimal import Decimal, localcontext
 import pytest
 import torch
 
+from raytrace.formats import read_lens
 from raytrace.media.glass import AIR, MIRROR, Glass, constant
+from raytrace.optics.scene import Scene, scene
 from raytrace.system.lens import Fields, Lens, SystemAperture
 from raytrace.system.surface import Aperture, Surface
 
@@ -24,8 +26,22 @@ PICOMETRE = 1e-9
 FEMTOMETRE = 1e-12
 
 
+def number(x) -> torch.Tensor:
+    """A number, or nested lists of them, as they are written down."""
+    return torch.tensor(x, dtype=torch.float64)
+
+
 def scalar(number: float) -> torch.Tensor:
     return torch.tensor(float(number), dtype=torch.float64)
+
+
+def floats(values) -> list[float]:
+    return [float(value) for value in values]
+
+
+def field(*y: float) -> torch.Tensor:
+    """Field points (2, F) along y."""
+    return number([[0.0] * len(y), list(y)])
 
 
 def vector(*numbers: float) -> torch.Tensor:
@@ -102,6 +118,25 @@ def double_gauss(glasses=None, **others) -> Lens:
         "wavelengths": (0.530,),
     }
     return lens([surface(c, t, glass) for c, t, glass in table], **{**options, **others})
+
+
+def sharp_double_gauss(stop: float | None = None, sensor: float = 57.8817685) -> Lens:
+    """The shipped double Gauss at the focus of 25 m; `stop`: semi-diameter in mm of an aperture that clips the beam."""
+    found = read_lens("double_gauss").at(sensor_distance=sensor)
+    return found if stop is None else found.replace(5, apertures=vignetting_aperture(stop))
+
+
+def plano_hyperbolic(
+    defocus: float = 0.0, *, diameter: float = 10.0, focus: float = 50.0, apertures=(), **others
+) -> Lens:
+    """A lens perfect on the axis, its sensor `defocus` mm behind its focus; apertures: of its plane face."""
+    surfaces = [surface(None, 10.0, 1.5, apertures=apertures), surface(-2 / focus, focus + defocus, conic=-2.25)]
+    return lens(surfaces, aperture=("entrance_pupil_diameter", diameter), **others)
+
+
+def scene_of(lens: Lens, y: float = 0.0, distance: float = math.inf, *, x: float = 0.0) -> Scene:
+    """One field, one object distance, all wavelengths of a lens."""
+    return scene(lens, vector(x, y)[:, None], vector(distance), lens.wavelengths)
 
 
 def aspheric_singlet(**others) -> Lens:
@@ -230,6 +265,39 @@ def _solve(rows: list[list[Decimal]]) -> list[Decimal]:
             if k != j:
                 rows[k] = [x - rows[k][j] * y for x, y in zip(rows[k], rows[j], strict=True)]
     return [row[-1] for row in rows]
+
+
+def relative_l1(found: torch.Tensor, expected: torch.Tensor) -> float:
+    return float((found - expected).detach().abs().sum() / expected.detach().abs().sum())
+
+
+def turned(vectors: torch.Tensor) -> torch.Tensor:
+    """Vectors (3, …) turned by a right angle about z."""
+    return torch.stack([-vectors[1], vectors[0], vectors[2]])
+
+
+def generator(seed: int = 5) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def draws(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+    """Numbers between 0 and 1, always the same of one seed."""
+    return torch.rand(shape, generator=generator(seed), dtype=dtype)
+
+
+def gaussian(width: float, size: int = 9) -> torch.Tensor:
+    """A round kernel (size, size) of standard deviation `width` in pixels that sums to 1."""
+    x = torch.arange(size, dtype=torch.float64) - (size - 1) / 2
+    kernel = torch.exp(-0.5 * (x[:, None] ** 2 + x**2) / width**2)
+    return kernel / kernel.sum()
+
+
+def covariance(spectrum: torch.Tensor) -> torch.Tensor:
+    """The matrix E[x xᵀ] of periodic pictures of a power spectrum."""
+    rows, columns = spectrum.shape
+    correlation = torch.fft.ifft2(spectrum).real
+    i, j = (n.flatten() for n in torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij"))
+    return correlation[(i[:, None] - i) % rows, (j[:, None] - j) % columns]
 
 
 def vignetting_aperture(radius: float) -> tuple[Aperture, ...]:

@@ -17,17 +17,12 @@ from raytrace.optics.trace import trace_lens, trace_surfaces
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface
 
+pytestmark = pytest.mark.usefixtures("same_threads")
+
 TINY = ["bench", "trace", "--rays", "300", "--repeats", "1", "--no-peers", "--threads", "1"]
 
 #: Bounds on the errors of the double Gauss: nm, waves, and relative to the largest component.
 BOUNDS = {"float32": (100.0, 0.1, 1e-3), "float64": (1e-6, 1e-8, 1e-11)}
-
-
-@pytest.fixture(autouse=True)
-def threads():
-    before = torch.get_num_threads()
-    yield
-    assert torch.get_num_threads() == before, "the benchmark left another number of threads behind"
 
 
 def tensor(*numbers: float) -> torch.Tensor:

@@ -17,14 +17,9 @@ from raytrace.formats import read_lens
 from raytrace.kernels import psf
 from raytrace.system.lens import with_sensor_distance
 
+pytestmark = pytest.mark.usefixtures("threads")
+
 SENSOR = 57.66
-
-
-@pytest.fixture(autouse=True)
-def threads():
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import math
 import problems
 import pytest
 import torch
-from problems import vector
+from problems import plano_hyperbolic, scene_of, vector
 
 from raytrace.bench import psf as bench
 from raytrace.bench import psf_cases
@@ -18,40 +18,19 @@ from raytrace.bench.psf import PsfRow, gradient, measure, random_rows, steps, tr
 from raytrace.bench.psf_cases import Case, Method, cases, random_histogram
 from raytrace.bench.psf_report import judged, markdown, table, targets
 from raytrace.cli import main
-from raytrace.files import shipped
 from raytrace.formats import read_lens
 from raytrace.kernels import MODELS, diffraction, raymap
 from raytrace.kernels.gaussian import kernels as gaussian_kernels
 from raytrace.maths.grid import grid
-from raytrace.optics.scene import scene
 from raytrace.system.surface import Aperture
 
-
-@pytest.fixture(autouse=True)
-def threads():
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
-
-
-def shipped_lens(name):
-    return read_lens(shipped("lenses") / f"{name}.zmx")
-
-
-def stigmatic(diameter=1.0, focus=50.0, apertures=()):
-    """A plano-hyperbolic lens, perfect on the axis; an aperture on its plane face."""
-    surfaces = [problems.surface(None, 10.0, 1.5, apertures=apertures), problems.surface(-0.04, focus, conic=-2.25)]
-    return problems.lens(surfaces, aperture=("entrance_pupil_diameter", diameter))
-
-
-def scene_of(lens, y=0.0, distance=math.inf):
-    return scene(lens, vector(0.0, y)[:, None], vector(distance), lens.wavelengths)
+pytestmark = pytest.mark.usefixtures("threads")
 
 
 @pytest.mark.parametrize("sampling", [Sampling(12, 32, 3), Sampling(80, 0, 3)])
 def test_direct_sum_of_a_perfect_lens_peaks_as_airy(sampling):
     """I(0) = E A/(λf)² with E = 1, A = πR²: to 4 NA² = 1e-4, a square grid to the raggedness of its rim, 0.5 %."""
-    lens = stigmatic(0.5)
+    lens = plano_hyperbolic(diameter=0.5)
     pitch = 1e-4  # 1/300 of the Airy radius: the pixel is flat
     kernel, rays = direct_sum(scene_of(lens), grid(pitch, 1), sampling)
     expected = math.pi * 0.25**2 / (0.55e-3 * 50.0) ** 2 * pitch**2
@@ -63,14 +42,14 @@ def test_direct_sum_of_an_annulus():
     """A central stop of radius ε leaves (1 - ε²) of the light and of the area: the peak falls by its square."""
     stop = (Aperture("circular", (0.2, math.inf)),)
     window = grid(1e-4, 1)
-    ratio = direct_sum(scene_of(stigmatic(apertures=stop)), window, Sampling(12, 32, 3))[0]
-    ratio = ratio / direct_sum(scene_of(stigmatic()), window, Sampling(12, 32, 3))[0]
+    ratio = direct_sum(scene_of(plano_hyperbolic(diameter=1.0, apertures=stop)), window, Sampling(12, 32, 3))[0]
+    ratio = ratio / direct_sum(scene_of(plano_hyperbolic(diameter=1.0)), window, Sampling(12, 32, 3))[0]
     assert float(ratio) == pytest.approx((1 - 0.4**2) ** 2, rel=1e-4)
 
 
 def test_direct_sum_keeps_the_light():
     """All light of the perfect lens within 6 Airy radii but the rings' tail, 2/(π v), v = π D r/(λ f)."""
-    kernel, _ = direct_sum(scene_of(stigmatic()), grid(0.08, 5), Sampling(16, 48, 7))
+    kernel, _ = direct_sum(scene_of(plano_hyperbolic(diameter=1.0)), grid(0.08, 5), Sampling(16, 48, 7))
     tail = 2 / (math.pi * math.pi * 0.2 / (0.55e-3 * 50.0))
     assert 0.5 * tail < 1 - float(kernel.sum()) < 1.5 * tail
 
@@ -90,7 +69,7 @@ def test_direct_sum_is_the_wave_models_limit():
 def test_rim_is_found():
     """Rings between the edges of an annulus carry its area and none is lost."""
     stop = (Aperture("circular", (0.2, 0.45)),)
-    s = scene_of(stigmatic(apertures=stop))
+    s = scene_of(plano_hyperbolic(diameter=1.0, apertures=stop))
     points, weights = clear_rings(s, 6, 16)
     radius = 0.5 * torch.linalg.vector_norm(points, dim=0)
     assert weights.sum() == pytest.approx((0.45**2 - 0.2**2) / 0.25, rel=1e-9)
@@ -101,11 +80,11 @@ def test_rim_is_found():
 def test_solid_angle_of_a_perfect_lens():
     """Parallel light into a perfect cone: (L, M) = -R p/f to NA², so that Ω = (R/f)²."""
     points = vector(0.0, 0.3, -0.2, 0.5).reshape(2, 2)
-    assert torch.allclose(solid_angle(scene_of(stigmatic()), points), vector(1e-4, 1e-4), rtol=3e-4)
+    assert torch.allclose(solid_angle(scene_of(plano_hyperbolic(diameter=1.0)), points), vector(1e-4, 1e-4), rtol=3e-4)
 
 
 def test_moments_are_those_of_many_rings():
-    lens = shipped_lens("double_gauss")
+    lens = read_lens("double_gauss")
     s = scene_of(lens, 14.0, 1e4)
     s = dataclasses.replace(s, wavelengths=lens.wavelengths[lens.primary_wavelength][None])
     found, fine = moments(s, 12, 48), gaussian_kernels(s, grid(1.0, 1), order=12)
@@ -115,7 +94,7 @@ def test_moments_are_those_of_many_rings():
 
 
 def test_random_histogram_is_one_histogram_however_it_is_cut():
-    case = cases([("double_gauss", shipped_lens("double_gauss"))])[0]
+    case = cases([("double_gauss", read_lens("double_gauss"))])[0]
     window = case.window(moments(case.scene, 6, 24).centroid)
     whole = random_histogram(case.scene, window, 3000, piece=3000)
     cut = random_histogram(case.scene, window, 3000, piece=1000)
@@ -125,8 +104,8 @@ def test_random_histogram_is_one_histogram_however_it_is_cut():
 
 
 def test_usual_cases_and_others():
-    found = cases([("double_gauss", shipped_lens("double_gauss")), ("tessar", shipped_lens("tessar"))])
-    largest = float(shipped_lens("tessar").fields.y.abs().max())
+    found = cases([("double_gauss", read_lens("double_gauss")), ("tessar", read_lens("tessar"))])
+    largest = float(read_lens("tessar").fields.y.abs().max())
     assert [case.field for case in found] == [0.0, 14.0, 0.0, largest]
     assert found[0].distance == 1e4
     assert math.isinf(found[2].distance)
@@ -137,7 +116,7 @@ def test_usual_cases_and_others():
 
 def test_gradients_are_by_all_that_is_modelled():
     """Curvatures, conics, coefficients and thicknesses; against a difference for one of each kind."""
-    lens = shipped_lens("phone")
+    lens = read_lens("phone")
     own, leaves = with_all_leaves(lens)
     kinds = sum(
         getattr(surface, name) is not None
@@ -208,7 +187,7 @@ def test_table_and_report_hold_every_row():
 def test_random_rays_reach_the_error_they_are_asked_for(monkeypatch):
     monkeypatch.setattr(bench, "RAYS_ERROR", 0.1)
     monkeypatch.setattr(bench, "_PILOT", 4000)
-    case = cases([("double_gauss", shipped_lens("double_gauss"))])[0]
+    case = cases([("double_gauss", read_lens("double_gauss"))])[0]
     window = case.window(vector(0.0, 0.0))
     kernels = {"rays": raymap.reference(case.scene, window, lines=512)[0, 0, 0]}
     truth = bench.Truth(case, kernels, {"rays": window}, vector(0.0, 0.0), moments(case.scene, 6, 24).variance.sqrt())
@@ -219,7 +198,7 @@ def test_random_rays_reach_the_error_they_are_asked_for(monkeypatch):
 
 def test_square_grids_are_extrapolated_by_the_power_their_error_falls_with(monkeypatch):
     """An error of rays^-3/4 and a time of 1 s for 100 rays: 1e-3 needs 10⁴ rays and 100 s."""
-    case = Case(stigmatic(), "stigmatic", 0.0, math.inf, 0.005)
+    case = Case(plano_hyperbolic(diameter=1.0), "stigmatic", 0.0, math.inf, 0.005)
     ones, now = torch.ones(21, 21, dtype=torch.float64), [0.0]
 
     def direct_sum(scene, window, sampling):
@@ -271,7 +250,7 @@ def test_progress_adds_up_and_refusals_are_said(few, monkeypatch):
         raise ValueError("too steep")
 
     monkeypatch.setattr(bench, "direct_sum", refuse)
-    case = Case(stigmatic(), "stigmatic", 0.0, math.inf, 0.005)
+    case = Case(plano_hyperbolic(diameter=1.0), "stigmatic", 0.0, math.inf, 0.005)
     done, said = [], []
     rows = measure([case], repeats=1, threads=1, progress=done.append, say=said.append)
     assert sum(done) == steps([case])
@@ -283,7 +262,7 @@ def test_progress_adds_up_and_refusals_are_said(few, monkeypatch):
 def test_peer_sees_the_same_kernels():
     """Optiland at full field, coma and all: turned or shifted by a pixel, its kernels would be off by 0.3 and more."""
     peer = pytest.importorskip("raytrace.bench.psf_peer", reason="needs the extra [bench]", exc_type=ImportError)
-    case = cases([("double_gauss", shipped_lens("double_gauss"))])[1]
+    case = cases([("double_gauss", read_lens("double_gauss"))])[1]
     window = case.window(moments(case.scene, 8, 32).centroid)
     kernels = {
         "rays": raymap.reference(case.scene, window, lines=512)[0, 0, 0],

@@ -21,7 +21,6 @@ from raytrace.bench.speed_own import Engine, leaves_of, three_aspheres, with_sen
 from raytrace.bench.speed_report import KEPT, document, markdown, table, targets
 from raytrace.bench.tracers import squared_radius
 from raytrace.cli import main
-from raytrace.files import shipped
 from raytrace.formats import read_lens
 from raytrace.fused import NoCompiler, tracing
 from raytrace.maths.value import to
@@ -29,6 +28,8 @@ from raytrace.optics.focus import spot_parabola
 from raytrace.optics.reuse import Memo, trace_bundle
 from raytrace.optics.trace import trace_lens, trace_surfaces
 from raytrace.system.rays import Rays
+
+pytestmark = pytest.mark.usefixtures("same_threads")
 
 #: What `raytrace bench speed --json` is read for.
 KEYS = {
@@ -41,13 +42,6 @@ LESS = {"prefix", "planes", "symmetry", "wavelengths", "object distances"}
 TINY = Sizes(600, (64,), small=16, memory=64, sensor=64, distances=2, window=0.01, less=64)
 #: mm on the image: rounding of 12 surfaces, a hundred millimetres of path.
 AGREES = {torch.float32: 1e-4, torch.float64: 1e-10}
-
-
-@pytest.fixture(autouse=True)
-def threads():
-    before = torch.get_num_threads()
-    yield
-    assert torch.get_num_threads() == before, "the benchmark left another number of threads behind"
 
 
 @pytest.fixture(autouse=True)
@@ -65,10 +59,6 @@ def built():
         return build()
     except NoCompiler as error:
         pytest.skip(str(error))
-
-
-def lens_named(name):
-    return read_lens(shipped("lenses") / f"{name}.zmx")
 
 
 def compared(limit, lens, rays):
@@ -92,14 +82,14 @@ def compared(limit, lens, rays):
 @pytest.mark.parametrize("name", ["double_gauss", "tessar", "cooke_triplet"])
 def test_safe_limit_traces_what_the_package_traces(built, name, dtype):
     """1000 rays: whole blocks and a part of one, shared by two threads."""
-    lens = lens_named(name)
+    lens = read_lens(name)
     limit = Limit(built, lens, dtype, safe=True, threads=2)
     assert compared(limit, lens, field_rays(lens, 1000)) < AGREES[dtype]
 
 
 def test_work_of_several_threads_is_that_of_one(built):
     """So many rays that three threads get unequal shares."""
-    lens = lens_named("double_gauss")
+    lens = read_lens("double_gauss")
     rays = field_rays(lens, 20_001)
     one, three = (Limit(built, lens, torch.float64, safe=True, threads=n).trace(rays) for n in (1, 3))
     assert torch.equal(one.position, three.position)
@@ -113,7 +103,7 @@ def test_lost_rays_are_lost_in_the_safe_limit_too(built, dtype):
 
     In float32 rays that graze a surface differ by more: the package takes roots in float64.
     """
-    lens = to(lens_named("double_gauss"), dtype=dtype)
+    lens = to(read_lens("double_gauss"), dtype=dtype)
     spread = torch.linspace(-1.0, 1.0, 900, dtype=dtype)
     position = torch.stack([70 * spread, 40 * torch.cos(9 * spread), -5 + 0 * spread])
     direction = torch.stack([0.6 * torch.sin(31 * spread), 0.5 * torch.cos(17 * spread), 1 + 0 * spread])
@@ -131,7 +121,7 @@ def test_lost_rays_are_lost_in_the_safe_limit_too(built, dtype):
 
 
 def test_plain_limit_is_the_textbook(built):
-    lens = lens_named("double_gauss")
+    lens = read_lens("double_gauss")
     limit = Limit(built, lens, torch.float64, safe=False)
     assert compared(limit, lens, field_rays(lens, 1000)) < AGREES[torch.float64]
 
@@ -149,12 +139,12 @@ def test_limit_of_the_aspheres_converges_in_the_steps_it_is_given(built, dtype):
 
 
 def test_limits_refuse_what_they_do_not_know(built):
-    for lens, safe in ((lens_named("hubble"), True), (three_aspheres(), False)):
+    for lens, safe in ((read_lens("hubble"), True), (three_aspheres(), False)):
         with pytest.raises(ValueError, match="know"):
             Limit(built, lens, torch.float64, safe=safe)
-    limit = Limit(built, lens_named("double_gauss"), torch.float64, safe=True)
+    limit = Limit(built, read_lens("double_gauss"), torch.float64, safe=True)
     with pytest.raises(ValueError, match="expected"):
-        limit.trace(to(field_rays(lens_named("double_gauss"), 8), dtype=torch.float32))
+        limit.trace(to(field_rays(read_lens("double_gauss"), 8), dtype=torch.float32))
     assert "-march=native" in built.words
 
 
@@ -177,7 +167,7 @@ def test_the_aspheres_are_strong_and_right():
 
 def test_gradient_is_by_curvatures_thicknesses_and_every_index():
     """The last of the leaves are indices; theirs against central differences of the merit."""
-    lens = lens_named("double_gauss")
+    lens = read_lens("double_gauss")
     rays, centroid = field_rays(lens, 50), torch.zeros(2, dtype=torch.float64)
     own = Engine(lens, torch.float64, "eager")
     found = own.gradient_by_all(rays, centroid)
@@ -200,7 +190,7 @@ def test_gradient_is_by_curvatures_thicknesses_and_every_index():
 
 def test_slope_of_the_sensor_step_is_a_derivative_with_and_without_memory():
     """The mean squared radius is a parabola in the sensor distance: central differences are exact but for rounding."""
-    lens, leaf = with_sensor_leaf(lens_named("double_gauss"))
+    lens, leaf = with_sensor_leaf(read_lens("double_gauss"))
     pupil = torch.tensor([[0.3, -0.7, 0.1], [0.2, 0.4, -0.9]], dtype=torch.float64)
     bundle = (lens, torch.zeros(2, 1, dtype=torch.float64), lens.wavelengths[0], pupil)
     memo = Memo()

@@ -9,12 +9,11 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from raytrace.cli import commands, main, options
+from raytrace.cli import commands, options
 
 ROOT = Path(__file__).parents[1]
 DOUBLE_GAUSS = ROOT / "lenses" / "double_gauss.zmx"
@@ -42,44 +41,6 @@ PRESCRIPTION = (
     (0.0, 0.0, 1.0),
 )
 MILLIMETRES = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "METER": 1000.0}
-
-
-class Outcome(NamedTuple):
-    code: int
-    out: str
-    err: str
-
-    @property
-    def document(self) -> dict:
-        """The one JSON document on standard output, read strictly: no NaN, no Infinity, nothing after it."""
-        return json.loads(self.out, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
-
-    @property
-    def error(self) -> str:
-        """The message of a command that failed: one line, nothing on standard output."""
-        assert self.code in (1, 2), self
-        assert self.out == ""
-        lines = [line for line in self.err.splitlines() if not line.startswith("raytrace: warning: ")]
-        assert len(lines) == 1, self.err
-        assert lines[0].startswith("raytrace: error: ")
-        assert "a defect of raytrace" not in lines[0]
-        assert "Traceback" not in self.err
-        return lines[0]
-
-
-@pytest.fixture
-def run(capsys, tmp_path, monkeypatch):
-    """Run a command line in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("RAYTRACE_CATALOGS", raising=False)
-    monkeypatch.delenv("RAYTRACE_TRACEBACK", raising=False)
-
-    def call(*arguments) -> Outcome:
-        capsys.readouterr()
-        code = main([str(argument) for argument in arguments])
-        return Outcome(code, *capsys.readouterr())
-
-    return call
 
 
 def python(*arguments: str, **keywords) -> subprocess.CompletedProcess:

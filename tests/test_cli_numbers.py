@@ -1,37 +1,10 @@
 """The command on what has no number: lost rays, quantities that do not exist, wavelengths that nothing is known at."""
 
-import json
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
-from raytrace.cli import main
-
 LENSES = Path(__file__).parents[1] / "lenses"
-
-
-class Outcome(NamedTuple):
-    code: int
-    out: str
-    err: str
-
-    @property
-    def document(self) -> dict:
-        return json.loads(self.out, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
-
-
-@pytest.fixture
-def run(capsys, monkeypatch, tmp_path):
-    """Run one command line in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-
-    def command(*words) -> Outcome:
-        capsys.readouterr()
-        code = main([str(word) for word in words])
-        return Outcome(code, *capsys.readouterr())
-
-    return command
 
 
 COMMANDS = [

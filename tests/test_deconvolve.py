@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from problems import covariance, draws
 
 from raytrace.camera.deconvolve import (
     blind_error,
@@ -24,10 +25,6 @@ from raytrace.camera.deconvolve import (
 )
 from raytrace.camera.image import blur, transfer_functions
 from raytrace.formats.pictures import dead_leaves
-
-
-def draws(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> torch.Tensor:
-    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
 
 
 def gaussians(*widths: float, size: int = 11) -> torch.Tensor:
@@ -53,14 +50,6 @@ def dense(kernel: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     count = size[0] * size[1]
     points = torch.eye(count, dtype=torch.float64).reshape(count, *size)
     return blur(points, kernel, boundary="circular").reshape(count, count).T
-
-
-def covariance(spectrum: torch.Tensor) -> torch.Tensor:
-    """The matrix E[x xᵀ] of periodic pictures of a power spectrum."""
-    rows, columns = spectrum.shape
-    correlation = torch.fft.ifft2(spectrum).real
-    i, j = (n.flatten() for n in torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij"))
-    return correlation[(i[:, None] - i) % rows, (j[:, None] - j) % columns]
 
 
 # --- one known kernel

@@ -200,10 +200,7 @@ def test_gradients_of_gradients_pass_through_the_eager_trace():
     rays = Rays(*(x[..., :5] for x in (some_rays().position, some_rays().direction, some_rays().valid)))
 
     def spread(curvature, thickness):
-        surfaces = list(system.surfaces)
-        surfaces[1] = dataclasses.replace(surfaces[1], curvature=curvature)
-        surfaces[2] = dataclasses.replace(surfaces[2], thickness=thickness)
-        changed = dataclasses.replace(system, surfaces=tuple(surfaces))
+        changed = system.replace(1, curvature=curvature).replace(2, thickness=thickness)
         return trace_lens(changed, rays, system.wavelengths[0]).position[:2]
 
     arguments = system.surfaces[1].curvature.clone().requires_grad_(), scalar(0.5).requires_grad_()

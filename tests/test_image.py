@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from problems import draws, gaussian, generator
 
 from raytrace.camera.image import (
     BOUNDARIES,
@@ -27,19 +28,9 @@ from raytrace.camera.image import (
 ROUNDING = 1e-13
 
 
-def draws(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> torch.Tensor:
-    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
-
-
 def direct(picture: torch.Tensor, kernel: torch.Tensor) -> torch.Tensor:
     """Σ_ab h_ab x_(i - a, j - b), written out."""
     return torch.nn.functional.conv2d(picture[None, None], kernel.flip(-1, -2)[None, None])[0, 0]
-
-
-def gaussian(width: float, size: int = 11) -> torch.Tensor:
-    x = torch.arange(size, dtype=torch.float64) - (size - 1) / 2
-    kernel = torch.exp(-0.5 * (x[:, None] ** 2 + x**2) / width**2)
-    return kernel / kernel.sum()
 
 
 @pytest.mark.parametrize("size", [(5, 5), (4, 7), (1, 3), (1, 1)])
@@ -268,10 +259,6 @@ def test_derivatives_of_layers(composition):
 
 
 # --- the sensor
-
-
-def generator(seed: int = 5) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
 
 
 def test_noise_has_the_deviation_asked_for_and_repeats_with_its_seed():

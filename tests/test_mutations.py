@@ -10,6 +10,7 @@ import pytest
 import torch
 from mutations import Reader, survive
 from PIL import Image
+from problems import number
 from test_prescriptions import LOWENTHAL, NOCTILUX, summilux
 
 from raytrace.camera.training import DamagedRun, OtherSettings, Run, load_state, read_state
@@ -27,10 +28,6 @@ from raytrace.wave.exchange import FORMATS as HEIGHTS
 from raytrace.wave.exchange import HeightMapError, read_heights, write_heights
 
 ROOT = Path(__file__).parents[1]
-
-
-def number(x):
-    return torch.tensor(x, dtype=torch.float64)
 
 
 def from_file(read, path):

@@ -67,10 +67,9 @@ def clipped():
         Aperture("rectangular", (12.0, 12.0)),
         Aperture("elliptic", (9.0, 10.0), obscures=True),
     ]
-    surfaces = list(found.surfaces)
     for k, edge in zip((1, 6, 11), edges, strict=True):
-        surfaces[k] = dataclasses.replace(surfaces[k], apertures=(edge,))
-    return dataclasses.replace(found, surfaces=tuple(surfaces))
+        found = found.replace(k, apertures=(edge,))
+    return found
 
 
 def conics():

@@ -9,6 +9,7 @@ import torch
 from matplotlib.collections import PathCollection
 from matplotlib.colors import to_hex
 from page import outside
+from problems import number
 
 from raytrace import analysis, plot, read_lens
 from raytrace.cli import main
@@ -18,10 +19,6 @@ from raytrace.plot.style import field_colours
 
 LENSES = Path(__file__).parents[1] / "lenses"
 LONG = "A lens whose name is so long that no figure of one panel is as wide as it, f = 57.6 m, F/24, of two mirrors"
-
-
-def number(value) -> torch.Tensor:
-    return torch.tensor(value, dtype=torch.float64)
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from page import outside
+from problems import number
 
 from raytrace import analysis, plot, read_lens
 from raytrace.cli import main
@@ -16,10 +17,6 @@ from raytrace.plot.psf import DECADES
 from raytrace.plot.style import fill
 
 LENSES = Path(__file__).parents[1] / "lenses"
-
-
-def number(value) -> torch.Tensor:
-    return torch.tensor(value, dtype=torch.float64)
 
 
 def own_fields(lens) -> torch.Tensor:

@@ -40,18 +40,9 @@ ANGLE = 2.0
 def base() -> Lens:
     """The double Gauss at 10 m with a stop of 9 mm, which takes a third of the beam."""
     lens = with_object_distance(with_sensor_distance(double_gauss(), scalar(57.88)), scalar(1e4))
-    surfaces = list(lens.surfaces)
-    surfaces[3] = dataclasses.replace(
-        surfaces[3], conic=scalar(0.0), coefficients=vector(0.0, 0.0), glass=model_glass(1.624, 60.0)
+    return lens.replace(3, conic=scalar(0.0), coefficients=vector(0.0, 0.0), glass=model_glass(1.624, 60.0)).replace(
+        5, apertures=(Aperture("circular", (0.0, 9.0)),)
     )
-    surfaces[5] = dataclasses.replace(surfaces[5], apertures=(Aperture("circular", (0.0, 9.0)),))
-    return dataclasses.replace(lens, surfaces=tuple(surfaces))
-
-
-def changed(lens: Lens, number: int, **parts) -> Lens:
-    surfaces = list(lens.surfaces)
-    surfaces[number] = dataclasses.replace(surfaces[number], **parts)
-    return dataclasses.replace(lens, surfaces=tuple(surfaces))
 
 
 def moved(kind: str, unit: torch.Tensor, pixels: Grid) -> tuple[Scene, Grid]:
@@ -59,17 +50,17 @@ def moved(kind: str, unit: torch.Tensor, pixels: Grid) -> tuple[Scene, Grid]:
     lens, fields, distance, wavelength = base(), vector(0.0, ANGLE)[:, None], scalar(1e4), scalar(0.53)
     step, surface = unit * KINDS[kind], lens.surfaces[3]
     if kind == "curvature":
-        lens = changed(lens, 3, curvature=surface.curvature + step)
+        lens = lens.replace(3, curvature=surface.curvature + step)
     elif kind == "conic":
-        lens = changed(lens, 3, conic=surface.conic + step)
+        lens = lens.replace(3, conic=surface.conic + step)
     elif kind == "asphere":
-        lens = changed(lens, 3, coefficients=torch.stack([torch.zeros_like(step), step]))
+        lens = lens.replace(3, coefficients=torch.stack([torch.zeros_like(step), step]))
     elif kind == "thickness":
-        lens = changed(lens, 4, thickness=lens.surfaces[4].thickness + step)
+        lens = lens.replace(4, thickness=lens.surfaces[4].thickness + step)
     elif kind in ("index", "abbe_number"):
         nd, vd, dpgf = surface.glass.coefficients
         numbers = (nd + step, vd, dpgf) if kind == "index" else (nd, vd + step, dpgf)
-        lens = changed(lens, 3, glass=dataclasses.replace(surface.glass, coefficients=torch.stack(numbers)))
+        lens = lens.replace(3, glass=dataclasses.replace(surface.glass, coefficients=torch.stack(numbers)))
     elif kind == "sensor_distance":
         lens = with_sensor_distance(lens, lens.surfaces[-2].thickness + step)
     elif kind == "aperture":

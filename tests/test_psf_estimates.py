@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from problems import number
 
 from raytrace.formats import read_lens
 from raytrace.kernels import NotConverged, diffraction, fourier, psf, raymap
@@ -26,10 +27,6 @@ from raytrace.system.surface import Aperture
 
 LENSES = Path(__file__).parents[1] / "lenses"
 INF = math.inf
-
-
-def number(x) -> torch.Tensor:
-    return torch.tensor(x, dtype=torch.float64)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,9 +110,7 @@ def prepared(model: str, case: Case) -> tuple[Lens, dict]:
     if case.clip is not None:
         radius, (inner, outer, shift) = float(stop_radius(lens)), case.clip
         hole = Aperture("circular", (inner * radius, outer * radius), centre=(0.0, shift * radius))
-        surfaces = list(lens.surfaces)
-        surfaces[lens.stop] = dataclasses.replace(surfaces[lens.stop], apertures=(hole,))
-        lens = dataclasses.replace(lens, surfaces=tuple(surfaces))
+        lens = lens.replace(lens.stop, apertures=(hole,))
     shown = slice(None) if case.colours == "all" else slice(lens.primary_wavelength, lens.primary_wavelength + 1)
     options = {
         "fields": number(case.field)[:, None],

@@ -36,17 +36,11 @@ def scene_of(lens, field=(0.0, 0.0), distances=(25_000.0,)):
 
 def clipped(lens: Lens, number: int, radius: float) -> Lens:
     """The lens with a clear aperture on one surface."""
-    surfaces = list(lens.surfaces)
-    surfaces[number] = dataclasses.replace(surfaces[number], apertures=(Aperture("circular", (0.0, radius)),))
-    return dataclasses.replace(lens, surfaces=tuple(surfaces))
+    return lens.replace(number, apertures=(Aperture("circular", (0.0, radius)),))
 
 
 def obscured(lens: Lens, number: int, radius: float, centre: tuple[float, float]) -> Lens:
-    surfaces = list(lens.surfaces)
-    surfaces[number] = dataclasses.replace(
-        surfaces[number], apertures=(Aperture("circular", (0.0, radius), True, centre),)
-    )
-    return dataclasses.replace(lens, surfaces=tuple(surfaces))
+    return lens.replace(number, apertures=(Aperture("circular", (0.0, radius), True, centre),))
 
 
 #: pixel (row, column) of 8 × 8 of 2.5 µm, mean, covariance, energy, allowed error in roundings. Exact: integrals in
@@ -294,11 +288,8 @@ def test_a_batch_is_its_single_kernels_at_every_order(lens):
 
 def test_a_dark_kernel_of_a_batch_is_zero_and_leaves_the_others():
     lens = clipped(lens_at(), 6, 7.0)
-    surfaces = list(lens.surfaces)
-    surfaces[1] = dataclasses.replace(surfaces[1], apertures=(Aperture("circular", (0.0, 6.0)),))
-    curvature = surfaces[3].curvature.clone().requires_grad_()
-    surfaces[3] = dataclasses.replace(surfaces[3], curvature=curvature)
-    lens = dataclasses.replace(lens, surfaces=tuple(surfaces))
+    curvature = lens.surfaces[3].curvature.clone().requires_grad_()
+    lens = clipped(lens, 1, 6.0).replace(3, curvature=curvature)
     fields, where = vector(0.0, 0.0, 0.0, 40.0).reshape(2, 2), grid(0.02, 5)
     both = gaussian.kernels(scene(lens, fields, vector(1e4), vector(0.53)), where, order=3)
     one = gaussian.kernels(scene(lens, fields[:, :1], vector(1e4), vector(0.53)), where, order=3)
@@ -328,10 +319,9 @@ def test_derivatives_with_vignetted_rays(field):
     place = gaussian.kernels(scene_of(base, field), grid(0.005, 3), order=3).centroid.flatten()
 
     def kernel(curvature, thickness, sensor_distance, pitch, shift):
-        surfaces = list(base.surfaces)
-        surfaces[3] = dataclasses.replace(surfaces[3], curvature=curvature / 10)
-        surfaces[5] = dataclasses.replace(surfaces[5], thickness=thickness)
-        lens = with_sensor_distance(dataclasses.replace(base, surfaces=tuple(surfaces)), sensor_distance)
+        lens = with_sensor_distance(
+            base.replace(3, curvature=curvature / 10).replace(5, thickness=thickness), sensor_distance
+        )
         pixel = Grid(pitch / 100, 2, 3, place + shift / 100)
         return 10 * gaussian.kernels(scene_of(lens, field, (10_000.0,)), pixel, order=3).kernel
 

@@ -6,22 +6,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from problems import number
 
 from raytrace import read_lens
 from raytrace.kernels import psf
 from raytrace.maths.grid import centres, grid
-from raytrace.system.lens import Lens, with_sensor_distance
+from raytrace.system.lens import with_sensor_distance
 
 LENSES = Path(__file__).parents[1] / "lenses"
 WAVES = ("fourier", "wave")
-
-
-def number(value) -> torch.Tensor:
-    return torch.tensor(value, dtype=torch.float64)
-
-
-def opened(name: str) -> Lens:
-    return read_lens(LENSES / f"{name}.zmx")
 
 
 def axis() -> torch.Tensor:
@@ -41,7 +34,7 @@ def sums(kernel: torch.Tensor, window) -> tuple[torch.Tensor, ...]:
 @pytest.mark.parametrize("model", WAVES)
 def test_what_is_said_of_waves_is_the_width_of_their_kernel_not_of_the_rays(model):
     """The telescope's rays meet in 0.01 µm, its diffraction pattern is a thousand times wider."""
-    found = psf(opened("hubble"), model, fields=axis(), tol=1e-3)
+    found = psf(read_lens("hubble"), model, fields=axis(), tol=1e-3)
     *_, xx, _, yy = sums(found.kernel[0, 0], found.grid)
     assert found.covariance[0, 0, 0] == pytest.approx(float(xx), rel=3e-3)
     assert found.covariance[2, 0, 0] == pytest.approx(float(yy), rel=3e-3)
@@ -53,7 +46,7 @@ def test_what_is_said_of_waves_is_the_width_of_their_kernel_not_of_the_rays(mode
 @pytest.mark.parametrize("shape", [(9, 21), (20, 8)])
 def test_round_light_in_a_window_that_is_not(model, shape):
     """Along one radius, or at every node of the window: the same moments, and those of a fine kernel."""
-    lens, pitch = opened("hubble"), 0.004
+    lens, pitch = read_lens("hubble"), 0.004
     options = {"fields": axis(), "order": 2}
     round_, plain = (
         psf(lens, model, grid=grid(number(pitch), shape, number([shift, 0.0])), **options) for shift in (0.0, 1e-9)
@@ -66,7 +59,7 @@ def test_round_light_in_a_window_that_is_not(model, shape):
 
 
 def test_moments_of_waves_off_the_axis_are_those_of_a_fine_kernel():
-    lens = opened("telephoto")
+    lens = read_lens("telephoto")
     lens = dataclasses.replace(lens, wavelengths=number([0.5, 0.6]), wavelength_weights=number([3.0, 1.0]))
     field, window = number([[1.0], [2.0]]), grid(number(0.0004), 61)
     found = psf(lens, "wave", fields=field, grid=window, center="chief", tol=0.01)
@@ -80,7 +73,7 @@ def test_moments_of_waves_off_the_axis_are_those_of_a_fine_kernel():
 
 @pytest.mark.parametrize("model", ["paraxial", "gaussian", "drt"])
 def test_geometric_models_keep_their_own_moments_whatever_the_window(model):
-    lens = opened("double_gauss")
+    lens = read_lens("double_gauss")
     wide, narrow = (
         psf(lens, model, fields=axis(), grid=grid(number(0.005), size), order=0 if model != "gaussian" else 4)
         for size in (21, 3)
@@ -93,7 +86,7 @@ def test_geometric_models_keep_their_own_moments_whatever_the_window(model):
 @pytest.mark.parametrize("shift", [0.0, 1e-3])
 @pytest.mark.parametrize("model", WAVES)
 def test_derivatives_of_the_moments(model, shift):
-    lens = opened("hubble")
+    lens = read_lens("hubble")
 
     def variance(sensor: torch.Tensor) -> torch.Tensor:
         window = grid(number(0.005), 7, number([shift, 0.0]))
@@ -109,7 +102,7 @@ def test_derivatives_of_the_moments(model, shift):
 
 @pytest.mark.parametrize("model", ["paraxial", "gaussian", "wave"])
 def test_kernels_of_each_wavelength_sum_to_those_of_all(model):
-    lens = opened("telephoto")
+    lens = read_lens("telephoto")
     options = {"fields": number([[0.0, 0.0], [0.0, 2.0]]), "center": "chief", "tol": 1e-2}
     options |= {"object_distances": number([1e5, math.inf, 2e5]), "grid": grid(number(0.01), (5, 7))}
     each, whole = (psf(lens, model, per_wavelength=kept, **options) for kept in (True, False))
@@ -130,7 +123,7 @@ def test_kernels_of_each_wavelength_sum_to_those_of_all(model):
 
 
 def test_the_lenses_own_fields_are_seen_about_their_chief_rays():
-    lens = opened("double_gauss")
+    lens = read_lens("double_gauss")
     found, asked = psf(lens, "gaussian"), psf(lens, "gaussian", fields=number([[0.0], [14.0]]))
     assert found.kernel.shape[1] == 3
     assert bool((found.energy > 0.05).all())

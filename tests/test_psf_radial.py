@@ -5,16 +5,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from problems import number
 
 from raytrace.kernels.dft import integrate, sub_pixels
 from raytrace.kernels.radial import energy_of_rings, is_centred, radii_of_waves, unfold
 from raytrace.maths.grid import grid
 
 SIZES = [21, 20, (1, 49), (7, 4)]
-
-
-def number(x) -> torch.Tensor:
-    return torch.tensor(x, dtype=torch.float64)
 
 
 def line(rays: int, radius: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -1,13 +1,12 @@
 """`wave` and `fourier` as models of `psf`: the contract of every kernel, derivatives, single precision, mirrors."""
 
-import dataclasses
 import math
 import warnings
 
 import problems
 import pytest
 import torch
-from problems import vector
+from problems import field, number, scene_of, vector
 
 from raytrace.kernels import NotConverged, diffraction, fourier, psf
 from raytrace.kernels.dft import huygens
@@ -18,32 +17,17 @@ from raytrace.media.glass import constant
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.scene import Scene, scene
 from raytrace.optics.wavefront import wavefront_of
-from raytrace.system.lens import Lens, with_sensor_distance
+from raytrace.system.lens import Lens
 from raytrace.system.surface import Aperture
 
 WAVES = ("fourier", "wave")
 MODULES = {"fourier": fourier, "wave": diffraction}
 
 
-def number(x) -> torch.Tensor:
-    return torch.tensor(x, dtype=torch.float64)
-
-
-def field(*angles: float) -> torch.Tensor:
-    return number([[0.0] * len(angles), list(angles)])
-
-
 def slow(stop: float | None = None, sensor: float = 57.8817685, beam: float = 8.0) -> Lens:
     """The double Gauss with a narrow beam, sharp at 25 m; `stop`: semi-diameter in mm of an aperture that clips it."""
-    lens = problems.double_gauss(aperture=("entrance_pupil_diameter", beam))
-    surfaces = list(with_sensor_distance(lens, number(sensor)).surfaces)
-    if stop is not None:
-        surfaces[6] = dataclasses.replace(surfaces[6], apertures=problems.vignetting_aperture(stop))
-    return dataclasses.replace(lens, surfaces=tuple(surfaces))
-
-
-def scene_of(lens: Lens, y: float, distance: float) -> Scene:
-    return scene(lens, field(y), number([distance]), lens.wavelengths)
+    lens = problems.double_gauss(aperture=("entrance_pupil_diameter", beam)).at(sensor_distance=sensor)
+    return lens if stop is None else lens.replace(6, apertures=problems.vignetting_aperture(stop))
 
 
 def light_at(model: str, s: Scene) -> torch.Tensor:
@@ -101,12 +85,9 @@ def test_energy_is_the_transmitted_share():
 
 
 def test_one_empty_kernel_of_a_batch_is_zero_with_derivative_zero():
-    surfaces = list(slow().surfaces)
+    curvature = slow().surfaces[3].curvature.clone().requires_grad_()
     # A hole in front passes the beam of the axis, not that of 40°.
-    surfaces[1] = dataclasses.replace(surfaces[1], apertures=problems.vignetting_aperture(5.0))
-    curvature = surfaces[3].curvature.clone().requires_grad_()
-    surfaces[3] = dataclasses.replace(surfaces[3], curvature=curvature)
-    lens = dataclasses.replace(slow(), surfaces=tuple(surfaces))
+    lens = slow().replace(1, apertures=problems.vignetting_aperture(5.0)).replace(3, curvature=curvature)
     found = psf(lens, "wave", fields=field(0.0, 40.0), object_distances=number([1e4]), grid=grid(0.01, 5), tol=0.1,
                 center="chief")  # fmt: skip
     assert float(found.energy[0, 0].detach()) > 0.5

@@ -48,8 +48,7 @@ SYSTEMS = {
 def immersed(system: Lens) -> Lens:
     """The object and the stop in water."""
     water = surface(None, 0.0, 1.33).glass
-    front = [dataclasses.replace(s, glass=water) for s in system.surfaces[:2]]
-    return dataclasses.replace(system, surfaces=(*front, *system.surfaces[2:]))
+    return system.replace(0, glass=water).replace(1, glass=water)
 
 
 SYSTEMS["immersed object"] = immersed(SYSTEMS["immersed object"])

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from problems import floats, number
 from test_hardcases import of_kind
 
 from raytrace.analysis import chief_reference
@@ -20,20 +21,12 @@ from raytrace.system.rays import Rays
 ROUNDING = 2.0**-53
 
 
-def tensor(x):
-    return torch.tensor(x, dtype=torch.float64)
-
-
-def floats(values):
-    return [float(v) for v in values]
-
-
 @pytest.mark.parametrize("case", of_kind("spot"))
 def test_hard_case(case):
     """Centroid, mean square and RMS radius with their gradients, against exact rational arithmetic."""
     data, expected = case["data"], case["expected"]
-    x, y = (tensor(floats(data[key])).requires_grad_() for key in "xy")
-    found = spot_of_points(torch.stack([x, y]), torch.tensor(data["valid"]), tensor(data["weight"]))
+    x, y = (number(floats(data[key])).requires_grad_() for key in "xy")
+    found = spot_of_points(torch.stack([x, y]), torch.tensor(data["valid"]), number(data["weight"]))
     mean_square = torch.autograd.grad(found.mean_square_radius, x, retain_graph=True)[0]
     rms = torch.autograd.grad(found.rms_radius, x)[0]
     assert torch.isfinite(rms).all()
@@ -42,20 +35,20 @@ def test_hard_case(case):
         assert found.mean_square_radius.isnan()
         assert (mean_square == 0).all()
         return
-    centroid = tensor(floats(expected["centroid"]))
+    centroid = number(floats(expected["centroid"]))
     assert (found.centroid - centroid).abs().max() <= 4 * ROUNDING * centroid.abs().max()
     size = float(expected["rms"])
     rounded = 4 * ROUNDING * centroid.abs().max().item()  # of the mean
     if 1e-140 < size < 1e140:  # beyond, the mean *square* leaves the range of float64
         assert found.mean_square_radius.item() == pytest.approx(float(expected["mean_square_radius"]), rel=1e-13)
-        reference = tensor(floats(expected["grad_mean_square_x"]))
+        reference = number(floats(expected["grad_mean_square_x"]))
         # Differences of points to the centroid are exact but for the rounding of the mean.
         assert (mean_square - reference).abs().max() <= 1e-13 * size + rounded
     assert found.rms_radius.item() == pytest.approx(size, rel=1e-13)
     if expected["grad_rms_x"] is None:
         assert (rms == 0).all()
     else:
-        reference = tensor(floats(expected["grad_rms_x"]))
+        reference = number(floats(expected["grad_rms_x"]))
         assert (rms - reference).abs().max() <= 1e-13 + rounded / size
 
 
@@ -66,7 +59,7 @@ def test_weighted_radius_by_numpy():
     w = np.where(valid, weights, 0) / weights[valid].sum()
     centre = points @ w
     square = ((points - centre[:, None]) ** 2).sum(0)
-    found = spot_of_points(tensor(points), torch.tensor(valid), tensor(weights))
+    found = spot_of_points(number(points), torch.tensor(valid), number(weights))
     assert found.rms_radius.item() == pytest.approx(math.sqrt(square @ w), rel=1e-14)
     assert found.geometric_radius.item() == pytest.approx(math.sqrt(square[valid].max()), rel=1e-14)
     assert found.rays.item() == valid.sum()
@@ -75,14 +68,14 @@ def test_weighted_radius_by_numpy():
 def test_a_picometre_spot_a_metre_off_the_axis():
     """1 pm is nine spacings of float64 at 1000 mm; these points are exact, and so is their RMS radius."""
     step = 2.0**-40  # 0.9 pm
-    points = tensor([[1000.0, 1000.0 + step, 1000.0, 1000.0 + step], [-500.0, -500.0, -500.0 + step, -500.0 + step]])
+    points = number([[1000.0, 1000.0 + step, 1000.0, 1000.0 + step], [-500.0, -500.0, -500.0 + step, -500.0 + step]])
     found = spot_of_points(points, torch.ones(4, dtype=torch.bool))
     assert found.rms_radius.item() == pytest.approx(step / math.sqrt(2), rel=1e-15)
 
 
 @pytest.mark.parametrize("points", [[[1.25], [-3.5]], [[1.1, 1.1], [0.3, 0.3]]])
 def test_one_point_or_identical_points_have_radius_and_gradient_zero(points):
-    points = tensor(points).requires_grad_()
+    points = number(points).requires_grad_()
     found = spot_of_points(points, torch.ones(points.shape[1], dtype=torch.bool))
     assert found.rms_radius == found.geometric_radius == 0
     (gradient,) = torch.autograd.grad(found.rms_radius + found.geometric_radius, points)
@@ -143,7 +136,7 @@ def test_a_lost_spot_can_be_an_error():
 
 def test_rays_without_weight_make_no_spot():
     points, _ = batch_with_a_lost_spot()
-    found = spot_of_points(points, torch.ones(2, 5, dtype=torch.bool), tensor([[1.0] * 5, [0.0] * 5]))
+    found = spot_of_points(points, torch.ones(2, 5, dtype=torch.bool), number([[1.0] * 5, [0.0] * 5]))
     assert found.rms_radius.isnan().tolist() == [False, True]
 
 
@@ -174,14 +167,14 @@ def test_derivatives_of_the_mean_square():
 
 
 def test_float32_keeps_its_digits():
-    points = tensor([[1000.0, 1000.0 + 2**-13, 1000.0], [0.0, 0.0, 2**-13]])
+    points = number([[1000.0, 1000.0 + 2**-13, 1000.0], [0.0, 0.0, 2**-13]])
     found = spot_of_points(points.float(), torch.ones(3, dtype=torch.bool))
     exact = spot_of_points(points, torch.ones(3, dtype=torch.bool)).rms_radius.item()
     assert found.rms_radius.item() == pytest.approx(exact, rel=1e-6)
 
 
 def test_spot_of_rays_ignores_lost_ones():
-    position = tensor([[0.0, 1.0, 77.0], [0.0, 0.0, 77.0], [0.0, 0.0, 0.0]])
+    position = number([[0.0, 1.0, 77.0], [0.0, 0.0, 77.0], [0.0, 0.0, 0.0]])
     direction = torch.zeros_like(position)
     direction[2] = 1.0
     found = spot_of(Rays(position, direction, torch.tensor([True, True, False])))
@@ -192,9 +185,9 @@ def test_spot_of_rays_ignores_lost_ones():
 def test_radii_about_another_point_follow_the_theorem_of_parallel_axes():
     """Mean square about a point = about the centroid + distance², and the largest radius is counted from there."""
     generator = np.random.default_rng(2)
-    points, weights = tensor(generator.normal(size=(2, 3, 40))), tensor(generator.random(40))
+    points, weights = number(generator.normal(size=(2, 3, 40))), number(generator.random(40))
     valid = torch.as_tensor(generator.random((3, 40)) < 0.8)
-    about = tensor([[0.3], [-1.0]]).requires_grad_()
+    about = number([[0.3], [-1.0]]).requires_grad_()
     own, other = (spot_of_points(points, valid, weights, about=at) for at in (None, about))
     torch.testing.assert_close(other.centroid, own.centroid)
     apart = ((own.centroid - about) ** 2).sum(0)
@@ -216,7 +209,7 @@ def test_the_command_takes_equal_weights_about_the_chief_ray(capsys):
     lens = read_lens(shipped("lenses") / "cooke_triplet.zmx")
     fields = torch.stack([lens.fields.x, lens.fields.y])
     expected = spot_of(image_rays(lens, pupil.hexapolar(6)[0]), about=chief_reference(lens, fields))
-    radii = tensor([entry["rms_radius"] for entry in found[1]["results"]]).reshape(3, 3)
+    radii = number([entry["rms_radius"] for entry in found[1]["results"]]).reshape(3, 3)
     torch.testing.assert_close(radii, expected.rms_radius, rtol=1e-12, atol=0)
     assert found[0]["reference"] == "centroid"
     assert all(a["rms_radius"] != b["rms_radius"] for a, b in zip(*(d["results"] for d in found), strict=True))

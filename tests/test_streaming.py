@@ -33,9 +33,7 @@ COLOURS = vector(0.48, 0.65)
 def clipped(**others):
     """The double Gauss with a rim that cuts beams off the axis, as tight as it must be to lose rays of the axis."""
     found = double_gauss(**others)
-    surfaces = list(found.surfaces)
-    surfaces[1] = dataclasses.replace(surfaces[1], apertures=(Aperture("circular", (0.0, 15.0)),))
-    return dataclasses.replace(found, surfaces=tuple(surfaces))
+    return found.replace(1, apertures=(Aperture("circular", (0.0, 15.0)),))
 
 
 # ---------------------------------------------------------------- points
@@ -383,8 +381,7 @@ def growth(run, rays, max_bytes):
 
 gauss, bulge = double_gauss(), aspheric_singlet()
 curvature = bulge.surfaces[1].curvature.clone().requires_grad_()
-first = dataclasses.replace(bulge.surfaces[1], curvature=curvature)
-bent = dataclasses.replace(bulge, surfaces=(bulge.surfaces[0], first, *bulge.surfaces[2:]))
+bent = bulge.replace(1, curvature=curvature)
 field = vector(0.0, 10.0)[:, None]
 aim = {"fields": field, "ray_aiming": "real"}
 run = lambda n, b: streaming.stream_spot(gauss, n, fields=field[:, :1], max_bytes=b)

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from problems import covariance, draws, gaussian
 
 from raytrace.camera.deconvolve import blind_filter, errors, mean_square_error, power_law, psnr, restore, within
 from raytrace.camera.image import blur, transfer_functions, visible
@@ -22,16 +23,6 @@ from raytrace.studies.superres.inversion import (
 )
 
 
-def draws(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> torch.Tensor:
-    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
-
-
-def gaussian(width: float, size: int = 9) -> torch.Tensor:
-    x = torch.arange(size, dtype=torch.float64) - (size - 1) / 2
-    kernel = torch.exp(-0.5 * (x[:, None] ** 2 + x**2) / width**2)
-    return kernel / kernel.sum()
-
-
 def places(*points: tuple[int, int, float], size: int = 9) -> torch.Tensor:
     """A kernel of points (row, column, share) around its middle."""
     kernel = torch.zeros(size, size, dtype=torch.float64)
@@ -48,14 +39,6 @@ def dense(kernel: torch.Tensor, size: tuple[int, int], factor: int) -> torch.Ten
     count = size[0] * size[1]
     points = torch.eye(count, dtype=torch.float64).reshape(count, *size)
     return coarse_image(points, kernel, factor, boundary="circular").reshape(count, -1).T
-
-
-def covariance(spectrum: torch.Tensor) -> torch.Tensor:
-    """The matrix E[x xᵀ] of periodic pictures of a power spectrum."""
-    rows, columns = spectrum.shape
-    correlation = torch.fft.ifft2(spectrum).real
-    i, j = (n.flatten() for n in torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij"))
-    return correlation[(i[:, None] - i) % rows, (j[:, None] - j) % columns]
 
 
 @pytest.mark.parametrize(("factor", "boundary"), [(1, "circular"), (2, "circular"), (2, "reflect"), (3, "valid")])

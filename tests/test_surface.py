@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from problems import FEMTOMETRE, surface, vector
+from problems import FEMTOMETRE, surface, turned, vector
 from torch.autograd import gradcheck, gradgradcheck
 
 from raytrace.system.surface import Aperture, inside, intersect, normal, sag
@@ -83,9 +83,6 @@ def test_origin_may_slide_along_the_ray(shape):
 def test_surface_turned_about_z_is_the_same(shape):
     position, direction = rays()
     hit, _ = intersect(shape, position, direction)
-
-    def turned(v):
-        return torch.stack([-v[1], v[0], v[2]])
 
     assert torch.equal(intersect(shape, turned(position), turned(direction))[0], turned(hit))
 

@@ -23,9 +23,7 @@ NASTY = st.text(
 
 def with_texts(name: str, note: str, comment: str):
     lens = read_lens(LENSES / "double_gauss.zmx")
-    surfaces = list(lens.surfaces)
-    surfaces[3] = dataclasses.replace(surfaces[3], comment=comment)
-    return dataclasses.replace(lens, name=name, notes=(note, "between", note), surfaces=tuple(surfaces))
+    return dataclasses.replace(lens.replace(3, comment=comment), name=name, notes=(note, "between", note))
 
 
 def texts_of(lens) -> tuple:

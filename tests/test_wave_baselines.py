@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from problems import number
 from scipy.special import j0, j1
 from torch.autograd import gradcheck
 
@@ -21,10 +22,6 @@ PMMA, SILICA = find_glass("PMMA"), find_glass("F_SILICA")
 POWER = 1 / 1000 + 1 / 35.5
 #: Rounding of paths of 0.1 mm.
 ROUNDING = 1e-15
-
-
-def number(x):
-    return torch.tensor(x, dtype=torch.float64)
 
 
 def spheres(r, *distances):

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from problems import number
 
 from raytrace.cli import wave_table
 from raytrace.maths.grid import grid
@@ -35,12 +36,8 @@ def run(command):
     return functools.partial(command, "wave")
 
 
-def tensor(numbers):
-    return torch.tensor(numbers, dtype=torch.float64)
-
-
 def library(elements, depths, wavelengths, size=128):
-    return psf(WaveScene(elements, tensor(35.5), tensor(depths), tensor(wavelengths), grid(tensor(0.00369), size)))
+    return psf(WaveScene(elements, number(35.5), number(depths), number(wavelengths), grid(number(0.00369), size)))
 
 
 def test_fixed_form_gives_the_librarys_kernels(run, tmp_path):

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from problems import number
 from torch.autograd import gradcheck
 
 from raytrace.maths.value import to
@@ -28,10 +29,6 @@ from raytrace.wave.element import (
 ROUNDING = 1e-14
 COLOURS = torch.tensor([0.46, 0.55, 0.64], dtype=torch.float64)
 PMMA, SILICA = find_glass("PMMA"), find_glass("F_SILICA")
-
-
-def number(x):
-    return torch.tensor(x, dtype=torch.float64)
 
 
 def element(profile, glass=PMMA, **known):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from problems import number
 
 from raytrace.media.catalog import find_glass
 from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, fabricated, period
@@ -20,10 +21,6 @@ PICTURES = (".png", ".tif", ".tiff")
 GRIDS = (".dat", ".grd")
 #: One wave of 550 nm in fused silica, mm.
 WAVE = 1.195888e-3
-
-
-def number(x):
-    return torch.tensor(x, dtype=torch.float64)
 
 
 def drawn(*shape, seed=0):

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from problems import generator, number
 from torch.autograd import gradcheck
 
 from raytrace.media.catalog import find_glass
@@ -13,16 +14,8 @@ from raytrace.wave.fabrication import as_made, as_pixels, as_rings, roughness, w
 SILICA = find_glass("F_SILICA")
 
 
-def number(x):
-    return torch.tensor(x, dtype=torch.float64)
-
-
 def lens(radius=0.5):
     return Element(EvenPowers(number([-0.03, 2e-3])), number(radius), SILICA)
-
-
-def seeded(seed):
-    return torch.Generator().manual_seed(seed)
 
 
 def test_rings_hold_the_height_at_their_middle():
@@ -80,7 +73,7 @@ def test_sixteen_steps_keep_sinc2_of_the_light():
 
 def test_tolerance_is_uniform_keyed_and_leaves_the_element():
     made = wrapped(as_rings(lens(2.5), 0.0005), 0.55, levels=16)
-    off = with_tolerance(made, 20e-6, generator=seeded(3))
+    off = with_tolerance(made, 20e-6, generator=generator(3))
     x = made.profile.heights
     r = (torch.arange(len(x)).double() + 0.5) * made.profile.pitch
     error = height(off, r, 0 * r) - height(made, r, 0 * r)
@@ -88,16 +81,16 @@ def test_tolerance_is_uniform_keyed_and_leaves_the_element():
     assert error.abs().max() > 19.9e-6
     assert abs(float(error.std()) / 20e-6 * math.sqrt(3) - 1) < 0.03  # 5000 draws: 1 % standard error
     assert abs(float(error.mean())) < 1e-6
-    again = with_tolerance(made, 20e-6, generator=seeded(3))
+    again = with_tolerance(made, 20e-6, generator=generator(3))
     assert torch.equal(again.profile.heights, off.profile.heights)
-    other = with_tolerance(made, 20e-6, generator=seeded(4))
+    other = with_tolerance(made, 20e-6, generator=generator(4))
     assert not torch.equal(other.profile.heights, off.profile.heights)
     assert (off.period, off.levels) == (None, 0)  # what is off a step is not put back on it
 
 
 def test_no_tolerance_is_the_element_as_made():
     made = wrapped(as_pixels(lens(), 0.02), 0.55, levels=16)
-    off = with_tolerance(made, 0.0, generator=seeded(0))
+    off = with_tolerance(made, 0.0, generator=generator(0))
     x = torch.linspace(-0.4, 0.4, 57, dtype=torch.float64)
     assert torch.equal(height(off, x, -x), height(made, x, -x))
 
@@ -122,7 +115,7 @@ def test_as_made_is_the_same_element_with_its_heights_written_out():
 def test_gradients_pass_sampling_steps_and_tolerance():
     c = number([-0.03, 2e-3]).requires_grad_()
     smooth = Element(EvenPowers(c), number(0.5), SILICA)
-    made = with_tolerance(wrapped(as_rings(smooth, 0.02), 0.55, levels=16), 2e-5, generator=seeded(1))
+    made = with_tolerance(wrapped(as_rings(smooth, 0.02), 0.55, levels=16), 2e-5, generator=generator(1))
     weights = torch.arange(25, dtype=torch.float64)
     found = torch.autograd.grad((made.profile.heights * weights).sum(), c)[0]
     r2 = ((torch.arange(25).double() + 0.5) * 0.02).double() ** 2
@@ -132,7 +125,7 @@ def test_gradients_pass_sampling_steps_and_tolerance():
 def test_float32_stays_float32():
     single = Element(EvenPowers(torch.tensor([-0.03])), torch.tensor(0.5), SILICA)
     for made in (as_rings(single, 0.02), as_pixels(single, 0.02)):
-        off = with_tolerance(wrapped(made, 0.55, levels=16), 2e-5, generator=seeded(0))
+        off = with_tolerance(wrapped(made, 0.55, levels=16), 2e-5, generator=generator(0))
         assert off.profile.heights.dtype == off.profile.pitch.dtype == torch.float32
 
 
@@ -157,7 +150,7 @@ def test_one_high_pixel_is_rough_by_itself_and_its_neighbours():
 
 
 def test_roughness_goes_over_batches_and_has_a_gradient():
-    maps = torch.rand(3, 5, 6, dtype=torch.float64, generator=seeded(2))
+    maps = torch.rand(3, 5, 6, dtype=torch.float64, generator=generator(2))
     assert torch.allclose(roughness(maps), torch.stack([roughness(h) for h in maps]), atol=0, rtol=1e-14)
     assert gradcheck(roughness, [maps[0].clone().requires_grad_()])
 
