@@ -68,6 +68,8 @@ PUBLIC = {
     "ray_fan": "analysis",
     "relative_illumination": "analysis",
     "seidel": "analysis",
+    "elements": "wave.compute",
+    "wave_psf": "wave.compute",
     "wavefront_map": "analysis",
     # learning
     "Camera": "camera",

@@ -29,8 +29,7 @@ from raytrace.studies.edof.world import (
     spectrum,
     transfer,
 )
-from raytrace.wave.aim import aim
-from raytrace.wave.baselines import baseline
+from raytrace.wave.designs import aim, baseline
 from raytrace.wave.element import Element, EvenPowers, height
 from raytrace.wave.psf import psf
 

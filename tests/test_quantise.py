@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from raytrace.cli import main
-from raytrace.cli.wave_setup import height_map
 from raytrace.formats.pictures import dead_leaves
 from raytrace.media.catalog import find_glass
 from raytrace.studies.edof.world import World, expected_error, periodic, quality, scene, spectrum, transfer
@@ -24,12 +23,10 @@ from raytrace.studies.quantise.experiment import (
     tolerances_of,
     whole,
 )
-from raytrace.wave.aim import aim
-from raytrace.wave.baselines import baseline
-from raytrace.wave.element import Element, EvenPowers, Rings, period
+from raytrace.wave.designs import aim, baseline
+from raytrace.wave.element import Element, EvenPowers, Rings, as_pixels, as_rings, period
+from raytrace.wave.element_file import read_element, write_element
 from raytrace.wave.exchange import write_heights
-from raytrace.wave.fabrication import as_pixels, as_rings
-from raytrace.wave.label import write_element
 from raytrace.wave.psf import psf
 
 #: Small, and quick: 1 mm, f/20, one colour, three depths.
@@ -165,7 +162,7 @@ def test_pixels_are_made_as_rings_are(tmp_path, suffix):
     """A lens in pixels of 12.5 µm from every format: the law of its levels beside whole pixels, and the same PSNR."""
     (lens,) = baseline("singlet", aim(radius=WORLD.radius, sensor=WORLD.sensor_distance, focus=WORLD.design))
     write_heights(as_pixels(lens, 0.0125).profile, tmp_path / f"lens{suffix}")
-    element = height_map(str(tmp_path / f"lens{suffix}"), aperture=1.0, glass=lambda: lens.glass)
+    element = read_element(str(tmp_path / f"lens{suffix}"), aperture=1.0, glass=lens.glass)
     some, all_ = (efficiency(made(element, levels, wrap=True), WORLD) for levels in (8, 0))
     assert some == pytest.approx(law(8) * all_, rel=0.02)
     if suffix == ".dat":

@@ -10,11 +10,8 @@ from torch.autograd import gradcheck
 
 from raytrace.media.catalog import find_glass
 from raytrace.media.glass import constant, index
-from raytrace.wave.achromat import achromat, encircled_energy
-from raytrace.wave.aim import aim, converging
-from raytrace.wave.baselines import BASELINES, FOCI, baseline
-from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike, height, path
-from raytrace.wave.fabrication import as_rings, features
+from raytrace.wave.designs import BASELINES, FOCI, achromat, aim, baseline, converging, encircled_energy
+from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike, as_rings, features, height, path
 
 COLOURS = torch.tensor([0.46, 0.55, 0.64], dtype=torch.float64)
 PMMA, SILICA = find_glass("PMMA"), find_glass("F_SILICA")

@@ -1,6 +1,8 @@
 """`raytrace wave psf` and `focus`: fixed forms, arrays and JSON against the library, files, and how they refuse."""
 
+import argparse
 import functools
+import inspect
 import json
 import math
 import subprocess
@@ -12,15 +14,15 @@ import pytest
 import torch
 from problems import number
 
-from raytrace.cli import wave_table
+import raytrace as rt
+from raytrace.cli import wave, wave_options, wave_psf
 from raytrace.maths.grid import grid
 from raytrace.media.glass import index
 from raytrace.plot.wave import height_figure
-from raytrace.wave.aim import aim
-from raytrace.wave.baselines import BASELINES, baseline
+from raytrace.wave.designs import BASELINES, aim, baseline
+from raytrace.wave.element import as_rings
+from raytrace.wave.element_file import read_label, write_element
 from raytrace.wave.exchange import write_heights
-from raytrace.wave.fabrication import as_rings
-from raytrace.wave.label import read_label, write_element
 from raytrace.wave.plan import ENGINES, plan
 from raytrace.wave.psf import psf
 from raytrace.wave.scene import WaveScene
@@ -62,9 +64,38 @@ def test_fixed_form_gives_the_librarys_kernels(run, tmp_path):
     assert (tmp_path / "psf.png").read_bytes()[:4] == b"\x89PNG"
 
 
+def test_the_command_is_the_verb(run):
+    """One name, the same options, the same defaults, the same result."""
+    parser = argparse.ArgumentParser(add_help=False)
+    wave_psf.options(parser)
+    keywords = inspect.signature(rt.wave_psf).parameters
+    for action in parser._actions:
+        if action.dest not in ("json", "output", "catalog") and not action.dest.startswith("plot"):
+            given = [*action.default] if isinstance(action.default, list) else action.default
+            default = keywords[action.dest].default
+            assert given == ([*default] if isinstance(default, tuple) else default), action.dest
+    _, out, _ = run("psf", "--element", "fresnel", *SMALL, "--json")
+    found = rt.wave_psf("fresnel", depths=[1000], wavelengths=[0.55], size=16)
+    assert json.loads(out) == found.document()
+    assert run("psf", "--element", "fresnel", *SMALL)[1] == f"{found}\n"
+    assert found.to_frame().half_energy_radius[0] == float(found.half_energy_radius)
+
+
+def test_kernels_of_an_element_at_hand_are_differentiable():
+    (lens,) = rt.elements("singlet", aperture=1.0)
+
+    def peak(power):
+        return rt.wave_psf(lens.with_numbers(power), depths=[500], wavelengths=[0.55], size=8).kernel.max()
+
+    power, step = lens.numbers.clone().requires_grad_(), 1e-6
+    (found,) = torch.autograd.grad(peak(power), power)
+    expected = (peak(lens.numbers + step) - peak(lens.numbers - step)) / (2 * step)
+    assert float(found) == pytest.approx(float(expected), rel=1e-6)
+
+
 def test_names_and_engines_are_those_of_the_library():
-    assert tuple(BASELINES) == wave_table.ELEMENTS
-    assert ("auto", *ENGINES) == wave_table.ENGINES
+    assert tuple(BASELINES) == wave_options.ELEMENTS
+    assert ("auto", *ENGINES) == wave_options.ENGINES
 
 
 @pytest.mark.parametrize("element", ["ideal", "singlet", "fresnel", "multifocal", "hybrid", "multifocal-refractive"])
@@ -239,7 +270,7 @@ def test_focus_prints_what_became_of_the_plate(run, tmp_path):
     assert (tmp_path / "focus.png").read_bytes()[:4] == b"\x89PNG"
 
 
-@pytest.mark.parametrize("name", [entry[0] for entry in wave_table.SUBCOMMANDS])
+@pytest.mark.parametrize("name", [command.name.removeprefix("wave-") for command in wave.SUBCOMMANDS])
 def test_help_teaches_by_example(run, name):
     from raytrace.cli import build_parser
 

@@ -17,12 +17,12 @@ from raytrace.wave.element import (
     Pixels,
     Rings,
     Zernike,
+    designed_height,
     fabricated,
     height,
     is_radial,
     path,
     period,
-    profile_height,
 )
 
 #: Rounding of a few operations on numbers of the order of 1.
@@ -269,6 +269,6 @@ def test_gradcheck_of_the_radius_and_of_the_glass():
 
 def test_second_derivatives_in_the_points_are_those_of_the_lens():
     x = number([0.0, 0.5, 1.0]).requires_grad_()
-    h = profile_height(EvenPowers(number([-0.03])), x, torch.zeros(3, dtype=torch.float64), radius=number(2.5))
+    h = designed_height(element(EvenPowers(number([-0.03])), PMMA), x, torch.zeros(3, dtype=torch.float64))
     slope = torch.autograd.grad(h.sum(), x, create_graph=True)[0]
     assert (torch.autograd.grad(slope.sum(), x)[0] + 0.06).abs().max() < ROUNDING

@@ -12,9 +12,8 @@ from PIL import Image
 from problems import number
 
 from raytrace.media.catalog import find_glass
-from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, fabricated, period
+from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, as_made, as_pixels, fabricated, period, wrapped
 from raytrace.wave.exchange import FORMATS, HeightMapError, read_heights, write_heights
-from raytrace.wave.fabrication import as_made, as_pixels, wrapped
 
 EXACT = (".npy", ".csv")
 PICTURES = (".png", ".tif", ".tiff")

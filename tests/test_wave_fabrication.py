@@ -1,15 +1,26 @@
-"""Fabrication: sampling at the size of features, wrapping, tolerance and roughness."""
+"""Fabrication: sampling at the size of features, wrapping and tolerance."""
 
 import math
 
 import pytest
 import torch
 from problems import generator, number
-from torch.autograd import gradcheck
 
 from raytrace.media.catalog import find_glass
-from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike, height, period
-from raytrace.wave.fabrication import as_made, as_pixels, as_rings, roughness, with_tolerance, wrapped
+from raytrace.wave.element import (
+    Element,
+    EvenPowers,
+    Pixels,
+    Rings,
+    Zernike,
+    as_made,
+    as_pixels,
+    as_rings,
+    height,
+    period,
+    with_tolerance,
+    wrapped,
+)
 
 SILICA = find_glass("F_SILICA")
 
@@ -127,38 +138,6 @@ def test_float32_stays_float32():
     for made in (as_rings(single, 0.02), as_pixels(single, 0.02)):
         off = with_tolerance(wrapped(made, 0.55, levels=16), 2e-5, generator=generator(0))
         assert off.profile.heights.dtype == off.profile.pitch.dtype == torch.float32
-
-
-# -- roughness --------------------------------------------------------------------------------------------------------
-
-
-def test_a_tilted_plane_is_not_rough_and_a_parabola_is_evenly():
-    y, x = torch.meshgrid(torch.arange(6).double(), torch.arange(8).double(), indexing="ij")
-    assert roughness(2 * x - 3 * y + 1) < 1e-13
-    # Σ over 8 neighbours of (x + i)² is 6 more than 8 x²
-    assert abs(float(roughness(x**2)) - 6) < 1e-13
-    assert abs(float(roughness(0.5 * x**2 + y**2)) - 9) < 1e-13
-
-
-def test_one_high_pixel_is_rough_by_itself_and_its_neighbours():
-    h = torch.zeros(7, 9, dtype=torch.float64)
-    h[3, 4] = 1.0
-    assert abs(float(roughness(h)) - (8 + 8) / 35) < 1e-14  # 5 × 7 inner points
-    border = torch.zeros(7, 9, dtype=torch.float64)
-    border[0, 0] = 1.0
-    assert abs(float(roughness(border)) - 1 / 35) < 1e-14
-
-
-def test_roughness_goes_over_batches_and_has_a_gradient():
-    maps = torch.rand(3, 5, 6, dtype=torch.float64, generator=generator(2))
-    assert torch.allclose(roughness(maps), torch.stack([roughness(h) for h in maps]), atol=0, rtol=1e-14)
-    assert gradcheck(roughness, [maps[0].clone().requires_grad_()])
-
-
-@pytest.mark.parametrize("shape", [(2, 9), (9,), ()])
-def test_roughness_needs_inner_points(shape):
-    with pytest.raises(ValueError, match="3 × 3"):
-        roughness(torch.zeros(shape))
 
 
 def test_rings_of_one_are_a_plate():

@@ -12,10 +12,8 @@ from test_wave_propagation import PLASTIC, R, lens, relative, scene
 
 from raytrace.kernels.dft import integrate, phasor, sub_pixels
 from raytrace.wave import mixed, radial
-from raytrace.wave.aim import aim
-from raytrace.wave.baselines import baseline
-from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike
-from raytrace.wave.fabrication import as_pixels, wrapped
+from raytrace.wave.designs import aim, baseline
+from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike, as_pixels, wrapped
 from raytrace.wave.plan import plan
 from raytrace.wave.psf import psf
 from raytrace.wave.scene import aperture, millimetres, residual

@@ -64,8 +64,7 @@ def test_the_error_axis_of_learning_has_numbers():
 def test_the_caption_of_a_single_kernel_stays_on_its_page():
     from page import outside
 
-    from raytrace.bench.wave import bench_scene
-    from raytrace.plot.wave import psf_figure
-    from raytrace.wave.psf import psf
+    import raytrace
 
-    assert not outside(psf_figure(psf(bench_scene(size=8), engine="pupil", samples=600), title="one kernel"))
+    found = raytrace.wave_psf("singlet", depths=[500], wavelengths=[0.46], size=8, engine="pupil", samples=600)
+    assert not outside(found.plot())

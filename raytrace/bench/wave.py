@@ -20,8 +20,7 @@ from raytrace.maths.grid import grid
 from raytrace.maths.value import to
 from raytrace.media.glass import index
 from raytrace.wave import radial
-from raytrace.wave.aim import aim
-from raytrace.wave.baselines import singlet
+from raytrace.wave.designs import aim, singlet
 from raytrace.wave.plan import AliasedSampling
 from raytrace.wave.plan import plan as plan_of
 from raytrace.wave.psf import psf

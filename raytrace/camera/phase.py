@@ -1,16 +1,12 @@
 """Phase variables: the heights of a thin element as parameters of a module."""
 
-import dataclasses
 import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
-from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike
-
-#: Of each kind of profile, the field that holds its numbers.
-NUMBERS = {Pixels: "heights", Rings: "heights", Zernike: "coefficients", EvenPowers: "coefficients"}
+from raytrace.wave.element import Element
 
 
 class PhaseVariables(nn.Module):
@@ -34,7 +30,7 @@ class PhaseVariables(nn.Module):
     ):
         super().__init__()
         self.element, self.unit, self.others, self.tolerance = element, unit, tuple(others), tolerance
-        self.start = getattr(element.profile, NUMBERS[type(element.profile)])
+        self.start = element.numbers
         self.basis = basis
         shape = self.start.shape if basis is None else basis.shape[-1:]
         if basis is not None and basis.shape[:-1] != self.start.shape:
@@ -55,8 +51,7 @@ class PhaseVariables(nn.Module):
         if draw is not None and self.tolerance:
             error = torch.rand(numbers.shape, generator=draw, dtype=numbers.dtype, device=numbers.device)
             numbers = numbers + self.tolerance * (2 * error - 1)
-        profile = dataclasses.replace(self.element.profile, **{NUMBERS[type(self.element.profile)]: numbers})
-        return (dataclasses.replace(self.element, profile=profile), *self.others)
+        return (self.element.with_numbers(numbers), *self.others)
 
 
 def radial_powers(radius: Tensor, terms: int) -> Tensor:

@@ -1,5 +1,6 @@
 """The commands of `raytrace`: their words, their arguments, and what runs them. Imports no torch."""
 
+from raytrace.cli import wave
 from raytrace.cli.analysis_table import ANALYSES
 from raytrace.cli.command import Command
 from raytrace.cli.options import (
@@ -25,7 +26,6 @@ from raytrace.cli.options import (
     window,
 )
 from raytrace.cli.studies import words
-from raytrace.cli.wave_table import WAVE
 
 
 def _info(parser):
@@ -339,5 +339,5 @@ COMMANDS = (
     ),
     *(Command(*entry) for entry in ANALYSES),
     *(Command(*entry) for entry in words("codesign")),
-    Command(*WAVE),
+    Command("wave", wave.SUMMARY, wave.DESCRIPTION, wave.EXAMPLES, wave.options, "cli.wave.options"),
 )

@@ -4,7 +4,7 @@ import argparse
 
 from raytrace.cli.options import catalog, count, file_name, positive, positive_finite, size
 
-#: The names that `--element` takes beside files: those of wave.baselines.
+#: The names that `--element` takes beside files: those of wave.designs.
 ELEMENTS = (
     "ideal",
     "singlet",
@@ -95,6 +95,7 @@ def light(
         listed = " ".join(f"{depth:g}" for depth in depths)
         group.add_argument(
             "--depth",
+            dest="depths",
             metavar="MM",
             type=positive,
             nargs="+",
@@ -103,6 +104,7 @@ def light(
         )
     group.add_argument(
         "--wavelength",
+        dest="wavelengths",
         metavar="UM",
         type=positive_finite,
         nargs="+",

@@ -112,3 +112,10 @@ def cell(value: float, form: str) -> str:
         return f"{'-':>{len(f'{0.0:{form}}')}}"
     shown = f"{value:{form}}"
     return shown if float(shown) else f"{0.0:{form}}"  # what rounds to 0 has no sign
+
+
+def object_text(distance: float) -> str:
+    """An object distance in mm, as it was given: `25 m`, `400 mm`, `infinity`."""
+    if math.isinf(distance):
+        return "infinity"
+    return (f"{distance / 1000:.6g} m" if abs(distance) >= 1e4 else f"{distance:.6g} mm").replace("-", "−")

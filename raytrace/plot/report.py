@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from raytrace.maths.result import object_text
 from raytrace.optics.paraxial import first_order, paraxial_image_distance
 from raytrace.plot import style
 from raytrace.plot.curve import FocusRays, draw_curves, focus_rays, focus_span
@@ -82,7 +83,7 @@ def _labels(lens: Lens, distances: list[float], fields: Tensor) -> list[str]:
     points = [style.field_label(lens, point) for point in style.array(fields).T]
     if len(distances) == 1:
         return points
-    objects = [style.object_text(distance) for distance in distances]
+    objects = [object_text(distance) for distance in distances]
     return [place if len(points) == 1 else f"{place}, {point}" for place in objects for point in points]
 
 

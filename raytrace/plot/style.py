@@ -20,6 +20,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.files import write_atomically
+from raytrace.maths.result import object_text
 from raytrace.optics.paraxial import FirstOrder
 from raytrace.system.lens import FIELD_UNITS, Lens
 
@@ -184,13 +185,6 @@ def length_text(length: float, digits: int = 4) -> str:
     scales = ((0.1, 1e3, "µm"), (1e4, 1.0, "mm"), (1e7, 1e-3, "m"), (math.inf, 1e-6, "km"))
     scale, unit = next((scale, unit) for limit, scale, unit in scales if abs(length) < limit)
     return f"{number_text(length * scale, digits)} {unit}"
-
-
-def object_text(distance: float) -> str:
-    """An object distance in mm, as it was given: `25 m`, `400 mm`, `infinity`."""
-    if math.isinf(distance):
-        return "infinity"
-    return _minus(f"{distance / 1000:.6g} m" if abs(distance) >= 1e4 else f"{distance:.6g} mm")
 
 
 def number_text(value: float, digits: int = 4) -> str:

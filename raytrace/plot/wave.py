@@ -2,14 +2,13 @@
 
 import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap, LinearSegmentedColormap, LogNorm, PowerNorm, to_rgb
 from matplotlib.figure import Figure
-from torch import Tensor
 
 from raytrace.maths.grid import centres
 from raytrace.plot.style import (
@@ -23,9 +22,8 @@ from raytrace.plot.style import (
     styled,
     wavelength_colours,
 )
-from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike, height
-from raytrace.wave.psf import WavePsf
-from raytrace.wave.scene import is_smooth
+from raytrace.wave.compute import ElementPsf, Progress, caustic
+from raytrace.wave.element import Element, height, is_flat, is_smooth
 
 _GAMMA = 0.4  # of brightness in kernels: a haze of a hundredth of the peak is still seen
 _DECADES = 4.0  # of light in a caustic
@@ -33,7 +31,7 @@ _ACROSS = 700  # points across a disc of heights
 
 
 @styled
-def psf_figure(found: WavePsf, *, title: str = "") -> Figure:
+def psf_figure(found: ElementPsf) -> Figure:
     """Kernels over depth (rows) and wavelength (columns), each from black to its own peak in its own colour.
 
     With several wavelengths a last column shows them together, as a camera would see a white point: each with its own
@@ -61,7 +59,7 @@ def psf_figure(found: WavePsf, *, title: str = "") -> Figure:
     for panel in axes.flat:
         framed(panel)
     _bar(axes[-1][0], found)
-    figure.suptitle(title, fontweight="bold", fontsize=10)
+    figure.suptitle(found.title, fontweight="bold", fontsize=10)
     caption = (
         f"{found.grid.columns} × {found.grid.rows} pixels of {1e3 * float(found.pitch):g} µm; brightness ∝ "
         f"light^{_GAMMA:g}; "
@@ -94,7 +92,7 @@ def height_figure(elements: Sequence[Element], *, title: str = "") -> Figure:
             continue
         whole, rim = figure.add_subplot(grid[above, 1]), figure.add_subplot(grid[below, 1])
         _profile(whole, element, -R, R)
-        feature = float(element.profile.pitch) if isinstance(element.profile, Rings | Pixels) else R / 500
+        feature = float(element.profile.pitch) if is_flat(element) else R / 500
         _profile(rim, element, R - min(0.3 * R, 40 * feature), R)
         rim.set_xlabel("x, mm  (above: the whole diameter; here: the rim)")
     figure.suptitle(title, fontweight="bold", fontsize=10)
@@ -116,28 +114,19 @@ def _disc(axes: Axes, element: Element) -> None:
 
 def _kind(element: Element) -> str:
     """What a height is, and of what."""
-    profile = element.profile
-    kind = {Pixels: "pixels", Rings: "rings", EvenPowers: "smooth, round", Zernike: "smooth, free form"}[type(profile)]
-    kind = f"{kind}, wrapped" if element.period is not None else kind
+    kind = f"{element.kind.words}, wrapped" if element.period is not None else element.kind.words
     return f"{kind}; {element.glass.name}" if element.glass.name else kind
 
 
 @styled
-def caustic_figure(
-    light: Tensor,
-    distances: Tensor,
-    *,
-    half: float,
-    wavelengths: Sequence[float],
-    depths: Sequence[float],
-    sensor: float,
-    title: str = "",
-) -> Figure:
-    """Light (D, W, Z, X) per mm² of `wave.caustic` over the distance behind the element, logarithmic.
+def caustic_figure(found: ElementPsf, *, progress: Progress | None = None) -> Figure:
+    """Light per mm² over the distance behind the element, logarithmic (`wave.compute.caustic`).
 
     A row for each depth, a column for each wavelength; one scale for all; the sensor is a line.
     """
+    light, distances, half = caustic(found.scene, **({"progress": progress} if progress else {}))
     values, z = array(light), array(distances)
+    wavelengths, depths = found.wavelengths.tolist(), found.depths.tolist()
     colours = wavelength_colours(wavelengths)
     figure = new_figure(2.5 * len(wavelengths) + 0.9, 1.5 * len(depths) + 0.9)
     axes = figure.subplots(len(depths), len(wavelengths), squeeze=False, sharex=True, sharey=True)
@@ -150,18 +139,18 @@ def caustic_figure(
                 values[row, column].T, origin="lower", extent=extent, aspect="auto", norm=norm, cmap="magma",
                 interpolation="bilinear",
             )  # fmt: skip
-            panel.axvline(sensor, color="white", linewidth=0.8, linestyle=(0, (4, 3)))
+            panel.axvline(float(found.scene.sensor_distance), color="white", linewidth=0.8, linestyle=(0, (4, 3)))
             if row == 0:
                 panel.set_title(f"{1e3 * wavelength:g} nm", color=colours[column])
         axes[row][0].set_ylabel(f"{_depth(depth)}\nx, µm")
     figure.colorbar(shown, ax=axes, label="share of the light per mm²", shrink=0.9, pad=0.01)
     figure.supxlabel("distance behind the element, mm; dashes: the sensor", fontsize=8.5)
-    figure.suptitle(title, fontweight="bold", fontsize=10)
+    figure.suptitle(found.title, fontweight="bold", fontsize=10)
     return figure
 
 
 @styled
-def encircled_figure(found: WavePsf, *, title: str = "") -> Figure:
+def encircled_figure(found: ElementPsf) -> Figure:
     """Share of the light within a radius of the axis: a panel for each depth, a curve for each wavelength."""
     x, y = (array(line) for line in centres(found.grid))
     radius = np.hypot(x, y[:, None]).ravel()
@@ -184,8 +173,24 @@ def encircled_figure(found: WavePsf, *, title: str = "") -> Figure:
         panel.grid(True, color=FAINT, linewidth=0.5)
     axes[0].set_ylabel("share of the light")
     axes[-1].legend(loc="lower right")
-    figure.suptitle(title, fontweight="bold", fontsize=10)
+    figure.suptitle(found.title, fontweight="bold", fontsize=10)
     return figure
+
+
+#: What can be drawn of what `wave_psf` gives: (it) -> figure.
+FIGURES: dict[str, Callable[..., Figure]] = {
+    "kernels": psf_figure,
+    "heights": lambda found: height_figure(found.scene.elements, title=found.title),
+    "caustic": caustic_figure,
+    "encircled": encircled_figure,
+}
+
+
+def element_figure(found: ElementPsf, *, what: str = "kernels", progress: Progress | None = None) -> Figure:
+    """One of FIGURES of what `wave_psf` gives; progress: of a caustic."""
+    if what not in FIGURES:
+        raise ValueError(f"no figure {what!r}; expected one of {', '.join(FIGURES)}")
+    return FIGURES[what](found, **({"progress": progress} if progress and what == "caustic" else {}))
 
 
 def _profile(panel: Axes, element: Element, first: float, last: float) -> None:
@@ -221,7 +226,7 @@ def framed(panel: Axes) -> None:
         spine.set_color(GREY)
 
 
-def _bar(panel: Axes, found: WavePsf) -> None:
+def _bar(panel: Axes, found: ElementPsf) -> None:
     """A bar of a round length in the corner of a kernel."""
     pitch, columns = float(found.pitch), found.grid.columns
     length = round_length(0.35 * pitch * columns)

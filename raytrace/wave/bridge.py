@@ -43,7 +43,7 @@ from raytrace.system.departure import GridSag, ZernikeSag, spline
 from raytrace.system.lens import Fields, Lens, SystemAperture, with_object_distance
 from raytrace.system.shapes import relief
 from raytrace.system.surface import Surface, sag_at
-from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike, is_radial, path, profile_height
+from raytrace.wave.element import Element, EvenPowers, Rings, Zernike, designed_height, is_flat, is_radial, path
 
 _MOST_RAYS = 400_000  # of one kernel
 _PROBE = 8, 32  # rings and arms of the rays that find how far directions spread and beams reach
@@ -272,7 +272,7 @@ def _slopes(elements: tuple[Element, ...], stop: Tensor, wavelengths: Tensor) ->
     """Gradient (2, D, F, W, P) of the path, no unit, at points of the stop; of what is smooth in the elements."""
     total = torch.zeros_like(stop)
     for element in elements:
-        if not isinstance(element.profile, Pixels | Rings):
+        if not is_flat(element):
             excess = (index(element.glass, wavelengths) - 1).to(wavelengths)
             total = total + excess[:, None] * _gradient(element, *stop)
     return total
@@ -282,7 +282,7 @@ def _gradient(element: Element, x: Tensor, y: Tensor) -> Tensor:
     """Of the height before it is wrapped, (2, ...) at points (...) mm."""
     with torch.enable_grad():
         x, y = (p.detach().clone().requires_grad_() for p in (x, y))
-        height = profile_height(element.profile, x, y, radius=element.radius).sum()
+        height = designed_height(element, x, y).sum()
         return torch.stack(torch.autograd.grad(height, (x, y)))
 
 
@@ -299,7 +299,7 @@ def _phase_of_steps(element: Element, beam: Tensor, wavelengths: Tensor) -> Tens
     """Phase (W,) in radians along a radius that the steps of flat pixels, rings and wrapped heights count for."""
     profile, none = element.profile, torch.zeros_like(wavelengths)
     excess = 2e3 * math.pi * (index(element.glass, wavelengths) - 1).abs().to(wavelengths) / wavelengths
-    if isinstance(profile, Pixels | Rings):
+    if is_flat(element):
         heights = profile.heights
         steps = [heights.diff(dim=axis).abs().max() for axis in range(heights.dim()) if heights.shape[axis] > 1]
         slope = torch.stack([*steps, heights.new_zeros(())]).max() / profile.pitch

@@ -1,14 +1,16 @@
-"""Element: a thin phase element, its height over the aperture.
+"""Element: a thin phase element, its height over the aperture, as it is designed and as it is made.
 
     path(x, y, λ) = (n(λ) - 1) h(x, y)
 
 beside air. Thicker is later: a converging element is thickest on its axis.
 
-Free heights are pixels or rings, flat each; smooth ones Zernike polynomials or even powers of the radius. Elements in
-contact add their paths.
+Free heights are pixels or rings, flat each; smooth ones Zernike polynomials or even powers of the radius; KINDS says
+all that the package needs to know of each. Elements in contact add their paths. Gradients pass everything here.
 """
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,6 +19,9 @@ from raytrace.maths.numerics import safe_sqrt
 from raytrace.maths.value import value
 from raytrace.maths.zernike import noll, polynomials
 from raytrace.media.glass import Glass, index
+
+#: Sizes of features, mm: what diamond turning makes of PMMA, and etching of fused silica.
+TURNED, ETCHED = 3.69e-3, 2e-3
 
 
 @value
@@ -52,6 +57,55 @@ class EvenPowers:
 Profile = Pixels | Rings | Zernike | EvenPowers
 
 
+def _pixels(profile: Pixels, x: Tensor, y: Tensor, radius: Tensor) -> Tensor:
+    rows, columns = profile.heights.shape
+    return profile.heights[_place(y, profile.pitch, rows), _place(x, profile.pitch, columns)]
+
+
+def _place(position: Tensor, pitch: Tensor, count: int) -> Tensor:
+    return torch.floor((position / pitch).detach() + 0.5 * count).long().clamp(0, count - 1)
+
+
+def _rings(profile: Rings, x: Tensor, y: Tensor, radius: Tensor) -> Tensor:
+    r = safe_sqrt((x * x + y * y).detach())
+    return profile.heights[(r / profile.pitch.detach()).long().clamp(max=len(profile.heights) - 1)]
+
+
+def _zernike(profile: Zernike, x: Tensor, y: Tensor, radius: Tensor) -> Tensor:
+    orders = [noll(j) for j in range(1, len(profile.coefficients) + 1)]
+    return torch.tensordot(profile.coefficients, polynomials(orders, x / radius, y / radius), 1)
+
+
+def _even_powers(profile: EvenPowers, x: Tensor, y: Tensor, radius: Tensor) -> Tensor:
+    r2, total = x * x + y * y, torch.zeros_like(x)
+    for c in profile.coefficients.flip(0):
+        total = (total + c) * r2
+    return total
+
+
+class Kind(NamedTuple):
+    """A kind of profile.
+
+    words: for people; numbers: its field that holds what can be learned; height: (profile, x, y, radius of the aperture
+    in mm) -> mm before it is wrapped or stepped; is_radial: whether it depends on the distance from the axis alone;
+    is_flat: whether it has features of one pitch, flat each, with steps between them.
+    """
+
+    words: str
+    numbers: str
+    height: Callable[[Profile, Tensor, Tensor, Tensor], Tensor]
+    is_radial: bool = False
+    is_flat: bool = False
+
+
+KINDS = {
+    Pixels: Kind("pixels", "heights", _pixels, is_flat=True),
+    Rings: Kind("rings", "heights", _rings, is_radial=True, is_flat=True),
+    Zernike: Kind("smooth, free form", "coefficients", _zernike),
+    EvenPowers: Kind("smooth, round", "coefficients", _even_powers, is_radial=True),
+}
+
+
 @value
 class Element:
     """A profile in a round aperture.
@@ -68,33 +122,43 @@ class Element:
     period: Tensor | None = None
     levels: int = 0
 
+    @property
+    def kind(self) -> Kind:
+        return KINDS[type(self.profile)]
+
+    @property
+    def numbers(self) -> Tensor:
+        """Heights or coefficients: what can be learned."""
+        return getattr(self.profile, self.kind.numbers)
+
+    def with_numbers(self, numbers: Tensor) -> "Element":
+        """The element with other heights or coefficients."""
+        return dataclasses.replace(self, profile=dataclasses.replace(self.profile, **{self.kind.numbers: numbers}))
+
 
 def is_radial(element: Element) -> bool:
-    """Whether the height depends on the distance from the axis alone, by the kind of its profile."""
-    return isinstance(element.profile, Rings | EvenPowers)
+    """Whether the height depends on the distance from the axis alone."""
+    return element.kind.is_radial
+
+
+def is_flat(element: Element) -> bool:
+    """Whether the height is that of features, flat each."""
+    return element.kind.is_flat
+
+
+def is_smooth(element: Element) -> bool:
+    """Whether the height has neither steps nor jumps."""
+    return element.period is None and not is_flat(element)
 
 
 def height(element: Element, x: Tensor, y: Tensor) -> Tensor:
     """h (...) mm at points (...) mm, as it can be made; beyond the outermost pixel or ring, that of its neighbour."""
-    return fabricated(profile_height(element.profile, x, y, radius=element.radius), element.period, element.levels)
+    return fabricated(designed_height(element, x, y), element.period, element.levels)
 
 
-def profile_height(profile: Profile, x: Tensor, y: Tensor, *, radius: Tensor) -> Tensor:
-    """h (...) mm before it is wrapped or stepped. radius: of the aperture, mm."""
-    match profile:
-        case Pixels(heights, pitch):
-            return heights[_place(y, pitch, heights.shape[0]), _place(x, pitch, heights.shape[1])]
-        case Rings(heights, pitch):
-            r = safe_sqrt((x * x + y * y).detach())
-            return heights[(r / pitch.detach()).long().clamp(max=len(heights) - 1)]
-        case Zernike(coefficients):
-            orders = [noll(j) for j in range(1, len(coefficients) + 1)]
-            return torch.tensordot(coefficients, polynomials(orders, x / radius, y / radius), 1)
-        case EvenPowers(coefficients):
-            r2, total = x * x + y * y, torch.zeros_like(x)
-            for c in coefficients.flip(0):
-                total = (total + c) * r2
-            return total
+def designed_height(element: Element, x: Tensor, y: Tensor) -> Tensor:
+    """h (...) mm before it is wrapped or stepped."""
+    return element.kind.height(element.profile, x, y, element.radius)
 
 
 def fabricated(height: Tensor, period: Tensor | None, levels: int = 0) -> Tensor:
@@ -117,14 +181,80 @@ def period(glass: Glass, wavelength: Tensor | float) -> Tensor:
     return 1e-3 * wavelength / (index(glass, wavelength) - 1)
 
 
+def excess_index(element: Element, wavelengths: Tensor, like: Tensor) -> Tensor:
+    """n - 1 (W,) at wavelengths (W,) µm, of the kind of `like`."""
+    return index(element.glass, wavelengths).to(like) - 1
+
+
 def path(elements: Sequence[Element], x: Tensor, y: Tensor, wavelengths: Tensor) -> Tensor:
     """Optical path (W, ...) mm that elements in contact add at points (...) mm, at wavelengths (W,) µm."""
     total = torch.zeros(len(wavelengths), *x.shape, dtype=x.dtype, device=x.device)
     for element in elements:
-        excess = index(element.glass, wavelengths).to(x) - 1
+        excess = excess_index(element, wavelengths, x)
         total = total + excess.reshape(-1, *[1] * x.ndim) * height(element, x, y)
     return total
 
 
-def _place(position: Tensor, pitch: Tensor, count: int) -> Tensor:
-    return torch.floor((position / pitch).detach() + 0.5 * count).long().clamp(0, count - 1)
+# -- as it is made -----------------------------------------------------------------------------------------------------
+
+
+def as_rings(element: Element, pitch: float | Tensor) -> Element:
+    """A radial element with the height at the middle of every ring of `pitch` mm, flat over the ring.
+
+    Period and levels stay those of the element. Raises ValueError for an element that is not radial.
+    """
+    if not is_radial(element):
+        kind = type(element.profile).__name__
+        raise ValueError(f"a profile of {kind} is not radial, and rings cannot hold it; use as_pixels")
+    pitch = torch.as_tensor(pitch, dtype=element.radius.dtype, device=element.radius.device)
+    r = (torch.arange(features(element.radius, pitch)).to(pitch) + 0.5) * pitch
+    return dataclasses.replace(element, profile=Rings(designed_height(element, r, torch.zeros_like(r)), pitch))
+
+
+def as_pixels(element: Element, pitch: float | Tensor) -> Element:
+    """An element with the height at the middle of every square of `pitch` mm around the axis, flat over the square.
+
+    Period and levels stay those of the element. Beyond the aperture the profile is continued.
+    """
+    pitch = torch.as_tensor(pitch, dtype=element.radius.dtype, device=element.radius.device)
+    count = features(2 * element.radius, pitch)
+    x = (torch.arange(count).to(pitch) - 0.5 * (count - 1)) * pitch
+    y, x = torch.meshgrid(x, x, indexing="ij")
+    return dataclasses.replace(element, profile=Pixels(designed_height(element, x, y), pitch))
+
+
+def features(length: Tensor, pitch: Tensor) -> int:
+    """How many features of `pitch` mm cover `length` mm; one is not added for what rounding leaves."""
+    return int(torch.ceil((length / pitch).detach() * (1 - 1e-6)))
+
+
+def wrapped(element: Element, wavelength: float | Tensor, *, levels: int = 0) -> Element:
+    """The element with its height modulo one wave of `wavelength` µm, in `levels` equal steps (0: any height).
+
+    Neutral at that wavelength alone. A kinoform of L levels keeps sinc²(1/L) of its light (Goodman and Silvestri,
+    IBM J. Res. Dev. 14, 478, 1970).
+    """
+    return dataclasses.replace(element, period=period(element.glass, wavelength).to(element.radius), levels=levels)
+
+
+def as_made(element: Element) -> Element:
+    """The element with the heights of its rings or pixels wrapped and stepped, as they are to be written to a file.
+
+    Raises ValueError for a smooth profile, which has no features.
+    """
+    if not is_flat(element):
+        kind = type(element.profile).__name__
+        raise ValueError(f"a profile of {kind} has no features to be made; use as_rings or as_pixels first")
+    heights = fabricated(element.numbers, element.period, element.levels)
+    return dataclasses.replace(element.with_numbers(heights), period=None, levels=0)
+
+
+def with_tolerance(element: Element, tolerance: float | Tensor, *, generator: torch.Generator | None = None) -> Element:
+    """The element as made, but each ring or pixel off by a uniform draw of ± `tolerance` mm.
+
+    The same generator state gives the same errors. Raises ValueError for a smooth profile, which has no features.
+    """
+    made = as_made(element)
+    heights = made.numbers
+    draw = torch.rand(heights.shape, generator=generator, dtype=heights.dtype, device=heights.device)
+    return made.with_numbers(heights + tolerance * (2 * draw - 1))

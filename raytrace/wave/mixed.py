@@ -20,10 +20,10 @@ from torch import Tensor
 from raytrace.kernels.dft import bessel_j0, phasor, sub_pixels
 from raytrace.kernels.radial import is_centred
 from raytrace.maths.value import value
-from raytrace.wave.element import Element, is_radial, path
+from raytrace.wave.element import Element, is_radial, is_smooth, path
 from raytrace.wave.pupil import halves, light_of, waves_at
 from raytrace.wave.radial import edges, rule, slope
-from raytrace.wave.scene import WaveScene, aperture, is_smooth, millimetres, spheres
+from raytrace.wave.scene import WaveScene, aperture, millimetres, spheres
 
 _POINTS = 12  # of the table of F per wave of its finest ripple
 _STEEP = 2.6  # erfc(2.6)/2 = 1e-4 is left of the taper at its ends

@@ -20,10 +20,10 @@ from raytrace.kernels.dft import Aliased, rings_and_arms
 from raytrace.kernels.ladder import NotConverged
 from raytrace.kernels.radial import is_centred, reach
 from raytrace.wave import propagate, radial
-from raytrace.wave.element import Pixels, Rings
+from raytrace.wave.element import Pixels, is_flat, is_smooth
 from raytrace.wave.mixed import deflection, extent_of, is_mixed, radii_of_band, round_part
 from raytrace.wave.pupil import cells_across
-from raytrace.wave.scene import WaveScene, aperture, check, is_round, is_smooth, millimetres
+from raytrace.wave.scene import WaveScene, aperture, check, is_round, millimetres
 from raytrace.wave.spread import blur, blur_of_pixels, is_free, slopes, spread
 
 ENGINES = "pupil", "radial", "fresnel", "angular_spectrum"
@@ -159,7 +159,7 @@ def _setting(scene: WaveScene) -> _Setting:
         core=float(core.max()),
         sharpest=float(core.min()),
         scatter=float((torch.sqrt(light.area * light.steps / 6) / focal).max()),
-        features=tuple(float(e.profile.pitch.detach()) for e in stepped if isinstance(e.profile, Pixels | Rings)),
+        features=tuple(float(e.profile.pitch.detach()) for e in stepped if is_flat(e)),
         speckle=any(is_free(element) for element in stepped),
         lattice=not scene.exact and len(stepped) == 1 and isinstance(stepped[0].profile, Pixels),
         edge=float(far.sqrt().max()),

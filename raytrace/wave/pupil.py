@@ -20,8 +20,8 @@ from raytrace.kernels.dft import phasor, sub_pixels
 from raytrace.kernels.radial import is_centred
 from raytrace.maths.numerics import safe_sqrt
 from raytrace.maths.value import value
-from raytrace.wave.element import path
-from raytrace.wave.scene import WaveScene, aperture, is_smooth, millimetres, residual, spheres
+from raytrace.wave.element import is_smooth, path
+from raytrace.wave.scene import WaveScene, aperture, millimetres, residual, spheres
 
 _MARGIN = 3  # cells beyond the aperture: half the points of the interpolation at its edge
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from raytrace.kernels.dft import bessel_j0, phasor
 from raytrace.kernels.radial import radii_of_waves, unfold
 from raytrace.maths.value import value
-from raytrace.wave.element import Element, Rings, path, profile_height
+from raytrace.wave.element import Element, Rings, designed_height, path
 from raytrace.wave.scene import WaveScene, aperture, millimetres, spheres
 
 _PROBES = 20_000  # radii where the jumps of a wrapped height are looked for
@@ -115,7 +115,7 @@ def edges(scene: WaveScene) -> Tensor:
 def _jumps(element: Element, radius: Tensor) -> Tensor:
     """Radii where a wrapped or stepped smooth height jumps: between two probes h runs straight."""
     r = radius * torch.sqrt(torch.linspace(0, 1, _PROBES, dtype=radius.dtype, device=radius.device))
-    h = profile_height(element.profile, r, torch.zeros_like(r), radius=element.radius).detach()
+    h = designed_height(element, r, torch.zeros_like(r)).detach()
     step = h / (element.period.detach() / max(1, element.levels))
     at = step.floor().diff().nonzero()[:, 0]
     # The integer between the two, the higher one's floor.

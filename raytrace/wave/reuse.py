@@ -56,7 +56,7 @@ def _constants(scene: WaveScene) -> tuple[list[Tensor], Any]:
     leaves, structure = pytree.tree_flatten(dataclasses.replace(scene, elements=()))
     for element in scene.elements:
         profile = element.profile
-        free = profile.coefficients if hasattr(profile, "coefficients") else profile.heights
+        free = element.numbers
         # Of free heights only how many there are counts; where a wrapped smooth one jumps moves with its coefficients.
         jumps = isinstance(profile, EvenPowers) and element.period is not None
         held = [free.detach()] if jumps else []

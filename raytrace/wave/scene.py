@@ -14,7 +14,7 @@ from raytrace.maths.grid import Grid
 from raytrace.maths.value import value
 from raytrace.media.glass import index
 from raytrace.system.lens import check_unit
-from raytrace.wave.element import Element, Pixels, Rings, is_radial, path
+from raytrace.wave.element import Element, is_radial, path
 
 
 @value
@@ -98,8 +98,3 @@ def millimetres(scene: WaveScene) -> Tensor:
 def is_round(scene: WaveScene) -> bool:
     """Whether all elements depend on the distance from the axis alone."""
     return all(is_radial(element) for element in scene.elements)
-
-
-def is_smooth(element: Element) -> bool:
-    """Whether the height has neither steps nor jumps."""
-    return element.period is None and not isinstance(element.profile, Pixels | Rings)

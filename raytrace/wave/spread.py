@@ -13,9 +13,8 @@ from torch import Tensor
 
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to, value
-from raytrace.media.glass import index
 from raytrace.wave import radial
-from raytrace.wave.element import Element, Pixels, Rings, fabricated, height, profile_height
+from raytrace.wave.element import Element, Pixels, Rings, designed_height, excess_index, fabricated, height, is_flat
 from raytrace.wave.scene import WaveScene, aperture, millimetres, residual, spheres
 
 _RAYS = 4096
@@ -58,7 +57,7 @@ def spread(scene: WaveScene) -> Spread:
 
 def is_free(element: Element) -> bool:
     """Whether heights are those of features, not wrapped: whatever they are."""
-    return isinstance(element.profile, Pixels | Rings) and element.period is None
+    return is_flat(element) and element.period is None
 
 
 def blur(scene: WaveScene) -> Tensor:
@@ -83,14 +82,14 @@ def slopes(scene: WaveScene, x: Tensor, y: Tensor, diffracted: bool = False) -> 
     for v in ((1 / scene.depths.detach())[:, None, None], 1 / z):
         total = total + position * (v / torch.sqrt(1 + r2 * v * v) if scene.exact else v)
     for element in scene.elements:
-        if isinstance(element.profile, Pixels | Rings):
+        if is_flat(element):
             continue
-        power = index(element.glass, scene.wavelengths.detach()).to(x) - 1
+        power = excess_index(element, scene.wavelengths.detach(), x)
         if diffracted and element.period is not None:
             power = wavelength / element.period.detach()
         with torch.enable_grad():
             a, b = x.clone().requires_grad_(), y.clone().requires_grad_()
-            h = profile_height(element.profile, a, b, radius=element.radius.detach())
+            h = designed_height(element, a, b)
             gradient = torch.stack(torch.autograd.grad(h.sum(), (a, b)))
         total = total + power[:, None] * gradient[:, None, None]
     return total
@@ -128,8 +127,8 @@ def _waves(scene: WaveScene, elements: Sequence[Element], x: Tensor, y: Tensor) 
     """Path (W, P) in waves of elements; a wrapped height counts whole, in periods: the first order."""
     total = x.new_zeros(len(scene.wavelengths), len(x))
     for element in elements:
-        h = profile_height(element.profile, x, y, radius=element.radius)
-        excess = (index(element.glass, scene.wavelengths).to(x) - 1) / millimetres(scene)
+        h = designed_height(element, x, y)
+        excess = excess_index(element, scene.wavelengths, x) / millimetres(scene)
         scale = excess if element.period is None else (1 / element.period).expand_as(excess)
         total = total + scale[:, None] * h
     return total
@@ -150,7 +149,7 @@ def _landings(scene: WaveScene, elements: Sequence[Element]) -> tuple[Tensor, Te
     """
     R, wavelength = aperture(scene), millimetres(scene)[:, None]
     x, y = _points(R)
-    features = [e.profile.pitch for e in elements if isinstance(e.profile, Pixels | Rings)]
+    features = [e.profile.pitch for e in elements if is_flat(e)]
     step = min(features) if features else wavelength.min() * scene.sensor_distance / (8 * R)
     along = torch.ones_like(x), torch.zeros_like(x)
     if any(isinstance(e.profile, Rings) for e in elements):
@@ -193,7 +192,7 @@ def _steps(scene: WaveScene) -> Tensor:
     """Σ |jump|² · length of all edges where heights jump, (W,) 1/mm, over the area of the aperture."""
     total = torch.zeros_like(scene.wavelengths)
     for element in scene.elements:
-        waves = (index(element.glass, scene.wavelengths).to(total) - 1) / millimetres(scene)
+        waves = excess_index(element, scene.wavelengths, total) / millimetres(scene)
         total = total + _edges(element, scene, waves)
     return total
 

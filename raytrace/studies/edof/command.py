@@ -26,9 +26,8 @@ from raytrace.studies.edof.table import NAMES, PUBLISHED, ROWS, Content, element
 from raytrace.studies.edof.training import EdofCamera, Settings, begin, learn_element
 from raytrace.studies.edof.words import STARTS, STEPS
 from raytrace.studies.edof.world import Quality, World, kernels, periodic, quality, spectrum
-from raytrace.wave.element import Element
-from raytrace.wave.fabrication import as_made, as_pixels
-from raytrace.wave.label import write_element
+from raytrace.wave.element import Element, as_made, as_pixels
+from raytrace.wave.element_file import write_element
 
 _WIDE = 512  # pixels of a period that is restored
 _LEAVES = 40  # pictures of dead leaves
@@ -89,9 +88,9 @@ def _world(arguments: argparse.Namespace) -> World:
     return World(
         radius=0.5 * arguments.aperture,
         sensor_distance=arguments.sensor,
-        depths=tuple(arguments.depth),
+        depths=tuple(arguments.depths),
         design=arguments.focus,
-        wavelengths=tuple(arguments.wavelength),
+        wavelengths=tuple(arguments.wavelengths),
         pixel=arguments.pixel,
         size=arguments.size,
         noise=World.noise if arguments.noise is None else arguments.noise,

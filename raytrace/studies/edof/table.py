@@ -14,8 +14,7 @@ from torch import Tensor
 
 from raytrace.files import write_atomically
 from raytrace.studies.edof.world import Quality, World, expected_error, kernels, quality, transfer
-from raytrace.wave.aim import Aim, aim
-from raytrace.wave.baselines import baseline
+from raytrace.wave.designs import Aim, aim, baseline
 from raytrace.wave.element import Element
 
 #: PSNR in dB as Sitzmann et al. published it, by our name of the row.

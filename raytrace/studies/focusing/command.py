@@ -10,8 +10,8 @@ from raytrace.cli.door import CommandError, print_json, refuse_suffix, say
 from raytrace.cli.progress import progress
 from raytrace.studies.focusing import figures
 from raytrace.studies.focusing.experiment import Learned, Setting, learn_to_focus
+from raytrace.wave.element_file import write_element
 from raytrace.wave.exchange import FORMATS
-from raytrace.wave.label import write_element
 
 _SHOWN = (0, 5, 10, 20, 40, 80, 160)  # steps of learning that the figure shows
 
@@ -47,7 +47,7 @@ def focus(arguments: argparse.Namespace) -> None:
 
 def _setting(arguments: argparse.Namespace) -> Setting:
     """What `wave focus` learns."""
-    if len(arguments.wavelength) > 1:
+    if len(arguments.wavelengths) > 1:
         raise CommandError("--wavelength: a lens is learned at one wavelength")
     if arguments.feature and arguments.feature > 0.5 * arguments.aperture:
         raise CommandError(
@@ -56,7 +56,7 @@ def _setting(arguments: argparse.Namespace) -> Setting:
     return Setting(
         diameter=arguments.aperture,
         distance=arguments.sensor,
-        wavelength=arguments.wavelength[0],
+        wavelength=arguments.wavelengths[0],
         samples=round(arguments.aperture / arguments.feature) if arguments.feature else arguments.samples,
         pixel=arguments.pixel,
         size=arguments.size,

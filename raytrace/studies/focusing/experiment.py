@@ -21,8 +21,7 @@ from raytrace.kernels.dft import phasor
 from raytrace.maths.grid import grid
 from raytrace.media.catalog import find_glass
 from raytrace.media.glass import index
-from raytrace.wave.aim import Aim, aim
-from raytrace.wave.baselines import ideal
+from raytrace.wave.designs import Aim, aim, ideal
 from raytrace.wave.element import Element, Pixels, height
 from raytrace.wave.plan import Plan
 from raytrace.wave.plan import plan as plan_of

@@ -11,7 +11,6 @@ from torch import Tensor
 from raytrace.cli.door import CommandError, print_json
 from raytrace.cli.options import did_you_mean
 from raytrace.cli.progress import progress
-from raytrace.cli.wave_setup import height_map, material
 from raytrace.formats.pictures import Pictures
 from raytrace.studies.codesign.page import table
 from raytrace.studies.edof.training import Settings
@@ -30,9 +29,9 @@ from raytrace.studies.quantise.experiment import (
     tolerances_of,
 )
 from raytrace.studies.superres.command import folders, page, pictures, write_csv
-from raytrace.wave.aim import aim
-from raytrace.wave.baselines import baseline, singlet
+from raytrace.wave.designs import aim, baseline, singlet
 from raytrace.wave.element import Element
+from raytrace.wave.element_file import read_element
 from raytrace.wave.exchange import FORMATS
 
 
@@ -84,13 +83,8 @@ def _element(arguments, given: str, train: Pictures, S: Tensor) -> tuple[str, El
         (element,) = baseline("fresnel", aim(radius=world.radius, sensor=world.sensor_distance, focus=world.design))
         return given, element, world
     if given != "learned" and Path(given).suffix.lower() in FORMATS and not Path(given).is_dir():
-        span = tuple(arguments.span) if arguments.span else None
-        made_of = height_map(
-            given,
-            aperture=arguments.aperture,
-            glass=lambda: material(given, arguments.glass),
-            pitch=arguments.pitch,
-            span=span,
+        made_of = read_element(
+            given, aperture=arguments.aperture, glass=arguments.glass, pitch=arguments.pitch, span=arguments.span
         )
         return Path(given).name, made_of, dataclasses.replace(world, radius=0.5 * arguments.aperture)
     if given != "learned" and not Path(given).is_dir():

@@ -23,8 +23,7 @@ from raytrace.formats.pictures import Pictures, draws
 from raytrace.studies.edof.training import EdofCamera, Settings, begin, learn_element, scheduled
 from raytrace.studies.edof.world import World, expected_error, scene, spectrum, transfer
 from raytrace.studies.edof.world import kernels as kernels_of
-from raytrace.wave.element import Element, Pixels, Rings, period
-from raytrace.wave.fabrication import with_tolerance, wrapped
+from raytrace.wave.element import Element, Pixels, Rings, period, with_tolerance, wrapped
 from raytrace.wave.plan import plan
 from raytrace.wave.psf import psf
 from raytrace.wave.reuse import Memo

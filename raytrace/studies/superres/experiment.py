@@ -36,8 +36,7 @@ from raytrace.studies.superres.inversion import (
     joint_superresolve,
     superresolve,
 )
-from raytrace.wave.aim import aim
-from raytrace.wave.baselines import baseline
+from raytrace.wave.designs import aim, baseline
 from raytrace.wave.element import Element, Pixels, Zernike
 from raytrace.wave.plan import plan
 from raytrace.wave.psf import psf
