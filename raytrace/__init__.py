@@ -14,7 +14,7 @@ import importlib
 #: Public names, and where each is defined: "room.file", or "room.file:name" if it has another name there.
 PUBLIC = {
     # lenses and their files
-    "Aperture": "system.surface",
+    "Aperture": "system.aperture",
     "Fields": "system.lens",
     "Lens": "system.lens",
     "Surface": "system.surface",

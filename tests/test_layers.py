@@ -162,6 +162,7 @@ FORBIDDEN_CALLS = {"item": "synchronises with the host", "numpy": "leaves the gr
 PHYSICS = [
     "maths.numerics",
     "system.surface",
+    "system.aperture",
     "system.search",
     "system.shapes",
     "optics.trace",

@@ -14,6 +14,7 @@ from raytrace.optics.f_number import real_working_f_number
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.trace import media
 from raytrace.system.lens import FIELD_UNITS, Lens, check_media
+from raytrace.system.shapes import EVEN
 from raytrace.system.surface import vertex_curvature
 
 #: Lines of `raytrace info`: words, entry of FirstOrder (and the real working F/#), unit.
@@ -70,6 +71,7 @@ def info_document(lens: Lens) -> dict:
                 "curvature": number(0.0 if surface.curvature is None else surface.curvature),
                 "conic": number(0.0 if surface.conic is None else surface.conic),
                 "coefficients": [] if surface.coefficients is None else numbers(surface.coefficients),
+                **({} if surface.kind == EVEN else {"kind": surface.kind}),
                 "thickness": number(surface.thickness),
                 "glass": surface.glass.name or None,
                 "indices": numbers(indices[k].expand_as(lens.wavelengths)),
@@ -129,7 +131,7 @@ def _remarks(lens: Lens, k: int) -> str:
     if surface.conic is not None:
         parts.append(f"conic {float(surface.conic):g}")
     if surface.coefficients is not None:
-        parts.append("even asphere")
+        parts.append(surface.kind)
     parts += [f"{a.shape} {'obscuration' if a.obscures else 'aperture'}" for a in surface.apertures]
     return ", ".join(dict.fromkeys(filter(None, [*parts, surface.comment])))
 

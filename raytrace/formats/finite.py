@@ -1,15 +1,18 @@
 """A lens that came out of a reader holds finite numbers only, but for the distance of the object."""
 
 import torch
+from torch.utils import _pytree as pytree
 
 from raytrace.formats.source import LensFileError, Place
 from raytrace.system.lens import Lens
+from raytrace.system.surface import SHAPE
 
 
 def refuse_overflow(lens: Lens, file: str) -> None:
     """Raise LensFileError where a number left the 64-bit range when it was converted to mm."""
     for number, surface in enumerate(lens.surfaces):
-        numbers = [surface.curvature, surface.coefficients, surface.semi_diameter]
+        shape = pytree.tree_leaves([getattr(surface, name) for name in SHAPE if name != "kind"])
+        numbers = [*shape, surface.semi_diameter]
         numbers += [surface.thickness] if number else []
         numbers += [part for aperture in surface.apertures for part in (*aperture.extent, *aperture.centre)]
         if not all(_finite(part) for part in numbers if part is not None):

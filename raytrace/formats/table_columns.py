@@ -15,6 +15,7 @@ from raytrace.formats.report import IGNORED, READ, UNKNOWN, Draft
 from raytrace.formats.source import LensFileError, Place, shown
 from raytrace.formats.zemax_keywords import MILLIMETRES
 from raytrace.media.glass import LINES
+from raytrace.system.shapes import KINDS
 
 _SPELLINGS = {
     "label": "surface, surf, srf, s, si, i, j, m, no, nr, num, number, #, id, surface no, surface number, surface #"
@@ -273,8 +274,9 @@ def _refuse_repeats(cells: list[str], names: list[str | None], place: Place) -> 
             fix = "name one otherwise, or leave it out by a header line '# ignore: HEADING'"
             raise LensFileError(f"columns {listed} are both the {name.replace('_', '-')}; {fix}", place)
         term = order(name) if name else None
-        if term is not None and not 2 <= term <= 60:
-            raise LensFileError(f"column {shown(cells[k])}: expected a coefficient of r² to r^60", place)
+        least = min(kind.step for kind in KINDS.values())
+        if term is not None and not least <= term <= 60:
+            raise LensFileError(f"column {shown(cells[k])}: expected a coefficient of r^{least} to r^60", place)
 
 
 def _report(cell: str, name: str | None, place: Place, report: Draft) -> None:

@@ -15,14 +15,16 @@ from raytrace.formats.table_media import figures as figures_of
 from raytrace.formats.table_media import medium
 from raytrace.formats.table_text import Row
 from raytrace.media.glass import AIR, LINES, MIRROR, Glass, constant, mil_glass, model_glass, refractive_index
-from raytrace.system.surface import Aperture, Surface
+from raytrace.system.aperture import SHAPES, Aperture
+from raytrace.system.shapes import KINDS
+from raytrace.system.surface import Surface
 
 _AIR = ("", "air", "-", "none", "nan", "vacuum", "luft", "空気", "空气")
 _MIRROR = re.compile(r"\b(mirror|reflect|reflecting|refl)\b", re.IGNORECASE)
 
-#: What a type may be called. Any other word is a shape that is not modelled.
+#: What a type may be called, beside the words of `shapes.KINDS`. Any other word is a shape that is not modelled.
 _TYPE = re.compile(
-    r"standard|spher(e|ical)|plan(e|o)?|flat|conic(oid)?|aspher(e|ic|ical)|even|evenasph|lens|surface|s"
+    r"standard|spher(e|ical)|plan(e|o)?|flat|conic(oid)?|aspher(e|ic|ical)|lens|surface|s"
     r"|stop|sto|aperture|diaphragm|iris|image|ima|img|sensor|detector|object|obj"
     r"|mirror|refl|reflect(ing)?|refr|refract(ing)?|dummy|planar"
 )
@@ -35,25 +37,32 @@ _UNSUPPORTED = re.compile(
 
 def refuse_unsupported(rows: Sequence[Row]) -> None:
     """Raise UnsupportedSurface for the first row whose type, or name, is that of a surface that is not modelled."""
+    own = {word for kind in KINDS.values() for word in kind.words}
     for row in rows:
         kind, label = row.cells.get("type", ""), row.cells.get("label", "")
-        words = re.findall(r"[^\W\d_]+", kind.lower())
-        unknown = any(not _TYPE.fullmatch(word) for word in words)
-        found = kind if unknown else label if _UNSUPPORTED.search(label) else ""
+        unknown = any(not _TYPE.fullmatch(word) and word not in own for word in _words(kind))
+        other = _UNSUPPORTED.search(label) and not own & set(_words(label))
+        found = kind if unknown else label if other else ""
         if found:
-            message = f"type {shown(found)} is not modelled; modelled are conics and even aspheres"
+            message = f"type {shown(found)} is not modelled; modelled are conics and {', '.join(KINDS)}s"
             raise UnsupportedSurface(message, row.place)
+
+
+def _words(text: str) -> list[str]:
+    return re.findall(r"[^\W\d_]+", text.lower())
 
 
 def build(row: Row, unit: float, catalogs: tuple[str, ...], user: Sequence[Path], report: Draft) -> Surface:
     """The surface of a row, its lengths in units of `unit` mm."""
     cells, place = row.cells, row.place
     conic = _cell(row, "conic")
+    kind, coefficients = _terms(row, unit)
     return Surface(
         thickness=_scalar(_thickness(row) * unit),
         curvature=_curvature(row, unit),
         conic=_scalar(conic) if conic else None,
-        coefficients=_coefficients(row, unit),
+        coefficients=coefficients,
+        kind=kind,
         glass=_glass(row, catalogs, user, report),
         semi_diameter=_semi_diameter(row, unit),
         apertures=tuple(_aperture(text, unit, place) for text in _several(cells.get("apertures", ""))),
@@ -88,18 +97,20 @@ def _curvature(row: Row, unit: float) -> Tensor | None:
     return _scalar(found / unit) if found else None
 
 
-def _coefficients(row: Row, unit: float) -> Tensor | None:
-    """a_j of r^(2j) in mm^(1-2j), up to the last cell that is filled."""
+def _terms(row: Row, unit: float) -> tuple[str, Tensor | None]:
+    """The kind that the type names, or the first that fits; and its a_j up to the last cell that is filled."""
     powers = {n: column for column in row.cells if (n := order(column)) is not None}
     terms = {n: found for n, column in powers.items() if (found := _cell(row, column)) is not None}
-    for n, found in terms.items():
-        if n % 2 and found:
-            raise UnsupportedSurface(f"the term r^{n} is odd; modelled are conics and even aspheres", row.place)
-    even = [n for n in terms if n % 2 == 0]
-    if not even:
-        return None
-    numbers = [terms.get(n, 0.0) / unit ** (n - 1) for n in range(2, max(even) + 1, 2)]
-    return torch.tensor(numbers, dtype=torch.float64)
+    words = set(_words(row.cells.get("type", "")))
+    odd = next((n for n in terms if n % 2), 0)
+    for kind in sorted(KINDS.values(), key=lambda kind: not words & set(kind.words)):
+        if not any(found and n % kind.step for n, found in terms.items()):
+            filled = [n for n in terms if n % kind.step == 0]
+            numbers = [
+                terms.get(n, 0.0) / unit ** (n - 1) for n in range(kind.step, max(filled, default=0) + 1, kind.step)
+            ]
+            return kind.name, torch.tensor(numbers, dtype=torch.float64) if numbers else None
+    raise UnsupportedSurface(f"the term r^{odd} is odd; modelled are conics and {', '.join(KINDS)}s", row.place)
 
 
 def _semi_diameter(row: Row, unit: float) -> float | None:
@@ -158,19 +169,17 @@ def _aperture(text: str, unit: float, place: Place) -> Aperture:
     words = text.lower().split()
     obscures = words[0] == "obscuration"
     words = words[1:] if obscures else words
-    if (
-        len(words) not in (3, 6)
-        or words[0] not in ("circular", "rectangular", "elliptic")
-        or words[3:4] not in ([], ["at"])
-    ):
+    at = words.index("at") if "at" in words else len(words)
+    count = SHAPES[words[0]].sizes if words[:1] and words[0] in SHAPES else None
+    if at - 1 != count or len(words[at + 1 :]) not in ((2,) if words[at:] else (0,)):
         raise LensFileError(
             f"aperture is {shown(text)}, expected for example 'circular 0 12.5' or 'rectangular 3 4'", place
         )
-    sizes = [number(word, "size of the aperture", place) * unit for word in words[1:3]]
-    centre = [number(word, "centre of the aperture", place) * unit for word in words[4:6]] or [0.0, 0.0]
+    sizes = tuple(number(word, "size of the aperture", place) * unit for word in words[1:at])
+    x, y = [number(word, "centre of the aperture", place) * unit for word in words[at + 1 :]] or [0.0, 0.0]
     if min(sizes) < 0:
         raise LensFileError(f"aperture {shown(text)} has a negative size", place)
-    return Aperture(words[0], (sizes[0], sizes[1]), obscures, (centre[0], centre[1]))
+    return Aperture(words[0], sizes, obscures, (x, y))
 
 
 def _scalar(number: float) -> Tensor:

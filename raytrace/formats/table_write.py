@@ -7,6 +7,7 @@ from pathlib import Path
 
 from raytrace.formats import texts
 from raytrace.formats.source import LensFileError, Place
+from raytrace.formats.table_columns import order
 from raytrace.formats.writing import (
     catalogs_needed,
     exact,
@@ -18,8 +19,10 @@ from raytrace.formats.writing import (
     thickness,
 )
 from raytrace.media.glass import Glass, mil_glass
+from raytrace.system.aperture import Aperture
 from raytrace.system.lens import Lens
-from raytrace.system.surface import Aperture, Surface
+from raytrace.system.shapes import KINDS
+from raytrace.system.surface import Surface
 
 Metadata = list[tuple[str, str]]
 
@@ -79,9 +82,9 @@ def header(lens: Lens, place: Place, catalogs: Sequence[Path] = ()) -> Metadata:
 
 def rows(lens: Lens, file: str) -> dict[str, list[str]]:
     """The columns of the table by heading; columns that would be empty are left out."""
-    terms = max((len(s.coefficients) for s in lens.surfaces if s.coefficients is not None), default=0)
-    names = ["conic", "semi_diameter", *(f"a{2 * j}" for j in range(1, terms + 1)), "apertures", "comment"]
     listed = [_row(lens, k, surface, Place(file, None, k)) for k, surface in enumerate(lens.surfaces)]
+    powers = sorted({n for row in listed for name in row if (n := order(name)) is not None})
+    names = ["conic", "semi_diameter", *(f"a{n}" for n in powers), "apertures", "comment"]
     used = [name for name in names if any(name in row for row in listed)]
     always = ["surface", "type", "curvature", "thickness", "glass"]
     return {name: [row.get(name, "") for row in listed] for name in always + used}
@@ -90,11 +93,11 @@ def rows(lens: Lens, file: str) -> dict[str, list[str]]:
 def _row(lens: Lens, number: int, surface: Surface, place: Place) -> dict[str, str]:
     refuse_departure(surface, place)
     last = len(lens.surfaces) - 1
-    asphere = "standard" if surface.coefficients is None else "even asphere"
-    kinds = {0: "object", lens.stop: "stop" if surface.coefficients is None else "stop, even asphere", last: "image"}
+    kind = None if surface.coefficients is None else KINDS[surface.kind]
+    roles = [name for k, name in ((0, "object"), (lens.stop, "stop"), (last, "image")) if k == number]
     row = {
         "surface": str(number),
-        "type": kinds.get(number, asphere),
+        "type": ", ".join([*roles, *([kind.name] if kind else [])]) or "standard",
         "curvature": "0.0" if surface.curvature is None else exact(surface.curvature, "curvature", place),
         "thickness": thickness(surface.thickness, "inf", place),
         "glass": _glass(surface.glass, place),
@@ -103,9 +106,9 @@ def _row(lens: Lens, number: int, surface: Surface, place: Place) -> dict[str, s
         row["conic"] = exact(surface.conic, "conic constant", place)
     if surface.semi_diameter is not None:
         row["semi_diameter"] = exact(surface.semi_diameter, "semi-diameter", place)
-    if surface.coefficients is not None:
+    if kind is not None:
         found = exact_list(surface.coefficients, "aspheric terms", place)
-        row |= {f"a{2 * j}": term for j, term in enumerate(found, 1)}
+        row |= {f"a{kind.step * j}": term for j, term in enumerate(found, 1)}
     if surface.apertures:
         row["apertures"] = " + ".join(_aperture(aperture, place) for aperture in surface.apertures)
     return row | {"comment": texts.written(surface.comment)} if surface.comment else row

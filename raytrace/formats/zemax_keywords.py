@@ -1,5 +1,8 @@
 """The keywords of a .zmx file: which are read, and which are known and left out, with the reason."""
 
+from raytrace.system.aperture import SHAPES
+from raytrace.system.shapes import KINDS
+
 
 def _words(text: str) -> frozenset[str]:
     return frozenset(text.split())
@@ -14,10 +17,8 @@ SYSTEM_READ = _words(
     " WAVM WAVL WAVN WWGT WWGN"
 )
 
-#: Keywords of a surface that are read.
-SURFACE_READ = _words(
-    "SURF TYPE CURV CONI DISZ GLAS DIAM STOP PARM COMM CLAP FLAP OBSC SQAP SQOB ELAP ELOB OBDC USAP USOB UDAD SCBD IGNR"
-)
+#: Keywords of a surface that are read, beside those of its aperture.
+_SURFACE_READ = _words("SURF TYPE CURV CONI DISZ GLAS DIAM STOP PARM COMM FLAP OBDC USAP USOB UDAD SCBD IGNR")
 
 #: Keywords that may stand more than once in the system or in one surface.
 REPEATED = _words("NOTE WAVM PARM UDAD XDAT PPAR VPAR SCBD")
@@ -82,7 +83,7 @@ SURFACE_IGNORED = {
 #: What follows the last surface belongs to these, and not to the lens.
 TAIL_REASON = "merit function, tolerances or configurations: not part of the lens"
 
-#: Types of surface by what OpticStudio calls them; only STANDARD and EVENASPH are modelled.
+#: Types of surface by what OpticStudio calls them; modelled are STANDARD and those of the rows of `shapes.KINDS`.
 TYPE_NAMES = {
     "COORDBRK": "coordinate break",
     "PARAXIAL": "paraxial lens",
@@ -131,8 +132,6 @@ TYPE_NAMES = {
     "BLACKBOX": "black box",
 }
 
-MODELLED_TYPES = ("STANDARD", "EVENASPH")
-
 #: Millimetres in the unit of length named by UNIT.
 MILLIMETRES = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "INCH": 25.4, "M": 1e3, "METER": 1e3}
 
@@ -140,13 +139,18 @@ MILLIMETRES = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "INCH": 25.4, "M": 1e3, "METER
 FIELD_KINDS = ("angle", "object_height", "paraxial_image_height", "real_image_height")
 FIELD_NAMES = {4: "theodolite angle"}
 
-#: Keywords of the surface apertures: shape, and whether it obscures.
-APERTURES = {
-    "CLAP": ("circular", False),
-    "FLAP": ("circular", False),
-    "OBSC": ("circular", True),
-    "SQAP": ("rectangular", False),
-    "SQOB": ("rectangular", True),
-    "ELAP": ("elliptic", False),
-    "ELOB": ("elliptic", True),
-}
+
+def modelled_types() -> dict[str, str]:
+    """Kind of sag by the TYPE that has its terms in PARM; STANDARD has none."""
+    return {"STANDARD": "", **{kind.zemax: name for name, kind in KINDS.items() if kind.zemax}}
+
+
+def aperture_keywords() -> dict[str, tuple[str, bool]]:
+    """Shape of an aperture, and whether it obscures, by keyword; FLAP floats by the semi-diameter."""
+    rows = {keyword: (name, bool(k)) for name, shape in SHAPES.items() for k, keyword in enumerate(shape.zemax)}
+    return {"FLAP": ("circular", False), **rows}
+
+
+def surface_read() -> frozenset[str]:
+    """Keywords of a surface that are read."""
+    return _SURFACE_READ | aperture_keywords().keys()

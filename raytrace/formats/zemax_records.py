@@ -8,10 +8,10 @@ from raytrace.formats.source import MAX_SURFACES, LensFileError, Place, integer,
 from raytrace.formats.zemax_keywords import (
     REPEATED,
     SURFACE_IGNORED,
-    SURFACE_READ,
     SYSTEM_IGNORED,
     SYSTEM_READ,
     TAIL_REASON,
+    surface_read,
 )
 
 
@@ -109,7 +109,7 @@ def sections(text: str, file: str, report: Draft) -> Sections:
             report.met("SURF", READ, block.place)
         elif block is not system and (record.indented if indents else _of_surface(record)):
             record = record._replace(place=record.place._replace(surface=block.place.surface))
-            _classify(record, block, SURFACE_READ, SURFACE_IGNORED, report)
+            _classify(record, block, surface_read(), SURFACE_IGNORED, report)
         elif record.keyword in SYSTEM_READ:
             block = system
             _classify(record, system, SYSTEM_READ, SYSTEM_IGNORED, report)
@@ -125,7 +125,7 @@ def sections(text: str, file: str, report: Draft) -> Sections:
 
 
 def _of_surface(record: Record) -> bool:
-    return record.keyword in SURFACE_READ or record.keyword in SURFACE_IGNORED
+    return record.keyword in surface_read() or record.keyword in SURFACE_IGNORED
 
 
 def _next_surface(record: Record, surfaces: list[Block]) -> Block:
@@ -153,6 +153,6 @@ def _classify(record: Record, block: Block, read: frozenset[str], ignored: dict[
 def _warn_of_repeats(blocks: list[Block], report: Draft) -> None:
     for block in blocks:
         for keyword, found in block.records.items():
-            if len(found) > 1 and keyword in SYSTEM_READ | SURFACE_READ and keyword not in REPEATED:
+            if len(found) > 1 and keyword in SYSTEM_READ | surface_read() and keyword not in REPEATED:
                 first = found[0].place.line
                 report.warn(f"{keyword} stands again (first in line {first}); the last is used", found[-1].place)

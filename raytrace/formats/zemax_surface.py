@@ -9,10 +9,12 @@ from torch import Tensor
 from raytrace.formats.media import listed_glass
 from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, UnsupportedSurface, is_infinite, shown
-from raytrace.formats.zemax_keywords import APERTURES, MODELLED_TYPES, TYPE_NAMES
+from raytrace.formats.zemax_keywords import TYPE_NAMES, aperture_keywords, modelled_types
 from raytrace.formats.zemax_records import Block, Record
 from raytrace.media.glass import AIR, MIRROR, Glass, constant, mil_glass, model_glass
-from raytrace.system.surface import Aperture, Surface
+from raytrace.system.aperture import Aperture
+from raytrace.system.shapes import EVEN, KINDS
+from raytrace.system.surface import Surface
 
 
 def refuse_unsupported(blocks: Sequence[Block]) -> None:
@@ -26,12 +28,12 @@ def refuse_unsupported(blocks: Sequence[Block]) -> None:
     others = [f"{other.place.surface} ({why.split()[1]})" for other, why in found[1:7]]
     more = " …" if len(found) > 7 else ""
     also = f"; neither are surfaces {', '.join(others)}{more}" if others else ""
-    raise UnsupportedSurface(f"{reason} is not modelled{also}; modelled are STANDARD and EVENASPH", place)
+    raise UnsupportedSurface(f"{reason} is not modelled{also}; modelled are {_modelled()}", place)
 
 
 def _unsupported(block: Block) -> str:
     kind = _type(block)
-    if kind not in MODELLED_TYPES:
+    if kind not in modelled_types():
         name = TYPE_NAMES.get(kind)
         return f"type {kind[:40]}" + (f" ({name})" if name else "")
     for record in block.all("SCBD"):
@@ -48,8 +50,13 @@ def _type(block: Block) -> str:
     if record is None:
         return "STANDARD"
     if not record.words:
-        raise LensFileError("TYPE without a name; expected STANDARD or EVENASPH", record.place)
+        raise LensFileError(f"TYPE without a name; expected {_modelled()}", record.place)
     return record.words[0].upper()
+
+
+def _modelled() -> str:
+    *first, last = modelled_types()
+    return f"{', '.join(first)} and {last}"
 
 
 def build(
@@ -69,6 +76,7 @@ def build(
         curvature=_nonzero(block, "CURV", "curvature", millimetres),
         conic=_nonzero(block, "CONI", "conic constant", 1.0),
         coefficients=_coefficients(block, millimetres, report),
+        kind=modelled_types()[_type(block)] or EVEN,
         glass=_medium(block, catalogs, user, report),
         semi_diameter=semi_diameter(block, millimetres),
         apertures=_apertures(block, millimetres, report),
@@ -92,9 +100,9 @@ def _nonzero(block: Block, keyword: str, what: str, divisor: float) -> Tensor | 
 
 
 def _coefficients(block: Block, millimetres: float, report: Draft) -> Tensor | None:
-    """a_j of r^(2j) from PARM j, j = 1…8, mm^(1-2j); an EVENASPH without PARM has eight zeros."""
-    parameters = block.all("PARM")
-    if _type(block) == "STANDARD":
+    """a_j of the kind from PARM j, j = 1…8; an asphere without PARM has eight zeros."""
+    parameters, kind = block.all("PARM"), KINDS.get(modelled_types()[_type(block)])
+    if kind is None:
         for record in parameters:
             if record.number(1, "value", 0.0):
                 report.note(f"{record.place}: PARM {record.words[0]} is not used by a STANDARD surface")
@@ -103,11 +111,12 @@ def _coefficients(block: Block, millimetres: float, report: Draft) -> Tensor | N
     for record in parameters:
         j = record.integer(0, "number of the parameter")
         found = record.number(1, "value")
-        if 1 <= j <= 8:
-            terms[j] = found / millimetres ** (2 * j - 1)
+        if 1 <= j <= kind.parameters:
+            terms[j] = found / millimetres ** (kind.step * j - 1)
         elif found:
-            report.warn(f"PARM {j}: an EVENASPH has parameters 1 to 8 (r² to r^16); left out", record.place)
-    count = max(terms, default=8)
+            message = f"PARM {j}: an {kind.zemax} has parameters 1 to {kind.parameters}{kind.powers}; left out"
+            report.warn(message, record.place)
+    count = max(terms, default=kind.parameters)
     return torch.tensor([terms.get(j, 0.0) for j in range(1, count + 1)], dtype=torch.float64)
 
 
@@ -158,7 +167,8 @@ def _apertures(block: Block, millimetres: float, report: Draft) -> tuple[Apertur
 
     A floating aperture (FLAP) follows the semi-diameter of its surface: it clips at DIAM as it now is.
     """
-    found = block.all(*APERTURES, "USAP", "USOB")
+    keywords = aperture_keywords()
+    found = block.all(*keywords, "USAP", "USOB")
     if not found:
         return ()
     record = found[-1]
@@ -170,7 +180,7 @@ def _apertures(block: Block, millimetres: float, report: Draft) -> tuple[Apertur
         message = f"user-defined aperture ({record.keyword}, {points} UDAD lines) is not modelled: it blocks no ray"
         report.warn(message, record.place)
         return ()
-    shape, obscures = APERTURES[record.keyword]
+    shape, obscures = keywords[record.keyword]
     first = record.number(0, "first size of the aperture") * millimetres
     second = record.number(1, "second size of the aperture") * millimetres
     if record.keyword == "FLAP":

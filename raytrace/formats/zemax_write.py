@@ -14,11 +14,13 @@ from raytrace.formats.writing import (
     refuse_departure,
     thickness,
 )
-from raytrace.formats.zemax_keywords import APERTURES, FIELD_KINDS
+from raytrace.formats.zemax_keywords import FIELD_KINDS
 from raytrace.formats.zemax_system import NOTE_PIECE
 from raytrace.media.glass import Glass, mil_glass
+from raytrace.system.aperture import SHAPES, Aperture
 from raytrace.system.lens import RAY_AIMING, Lens
-from raytrace.system.surface import Aperture, Surface
+from raytrace.system.shapes import KINDS
+from raytrace.system.surface import Surface
 
 #: OpticStudio has this many wavelengths.
 _WAVELENGTHS = 24
@@ -31,7 +33,6 @@ _APERTURE_LINES = {
     "object_cone_angle": "OBNA {} 1",
     "float_by_stop": "FLOA",
 }
-_SHAPES = {shape: keyword for keyword, shape in APERTURES.items() if keyword != "FLAP"}
 
 
 def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
@@ -119,7 +120,7 @@ def _surface(lens: Lens, number: int, surface: Surface, place: Place) -> list[st
     lines = [
         f"SURF {number}",
         *(["  STOP"] if number == lens.stop else []),
-        f"  TYPE {'STANDARD' if surface.coefficients is None else 'EVENASPH'}",
+        f"  TYPE {'STANDARD' if surface.coefficients is None else KINDS[surface.kind].zemax}",
         f'  CURV {curvature} 0 0 0 0 ""',
         *_coefficients(surface, place),
         f"  DISZ {thickness(surface.thickness, 'INFINITY', place)}",
@@ -135,11 +136,13 @@ def _surface(lens: Lens, number: int, surface: Surface, place: Place) -> list[st
 def _coefficients(surface: Surface, place: Place) -> list[str]:
     if surface.coefficients is None:
         return []
-    terms = exact_list(surface.coefficients, "aspheric terms", place)
-    if any(float(term) for term in terms[8:]):
-        message = f"{len(terms)} aspheric terms (to r^{2 * len(terms)}), an EVENASPH has 8 (to r^16)"
-        raise LensFileError(f"{message}; write a table (.csv)", place)
-    return [f"  PARM {j} {term}" for j, term in enumerate(terms[:8], 1)]
+    kind, terms = KINDS[surface.kind], exact_list(surface.coefficients, "aspheric terms", place)
+    if kind.zemax is None:
+        raise LensFileError(f"a .zmx file has no type for an {kind.name}; write a table (.csv)", place)
+    if any(float(term) for term in terms[kind.parameters :]):
+        message = f"{len(terms)} terms (to r^{kind.step * len(terms)}), an {kind.zemax} has {kind.parameters}"
+        raise LensFileError(f"{message}{kind.powers}; write a table (.csv)", place)
+    return [f"  PARM {j} {term}" for j, term in enumerate(terms[: kind.parameters], 1)]
 
 
 def _glass(glass: Glass, place: Place) -> list[str]:
@@ -169,8 +172,8 @@ def _apertures(apertures: tuple[Aperture, ...], place: Place) -> list[str]:
         message = f"{len(apertures)} apertures, a surface of a .zmx file has one"
         raise LensFileError(f"{message}; put the others on dummy surfaces, or write a table (.csv)", place)
     aperture = apertures[0]
-    first, second = (exact(number, "size of the aperture", place) for number in aperture.extent)
-    lines = [f"  {_SHAPES[aperture.shape, aperture.obscures]} {first} {second} 0"]
+    sizes = " ".join(exact(number, "size of the aperture", place) for number in aperture.extent)
+    lines = [f"  {SHAPES[aperture.shape].zemax[aperture.obscures]} {sizes} 0"]
     if any(aperture.centre):
         x, y = (exact(number, "decentre of the aperture", place) for number in aperture.centre)
         lines.append(f"  OBDC {x} {y}")

@@ -6,8 +6,10 @@ trust       what may be executed: what nobody else can have written
 structure   a run of surfaces as that code reads it
 run         the code called on tensors, forward and backward
 block.h     what it works on: blocks of rays that stay in the cache
+sags.h      the kinds of sag, as rows of shapes.py
+apertures.h the shapes of apertures, as rows of aperture.py
 loops.h     the surfaces as loops over a block, where nothing can go wrong
-careful.h   one ray at one surface, with every case that surface.py and asphere.py know
+careful.h   one ray at one surface, with every case that surface.py and search.py know
 adjoint.h   the adjoint of a surface, with its derivation
 trace.cpp   rays through all surfaces and back, block by block
 """

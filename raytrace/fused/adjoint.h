@@ -27,8 +27,8 @@ struct Sums {
   T gap = 0, c = 0, k = 0, n1 = 0, n2 = 0, a[kTerms] = {};
 };
 
-// What a coefficient a_j of u^j gets from each ray, s u^j + S̄' j u^(j-1), summed.
-template <typename T>
+// What a coefficient a_j of v^j gets from each ray, s v^j + S̄' j v^(j-1) v', summed.
+template <int kind, typename T>
 void sum_coefficients(const Rays<T>& to, Notes<T>& notes, int n, int terms, T* sums) {
 #pragma omp simd
   for (int i = 0; i < n; i++) notes.pz[i] = 1;
@@ -36,9 +36,9 @@ void sum_coefficients(const Rays<T>& to, Notes<T>& notes, int n, int terms, T* s
     T sum = 0;
 #pragma omp simd reduction(+ : sum)
     for (int i = 0; i < n; i++) {
-      T u = to.x[i] * to.x[i] + to.y[i] * to.y[i];
-      sum += notes.pz[i] * (notes.px[i] * u + T(j + 1) * notes.py[i]);
-      notes.pz[i] *= u;
+      const Argument<T> at = argument<kind>(to.x[i] * to.x[i] + to.y[i] * to.y[i]);
+      sum += notes.pz[i] * (notes.px[i] * at.v + T(j + 1) * notes.py[i] * at.dv);
+      notes.pz[i] *= at.v;
     }
     sums[j] += sum;
   }
@@ -62,8 +62,8 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
     if (kind == kSphere || kind == kConic) {
       nx = -c * hx, ny = -c * hy, nz = T(1) - shape * c * hz;
       if (kind == kConic) w = T(1) - k * c * c * u;
-    } else if (kind == kAsphere) {
-      sag<T, true>(s, terms, u, S, dS, d2S);
+    } else if (has_terms(kind)) {
+      sag<kind, true>(s, terms, u, S, dS, d2S);
       nx = T(-2) * dS * hx, ny = T(-2) * dS * hy, w = T(1) + T(4) * dS * dS * u;
     }
     T tilt = nx * L + ny * M, cosine = tilt + nz * N, over_cosine;
@@ -123,7 +123,7 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
         sum_c += pull_w * u;
         sum_k -= c * hz * gnz + c * c * u * gw;
       }
-    } else if (kind == kAsphere) {
+    } else if (has_terms(kind)) {
       gdS = T(-2) * (hx * gnx + hy * gny) + T(8) * dS * u * gw;
       T radicand = T(1) - shape * c * c * u;
       over_w = T(1) / root(radicand > 0 ? radicand : T(1));
@@ -144,7 +144,7 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
     if (kind == kSphere || kind == kConic) {
       sum_c += T(0.5) * s_bar * (u + shape * hz * hz);
       if (kind == kConic) sum_k += T(0.5) * s_bar * c * hz * hz;
-    } else if (kind == kAsphere) {
+    } else if (has_terms(kind)) {
       sum_c += s_bar * u * over_w * over_w / (over_w + T(1));
       sum_k += T(0.5) * s_bar * c * conic_sag * conic_sag * over_w;
       notes.px[i] = s_bar, notes.py[i] = gdS;
@@ -156,7 +156,7 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
   }
   Sums<T> sums;
   sums.gap = sum_gap, sums.c = sum_c, sums.k = sum_k, sums.n1 = sum_n1, sums.n2 = sum_n2;
-  if (kind == kAsphere) sum_coefficients(to, notes, n, s.at->terms, sums.a);
+  if constexpr (has_terms(kind)) sum_coefficients<kind>(to, notes, n, s.at->terms, sums.a);
   return sums;
 }
 

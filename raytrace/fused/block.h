@@ -1,8 +1,7 @@
 // The values that one call traces through: surfaces with their numbers, and a block of rays that stays in the cache.
 //
 // Every loop over a block runs over whole vectors (a block is filled up with axial rays), so a ray's result does not
-// depend on its neighbours. ; `careful.h` then takes the
-// flagged rays one by one, in the arithmetic of raytrace/system/surface.py.
+// depend on its neighbours; `careful.h` takes the flagged rays one by one, as raytrace/system/surface.py would.
 #pragma once
 #include <cmath>
 #include <cstdint>
@@ -13,10 +12,9 @@ namespace raytrace {
 
 constexpr int kBlock = 256;   // rays
 constexpr int kVector = 16;   // rays: whole vectors of either type
-constexpr int kTerms = 16;    // of an even asphere, at most
-constexpr int kFields = 18;   // integers that tell of a surface, see structure.py
+constexpr int kTerms = 16;    // of an asphere, at most
+constexpr int kFields = 13;   // integers that tell of a surface, see structure.py
 
-enum Kind { kPlane, kSphere, kConic, kAsphere };
 enum Bend { kNone, kRefract, kReflect };
 
 // One surface as structure.py lays it out. Offsets count numbers of a row; -1 stands for a number that is not modelled.
@@ -24,9 +22,8 @@ struct Layout {
   int32_t kind, bend, side, terms, apertures, first_aperture;
   int32_t gap, curvature, conic, coefficients, before, behind;
   int32_t rim;  // place in the constants
-  int32_t unused[5];
 };
-static_assert(sizeof(Layout) == kFields * sizeof(int32_t), "structure.py writes 18 integers");
+static_assert(sizeof(Layout) == kFields * sizeof(int32_t), "structure.py writes 13 integers");
 
 // The same surface with the numbers of one row.
 template <typename T>

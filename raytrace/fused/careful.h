@@ -1,26 +1,24 @@
-// One ray at one surface in the arithmetic of raytrace/system/surface.py and asphere.py, with every case they know; in float64
+// One ray at one surface in the arithmetic of raytrace/system/surface.py and search.py, with every case they know; in float64
 // also for float32 rays, for what becomes of a ray must not be decided by rounding.
 #pragma once
 #include "loops.h"
 
 namespace raytrace {
 
-// First crossing with an even asphere, asphere.py line by line: Newton's method from the base conic, accepted by a
+// First crossing with an asphere, search.py line by line: Newton's method from the base conic, accepted by a
 // residual relative to the size of the terms, and a bracketed search for the rays that fail.
 struct AsphereSearch {
   const Surface<double>& s;
-  int terms;
   double x, y, z, L, M, N;
 
   struct Residual { double F, dF, scale, u; bool inside; };
   struct Found { double t; bool small, forward; double radius; };
 
   Residual residual(double t) const {
-    double hx = x + t * L, hy = y + t * M, hz = z + t * N, u = hx * hx + hy * hy, S, dS, d2S, size = 0;
-    bool inside = sag<double, false>(s, terms, u, S, dS, d2S);
-    for (int j = terms - 1; j >= 0; j--) size = size * u + std::fabs(s.a[j]);
+    double hx = x + t * L, hy = y + t * M, hz = z + t * N, u = hx * hx + hy * hy;
+    auto [S, dS, size, inside] = slope_at(s, u);
     double radial = hx * L + hy * M;
-    double scale = std::fabs(hz) + std::fabs(s.c * u) + u * size + std::fabs(z) + std::fabs(t * N);
+    double scale = std::fabs(hz) + std::fabs(s.c * u) + size + std::fabs(z) + std::fabs(t * N);
     scale += 2 * std::fabs(dS) * (u + std::fabs(radial) * std::fabs(t));
     return {hz - S, N - 2 * dS * radial, scale, u, inside};
   }
@@ -65,8 +63,7 @@ struct AsphereSearch {
 
     double low = infinity, high = -infinity;
     for (int i = 0; i <= 64; i++) {
-      double at = i / 64.0 * radius, S, dS, d2S;
-      sag<double, false>(s, terms, at * at * (1 - 1e-7), S, dS, d2S);
+      double at = i / 64.0 * radius, S = slope_at(s, at * at * (1 - 1e-7)).S;
       low = std::fmin(low, S), high = std::fmax(high, S);
     }
     double margin = (high - low) * 0.05 + std::numeric_limits<double>::min();
@@ -121,7 +118,7 @@ struct Ray { double x, y, z, L, M, N, path; };
 
 // Path from the foot of the perpendicular; whether there is a crossing.
 inline bool crossing(const Surface<double>& s, double x, double y, double z, double L, double M, double N, double& t) {
-  if (s.at->kind == kAsphere) return AsphereSearch{s, s.at->terms, x, y, z, L, M, N}(t);
+  if (has_terms(s.at->kind)) return AsphereSearch{s, x, y, z, L, M, N}(t);
   double c = s.c, shape = 1 + s.k;
   double A = c * (L * L + M * M + shape * N * N);
   double G = s.at->kind == kSphere ? N : N - c * (x * L + y * M + shape * z * N);
@@ -144,14 +141,14 @@ inline bool carry(Ray& ray, const Surface<double>& s, double farthest, bool with
     if (!(std::fabs(t) < farthest)) return false;
     hx = x - t * L, hy = y - t * M, hz = 0;
   } else {
-    const bool asphere = s.at->kind == kAsphere;
-    double slide = -(x * L + y * M + ahead * N), t = 0, S, dS = 0, d2S, F, dF;
+    const bool asphere = has_terms(s.at->kind);
+    double slide = -(x * L + y * M + ahead * N), t = 0, F, dF;
     double px = x + slide * L, py = y + slide * M, pz = ahead + slide * N;
     if (!crossing(s, px, py, pz, L, M, N, t)) return false;
     hx = px + t * L, hy = py + t * M, hz = pz + t * N;
     if (asphere) {
-      sag<double, false>(s, s.at->terms, hx * hx + hy * hy, S, dS, d2S);
-      F = hz - S, dF = N - 2 * dS * (hx * L + hy * M);
+      Slope at = slope_at(s, hx * hx + hy * hy);
+      F = hz - at.S, dF = N - 2 * at.dS * (hx * L + hy * M);
     } else {
       F = 0.5 * s.c * (hx * hx + hy * hy + shape * hz * hz) - hz;
       dF = s.c * (hx * L + hy * M + shape * hz * N) - N;
@@ -159,7 +156,7 @@ inline bool carry(Ray& ray, const Surface<double>& s, double farthest, bool with
     double step = F / dF;  // polished
     hx -= step * L, hy -= step * M, hz -= step * N;
     if (asphere) {
-      sag<double, false>(s, s.at->terms, hx * hx + hy * hy, S, dS, d2S);
+      double dS = slope_at(s, hx * hx + hy * hy).dS;
       nx = -2 * dS * hx, ny = -2 * dS * hy, w = 1 + 4 * dS * dS * (hx * hx + hy * hy);
     } else {
       nx = -s.c * hx, ny = -s.c * hy, nz = 1 - shape * s.c * hz, w = 1 - s.k * s.c * s.c * (hx * hx + hy * hy);

@@ -1,6 +1,6 @@
 // The surfaces as loops over a block: the algebra of raytrace/system/surface.py and trace.py where nothing can go wrong.
 #pragma once
-#include "block.h"
+#include "sags.h"
 
 namespace raytrace {
 
@@ -42,26 +42,6 @@ inline T reduced_path(T hx, T hy, T hz, T x, T y, T z, T L, T M, T N, T gap, boo
   bool usual = side * N > 0;
   T lag = usual ? -side * (L * L + M * M) / (usual ? forward : T(1)) : N - side;
   return path + gap * lag;
-}
-
-// S(u), its slope and, if asked for, what the polynomial adds to its second derivative at u = r² (the conic's holds c³,
-// which may leave the range of numbers: see the adjoint); returns whether the radicand of the conic is above 0.
-template <typename T, bool second>
-inline bool sag(const Surface<T>& s, int terms, T u, T& S, T& dS, T& d2S) {
-  T shape = T(1) + s.k, radicand = T(1) - shape * s.c * s.c * u;
-  bool inside = radicand > 0;
-  T w = root(inside ? radicand : std::numeric_limits<T>::min()), over_w = T(1) / w;
-  T p = 0, dp = 0, d2p = 0;
-  for (int j = terms - 1; j >= 0; j--) {
-    if (second) d2p = d2p * u + dp;
-    dp = dp * u + p;
-    p = p * u + s.a[j];
-  }
-  // Σ a_j u^(j+1) = u p, so its derivatives are p + u p' and 2 p' + u p''; d2p carries p''/2.
-  S = s.c * u / (T(1) + w) + u * p;
-  dS = T(0.5) * s.c * over_w + p + u * dp;
-  if (second) d2S = 2 * dp + 2 * u * d2p;
-  return inside;
 }
 
 // Ray i behind a surface; 1 if it is flagged.
@@ -140,7 +120,7 @@ template <typename T>
 constexpr T kSmallStep = sizeof(T) == 4 ? T(2e-5) : T(1e-9);
 constexpr int kSteps = 8;
 
-template <typename T, int terms>
+template <typename T, int kind, int terms>
 void newton(const Rays<T>& from, Notes<T>& notes, int n, const Surface<T>& s) {
   const T gap = s.gap, c = s.c, shape = T(1) + s.k;
   const T rim_squared = T(s.rim) * T(s.rim);
@@ -170,7 +150,7 @@ void newton(const Rays<T>& from, Notes<T>& notes, int n, const Surface<T>& s) {
       T L = from.L[i], M = from.M[i], N = from.N[i], t = notes.t[i];
       T x = notes.px[i] + t * L, y = notes.py[i] + t * M, z = notes.pz[i] + t * N;
       T u = x * x + y * y, S, dS, d2S;
-      sag<T, false>(s, terms, u, S, dS, d2S);
+      sag<kind, false>(s, terms, u, S, dS, d2S);
       T dF = N - T(2) * dS * (x * L + y * M);
       T change = (z - S) / dF;
       bool active = notes.active[i] > 0;
@@ -183,9 +163,9 @@ void newton(const Rays<T>& from, Notes<T>& notes, int n, const Surface<T>& s) {
   }
 }
 
-template <typename T, int bend, bool path, int terms>
+template <typename T, int kind, int bend, bool path, int terms>
 int cross_asphere(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, const Surface<T>& s) {
-  newton<T, terms>(from, notes, n, s);
+  newton<T, kind, terms>(from, notes, n, s);
   const Law<T, bend> law(s);
   const bool has_gap = s.at->gap >= 0;
   const T gap = s.gap, side = T(s.at->side), rim_squared = T(s.rim) * T(s.rim);
@@ -195,7 +175,7 @@ int cross_asphere(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, cons
     T x = from.x[i], y = from.y[i], z = from.z[i], L = from.L[i], M = from.M[i], N = from.N[i], t = notes.t[i];
     T hx = notes.px[i] + t * L, hy = notes.py[i] + t * M, hz = notes.pz[i] + t * N;
     T u = hx * hx + hy * hy, S, dS, d2S;
-    bool good = sag<T, false>(s, terms, u, S, dS, d2S);
+    bool good = sag<kind, false>(s, terms, u, S, dS, d2S);
     T slope = T(2) * dS, cosine = N - slope * (hx * L + hy * M);
     T w = T(1) + slope * slope * u;
     // `active` is 1 where Newton's method has not arrived, and NaN compares as false.

@@ -6,25 +6,43 @@ takes. The numbers are tensors, and autograd sees how they were put together.
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from raytrace.system.aperture import SHAPES
+from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface
 
-_FIELDS = 18  # integers of a surface, see `Layout` in block.h
-_MOST_TERMS = 16  # of an even asphere
-_PLANE, _SPHERE, _CONIC, _ASPHERE = range(4)
+_PLANE, _SPHERE, _CONIC = range(3)  # and the codes of shapes.KINDS
 _NONE, _REFRACT, _REFLECT = range(3)
-_SHAPES = {"circular": 0.0, "rectangular": 1.0, "elliptic": 2.0}
+
+
+class _Row(NamedTuple):
+    """`Layout` of block.h: the first six are told there, the others are places of numbers, -1 where there is none."""
+
+    kind: int
+    bend: int
+    side: int
+    terms: int
+    apertures: int
+    first_aperture: int
+    gap: int
+    curvature: int
+    conic: int
+    coefficients: int
+    before: int
+    behind: int
+    rim: int
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Structure:
     """Surfaces without their numbers.
 
-    layout: (S, 18) int32; constants: (C,) float64, what no derivative is asked for: rims and apertures.
+    layout: (S, 13) int32, a `_Row` each; constants: (C,) float64, what no derivative is asked for: rims and apertures.
     """
 
     layout: np.ndarray
@@ -32,8 +50,11 @@ class Structure:
 
 
 def is_expressible(surface: Surface) -> bool:
-    """Whether the compiled trace knows the surface: no departure, at most 16 aspheric terms."""
-    return surface.departure is None and len(_terms(surface)) <= _MOST_TERMS
+    """Whether the compiled trace knows the surface: no departure, a compiled kind and not too many of its terms."""
+    if surface.departure is not None:
+        return False
+    kind = KINDS[surface.kind]
+    return surface.coefficients is None or (kind.code is not None and len(surface.coefficients) <= kind.compiled)
 
 
 def structure_of(
@@ -54,17 +75,29 @@ def structure_of(
 
     rows = []
     for surface, n1, n2 in zip(surfaces, indices[:-1], indices[1:], strict=True):
-        bend = _REFLECT if surface.is_mirror else _NONE if n2 is n1 else _REFRACT
-        terms, first_term, rim = _terms(surface), len(numbers), len(constants)
+        terms = () if surface.coefficients is None else surface.coefficients.unbind(0)
+        first_term, rim = len(numbers), len(constants)
         numbers.extend(terms)
         constants.append(float("inf") if surface.semi_diameter is None else surface.semi_diameter)
         for aperture in surface.apertures:
-            shape = _SHAPES[aperture.shape]
-            constants += [shape, *aperture.extent, float(aperture.obscures), *aperture.centre]
+            sizes = aperture.extent
+            constants += [SHAPES[aperture.shape].code, float(aperture.obscures), *aperture.centre, len(sizes), *sizes]
         rows.append(
-            [_kind(surface), bend, side, len(terms), len(surface.apertures), rim + 1]
-            + [place(gap), place(surface.curvature), place(surface.conic), first_term, place(n1), place(n2), rim]
-            + [0] * (_FIELDS - 13)
+            _Row(
+                kind=_kind(surface),
+                bend=_REFLECT if surface.is_mirror else _NONE if n2 is n1 else _REFRACT,
+                side=side,
+                terms=len(terms),
+                apertures=len(surface.apertures),
+                first_aperture=rim + 1,
+                gap=place(gap),
+                curvature=place(surface.curvature),
+                conic=place(surface.conic),
+                coefficients=first_term,
+                before=place(n1),
+                behind=place(n2),
+                rim=rim,
+            )
         )
         gap, side = surface.thickness, -side if surface.is_mirror else side
     return Structure(np.array(rows, dtype=np.int32), np.array(constants, dtype=np.float64)), numbers
@@ -78,30 +111,26 @@ def with_numbers(
     def number(place: int) -> Tensor | None:
         return None if place < 0 else numbers[place]
 
-    rows = structure.layout.tolist()
-    gaps = [number(row[6]) for row in rows]
+    rows = [_Row(*row) for row in structure.layout.tolist()]
+    gaps = [number(row.gap) for row in rows]
     own = []
     for row, surface, thickness in zip(rows, surfaces, [*gaps[1:], surfaces[-1].thickness], strict=True):
-        terms = numbers[row[9] : row[9] + row[3]]
+        terms = numbers[row.coefficients : row.coefficients + row.terms]
         own.append(
             dataclasses.replace(
                 surface,
                 thickness=thickness,
-                curvature=number(row[7]),
-                conic=number(row[8]),
+                curvature=number(row.curvature),
+                conic=number(row.conic),
                 coefficients=surface.coefficients if not terms else torch.stack(list(terms)),
             )
         )
-    return own, [numbers[rows[0][10]], *(numbers[row[11]] for row in rows)], gaps[0]
-
-
-def _terms(surface: Surface) -> tuple[Tensor, ...]:
-    return () if surface.coefficients is None else surface.coefficients.unbind(0)
+    return own, [numbers[rows[0].before], *(numbers[row.behind] for row in rows)], gaps[0]
 
 
 def _kind(surface: Surface) -> int:
     if surface.coefficients is not None:
-        return _ASPHERE
+        return KINDS[surface.kind].code
     if surface.curvature is None:
         return _PLANE
     return _SPHERE if surface.conic is None else _CONIC

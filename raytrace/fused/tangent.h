@@ -48,15 +48,16 @@ void push(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, int n, const Surfa
       nx = -c * hx, ny = -c * hy, nz = T(1) - shape * c * hz;
       if (kind == kConic) w = T(1) - k * c * c * u;
       moved = T(-0.5) * ((u + shape * hz * hz) * dc + c * hz * hz * dk);
-    } else if (kind == kAsphere) {
-      sag<T, true>(s, terms, u, S, dS, d2S);
+    } else if (has_terms(kind)) {
+      sag<kind, true>(s, terms, u, S, dS, d2S);
       nx = T(-2) * dS * hx, ny = T(-2) * dS * hy, w = T(1) + T(4) * dS * dS * u;
       T radicand = T(1) - shape * c * c * u, over_w = T(1) / root(radicand > 0 ? radicand : T(1));
       steep = c * over_w;
       T conic_sag = c * u * over_w / (over_w + T(1)), third = over_w * over_w * over_w, p = 0, q = 0;
-      for (int j = terms - 1; j >= 0; j--) p = p * u + change.a[j], q = q * u + T(j + 1) * change.a[j];
-      moved = -(dc * u * over_w * over_w / (over_w + T(1)) + T(0.5) * dk * c * conic_sag * conic_sag * over_w + u * p);
-      slope = T(0.5) * dc * third + T(0.25) * dk * c * (c * c * u) * third + q;
+      const Argument<T> at = argument<kind>(u);
+      for (int j = terms - 1; j >= 0; j--) p = p * at.v + change.a[j], q = q * at.v + T(j + 1) * change.a[j];
+      moved = -(dc * u * over_w * over_w / (over_w + T(1)) + T(0.5) * dk * c * conic_sag * conic_sag * over_w + at.v * p);
+      slope = T(0.5) * dc * third + T(0.25) * dk * c * (c * c * u) * third + q * at.dv;
     }
     T cosine = nx * L + ny * M + nz * N;
 
@@ -85,7 +86,7 @@ void push(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, int n, const Surfa
     if (kind == kSphere || kind == kConic) {
       dnx = -c * px - dc * hx, dny = -c * py - dc * hy, dnz = -shape * (c * pz + dc * hz) - dk * c * hz;
       if (kind == kConic) dw = -c * (c * u * dk + T(2) * k * (u * dc + hx * (c * px) + hy * (c * py)));
-    } else if (kind == kAsphere) {
+    } else if (has_terms(kind)) {
       // No product of two lengths, as hx px, stands alone: it leaves the range of numbers before its factors do.
       slope += T(2) * (d2S * hx * px + d2S * hy * py);
       slope += T(0.5) * shape * steep * (steep * hx * (steep * px) + steep * hy * (steep * py));

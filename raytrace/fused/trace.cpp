@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "adjoint.h"
+#include "apertures.h"
 #include "careful.h"
 #include "tangent.h"
 
@@ -42,7 +43,7 @@ template <typename T, int kind, int bend, bool path, int terms>
 struct Of {
   static Crosses<T> crosses() {
     if constexpr (kind == kPlane) return cross_plane<T, bend, path>;
-    else if constexpr (kind == kAsphere) return cross_asphere<T, bend, path, terms>;
+    else if constexpr (has_terms(kind)) return cross_asphere<T, kind, bend, path, terms>;
     else return cross_conic<T, bend, path, kind == kConic>;
   }
   static Pulls<T> pulls() { return pull<T, kind, bend, path, terms>; }
@@ -55,9 +56,7 @@ void by_kind(const Layout& at, Work work) {
   if (at.kind == kPlane) work(Of<T, kPlane, bend, path, 0>{});
   else if (at.kind == kSphere) work(Of<T, kSphere, bend, path, 0>{});
   else if (at.kind == kConic) work(Of<T, kConic, bend, path, 0>{});
-  else if (at.terms <= 4) work(Of<T, kAsphere, bend, path, 4>{});
-  else if (at.terms <= 8) work(Of<T, kAsphere, bend, path, 8>{});
-  else work(Of<T, kAsphere, bend, path, kTerms>{});
+  else by_kind_of_terms(at, [&work](auto kind, auto terms) { work(Of<T, kind(), bend, path, terms()>{}); });
 }
 
 template <typename T, bool path, typename Work>
@@ -65,32 +64,6 @@ void by_bend(const Layout& at, Work work) {
   if (at.bend == kNone) by_kind<T, kNone, path>(at, work);
   else if (at.bend == kRefract) by_kind<T, kRefract, path>(at, work);
   else by_kind<T, kReflect, path>(at, work);
-}
-
-// A ray passes all apertures of a surface (surface.py, `inside`); six constants each.
-template <typename T>
-void clip(const Rays<T>& rays, Notes<T>& notes, int n, const Layout& at, const double* constants) {
-  for (int number = 0; number < at.apertures; number++) {
-    const double* shape = constants + at.first_aperture + 6 * number;
-    const T a = T(shape[1]), b = T(shape[2]), cx = T(shape[4]), cy = T(shape[5]);
-    const bool obscures = shape[3] != 0;
-    for (int i = 0; i < n; i++) {
-      T x = rays.x[i] - cx, y = rays.y[i] - cy;
-      bool within, blocked;
-      if (shape[0] == 0) {
-        T r = x * x + y * y;
-        within = r >= a * a && r <= b * b;
-        blocked = (a > 0 ? r > a * a : r >= 0) && r < b * b;
-      } else if (shape[0] == 1) {
-        within = magnitude(x) <= a && magnitude(y) <= b;
-        blocked = magnitude(x) < a && magnitude(y) < b;
-      } else {
-        T level = (x / a) * (x / a) + (y / b) * (y / b);
-        within = level <= 1, blocked = level < 1;
-      }
-      notes.valid[i] &= obscures ? !blocked : within;
-    }
-  }
 }
 
 template <typename T>
@@ -231,7 +204,7 @@ class Trace {
         if (path) cross_carefully<T, true>(from, to, notes, i, s);
         else cross_carefully<T, false>(from, to, notes, i, s);
       }
-    if (s.at->apertures) clip(to, notes, n, *s.at, call_.constants);
+    clip(to, notes.valid, n, call_.constants + s.at->first_aperture, s.at->apertures);
   }
 
   void pick(Cotangents<T>& g, int64_t at, int count, int n) {

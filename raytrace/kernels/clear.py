@@ -1,16 +1,17 @@
 """Clear pupil: where along arms of the pupil light passes every aperture, and how those edges move with the lens.
 
-An edge ρ of the clear part of an arm is a zero of a clearance c of `rays.clearance`. Traced rays find it without
+An edge ρ of the clear part of an arm is a zero of a clearance c of `aperture.clearance`. Traced rays find it without
 derivatives. Two Newton steps with a constant slope s, ρ - c(ρ)/s, then carry its derivatives.
 """
 
 import torch
 from torch import Tensor
 
-from raytrace.kernels.rays import clearance, trace_apertures
+from raytrace.kernels.rays import trace_apertures
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_legendre
 from raytrace.optics.scene import Scene
+from raytrace.system.aperture import clearance
 
 _SCAN = 32  # steps along an arm in which edges are looked for
 _SECTIONS, _ZOOMS = 8, 2  # an edge is enclosed in 8⁻² of a step: slopes are good to 5e-4

@@ -19,7 +19,7 @@ from raytrace.maths.pupil import gauss_rings, sobol
 from raytrace.maths.value import value
 from raytrace.optics.scene import Kernels, Scene, beam_share
 from raytrace.shards import Share, everywhere
-from raytrace.system.surface import Aperture
+from raytrace.system.aperture import stands_inside
 
 _MAP_POINTS = 4096  # of the ray map that the residual is computed from
 _MAP_NODES, _MAP_ARMS = 32, 128  # the same where apertures clip: nodes on every arm, and arms of a round lens
@@ -96,11 +96,6 @@ def trace_light(scene: Scene, order: int, fold: str, *, share: Share | None = No
     hits, valid = trace_shared(scene, points, share)
     count += rays_of_search(unit.shape[1], inner.shape[-1]) + points.shape[-1]
     return Light(hits, valid, weights, count, inner, outer)
-
-
-def stands_inside(aperture: Aperture) -> bool:
-    """Whether an aperture can stop light in the midst of a beam whose rim it lets through."""
-    return aperture.obscures or (aperture.shape == "circular" and aperture.extent[0] > 0)
 
 
 def arms_of(order: int) -> int:

@@ -20,7 +20,6 @@ from raytrace.kernels.radial import energy_of_rings, is_centred, lit_part, unfol
 from raytrace.kernels.rays import (
     Fans,
     cell_width,
-    clearance,
     energy_of_fans,
     kernels_of_fans,
     moments_of_fans,
@@ -36,7 +35,7 @@ from raytrace.maths.numerics import safe_divide
 from raytrace.maths.value import value
 from raytrace.optics.scene import Kernels, Scene, beam_share, varies
 from raytrace.shards import largest
-from raytrace.system.surface import Aperture
+from raytrace.system.aperture import Aperture, clearance
 
 _LINES = 32  # round the pupil at least, and half as many cells on each
 _MOST_LINES = 8192

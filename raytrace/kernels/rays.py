@@ -24,7 +24,7 @@ from raytrace.maths.value import value
 from raytrace.optics.scene import Kernels, Scene, beam_share, cross_scene, trace_scene
 from raytrace.optics.spot import spot_of
 from raytrace.shards import Share, total
-from raytrace.system.surface import Aperture
+from raytrace.system.aperture import Aperture, clearance
 
 _LINES = (16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512)  # round the pupil, by order; half as many nodes on each
 _CHUNK = 2**17  # cells that are deposited at once: 50 MB of temporaries
@@ -140,22 +140,6 @@ def trace_apertures(scene: Scene, disc: Tensor) -> tuple[Tensor, list[tuple[Aper
         hit = crossing.rays.position[:2]
         crossed += [(aperture, hit.expand(2, *shape)) for aperture in surface.apertures]
     return hit.expand(2, *shape), crossed, met.expand(shape)
-
-
-def clearance(aperture: Aperture, hit: Tensor) -> Tensor:
-    """How far points (2, ...) lie on the clear side of an aperture's edge: smooth there, above 0 where light passes."""
-    x, y = hit[0] - aperture.centre[0], hit[1] - aperture.centre[1]
-    a, b = aperture.extent
-    if aperture.shape == "circular":
-        # An edge at 0 or at infinity is none; distances count in the edge's own radius.
-        square = x * x + y * y
-        sides = [1 - square / (b * b)] + ([square / (a * a) - 1] if a > 0 else [])
-    elif aperture.shape == "rectangular":
-        sides = [1 - x.abs() / a, 1 - y.abs() / b]
-    else:
-        sides = [1 - (x / a) ** 2 - (y / b) ** 2]
-    within = sides[0] if len(sides) == 1 else torch.minimum(*sides)
-    return -within if aperture.obscures else within
 
 
 def cell_width(order: int) -> float:

@@ -10,6 +10,7 @@ from raytrace.maths.value import value
 from raytrace.optics.reuse import Bundle, Memo, cross_bundle, trace_bundle
 from raytrace.optics.trace import Crossing
 from raytrace.optics.vignetting import vignette
+from raytrace.system.aperture import SHAPES
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.rays import Rays
 from raytrace.system.surface import is_round
@@ -138,7 +139,10 @@ def symmetry(scene: Scene) -> str:
     if bool(tilted) or any(aperture.centre[0] != 0 for aperture in apertures):
         return "none"
     skewed = (scene.fields[1] != 0).any() | (centre[1] != 0).any() | (along_x[0] != along_y[1]).any()
-    if bool(skewed) or any(aperture.centre[1] != 0 or aperture.shape != "circular" for aperture in apertures):
+    own = {SHAPES[aperture.shape].symmetry for aperture in apertures}
+    if "none" in own:
+        return "none"
+    if bool(skewed) or any(aperture.centre[1] != 0 for aperture in apertures) or "mirror" in own:
         return "mirror"
     return "round"
 

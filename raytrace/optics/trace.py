@@ -18,9 +18,10 @@ from raytrace.fused.structure import is_expressible
 from raytrace.maths.numerics import dot
 from raytrace.maths.value import value
 from raytrace.media import glass
+from raytrace.system.aperture import inside
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
-from raytrace.system.surface import Surface, in_double, inside, meet, normal
+from raytrace.system.surface import Surface, in_double, meet, normal
 
 
 @value
@@ -140,7 +141,7 @@ def _cross(surface: Surface, rays: _Ray, gap: Tensor | None, side: int, n1: Tens
             sure = None if exact is None else _snell_discriminant(surface, *exact, n1, n2)
             direction, passes = refract(direction, n, cosine, norm_squared, n1, n2, sure)
     survives = met if passes is None else met & passes
-    clear = inside(surface, hit)
+    clear = inside(surface.apertures, hit)
     valid = rays.valid & survives
     after = _Ray(
         position=[at if surface.is_plane and i == 2 else torch.where(survives, at, 0.0) for i, at in enumerate(hit)],

@@ -15,6 +15,7 @@ from raytrace.optics.launch import stop_radius
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.trace import media
 from raytrace.plot import outline, style
+from raytrace.system.aperture import reach
 from raytrace.system.lens import Lens, with_object_distance
 
 _LEAD = 0.14  # of the length of the lens: how far in front of it rays of a far object start
@@ -125,7 +126,7 @@ def _draw_mirrors(axes: Axes, lens: Lens, z: np.ndarray, radii: list[float], pat
         surface = lens.surfaces[k]
         if not surface.is_mirror:
             continue
-        hole = max([a.extent[0] for a in surface.apertures if a.shape == "circular" and not a.obscures] or [0.0])
+        hole = max([reach(a)[0] for a in surface.apertures if not a.obscures] or [0.0])
         hole = min(max(hole, outline.hole_radius(k, z, radii[k], paths)), 0.95 * radii[k])
         y = np.linspace(hole, radii[k], 121)
         face = z[k] + outline.depth(surface, y)
@@ -144,18 +145,16 @@ def _draw_apertures(axes: Axes, lens: Lens, z: np.ndarray, radii: list[float]) -
     outward = 0.12 * max(radii[1:])
     for k, surface in enumerate(lens.surfaces[1:-1], start=1):
         for aperture in surface.apertures:
-            inner, outer = aperture.extent
-            centre, rim = aperture.centre[1], outer  # the extent in y is the second number of every shape
+            centre, (inner, rim) = aperture.centre[1], reach(aperture)
             if not math.isfinite(rim):
                 continue
             if aperture.obscures:
-                inner = inner if aperture.shape == "circular" else 0.0
                 bars = [(-rim, rim)] if inner <= 0 else [(-rim, -inner), (inner, rim)]
             elif surface.is_mirror:
                 bars = []  # its mirror is drawn to this rim
             else:
                 bars = [(-rim - outward, -rim), (rim, rim + outward)]
-                bars += [(-inner, inner)] if aperture.shape == "circular" and inner > 0 else []
+                bars += [(-inner, inner)] if inner > 0 else []
             for low, high in bars:
                 y = centre + np.linspace(low, high, 41)
                 depth = outline.depth(surface, np.minimum(np.abs(y), 0.9999 * outline.edge_radius(surface)))

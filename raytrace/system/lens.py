@@ -9,6 +9,7 @@ from torch import Tensor
 
 from raytrace.maths.value import value
 from raytrace.media.glass import Glass, check_wavelengths, refractive_index
+from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface
 
 #: Units of a field point by the kind of field.
@@ -152,13 +153,15 @@ class Lens:
 def changed(surface: Surface, numbers: Mapping[str, object], where: str, *, like: Tensor) -> Surface:
     """A surface with some of its fields replaced by plain numbers, tensors or values; radius: mm, for the curvature."""
     known = [field.name for field in dataclasses.fields(Surface)]
-    numeric = ("thickness", "curvature", "conic", "coefficients")
+    numeric = {field.name for field in dataclasses.fields(Surface) if field.type in (Tensor, Tensor | None)}
     given = dict(numbers)
     for name in given:
         if name not in (*known, "radius"):
             near = difflib.get_close_matches(name, [*known, "radius"], 1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
             raise ValueError(f"{where} has no {name!r}{hint} (it has {', '.join(known)}, radius)")
+    if given.get("kind", EVEN) not in KINDS:
+        raise ValueError(f"{where}: kind {given['kind']!r}; expected one of {', '.join(KINDS)}")
     if "radius" in given:
         if "curvature" in given:
             raise ValueError(f"{where}: both radius and curvature are given; leave one out")

@@ -28,7 +28,7 @@ class Kind:
     step: v = r^step near the vertex, so that a_j belongs to r^(step j) and is named for it; mm^(1 - step j).
     argument: u = r² and a factor f -> v, dv/du, f² d²v/du²; None: v is u itself.
     zemax: TYPE of a .zmx file, where PARM j is a_j up to `parameters`; None: no file holds it.
-    words: what a table's column "type" may say beside the name, without blanks; none: the terms themselves tell.
+    words: what a table's column "type" may say for it; without any the powers tell.
     code: the kind in fused/sags.h, which traces up to `compiled` terms; None: traced by torch alone.
     """
 
@@ -41,13 +41,19 @@ class Kind:
     code: int | None = None
     compiled: int = 16
 
+    @property
+    def powers(self) -> str:
+        """The powers of r that a file holds, in words."""
+        first = {1: "r", 2: "r²"}.get(self.step, f"r^{self.step}")
+        return f" ({first} to r^{self.step * self.parameters})"
+
     def term(self, coefficients: Tensor | None, power: int) -> Tensor | float:
         """The coefficient (...) of r^power, 0 where there is none."""
         j, rest = divmod(power, self.step)
         return 0.0 if coefficients is None or rest or j > len(coefficients) else coefficients[j - 1]
 
 
-KINDS = {kind.name: kind for kind in (Kind(EVEN, zemax="EVENASPH", words=("evenasph",), code=3),)}
+KINDS = {kind.name: kind for kind in (Kind(EVEN, zemax="EVENASPH", words=("even", "evenasph"), code=3),)}
 
 
 @dataclasses.dataclass(frozen=True)

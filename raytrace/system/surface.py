@@ -19,25 +19,10 @@ from torch import Tensor
 from raytrace.maths.numerics import differentiating, dot
 from raytrace.maths.value import to, value
 from raytrace.media.glass import AIR, Glass
+from raytrace.system.aperture import Aperture
 from raytrace.system.departure import Departure
 from raytrace.system.search import first_crossing
 from raytrace.system.shapes import DEPARTURES, EVEN, KINDS, Relief, relief, sag_and_derivatives
-
-
-@value
-class Aperture:
-    """The part of a surface that passes light; one surface may carry several, and a ray must pass all of them.
-
-    shape: "circular" (extent: inner and outer radius), "rectangular" or "elliptic" (half-widths in x and y).
-    extent: the two numbers of the shape, mm.
-    obscures: True if the shape blocks what lies inside it (an obscuration) instead of passing it.
-    centre: (x, y) mm of the shape in the surface's frame.
-    """
-
-    shape: str
-    extent: tuple[float, float]
-    obscures: bool = False
-    centre: tuple[float, float] = (0.0, 0.0)
 
 
 @value
@@ -190,26 +175,6 @@ def normal(surface: Surface, hit: Sequence[Tensor]) -> tuple[tuple[Tensor, Tenso
     # In this order no product of a backward derivative leaves the range of numbers: c² c̄ and r² c̄ would.
     k = surface.conic
     return (-c * x, -c * y, 1 - (1 + k) * c * z), 1 - k * (c * (c * (x * x + y * y)))
-
-
-def inside(surface: Surface, hit: Tensor) -> Tensor | None:
-    """Which points (...) pass all apertures of the surface; None if it has none. An edge belongs to the clear side."""
-    passed = None
-    for aperture in surface.apertures:
-        x, y = hit[0] - aperture.centre[0], hit[1] - aperture.centre[1]
-        a, b = aperture.extent
-        if aperture.shape == "circular":
-            radius_squared = x * x + y * y
-            within = (radius_squared >= a * a) & (radius_squared <= b * b)
-            blocked = (radius_squared > a * a if a > 0 else radius_squared >= 0) & (radius_squared < b * b)
-        elif aperture.shape == "rectangular":
-            within, blocked = (x.abs() <= a) & (y.abs() <= b), (x.abs() < a) & (y.abs() < b)
-        else:
-            level = (x / a) ** 2 + (y / b) ** 2
-            within, blocked = level <= 1, level < 1
-        clear = ~blocked if aperture.obscures else within
-        passed = clear if passed is None else passed & clear
-    return passed
 
 
 def _meet_plane(position, direction) -> Meeting:
