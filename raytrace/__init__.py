@@ -22,6 +22,8 @@ PUBLIC = {
     "BadPrescription": "system.build",
     "LensFileError": "formats",
     "UnsupportedSurface": "formats",
+    "check": "formats",
+    "convert": "formats",
     "lens": "system.build",
     "read_lens": "formats",
     "write_lens": "formats",
@@ -33,6 +35,7 @@ PUBLIC = {
     "Glass": "media.glass",
     "UnknownGlass": "media.catalog",
     "find_glass": "media.catalog",
+    "glass": "media.figures",
     "refractive_index": "media.glass",
     # rays
     "FirstOrder": "optics.paraxial",

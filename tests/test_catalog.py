@@ -13,6 +13,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import raytrace as rt
 from raytrace.media import catalog as catalogs
 from raytrace.media.agf import format_agf, parse_agf
 from raytrace.media.catalog import (
@@ -462,3 +463,15 @@ def test_a_damaged_file_is_a_catalog_or_a_catalog_error(tmp_path, seed, encoding
         assert glass.wavelength_range is None or 0 < glass.wavelength_range[0] < glass.wavelength_range[1]
     again = parse_agf(format_agf(catalog), path)
     assert all(same(again.glasses[name], glass) for name, glass in catalog.glasses.items())
+
+
+def test_the_figures_of_a_glass_are_text_document_and_table():
+    found = rt.glass("SK16", wavelengths=[0.53, 0.6])
+    indices = refractive_index(find_glass("SK16"), torch.tensor([0.53, 0.6], dtype=torch.float64))
+    assert found.document()["indices"] == indices.tolist()
+    assert found.to_frame()["index"].tolist() == indices.tolist()
+    assert f"n(0.53 µm) = {float(indices[0]):.10f}" in str(found)
+    assert rt.glass("517642").document()["catalog"] is None
+    assert str(rt.glass("517642")).startswith("517642  (MIL code)")
+    with pytest.raises(ValueError, match=r"did you mean 0\.53"):
+        rt.glass("SK16", wavelengths=530)

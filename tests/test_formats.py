@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import random
+import re
 import warnings
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from problems import number
 
+import raytrace as rt
 from raytrace.formats import FORMATS, LensFileError, LensFileWarning, read_lens, read_lens_with_report, write_lens
 from raytrace.formats.frame import lens_from_frame, to_frame
 from raytrace.formats.source import MAX_BYTES, Place, decode
@@ -375,3 +377,34 @@ def test_a_file_cut_off_anywhere_is_no_shorter_lens(path):
         except (LensFileError, UnknownGlass):
             continue
         assert len(cut.surfaces) == len(lens.surfaces)
+
+
+# -- the verbs --------------------------------------------------------------------------------------------------------
+
+
+def test_check_tells_what_was_read():
+    found = rt.check("double_gauss")
+    lens, report = read_lens_with_report("double_gauss")
+    assert str(found) == str(report)
+    assert found.document()["surfaces"] == len(lens.surfaces)
+    assert found.document()["stop_surface"] == lens.stop
+    frame = found.to_frame()
+    assert frame[frame.keyword == "SURF"]["count"].tolist() == [len(lens.surfaces)]
+    assert set(frame.status) <= {"read", "ignored", "unknown"}
+
+
+def test_check_refuses_what_cannot_be_traced(tmp_path):
+    path = tmp_path / "still.zmx"
+    text = (ROOT / "lenses" / "singlet.zmx").read_text()
+    path.write_text(text.replace("FTYP 0", "FTYP 1"))  # heights of an object at infinity
+    read_lens(path)
+    with pytest.raises(LensFileError, match=re.escape(str(path))):
+        rt.check(path)
+
+
+def test_convert_says_what_it_wrote(tmp_path):
+    found = rt.convert("double_gauss", tmp_path / "copy.csv")
+    source, target = ROOT / "lenses" / "double_gauss.zmx", tmp_path / "copy.csv"
+    assert str(found) == f"{target}: 13 surfaces from {source}"
+    assert found.document() == {"input": str(source), "output": str(target), "surfaces": 13}
+    assert leaves(read_lens(tmp_path / "copy.csv")) == leaves(read_lens("double_gauss"))

@@ -10,9 +10,9 @@ from problems import lens, surface, vector
 
 from raytrace.analysis import distortion
 from raytrace.formats import LensFileError, read_lens, write_lens
-from raytrace.media.glass import MIRROR, InvalidIndex, OutOfRange
+from raytrace.media.glass import MIRROR, ImplausibleWavelength, InvalidIndex, OutOfRange, check_unit
 from raytrace.media.glass import constant as medium
-from raytrace.system.lens import ImplausibleWavelength, check, check_media, check_unit, with_wavelengths
+from raytrace.system.lens import check, check_media, with_wavelengths
 
 LENSES = Path(__file__).parents[1] / "lenses"
 MIRRORS = lens([surface(-0.01, -50.0, MIRROR), surface(-0.01, 60.0, MIRROR)])

@@ -21,8 +21,7 @@ from raytrace.formats.pictures import PictureError, read_grey
 from raytrace.maths.arrays import ArrayError, read_npy, read_npz
 from raytrace.media.agf import CatalogError, read_agf
 from raytrace.media.catalog import UnknownGlass
-from raytrace.media.glass import InvalidIndex
-from raytrace.system.lens import ImplausibleWavelength
+from raytrace.media.glass import ImplausibleWavelength, InvalidIndex
 from raytrace.wave.element import Pixels, Rings
 from raytrace.wave.exchange import FORMATS as HEIGHTS
 from raytrace.wave.exchange import HeightMapError, read_heights, write_heights

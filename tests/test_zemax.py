@@ -352,7 +352,7 @@ def test_report_sorts_every_keyword():
     assert len(report.warnings) == 2
     assert "unknown" in str(report)
     assert "surface 1: N-BK7, SCHOTT" in str(report)
-    assert json.loads(json.dumps(report.to_dict()))["keywords"][0]["count"] == 1
+    assert json.loads(json.dumps(report.document()))["keywords"][0]["count"] == 1
     with pytest.raises(LensFileError, match=r"unknown keyword .* \(and 1 more warning\)"):
         read(text, strict=True)
 

@@ -5,7 +5,6 @@ from raytrace.cli.analysis_table import ANALYSES
 from raytrace.cli.command import Command
 from raytrace.cli.options import (
     aperture,
-    catalog,
     conditions,
     count,
     fields,
@@ -31,19 +30,6 @@ from raytrace.cli.studies import words
 def _info(parser):
     lens(parser)
     conditions(parser)
-
-
-def _check(parser):
-    lens(parser)
-    parser.add_argument("--strict", action="store_true", help="fail on anything unknown or assumed")
-
-
-def _convert(parser):
-    parser.add_argument("lens", metavar="IN", type=file_name, help="lens file, or the name of a shipped lens")
-    parser.add_argument("output", metavar="OUT", type=file_name, help="lens file to write: .zmx, .csv, .tsv or .txt")
-    catalog(parser)
-    json(parser)
-    parser.add_argument("--strict", action="store_true", help="fail on anything unknown or assumed in IN")
 
 
 def _layout(parser):
@@ -144,15 +130,6 @@ def _log(parser):
     parser.add_argument("--log", action="store_true", help="draw brightness on a logarithmic scale of four decades")
 
 
-def _glass(parser):
-    parser.add_argument("name", metavar="NAME", help="name of a glass, as in a lens file, or a six-digit MIL code")
-    catalog(parser)
-    json(parser)
-    parser.add_argument(
-        "--wavelength", metavar="UM", type=positive_finite, nargs="+", help="wavelengths in µm (default: F d C)"
-    )
-
-
 def _bench(parser):
     parser.add_argument("what", choices=("trace", "psf", "codesign", "wave", "speed"), help="what to measure")
     parser.add_argument(
@@ -219,27 +196,8 @@ COMMANDS = (
         _info,
         "cli.lens_commands.info",
     ),
-    Command(
-        "check",
-        "what was read from a lens file, and what was not",
-        "Print the import report: every keyword read, ignored (with the reason) or unknown, and where each glass came "
-        "from. Fails if the file cannot be read; with --strict also if anything was assumed.",
-        """examples:
-  raytrace check lens.zmx
-  raytrace check lens.zmx --strict --json""",
-        _check,
-        "cli.lens_commands.check",
-    ),
-    Command(
-        "convert",
-        "write a lens in another format",
-        "Read a lens file and write it as the suffix of OUT says. Every number comes back bit for bit.",
-        """examples:
-  raytrace convert lenses/double_gauss.zmx double_gauss.csv
-  raytrace convert table.txt lens.zmx""",
-        _convert,
-        "cli.lens_commands.convert",
-    ),
+    Command.of("cli.check"),
+    Command.of("cli.convert"),
     Command(
         "layout",
         "draw the lens with rays",
@@ -307,17 +265,7 @@ COMMANDS = (
         _compare,
         "cli.psf_commands.compare",
     ),
-    Command(
-        "glass",
-        "look up a glass",
-        "Print index, nd, Vd, formula, range and catalog of a glass; a name that is not found gets suggestions.",
-        """examples:
-  raytrace glass N-BK7
-  raytrace glass SK16 --wavelength 0.53 --json
-  raytrace glass MYGLASS --catalog my_glasses.agf""",
-        _glass,
-        "cli.glass_commands.glass",
-    ),
+    Command.of("cli.glass"),
     Command(
         "bench",
         "measure speed against error",

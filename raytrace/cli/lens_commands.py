@@ -1,19 +1,17 @@
-"""`raytrace info`, `check`, `convert` and `layout`."""
+"""`raytrace info` and `layout`."""
 
 import argparse
 import math
-import warnings
 from pathlib import Path
 
 import torch
 
-from raytrace.cli.door import catalogs, field_points, find_lens, open_lens, print_json, refuse_untraceable, say
-from raytrace.formats import LensFileWarning, read_lens_with_report, write_lens
+from raytrace.cli.door import field_points, open_lens, print_json, say
 from raytrace.maths.result import number, numbers
 from raytrace.optics.f_number import real_working_f_number
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.trace import media
-from raytrace.system.lens import FIELD_UNITS, Lens, check_media
+from raytrace.system.lens import FIELD_UNITS, Lens
 from raytrace.system.shapes import EVEN
 from raytrace.system.surface import vertex_curvature
 
@@ -134,31 +132,6 @@ def _remarks(lens: Lens, k: int) -> str:
         parts.append(surface.kind)
     parts += [f"{a.shape} {'obscuration' if a.obscures else 'aperture'}" for a in surface.apertures]
     return ", ".join(dict.fromkeys(filter(None, [*parts, surface.comment])))
-
-
-def check(arguments: argparse.Namespace) -> None:
-    """The import report."""
-    path = find_lens(arguments.lens)
-    lens, report = read_lens_with_report(path, catalogs=catalogs(arguments), strict=arguments.strict)
-    refuse_untraceable(lens, str(path))
-    check_media(lens, lens.wavelengths, where=str(path))
-    if arguments.json:
-        print_json({**report.to_dict(), "surfaces": len(lens.surfaces), "stop_surface": lens.stop})
-    else:
-        print(report)
-
-
-def convert(arguments: argparse.Namespace) -> None:
-    """Read one format, write another."""
-    path, chosen = find_lens(arguments.lens), catalogs(arguments)
-    lens, report = read_lens_with_report(path, catalogs=chosen, strict=arguments.strict)
-    for warning in report.warnings:
-        warnings.warn(warning, LensFileWarning, stacklevel=1)
-    write_lens(lens, arguments.output, catalogs=chosen)
-    if arguments.json:
-        print_json({"input": str(path), "output": arguments.output, "surfaces": len(lens.surfaces)})
-    else:
-        print(f"{arguments.output}: {len(lens.surfaces)} surfaces from {path}")
 
 
 def layout(arguments: argparse.Namespace) -> None:

@@ -1,5 +1,6 @@
 """Lens files: the suffix of a file names its format; reading gives a Lens, writing brings every number back exactly."""
 
+import dataclasses
 import os
 import warnings
 from collections.abc import Callable, Sequence
@@ -13,8 +14,12 @@ from raytrace.formats.source import LensFileError as LensFileError
 from raytrace.formats.source import LensFileWarning as LensFileWarning
 from raytrace.formats.source import Place, decode, read_text, shown
 from raytrace.formats.source import UnsupportedSurface as UnsupportedSurface
+from raytrace.maths.result import Result
+from raytrace.maths.value import value
 from raytrace.media.catalog import UnknownGlass
-from raytrace.system.lens import Lens, check_unit
+from raytrace.media.glass import check_unit
+from raytrace.system.lens import Lens, check_media
+from raytrace.system.lens import check as check_lens
 
 
 class Format(NamedTuple):
@@ -57,7 +62,51 @@ def read_lens_with_report(
     form = _format(path)
     lens, report = form.read(read_text(path), str(path), catalogs=tuple(catalogs), strict=strict)
     _refuse_other_units(lens, path)
-    return lens, report
+    return lens, dataclasses.replace(report, surfaces=len(lens.surfaces), stop_surface=lens.stop)
+
+
+def check(path: str | os.PathLike, *, catalogs: Sequence[str | Path] = (), strict: bool = False) -> ImportReport:
+    """What was read from a lens file, what was not, and where each glass came from.
+
+    strict: raise where something was assumed. Raises as `read_lens`, and LensFileError for what cannot be traced.
+    """
+    lens, report = read_lens_with_report(path, catalogs=catalogs, strict=strict)
+    try:
+        check_lens(lens)
+    except ValueError as error:
+        raise LensFileError(str(error), Place(str(path))) from error
+    check_media(lens, lens.wavelengths, where=str(path))
+    return report
+
+
+@value
+class Conversion(Result):
+    """A lens file written in another format."""
+
+    source: str
+    target: str
+    surfaces: int
+
+    def document(self) -> dict:
+        return {"input": self.source, "output": self.target, "surfaces": self.surfaces}
+
+    def __str__(self) -> str:
+        return f"{self.target}: {self.surfaces} surfaces from {self.source}"
+
+
+def convert(
+    source: str | os.PathLike,
+    target: str | os.PathLike,
+    *,
+    catalogs: Sequence[str | Path] = (),
+    strict: bool = False,
+) -> Conversion:
+    """Read a lens file and write it in the format of the suffix of `target`; as `read_lens` and `write_lens`."""
+    lens, report = read_lens_with_report(source, catalogs=catalogs, strict=strict)
+    for warning in report.warnings:
+        warnings.warn(warning, LensFileWarning, stacklevel=2)
+    write_lens(lens, target, catalogs=catalogs)
+    return Conversion(report.file, str(target), len(lens.surfaces))
 
 
 def shipped_lens(name: str | os.PathLike) -> Path | None:

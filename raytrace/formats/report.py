@@ -3,9 +3,15 @@
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 
+import torch
+from torch import Tensor
+
 from raytrace.formats.source import LensFileError, Place
+from raytrace.maths.result import Result
+from raytrace.maths.value import value
 
 READ, IGNORED, UNKNOWN = "read", "ignored", "unknown"
+_TITLES = {READ: "read", IGNORED: "known and ignored", UNKNOWN: "unknown"}
 
 #: A keyword met a thousand times is listed with its first lines only.
 _LISTED = 8
@@ -26,6 +32,13 @@ class Keyword:
     surfaces: tuple[int, ...]
     reason: str = ""
 
+    def __str__(self) -> str:
+        if self.status == READ:
+            return f"{self.name} x{self.count}"
+        where, times = ("line", "") if self.count == 1 else ("lines", f" x{self.count}")
+        listed = ", ".join(map(str, self.lines)) + (", …" if self.count > len(self.lines) else "")
+        return f"{self.name}{times} ({where} {listed})" + (f": {self.reason}" if self.reason else "")
+
 
 @dataclass(frozen=True)
 class GlassSource:
@@ -35,13 +48,16 @@ class GlassSource:
     name: str
     source: str
 
+    def __str__(self) -> str:
+        return f"surface {self.surface}: {self.name or '(unnamed)'}, {self.source}"
 
-@dataclass(frozen=True)
-class ImportReport:
+
+@value
+class ImportReport(Result):
     """What became of a lens file: every keyword met, where each glass came from, notes and warnings.
 
     A note says what was done where the file leaves a choice; a warning says what was assumed or lost, and is an
-    error when the file is read with `strict=True`.
+    error when the file is read with `strict=True`. surfaces, stop_surface: of the lens that was read.
     """
 
     file: str
@@ -50,37 +66,30 @@ class ImportReport:
     glasses: tuple[GlassSource, ...] = ()
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    surfaces: int = 0
+    stop_surface: int = 0
 
-    def to_dict(self) -> dict:
-        """The report as lists, dicts, strings and numbers: ready for `json.dumps`."""
+    def document(self) -> dict:
         return asdict(self)
+
+    def columns(self) -> dict[str, Tensor]:
+        """A row for each keyword."""
+        statuses = [list(_TITLES).index(keyword.status) for keyword in self.keywords]
+        columns = {"keyword": range(len(statuses)), "status": statuses, "count": [one.count for one in self.keywords]}
+        return {name: torch.tensor([*column]) for name, column in columns.items()}
+
+    def words(self) -> dict[str, list[str]]:
+        return {"keyword": [keyword.name for keyword in self.keywords], "status": [*_TITLES]}
 
     def __str__(self) -> str:
         lines = [f"{self.file} ({self.format})"]
-        lines += [f"  warning: {warning}" for warning in self.warnings]
-        lines += [f"  note: {note}" for note in self.notes]
-        for status, title in ((READ, "read"), (IGNORED, "known and ignored"), (UNKNOWN, "unknown")):
-            chosen = [keyword for keyword in self.keywords if keyword.status == status]
-            if not chosen:
-                continue
-            lines.append(f"  {title}:")
-            if status == READ:
-                lines += _wrapped(f"{keyword.name} x{keyword.count}" for keyword in chosen)
-            else:
-                lines += [f"    {_row(keyword)}" for keyword in chosen]
-        if self.glasses:
-            lines.append("  glasses:")
-            lines += [f"    surface {use.surface}: {use.name or '(unnamed)'}, {use.source}" for use in self.glasses]
+        lines += [f"  warning: {warning}" for warning in self.warnings] + [f"  note: {note}" for note in self.notes]
+        for status, title in _TITLES.items():
+            chosen = [str(keyword) for keyword in self.keywords if keyword.status == status]
+            listed = _wrapped(chosen) if status == READ else [f"    {keyword}" for keyword in chosen]
+            lines += [f"  {title}:", *listed] if chosen else []
+        lines += ["  glasses:", *(f"    {use}" for use in self.glasses)] if self.glasses else []
         return "\n".join(lines)
-
-
-def _row(keyword: Keyword) -> str:
-    where = "line" if keyword.count == 1 else "lines"
-    listed = ", ".join(str(line) for line in keyword.lines)
-    more = ", …" if keyword.count > len(keyword.lines) else ""
-    times = "" if keyword.count == 1 else f" x{keyword.count}"
-    reason = f": {keyword.reason}" if keyword.reason else ""
-    return f"{keyword.name}{times} ({where} {listed}{more}){reason}"
 
 
 def _wrapped(words: Iterable[str], width: int = 100) -> list[str]:
@@ -102,17 +111,11 @@ class Draft:
     notes: list[str] = field(default_factory=list)
     warnings: list[tuple[str, Place]] = field(default_factory=list)
     glasses: list[GlassSource] = field(default_factory=list)
-    _met: dict[tuple[str, str], dict] = field(default_factory=dict)
+    _met: dict[tuple[str, str], list[tuple[Place, str]]] = field(default_factory=dict)
 
     def met(self, name: str, status: str, place: Place, reason: str = "") -> None:
         """Count one keyword."""
-        entry = self._met.setdefault((name, status), {"count": 0, "lines": [], "surfaces": [], "reason": reason})
-        entry["count"] += 1
-        if len(entry["lines"]) < _LISTED and place.line is not None:
-            entry["lines"].append(place.line)
-        surfaces = entry["surfaces"]
-        if place.surface is not None and len(surfaces) < _LISTED and place.surface not in surfaces:
-            surfaces.append(place.surface)
+        self._met.setdefault((name, status), []).append((place, reason))
 
     def note(self, text: str) -> None:
         """Say what was done, with nothing lost."""
@@ -129,19 +132,22 @@ class Draft:
 
     def finished(self, *, strict: bool) -> ImportReport:
         """The report. Raises LensFileError for the first warning if `strict`."""
-        for (name, status), entry in self._met.items():
-            if status == UNKNOWN:
-                place = Place(self.file, entry["lines"][0] if entry["lines"] else None)
-                times = "" if entry["count"] == 1 else f" ({entry['count']} times)"
-                self.warn(f"unknown keyword {name}{times}: left out", place)
+        keywords = [_keyword(name, status, met) for (name, status), met in self._met.items()]
+        for one in keywords:
+            if one.status == UNKNOWN:
+                times = "" if one.count == 1 else f" ({one.count} times)"
+                place = Place(self.file, one.lines[0] if one.lines else None)
+                self.warn(f"unknown keyword {one.name}{times}: left out", place)
         if strict and self.warnings:
             text, place = self.warnings[0]
             more = len(self.warnings) - 1
             also = f" (and {more} more warning{'s' if more > 1 else ''})" if more else ""
             raise LensFileError(f"{text}{also}; refused because strict reading was asked for", place)
-        keywords = tuple(
-            Keyword(name, status, entry["count"], tuple(entry["lines"]), tuple(entry["surfaces"]), entry["reason"])
-            for (name, status), entry in self._met.items()
-        )
         warnings = tuple(f"{place}: {text}" for text, place in self.warnings)
-        return ImportReport(self.file, self.format, keywords, tuple(self.glasses), tuple(self.notes), warnings)
+        return ImportReport(self.file, self.format, tuple(keywords), tuple(self.glasses), tuple(self.notes), warnings)
+
+
+def _keyword(name: str, status: str, met: list[tuple[Place, str]]) -> Keyword:
+    lines = [place.line for place, _ in met if place.line is not None]
+    surfaces = dict.fromkeys(place.surface for place, _ in met if place.surface is not None)
+    return Keyword(name, status, len(met), tuple(lines[:_LISTED]), tuple(surfaces)[:_LISTED], met[0][1])

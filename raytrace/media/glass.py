@@ -13,7 +13,7 @@ Wavelengths in µm, indices relative to air at the catalog's reference temperatu
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -29,6 +29,14 @@ LINES |= {"t": 1.0139800}
 
 #: Relative slack at the ends of a wavelength range: a few float32 spacings.
 _RANGE_SLACK = 1e-6
+
+#: µm: wavelengths between these are traced; glasses end at 39, x-ray mirrors begin at 1e-4.
+_SHORTEST, _LONGEST = 3e-5, 100.0
+_UNITS, _LIKELY = (1e-3, 1e6), (0.1, 20.0)  # µm of a nm and of a m, and what is likely to be meant by them
+
+
+class ImplausibleWavelength(ValueError):
+    """A wavelength that no lens is for: most likely it is in another unit than µm."""
 
 
 class InvalidIndex(ValueError):
@@ -124,6 +132,23 @@ def check_wavelengths(glass: Glass, wavelengths: Tensor | Sequence[float] | floa
         if outside.numel():
             message = f"{place}{name} is extrapolated to {_spell(outside)} µm; {fitted}"
             warnings.warn(message, OutOfRange, stacklevel=2)
+
+
+def check_unit(wavelengths: Tensor, media: Iterable[Glass] = (), *, where: str = "") -> None:
+    """Refuse wavelengths in another unit than µm: shorter than hard x-rays, or longer than any glass lets through.
+
+    media: glasses whose range, where it reaches further, is believed. Raises ImplausibleWavelength, with a guess.
+    """
+    spans = [medium.wavelength_range for medium in media if medium.wavelength_range]
+    shortest, longest = min([_SHORTEST, *(s[0] for s in spans)]), max([_LONGEST, *(s[1] for s in spans)])
+    for wavelength in wavelengths.detach().flatten().tolist():
+        if not shortest <= wavelength <= longest:
+            guesses = (wavelength * factor for factor in _UNITS)
+            guess = next((f"did you mean {g:.7g}?" for g in guesses if _LIKELY[0] <= g <= _LIKELY[1]), None)
+            raise ImplausibleWavelength(
+                f"{where}{': ' if where else ''}a wavelength of {wavelength:g} µm: expected "
+                f"{shortest:g} to {longest:g}; wavelengths are in µm" + (f"; {guess}" if guess else "")
+            )
 
 
 def index(glass: Glass, wavelength: Tensor | float) -> Tensor:

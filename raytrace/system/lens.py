@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.value import value
-from raytrace.media.glass import Glass, check_wavelengths, refractive_index
+from raytrace.media.glass import check_unit, check_wavelengths, refractive_index
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface
 
@@ -36,15 +36,6 @@ APERTURE_KINDS = {
     "object_cone_angle": "degrees, half angle of the marginal ray at the object",
     "float_by_stop": "mm, semi-diameter of the stop",
 }
-
-
-#: µm: wavelengths between these are traced; glasses end at 39, x-ray mirrors begin at 1e-4.
-_SHORTEST, _LONGEST = 3e-5, 100.0
-_UNITS, _LIKELY = (1e-3, 1e6), (0.1, 20.0)  # µm of a nm and of a m, and what is likely to be meant by them
-
-
-class ImplausibleWavelength(ValueError):
-    """A wavelength that no lens is for: most likely it is in another unit than µm."""
 
 
 @value
@@ -287,23 +278,6 @@ def check_media(lens: Lens, wavelengths: Tensor, *, where: str = "") -> None:
             seen.add(key)
             place = f"{where}, surface {number}" if where else f"surface {number}"
             check_wavelengths(medium, wavelengths, where=place)
-
-
-def check_unit(wavelengths: Tensor, media: Iterable[Glass] = (), *, where: str = "") -> None:
-    """Refuse wavelengths in another unit than µm: shorter than hard x-rays, or longer than any glass lets through.
-
-    media: glasses whose range, where it reaches further, is believed. Raises ImplausibleWavelength, with a guess.
-    """
-    spans = [medium.wavelength_range for medium in media if medium.wavelength_range]
-    shortest, longest = min([_SHORTEST, *(s[0] for s in spans)]), max([_LONGEST, *(s[1] for s in spans)])
-    for wavelength in wavelengths.detach().flatten().tolist():
-        if not shortest <= wavelength <= longest:
-            guesses = (wavelength * factor for factor in _UNITS)
-            guess = next((f"did you mean {g:.7g}?" for g in guesses if _LIKELY[0] <= g <= _LIKELY[1]), None)
-            raise ImplausibleWavelength(
-                f"{where}{': ' if where else ''}a wavelength of {wavelength:g} µm: expected "
-                f"{shortest:g} to {longest:g}; wavelengths are in µm" + (f"; {guess}" if guess else "")
-            )
 
 
 def _with_thickness(lens: Lens, number: int, thickness: Tensor | float) -> Lens:

@@ -17,8 +17,7 @@ from raytrace.files import write_atomically
 from raytrace.maths.grid import Grid, centres, grid
 from raytrace.maths.result import Result, number, object_text, rows
 from raytrace.maths.value import value
-from raytrace.media.glass import Glass, check_wavelengths, from_table
-from raytrace.system.lens import check_unit
+from raytrace.media.glass import Glass, check_unit, check_wavelengths, from_table
 from raytrace.wave.designs import BASELINES, STEPPED, aim, baseline
 from raytrace.wave.element import Element
 from raytrace.wave.element_file import read_element

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from raytrace.maths.grid import Grid
 from raytrace.maths.value import value
-from raytrace.media.glass import index
-from raytrace.system.lens import check_unit
+from raytrace.media.glass import check_unit, index
 from raytrace.wave.element import Element, is_radial, path
 
 

@@ -1,0 +1,27 @@
+"""`raytrace convert`."""
+
+import argparse
+
+import raytrace
+from raytrace.cli.options import catalog, file_name, json
+
+SUMMARY = "write a lens in another format"
+DESCRIPTION = "Read a lens file and write it as the suffix of OUT says. Every number comes back bit for bit."
+EXAMPLES = """examples:
+  raytrace convert lenses/double_gauss.zmx double_gauss.csv
+  raytrace convert table.txt lens.zmx"""
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("source", metavar="IN", type=file_name, help="lens file, or the name of a shipped lens")
+    parser.add_argument("target", metavar="OUT", type=file_name, help="lens file to write: .zmx, .csv, .tsv or .txt")
+    catalog(parser)
+    json(parser)
+    parser.add_argument("--strict", action="store_true", help="fail on anything unknown or assumed in IN")
+
+
+def run(arguments: argparse.Namespace):
+    from raytrace.cli.door import catalogs, find_lens
+
+    path, own = find_lens(arguments.source), catalogs(arguments)
+    return raytrace.convert(path, arguments.target, catalogs=own, strict=arguments.strict)

@@ -1,0 +1,33 @@
+"""`raytrace glass`."""
+
+import argparse
+
+import raytrace
+from raytrace.cli.options import catalog, json, positive_finite
+
+SUMMARY = "look up a glass"
+DESCRIPTION = "Print index, nd, Vd, formula, range and catalog of a glass; a name that is not found gets suggestions."
+EXAMPLES = """examples:
+  raytrace glass N-BK7
+  raytrace glass SK16 --wavelength 0.53 --json
+  raytrace glass MYGLASS --catalog my_glasses.agf"""
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", metavar="NAME", help="name of a glass, as in a lens file, or a six-digit MIL code")
+    catalog(parser)
+    json(parser)
+    parser.add_argument(
+        "--wavelength",
+        dest="wavelengths",
+        metavar="UM",
+        type=positive_finite,
+        nargs="+",
+        help="wavelengths in µm (default: F d C)",
+    )
+
+
+def run(arguments: argparse.Namespace):
+    from raytrace.cli.door import catalogs
+
+    return raytrace.glass(arguments.name, wavelengths=arguments.wavelengths, catalogs=catalogs(arguments))
