@@ -74,8 +74,20 @@ PUBLIC = {
     "elements": "wave.compute",
     "wave_psf": "wave.compute",
     "wavefront_map": "analysis",
-    # learning
+    # pictures and learning
+    "add_noise": "camera.noise",
+    "add_shot_noise": "camera.noise",
+    "blind_filter": "camera.deconvolve",
+    "blur": "camera.image",
+    "blur_layers": "camera.image",
+    "count_electrons": "camera.noise",
+    "depth_masks": "camera.image",
+    "digitise": "camera.noise",
+    "psnr": "camera.deconvolve",
+    "restore": "camera.deconvolve",
+    "wiener": "camera.deconvolve",
     "Camera": "camera",
+    "PhaseVariables": "camera",
     "RedNet": "camera",
     "Variables": "camera",
 }

@@ -208,3 +208,48 @@ def test_a_command_prints_what_its_verb_gives(command, capsys):
     assert json.loads(printed) == found.document()
     assert main([command.name, "cooke_triplet"]) == 0
     assert capsys.readouterr().out == f"{found}\n"
+
+
+# -- learning ----------------------------------------------------------------------------------------------------------
+
+
+class Same(torch.nn.Module):
+    """A network that restores nothing."""
+
+    def forward(self, image):
+        return image
+
+
+def test_a_camera_is_variables_and_a_network():
+    lens = rt.read_lens("double_gauss")
+    module = rt.Variables(lens, "curvature:1-4 sensor")
+    camera = rt.Camera(module, Same())
+    optimizer = torch.optim.Adam(camera.parameters(), 1e-3)
+    pictures = torch.rand(2, 40, 40, generator=torch.Generator().manual_seed(1))
+    restored = camera(pictures, torch.tensor([10e3, 50e3]))
+    loss = (restored - camera.target(pictures)).abs().mean() + module.violation()
+    loss.backward()
+    slopes = [float(getattr(module, name).grad) for name in module.numbers()]
+    assert len(slopes) == 5
+    assert all(abs(slope) > 1e-6 for slope in slopes)
+    before = module.numbers()
+    optimizer.step()
+    assert all(module.numbers()[name] != before[name] for name in before)
+
+
+def test_a_camera_sees_fields_as_plain_numbers():
+    lens = rt.read_lens("double_gauss")
+    camera = rt.Camera(rt.Variables(lens, "sensor"), Same(), fields=[0, 14], object_distances=(20e3, 30e3))
+    assert camera.fields.tolist() == [[0, 0], [0, 14]]
+    kernel = camera.kernels(torch.tensor([25e3], dtype=torch.float64), field=1)
+    assert float(kernel.sum().detach()) == pytest.approx(1, abs=1e-9)
+
+
+def test_a_picture_is_blurred_and_restored():
+    picture = torch.rand(32, 32, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    kernel = rt.psf(rt.read_lens("double_gauss"), "gaussian", fields=torch.zeros(2, 1), normalise="window").kernel[0, 0]
+    blurred = rt.blur(picture, kernel, boundary="circular")
+    transfer = importlib.import_module("raytrace.camera.image").transfer_functions(kernel, 32)
+    restored = rt.restore(blurred, rt.wiener(transfer, 1e-6))
+    errors = [rt.psnr(((estimate - picture) ** 2).mean()) for estimate in (restored, blurred)]
+    assert float(errors[0] - errors[1]) > 5  # dB, of white noise, most of which the lens does not show

@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from raytrace.camera.deconvolve import blind_filter, errors, psnr, wiener
-from raytrace.camera.phase import PhaseVariables, radial_powers
+from raytrace.camera.phase import PhaseVariables
 from raytrace.camera.training import OtherSettings
 from raytrace.formats.pictures import dead_leaves
 from raytrace.maths.zernike import polynomials
 from raytrace.media.glass import index
 from raytrace.studies.edof import table as edof_table
 from raytrace.studies.edof.table import STRENGTHS, Content, elements_of, records, table_of
-from raytrace.studies.edof.training import Settings, begin, learn_element, scheduled
+from raytrace.studies.edof.training import Settings, begin, learn_element, radial_powers, scheduled
 from raytrace.studies.edof.world import (
     World,
     best_gamma,

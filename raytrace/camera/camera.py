@@ -1,30 +1,41 @@
 """Camera: a lens with variables, a sensor, and a network that restores its pictures, as one module.
 
-camera = Camera(Variables(lens, "sensor"), RedNet(), model="gaussian")
-restored = camera(pictures, object_distances)
-(restored - camera.target(pictures)).abs().mean().backward()
+A step of learning lens and network together:
+
+    camera = rt.Camera(rt.Variables(lens, "curvature:1-4 sensor"), rt.RedNet())
+    optimizer = torch.optim.Adam(camera.parameters(), 1e-3)
+    distances = 10e3 + 40e3 * torch.rand(len(pictures))     # mm, one each
+    restored = camera(pictures, distances)                  # blurred, noisy, restored
+    loss = (restored - camera.target(pictures)).abs().mean() + camera.variables.violation()
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
+    camera.variables.project()                              # within the bounds, if there are any
 """
 
 import dataclasses
 import warnings
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
-from raytrace.camera.image import add_noise, blur
+from raytrace.camera.image import blur
+from raytrace.camera.noise import add_noise
 from raytrace.camera.variables import Variables
 from raytrace.kernels import NotConverged, psf
 from raytrace.maths.grid import Grid, grid
 from raytrace.optics.reuse import Memo
 from raytrace.optics.scene import scene, trace_scene
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, field_points
 
 
 class Camera(nn.Module):
     """Pictures (B, H, W) in [0, 1], each at its own object distance, as a lens, a sensor and a network give them back.
 
     variables: what of the lens is learned; network: (B, 1, h, w) -> the same; model: a PSF model.
-    object_distances: smallest and largest, mm; fields: (2, F) in the lens's kind of field, on the axis by default.
+    object_distances: smallest and largest, mm; fields: (2, F), or a list of y or (x, y), in the lens's kind
+    of field, on the axis by default.
     pixels: the window of the PSF, 21 × 21 of 5 µm by default; normalise: "window" or "energy", as for `psf`.
     noise: standard deviation of the sensor's noise. tol: what the kernels may err by: the order of the PSF model is
     chosen once, for the lens as it is at the first call (`plan`). rho: of the paraxial model.
@@ -39,7 +50,7 @@ class Camera(nn.Module):
         *,
         model: str = "gaussian",
         object_distances: tuple[float, float] = (1e4, 5e4),
-        fields: Tensor | None = None,
+        fields: Tensor | Sequence | None = None,
         pixels: Grid | None = None,
         normalise: str = "window",
         noise: float = 0.1,
@@ -51,7 +62,7 @@ class Camera(nn.Module):
         self.variables, self.network, self.model = variables, network, model
         self.range = object_distances
         like = variables.lens.wavelengths
-        self.fields = like.new_zeros(2, 1) if fields is None else fields
+        self.fields = like.new_zeros(2, 1) if fields is None else field_points(fields, like=variables.lens)
         self.pixels = grid(like.new_tensor(0.005), 21) if pixels is None else pixels
         self.normalise, self.noise, self.tol, self.rho, self.network_dtype = normalise, noise, tol, rho, network_dtype
         self._order: int | None = None

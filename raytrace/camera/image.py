@@ -1,4 +1,4 @@
-"""Image: what a camera makes of a picture: blur by point spread functions at one or many depths, and sensor noise.
+"""Image: what a camera makes of a picture: blur by point spread functions at one or many depths.
 
 Kernels (..., h, w) are spots around their middle pixel (h//2, w//2); a kernel whose only value stands there gives the
 picture back. A spot centred on a `Grid` of even size lies half a pixel before it, between pixels: such a kernel moves a
@@ -10,7 +10,7 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.numerics import safe_divide
 
 #: What lies beyond the borders of a picture: "zero" darkens them, "reflect" mirrors the picture there, "taper" fades
 #: from the mirror image at one border to that at the opposite one, so that the whole is periodic without a jump.
@@ -49,25 +49,11 @@ def blur_adjoint(image: Tensor, kernel: Tensor, *, boundary: str = "valid", orig
 
     image: (..., H, W) as `blur` returns it with this boundary; returns pictures, which "valid" makes larger again.
     """
-    _check_choice(boundary, BOUNDARIES, "boundary")
-    spot, size = kernel.shape[-2:], image.shape[-2:]
-    _check_origin(boundary, origin, spot)
-    if boundary == "valid":
-        size = (size[0] + spot[0] - 1, size[1] + spot[1] - 1)
-    shape = _work_shape(size, spot, boundary)
-    check_fit(spot, shape)
-    missing = shape[1] - image.shape[-1], shape[0] - image.shape[-2]
-    if boundary == "valid":
-        placed = torch.nn.functional.pad(image, (missing[0], 0, missing[1], 0))
-    else:
-        placed = torch.nn.functional.pad(image, (0, missing[0], 0, missing[1]))
-        placed = torch.roll(placed, (spot[0] // 2, spot[1] // 2), (-2, -1))
-    picture = torch.fft.irfft2(torch.fft.rfft2(placed) * _half_transfer(kernel, shape, origin).conj(), s=shape)
-    if boundary not in EXTENSIONS:
-        return picture
-    if boundary == "zero":
-        return picture[..., : size[0], : size[1]]
-    return _fold_axis(_fold_axis(picture, size[1], -1, boundary), size[0], -2, boundary)
+    more = [n - 1 if boundary == "valid" else 0 for n in kernel.shape[-2:]]
+    batch = torch.broadcast_shapes(image.shape[:-2], kernel.shape[:-2])
+    picture = image.new_zeros(*batch, *(n + m for n, m in zip(image.shape[-2:], more, strict=True)))
+    _, transpose = torch.func.vjp(lambda x: blur(x, kernel, boundary=boundary, origin=origin), picture)
+    return transpose(image.expand(*batch, *image.shape[-2:]))[0]
 
 
 def visible(picture: Tensor, spot: tuple[int, int]) -> Tensor:
@@ -160,40 +146,6 @@ def blur_layers(
     return _over(light, blur(layers, safe_divide(kernels, kernels.sum((-2, -1), keepdim=True)), boundary=boundary))
 
 
-def add_noise(picture: Tensor, sigma: Tensor | float, *, generator: torch.Generator | None = None) -> Tensor:
-    """Gaussian sensor noise of standard deviation `sigma`, in the units of the picture, broadcast against it."""
-    return picture + sigma * _normal(picture, generator)
-
-
-def draw_sigma(picture: Tensor, low: float, high: float, *, generator: torch.Generator | None = None) -> Tensor:
-    """A standard deviation for every sample of a batch (B, ...), uniform in [low, high]: (B, 1, ...)."""
-    shape = (picture.shape[0], *(1,) * (picture.dim() - 1))
-    return low + (high - low) * torch.rand(shape, dtype=picture.dtype, device=picture.device, generator=generator)
-
-
-def add_shot_noise(picture: Tensor, electrons: Tensor | float, *, generator: torch.Generator | None = None) -> Tensor:
-    """Noise of counted electrons as a Gaussian of their variance, y = x + √(x/N) ξ, differentiable in x and N.
-
-    electrons: N, how many a pixel of level 1 collects. Levels ≤ 0 have no noise.
-    """
-    return picture + safe_sqrt(picture / electrons) * _normal(picture, generator)
-
-
-def count_electrons(picture: Tensor, electrons: Tensor | float, *, generator: torch.Generator | None = None) -> Tensor:
-    """Exact shot noise: y = n/N, n Poisson distributed of mean N x, none for x < 0; its gradient is that of x."""
-    counts = torch.poisson((picture.detach() * electrons).clamp(min=0), generator=generator)
-    return picture + (counts / electrons - picture).detach()
-
-
-def digitise(picture: Tensor, bits: int) -> Tensor:
-    """The nearest of 2^bits levels from 0 to 1, saturated beyond; gradients pass as if there were no steps."""
-    if bits < 1:
-        raise ValueError(f"{bits} bits: expected at least 1")
-    steps = 2**bits - 1
-    limited = picture.clamp(0.0, 1.0)
-    return limited + ((limited * steps).round() / steps - limited).detach()
-
-
 def _over(light: Tensor, cover: Tensor) -> Tensor:
     """Layers (..., D, C, H, W) of light and coverage from far to near, one before the other, over their coverage."""
     total, covered = light[..., 0, :, :, :], cover[..., 0, :, :, :]
@@ -214,16 +166,6 @@ def _extend_axis(picture: Tensor, length: int, axis: int, boundary: str) -> Tens
     after, before, fade = _mirror_images(picture, count, missing, axis, boundary)
     last, first = picture.index_select(axis, after), picture.index_select(axis, before)
     return torch.cat([picture, last + fade * (first - last)], axis)
-
-
-def _fold_axis(extended: Tensor, count: int, axis: int, boundary: str) -> Tensor:
-    """The transpose of `_extend_axis`: every pixel of the mirror images is added to the one it came from."""
-    missing = extended.shape[axis] - count
-    if missing == 0:
-        return extended
-    after, before, fade = _mirror_images(extended, count, missing, axis, boundary)
-    picture, rest = extended.split((count, missing), axis)
-    return picture.index_add(axis, after, (1 - fade) * rest).index_add(axis, before, fade * rest)
 
 
 def _mirror_images(like: Tensor, count: int, missing: int, axis: int, boundary: str) -> tuple[Tensor, Tensor, Tensor]:
@@ -268,10 +210,6 @@ def _work_shape(size: tuple[int, int], spot: tuple[int, int], boundary: str) -> 
     if boundary not in EXTENSIONS:
         return size[0], size[1]
     return size[0] + 2 * (spot[0] // 2), size[1] + 2 * (spot[1] // 2)
-
-
-def _normal(picture: Tensor, generator: torch.Generator | None) -> Tensor:
-    return torch.randn(picture.shape, dtype=picture.dtype, device=picture.device, generator=generator)
 
 
 def _gaussian(deviation: float, like: Tensor) -> Tensor:

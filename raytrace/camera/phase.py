@@ -1,6 +1,5 @@
 """Phase variables: the heights of a thin element as parameters of a module."""
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -52,17 +51,3 @@ class PhaseVariables(nn.Module):
             error = torch.rand(numbers.shape, generator=draw, dtype=numbers.dtype, device=numbers.device)
             numbers = numbers + self.tolerance * (2 * error - 1)
         return (self.element.with_numbers(numbers), *self.others)
-
-
-def radial_powers(radius: Tensor, terms: int) -> Tensor:
-    """Zernike polynomials without angle, n = 2, 4, …, as even powers of r in mm: (terms, terms), a column each.
-
-    Z_n0 = √(n + 1) Σ_s (-1)^s (n - s)!/(s! ((n/2 - s)!)²) (r/R)^(n - 2s);   piston is left out
-    """
-    found = torch.zeros(terms, terms, dtype=torch.float64)
-    for k in range(1, terms + 1):
-        for s in range(k):
-            share = math.factorial(2 * k - s) / (math.factorial(s) * math.factorial(k - s) ** 2)
-            found[k - s - 1, k - 1] = (-1) ** s * math.sqrt(2 * k + 1) * share
-    power = radius.detach() ** (-2.0 * torch.arange(1, terms + 1, dtype=torch.float64).to(radius))
-    return power[:, None] * found.to(radius)

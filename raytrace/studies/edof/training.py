@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from raytrace.camera.deconvolve import blind_filter, towards_measurement
 from raytrace.camera.network import RedNet, RedNetShape
-from raytrace.camera.phase import PhaseVariables, radial_powers
+from raytrace.camera.phase import PhaseVariables
 from raytrace.camera.training import DamagedRun, Record, Run, Share, read_state, train
 from raytrace.files import write_atomically
 from raytrace.formats.pictures import Pictures, crop, draws
@@ -268,3 +268,17 @@ def begin(
         write_atomically(kept, lambda file: torch.save(found, file))
     network = RedNet(_NETWORK, seed=settings.seed) if settings.restoration == "network" else None
     return EdofCamera(variables, world, spectrum, restoration=settings.restoration, network=network), run
+
+
+def radial_powers(radius: Tensor, terms: int) -> Tensor:
+    """Zernike polynomials without angle, n = 2, 4, …, as even powers of r in mm: (terms, terms), a column each.
+
+    Z_n0 = √(n + 1) Σ_s (-1)^s (n - s)!/(s! ((n/2 - s)!)²) (r/R)^(n - 2s);   piston is left out
+    """
+    found = torch.zeros(terms, terms, dtype=torch.float64)
+    for k in range(1, terms + 1):
+        for s in range(k):
+            share = math.factorial(2 * k - s) / (math.factorial(s) * math.factorial(k - s) ** 2)
+            found[k - s - 1, k - 1] = (-1) ** s * math.sqrt(2 * k + 1) * share
+    power = radius.detach() ** (-2.0 * torch.arange(1, terms + 1, dtype=torch.float64).to(radius))
+    return power[:, None] * found.to(radius)
