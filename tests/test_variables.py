@@ -6,13 +6,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from problems import scalar
 
 from raytrace.camera.limits import BadLimits, Limits, edge_thickness, limits_of, parse_range, violation
 from raytrace.camera.variables import BadVariables, Variables, parse_bounds
 from raytrace.formats import read_lens
 from raytrace.media.glass import AIR, MIRROR, constant, is_air, model_glass, nd
+from raytrace.system.departure import ZernikeSag
 from raytrace.system.lens import with_sensor_distance
-from raytrace.system.surface import Surface, sag
+from raytrace.system.surface import Surface, places, sag
 
 LENSES = Path(__file__).parents[1] / "lenses"
 NANOMETRE = 1e-6
@@ -250,3 +252,29 @@ def test_elements_either_side_of_a_stop_may_not_touch():
         variables.get_parameter("thickness_6").fill_(2.1247 - 12.4281)
     assert float(variables.violation().detach()) > 1
     assert float(violation(read_lens("double_gauss"))) == 0
+
+
+def test_every_number_of_a_shape_can_be_varied_by_its_name():
+    """Coefficients by their power of r, a departure's by its fields; one unit is 1 mm of sag at the edge."""
+    lens = read_lens("double_gauss").replace(3, coefficients=[1e-4, 2e-7, 0.0])
+    bumps = ZernikeSag(torch.tensor([0.0, 1e-3, 0.0], dtype=torch.float64), torch.tensor(20.0, dtype=torch.float64))
+    lens = lens.replace(5, departure=bumps)
+    assert list(places(lens.surfaces[5])) == ["curvature", "conic", *(f"coefficients{j}" for j in (1, 2, 3)), "radius"]
+    variables = Variables(lens, "a4:3 coefficients2:5 radius:5")
+    assert variables.numbers() == {"a4_3": 2e-7, "coefficients2_5": 1e-3, "radius_5": 20.0}
+    edge = lens.surfaces[3].semi_diameter
+    with torch.no_grad():
+        variables.a4_3 += 1e-3
+        variables.coefficients2_5 += 1e-3
+    changed = variables()
+    moved = sag(changed.surfaces[3], scalar(edge**2)) - sag(lens.surfaces[3], scalar(edge**2))
+    assert float(moved) == pytest.approx(1e-3, rel=1e-9)
+    assert changed.surfaces[5].departure.coefficients[1] > 1e-3
+    assert torch.equal(changed.surfaces[3].coefficients[[0, 2]], lens.surfaces[3].coefficients[[0, 2]])
+    total = changed.surfaces[3].coefficients.sum() + changed.surfaces[5].departure.radius
+    total.backward()
+    assert float(variables.a4_3.grad) == variables.variables[0].unit
+    assert float(variables.radius_5.grad) == variables.variables[2].unit
+    for wrong in ("a4:4", "a3:3", "focus:3"):
+        with pytest.raises(BadVariables, match=r"surface \d has no \w+; it has thickness, curvature, conic"):
+            Variables(lens, wrong)

@@ -5,6 +5,7 @@ changed = variables()          # the lens with its variables, differentiable
 """
 
 import dataclasses
+import math
 import re
 from collections.abc import Mapping
 
@@ -13,8 +14,9 @@ from torch import Tensor, nn
 
 from raytrace.camera.limits import limits_of, violation
 from raytrace.system.lens import Lens
+from raytrace.system.surface import Place, Surface, number_at, places, sag_at, with_number
 
-KINDS = ("sensor", "thickness", "curvature", "conic")
+_KINDS = "thickness, curvature, conic, or a number of its kind of shape as a4"
 
 
 class BadVariables(ValueError):
@@ -25,14 +27,16 @@ class BadVariables(ValueError):
 class Variable:
     """One number of one surface.
 
-    unit: how much of the lens's number one unit of the parameter is. Thicknesses are in mm; curvatures and conics in
+    unit: how much of the lens's number one unit of the parameter is. Thicknesses are in mm; numbers of the shape in
     what moves the surface by 1 mm of sag at its semi-diameter, so that one step means the same for all of them.
+    place: where the surface holds it.
     """
 
     kind: str
     surface: int
     start: float
     unit: float
+    place: Place
 
     @property
     def name(self) -> str:
@@ -42,7 +46,8 @@ class Variable:
 class Variables(nn.Module):
     """The variables of a lens as parameters: 0 at the start, in units of `Variable.unit`.
 
-    vary: "sensor", and lists like "thickness:5,6,10 curvature:1-4", of the file's surface numbers.
+    vary: "sensor", and lists like "thickness:5,6,10 curvature:1-4 a4:3", of the file's surface numbers; beside
+        thickness, curvature and conic every number that the surface has by its kind (`surface.places`).
     bounds: by name ("sensor", "curvature_3"), smallest and largest number of the lens; `project` keeps them.
     glass_thickness, air_thickness: least and greatest in mm at the axis; edge: least of glass at its edge; by default
     they go with the size of the lens (`limits_of`). `violation` says how far the lens is from them.
@@ -74,9 +79,8 @@ class Variables(nn.Module):
         """The lens with its variables where they are now."""
         surfaces = list(self.lens.surfaces)
         for variable in self.variables:
-            kind = "thickness" if variable.kind == "sensor" else variable.kind
-            surface = surfaces[variable.surface]
-            surfaces[variable.surface] = dataclasses.replace(surface, **{kind: self.number(variable)})
+            changed = with_number(surfaces[variable.surface], variable.place, self.number(variable))
+            surfaces[variable.surface] = changed
         return dataclasses.replace(self.lens, surfaces=tuple(surfaces))
 
     def number(self, variable: Variable) -> Tensor:
@@ -105,10 +109,8 @@ def parse(lens: Lens, vary: str) -> tuple[Variable, ...]:
     found: dict[str, Variable] = {}
     for word in vary.split():
         kind, _, numbers = word.partition(":")
-        if kind not in KINDS or bool(numbers) == (kind == "sensor"):
-            raise BadVariables(
-                f"{word!r}: expected sensor, or one of {', '.join(KINDS[1:])} with surfaces: thickness:5,6"
-            )
+        if bool(numbers) == (kind == "sensor"):
+            raise BadVariables(f"{word!r}: expected sensor, or one of {_KINDS} with surfaces: thickness:5,6")
         last = len(lens.surfaces) - 2
         for number in [last] if kind == "sensor" else _numbers(word, numbers):
             variable = _variable(lens, kind, number, word)
@@ -148,15 +150,35 @@ def _variable(lens: Lens, kind: str, number: int, word: str) -> Variable:
     if not 1 <= number <= len(lens.surfaces) - 2:
         raise BadVariables(f"{word!r}: surface {number}; this lens has surfaces 1 to {len(lens.surfaces) - 2} to vary")
     surface = lens.surfaces[number]
-    if kind in ("sensor", "thickness"):
-        return Variable(kind, number, float(surface.thickness), 1.0)
-    edge = surface.semi_diameter
+    known = {"sensor": Place(("thickness",)), "thickness": Place(("thickness",)), **places(surface)}
+    if kind not in known:
+        raise BadVariables(f"{word!r}: surface {number} has no {kind}; it has {', '.join(list(known)[1:])}")
+    start = number_at(surface, known[kind])
+    start = torch.zeros_like(surface.thickness) if start is None else start.detach()
+    unit = 1.0 if known[kind].path == ("thickness",) else 1 / _sag_moved(surface, kind, known[kind], start, word)
+    return Variable(kind, number, float(start), unit, known[kind])
+
+
+def _sag_moved(surface: Surface, kind: str, place: Place, start: Tensor, word: str) -> float:
+    """How far the surface moves at its semi-diameter with one unit of a number, by the first term of the series
+
+    z ≈ c r²/2 + (1 + k) c³ r⁴/8 + …
+    """
+    edge, curvature = surface.semi_diameter, 0.0 if surface.curvature is None else float(surface.curvature)
     if not edge:
-        raise BadVariables(f"{word!r}: surface {number} has no semi-diameter, by which its {kind} is scaled; give one")
-    curvature = 0.0 if surface.curvature is None else float(surface.curvature)
+        raise BadVariables(f"{word!r}: a surface without semi-diameter, by which its {kind} is scaled; give one")
     if kind == "curvature":
-        return Variable(kind, number, curvature, 2 / edge**2)  # z ≈ c r²/2
-    if curvature == 0:
-        raise BadVariables(f"{word!r}: surface {number} is flat, and a conic constant changes nothing there")
-    start = 0.0 if surface.conic is None else float(surface.conic)
-    return Variable(kind, number, start, 8 / (abs(curvature) ** 3 * edge**4))  # z ≈ … + (1 + k) c³ r⁴/8
+        return edge**2 / 2
+    if kind == "conic":
+        moved = abs(curvature) ** 3 * edge**4 / 8
+    else:
+        angle = torch.linspace(0, 2 * math.pi, 33, dtype=start.dtype, device=start.device)
+        x, y = edge * torch.cos(angle), edge * torch.sin(angle)
+        changed = torch.func.jvp(
+            lambda v: sag_at(with_number(surface, place, v), x, y), (start,), (torch.ones_like(start),)
+        )
+        moved = float(changed[1].abs().max())
+    if moved == 0:
+        why = "is flat, and a conic constant" if kind == "conic" else "has a number that"
+        raise BadVariables(f"{word!r}: the surface {why} changes nothing there")
+    return moved

@@ -27,23 +27,6 @@ struct Sums {
   T gap = 0, c = 0, k = 0, n1 = 0, n2 = 0, a[kTerms] = {};
 };
 
-// What a coefficient a_j of v^j gets from each ray, s v^j + S̄' j v^(j-1) v', summed.
-template <int kind, typename T>
-void sum_coefficients(const Rays<T>& to, Notes<T>& notes, int n, int terms, T* sums) {
-#pragma omp simd
-  for (int i = 0; i < n; i++) notes.pz[i] = 1;
-  for (int j = 0; j < terms; j++) {
-    T sum = 0;
-#pragma omp simd reduction(+ : sum)
-    for (int i = 0; i < n; i++) {
-      const Argument<T> at = argument<kind>(to.x[i] * to.x[i] + to.y[i] * to.y[i]);
-      sum += notes.pz[i] * (notes.px[i] * at.v + T(j + 1) * notes.py[i] * at.dv);
-      notes.pz[i] *= at.v;
-    }
-    sums[j] += sum;
-  }
-}
-
 template <typename T, int kind, int bend, bool path, int terms>
 Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>& notes, int n, const Surface<T>& s) {
   const T gap = s.gap, c = s.c, k = s.k, shape = T(1) + k, n1 = s.n1, n2 = s.n2;
@@ -156,7 +139,7 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
   }
   Sums<T> sums;
   sums.gap = sum_gap, sums.c = sum_c, sums.k = sum_k, sums.n1 = sum_n1, sums.n2 = sum_n2;
-  if constexpr (has_terms(kind)) sum_coefficients<kind>(to, notes, n, s.at->terms, sums.a);
+  if constexpr (has_terms(kind)) sum_terms<kind>(to, notes, n, s.at->terms, sums.a);
   return sums;
 }
 

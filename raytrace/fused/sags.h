@@ -1,5 +1,5 @@
-// The kinds of sag, S = c u/(1 + w) + Σ a_j v^j with u = r²: raytrace/system/shapes.py. A new kind is one more `Kind`, in
-// the order of the `code` of its row there, its v as a case of `argument`, and a line of `by_kind_of_terms`.
+// The kinds of sag, S = c u/(1 + w) + Σ a_j b_j(u) with u = r²: raytrace/system/shapes.py. A new kind is one more `Kind`, in
+// the order of the `code` of its row there, and a case of `add_terms`, `sum_terms` and `by_kind_of_terms`.
 #pragma once
 #include <type_traits>
 
@@ -14,13 +14,46 @@ constexpr bool has_terms(int kind) { return kind >= kEven; }
 template <int number>
 using Constant = std::integral_constant<int, number>;
 
-// v(u) with its derivatives.
-template <typename T>
-struct Argument { T v, dv, d2v; };
+// Adds Σ a_j u^(j+1) over every `stride`-th of the coefficients, and its derivatives by u.
+template <bool second, int stride = 1, typename T>
+inline void series(const T* a, int count, T u, T& S, T& dS, T& d2S) {
+  T p = 0, dp = 0, d2p = 0;  // d2p carries p''/2
+  for (int j = count - 1; j >= 0; j--) {
+    if (second) d2p = d2p * u + dp;
+    dp = dp * u + p;
+    p = p * u + a[stride * j];
+  }
+  S = S + u * p, dS = dS + p + u * dp;
+  if (second) d2S = d2S + 2 * dp + 2 * u * d2p;
+}
 
+// Adds Σ a_j b_j(u) to a sag, and its derivatives.
+template <int kind, bool second, typename T>
+inline void add_terms(const T* a, int count, T u, T& S, T& dS, T& d2S) {
+  series<second>(a, count, u, S, dS, d2S);
+}
+
+// What a_j of Σ a_j v u^m, v = u, gets from each ray, s b_j + S̄' b_j', summed; s and S̄' stand in notes.px and py.
+template <int stride = 1, typename T>
+void sum_series(const Rays<T>& to, Notes<T>& notes, int n, int count, T* sums) {
+#pragma omp simd
+  for (int i = 0; i < n; i++) notes.pz[i] = 1;
+  for (int j = 0; j < count; j++) {
+    T sum = 0;
+#pragma omp simd reduction(+ : sum)
+    for (int i = 0; i < n; i++) {
+      T u = to.x[i] * to.x[i] + to.y[i] * to.y[i];
+      sum += notes.pz[i] * (notes.px[i] * u + T(j + 1) * notes.py[i]);
+      notes.pz[i] *= u;
+    }
+    sums[stride * j] += sum;
+  }
+}
+
+// The same of all coefficients of a kind.
 template <int kind, typename T>
-inline Argument<T> argument(T u) {
-  return {u, T(1), T(0)};
+void sum_terms(const Rays<T>& to, Notes<T>& notes, int n, int count, T* sums) {
+  sum_series(to, notes, n, count, sums);
 }
 
 // Calls work(kind, terms) for a surface with terms: loops are compiled for these kinds, and up to so many terms.
@@ -38,36 +71,21 @@ inline bool sag(const Surface<T>& s, int terms, T u, T& S, T& dS, T& d2S) {
   T shape = T(1) + s.k, radicand = T(1) - shape * s.c * s.c * u;
   bool inside = radicand > 0;
   T w = root(inside ? radicand : std::numeric_limits<T>::min()), over_w = T(1) / w;
-  const Argument<T> at = argument<kind>(u);
-  const T v = at.v;
-  T p = 0, dp = 0, d2p = 0;
-  for (int j = terms - 1; j >= 0; j--) {
-    if (second) d2p = d2p * v + dp;
-    dp = dp * v + p;
-    p = p * v + s.a[j];
-  }
-  // Σ a_j v^(j+1) = v p, so its derivatives by v are p + v p' and 2 p' + v p''; d2p carries p''/2.
-  S = s.c * u / (T(1) + w) + v * p;
-  if constexpr (kind == kEven) {
-    dS = T(0.5) * s.c * over_w + p + v * dp;
-    if (second) d2S = 2 * dp + 2 * v * d2p;
-  } else {
-    dS = T(0.5) * s.c * over_w + (p + v * dp) * at.dv;
-    if (second) d2S = (2 * dp + 2 * v * d2p) * at.dv * at.dv + (p + v * dp) * at.d2v;
-  }
+  S = s.c * u / (T(1) + w), dS = T(0.5) * s.c * over_w, d2S = 0;
+  add_terms<kind, second>(s.a, terms, u, S, dS, d2S);
   return inside;
 }
 
-// S and its slope where the kind is not known before; `size`: c u/(1 + w) apart, what the terms add up from.
+// S and its slope where the kind is not known before; size: what the terms add up from.
 struct Slope { double S, dS, size; bool inside; };
 
 inline Slope slope_at(const Surface<double>& s, double u) {
   Slope found{};
+  double sizes[kTerms], d = 0, d2 = 0;
+  for (int j = 0; j < kTerms; j++) sizes[j] = std::fabs(s.a[j]);
   by_kind_of_terms(*s.at, [&](auto kind, auto) {
-    double d2S, v = argument<kind()>(u).v;
-    found.inside = sag<kind(), false>(s, s.at->terms, u, found.S, found.dS, d2S);
-    for (int j = s.at->terms - 1; j >= 0; j--) found.size = found.size * v + std::fabs(s.a[j]);
-    found.size *= v;
+    found.inside = sag<kind(), false>(s, s.at->terms, u, found.S, found.dS, d2);
+    add_terms<kind(), false>(sizes, s.at->terms, u, found.size, d, d2);
   });
   return found;
 }

@@ -53,11 +53,10 @@ void push(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, int n, const Surfa
       nx = T(-2) * dS * hx, ny = T(-2) * dS * hy, w = T(1) + T(4) * dS * dS * u;
       T radicand = T(1) - shape * c * c * u, over_w = T(1) / root(radicand > 0 ? radicand : T(1));
       steep = c * over_w;
-      T conic_sag = c * u * over_w / (over_w + T(1)), third = over_w * over_w * over_w, p = 0, q = 0;
-      const Argument<T> at = argument<kind>(u);
-      for (int j = terms - 1; j >= 0; j--) p = p * at.v + change.a[j], q = q * at.v + T(j + 1) * change.a[j];
-      moved = -(dc * u * over_w * over_w / (over_w + T(1)) + T(0.5) * dk * c * conic_sag * conic_sag * over_w + at.v * p);
-      slope = T(0.5) * dc * third + T(0.25) * dk * c * (c * c * u) * third + q * at.dv;
+      T conic_sag = c * u * over_w / (over_w + T(1)), third = over_w * over_w * over_w, P = 0, dP = 0, d2P = 0;
+      add_terms<kind, false>(change.a, terms, u, P, dP, d2P);
+      moved = -(dc * u * over_w * over_w / (over_w + T(1)) + T(0.5) * dk * c * conic_sag * conic_sag * over_w + P);
+      slope = T(0.5) * dc * third + T(0.25) * dk * c * (c * c * u) * third + dP;
     }
     T cosine = nx * L + ny * M + nz * N;
 

@@ -1,10 +1,10 @@
 """Shapes: one row for every kind of sag, which holds all that the rest of the package knows of the kind.
 
-    z = c r²/(1 + √(1 - (1+k) c² r²)) + Σ_j a_j v^j + D(x, y)
+    z = c r²/(1 + √(1 - (1+k) c² r²)) + Σ_j a_j b_j(r²) + D(x, y)
 
-KINDS tells what v is, by `Surface.kind`; DEPARTURES tells D, by the class of `Surface.departure`. A new kind is a new
-row: rays, derivatives, first order, variables, figures, files and, with its v in fused/sags.h, the compiled trace read
-it.
+KINDS tells the b_j, by `Surface.kind`; DEPARTURES tells D, by the class of `Surface.departure`. A new kind is a new
+row: rays, derivatives, first order, variables, figures, files and, with its terms in fused/sags.h, the compiled trace
+read it.
 """
 
 import dataclasses
@@ -21,20 +21,39 @@ from raytrace.system.departure import Departure, Sag
 EVEN = "even asphere"
 
 
+#: What terms add to a sag: u (...), coefficients (m, ...), highest derivative, a factor f -> Σ_j a_j b_j(u), its slope
+#: and f² times its second derivative; None for those above the highest. The b_j are at least 0.
+Terms = Callable[[Tensor, Tensor, int, Tensor | float], tuple[Tensor, Tensor | None, Tensor | None]]
+
+
+def even_terms(u: Tensor, coefficients: Tensor, highest: int, along: Tensor | float):
+    """b_j = u^j, as `Terms`."""
+    P = u * polynomial(coefficients, u)
+    if highest == 0:
+        return P, None, None
+    order = torch.arange(1, len(coefficients) + 1, dtype=coefficients.dtype, device=coefficients.device)
+    first = order.reshape(-1, *(1,) * (coefficients.dim() - 1)) * coefficients
+    dP = polynomial(first, u)
+    if highest == 1:
+        return P, dP, None
+    second = (order - 1).reshape(-1, *(1,) * (coefficients.dim() - 1)) * first
+    return P, dP, polynomial(second[1:], u) * along * along
+
+
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """A kind of rotationally symmetric terms Σ_j a_j v^j, j = 1, 2, …
+    """A kind of rotationally symmetric terms Σ_j a_j b_j(u), u = r², j = 1, 2, …
 
-    step: v = r^step near the vertex, so that a_j belongs to r^(step j) and is named for it; mm^(1 - step j).
-    argument: u = r² and a factor f -> v, dv/du, f² d²v/du²; None: v is u itself.
-    zemax: TYPE of a .zmx file, where PARM j is a_j up to `parameters`; None: no file holds it.
-    words: what a table's column "type" may say for it; without any the powers tell.
+    terms: the sum and its derivatives.
+    step: b_j is r^(step j), so that a_j is named for it and in mm^(1 - step j).
+    zemax: TYPE of a .zmx file, where PARM j is a_j up to `parameters`; None: no such file holds it.
+    words: what the column "type" of a table may say for it; where that says nothing the powers of the terms tell.
     code: the kind in fused/sags.h, which traces up to `compiled` terms; None: traced by torch alone.
     """
 
     name: str
+    terms: Terms = even_terms
     step: int = 2
-    argument: Callable[[Tensor, Tensor | float], tuple[Tensor, Tensor, Tensor]] | None = None
     zemax: str | None = None
     parameters: int = 8
     words: tuple[str, ...] = ()
@@ -122,7 +141,7 @@ def sag_and_derivatives(
     along: v, by whose square the second derivative comes multiplied: c³ alone leaves the range of numbers before any
     length or curvature does. Beyond the edge of a closed conic its radicand is held at 0+.
 
-    S = c u/(1+w) + Σ_j a_j v^j,  w = √(1 - (1+k) c² u);  dS = c/2w + …;  d²S = (1+k) c³/4w³ + …
+    S = c u/(1+w) + Σ_j a_j b_j,  w = √(1 - (1+k) c² u);  dS = c/2w + …;  d²S = (1+k) c³/4w³ + …
     """
     S = dS = d2S = torch.zeros_like(u)
     if curvature is not None:
@@ -137,34 +156,13 @@ def sag_and_derivatives(
             tilt = c * along / w
             d2S = 0.25 * shape * c / w * tilt * tilt
     if coefficients is not None:
-        P, dP, d2P = _terms(u, coefficients, highest, along, KINDS[kind].argument)
+        P, dP, d2P = KINDS[kind].terms(u, coefficients, highest, along)
         S = S + P
         dS = dS if dP is None else dS + dP
         d2S = d2S if d2P is None else d2S + d2P
     return S, dS, d2S
 
 
-def _terms(u: Tensor, coefficients: Tensor, highest: int, along: Tensor | float, argument: Callable | None):
-    """Σ_j a_j v^j with its derivatives by u, the second one multiplied by along²; None above the highest."""
-    v, dv, d2v = (u, None, None) if argument is None else argument(u, along)
-    P = v * polynomial(coefficients, v)
-    if highest == 0:
-        return P, None, None
-    order = torch.arange(1, len(coefficients) + 1, dtype=coefficients.dtype, device=coefficients.device)
-    order = order.reshape(-1, *(1,) * (coefficients.dim() - 1))
-    first = order * coefficients
-    by_v = polynomial(first, v)
-    dP = by_v if dv is None else by_v * dv
-    if highest == 1:
-        return P, dP, None
-    second = polynomial(((order - 1) * first)[1:], v)
-    if dv is None:
-        return P, dP, second * along * along
-    return P, dP, second * (dv * along) * (dv * along) + by_v * d2v
-
-
 def size_of_terms(u: Tensor, coefficients: Tensor, kind: str = EVEN) -> Tensor:
-    """Σ_j |a_j| v^j (...): what the terms add up from, by which their rounding is judged."""
-    argument = KINDS[kind].argument
-    v = u if argument is None else argument(u, 1.0)[0]
-    return v * polynomial(coefficients.abs(), v)
+    """Σ_j |a_j| b_j (...): what the terms add up from, by which their rounding is judged."""
+    return KINDS[kind].terms(u, coefficients.abs(), 0, 1.0)[0]

@@ -1,8 +1,8 @@
 """Surface: sag, normal and intersection of a refracting or reflecting surface.
 
-    z = c r² / (1 + √(1 - (1+k) c² r²)) + Σ_j a_j v^j + D(x, y),  j = 1, 2, …
+    z = c r² / (1 + √(1 - (1+k) c² r²)) + Σ_j a_j b_j(r²) + D(x, y),  j = 1, 2, …
 
-v = r² of an even asphere; other kinds, and the departures D that few surfaces have, are rows of `shapes`.
+b_j = r^(2j) of an even asphere; other kinds, and the departures D that few surfaces have, are rows of `shapes`.
 
 Every function works in the frame of the surface's vertex, components first, for any batch shape. Roots are found
 outside the graph and in float64, also of float32 rays: within 1e-7 of the edge of a surface rounding would decide
@@ -70,6 +70,58 @@ SHAPE = tuple(
     for field in dataclasses.fields(Surface)
     if field.name not in ("thickness", "glass", "semi_diameter", "apertures", "comment")
 )
+
+
+class Place(NamedTuple):
+    """Where a surface holds a number: the fields from it down, and which entry of a tensor of several."""
+
+    path: tuple[str, ...]
+    entry: int | None = None
+
+
+def places(surface: Surface) -> dict[str, Place]:
+    """Every number of the shape by its name: curvature, conic, a4 (of r⁴) …, and the fields of a departure.
+
+    Entries of a tensor are counted from 1, coefficients by the power of r that they belong to.
+    """
+    found: dict[str, Place] = {}
+    for field in dataclasses.fields(Surface):
+        part = getattr(surface, field.name)
+        if field.name == "coefficients":
+            found |= _entries(("coefficients",), part, "a", KINDS[surface.kind].step)
+        elif field.name in SHAPE and field.type == Tensor | None:
+            found[field.name] = Place((field.name,))
+        elif field.name in SHAPE and dataclasses.is_dataclass(part):
+            for own in dataclasses.fields(part):
+                found |= _entries((field.name, own.name), getattr(part, own.name), own.name)
+    return found
+
+
+def _entries(path: tuple[str, ...], part: Tensor | None, name: str, step: int = 1) -> dict[str, Place]:
+    if not isinstance(part, Tensor):
+        return {}
+    if part.dim() == 0:
+        return {name: Place(path)}
+    return {f"{name}{step * (entry + 1)}": Place(path, entry) for entry in range(part.numel())}
+
+
+def number_at(part, place: Place) -> Tensor | None:
+    """The number in its place; None where it is not modelled."""
+    for name in place.path:
+        part = getattr(part, name)
+    return part if place.entry is None else part.reshape(-1)[place.entry]
+
+
+def with_number(part, place: Place, number: Tensor):
+    """The surface with another number in that place."""
+    name, *rest = place.path
+    old = getattr(part, name)
+    if rest:
+        number = with_number(old, Place(tuple(rest), place.entry), number)
+    elif place.entry is not None:
+        flat = old.reshape(-1)
+        number = torch.cat([flat[: place.entry], number[None], flat[place.entry + 1 :]]).reshape(old.shape)
+    return dataclasses.replace(part, **{name: number})
 
 
 def is_round(surface: Surface) -> bool:
