@@ -52,6 +52,7 @@ PUBLIC = {
     "rays": "optics.launch",
     "read_rays": "formats.ray_table",
     "sobol": "maths.pupil",
+    "spot": "optics.spots",
     "to": "maths.value",
     "trace": "optics.traced",
     "tracing": "fused",

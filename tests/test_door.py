@@ -179,6 +179,32 @@ def test_a_table_of_rays_is_traced_by_its_name(tmp_path):
     assert str(same) == str(found)
 
 
+def test_a_spot_is_differentiable_and_a_table_and_draws_itself(tmp_path):
+    lens = rt.read_lens("cooke_triplet")
+    curvature = lens.surfaces[3].curvature.clone().requires_grad_()
+    found = rt.spot(lens.replace(3, curvature=curvature), fields=[0, 14])
+    assert found.rms_radius.shape == (2, 3)
+    found.rms_radius.sum().backward()
+    step = 1e-7
+
+    def merit(c):
+        return float(rt.spot(lens.replace(3, curvature=c), fields=[0, 14]).rms_radius.sum())
+
+    slope = (merit(curvature.detach() + step) - merit(curvature.detach() - step)) / (2 * step)
+    assert float(curvature.grad) == pytest.approx(slope, rel=1e-5)
+    assert found.to_frame().rms_radius.tolist() == found.rms_radius.flatten().tolist()
+    assert len(found.plot(tmp_path / "spot.png").axes) == 2
+    assert (tmp_path / "spot.png").stat().st_size > 0
+    found.save(tmp_path / "rays.csv")
+    assert len(pd.read_csv(tmp_path / "rays.csv")) == found.arrivals.status.numel()
+    many = rt.spot(lens, fields=[0, 14], rays=20_000)
+    assert torch.allclose(many.rms_radius, found.rms_radius.double(), rtol=0.01)
+    with pytest.raises(ValueError, match="keeps none"):
+        many.plot()
+    with pytest.warns(rt.LostRays, match="field 80 degrees, .* all 648 rays lost: missed surface"):
+        rt.spot(lens, fields=[80])
+
+
 # -- one verb, one door ------------------------------------------------------------------------------------------------
 
 #: Commands that are a verb, each in a file of its own.

@@ -12,6 +12,7 @@ import torch
 from matplotlib.patches import Circle
 from problems import number
 
+import raytrace as rt
 from raytrace import plot
 from raytrace.formats import read_lens
 from raytrace.maths.pupil import fan, gauss_rings
@@ -210,7 +211,7 @@ def test_printed_radii_are_those_of_the_spot():
     rays = image_rays(lens, PUPIL[0])
     weights = (lens.wavelength_weights[:, None] * PUPIL[1]).flatten()
     expected = spot_of_points(rays.position[:2].flatten(2), rays.valid.flatten(1), weights)
-    text = words(plot.spot_diagram(lens, pupil=PUPIL))
+    text = words(rt.spot(lens, rings=4).plot())
     for radius in expected.rms_radius:
         assert f"RMS {style.number_text(1000 * float(radius))} µm" in text
     whole, dots = field_spots(lens, pupil=PUPIL)
@@ -234,15 +235,13 @@ def test_airy_circle_is_the_first_dark_ring(double_gauss):
     data = first_order(double_gauss)
     radius = 1.22 * 0.530e-3 * float(data.effective_focal_length) / 33.33
     assert float(plot.airy_radius(double_gauss)) == pytest.approx(radius, rel=1e-9)
-    circles = [
-        artist for artist in by_gid(plot.spot_diagram(double_gauss, pupil=PUPIL), "Airy") if isinstance(artist, Circle)
-    ]
+    circles = [artist for artist in by_gid(rt.spot(double_gauss, rings=4).plot(), "Airy") if isinstance(artist, Circle)]
     assert [circle.radius for circle in circles] == pytest.approx([radius] * 3)
 
 
 def test_panels_share_one_scale_and_are_centred_on_the_centroid():
     lens = read_lens("cooke_triplet")
-    figure = plot.spot_diagram(lens, pupil=PUPIL)
+    figure = rt.spot(lens, rings=4).plot()
     whole, _ = field_spots(lens, pupil=PUPIL)
     assert len({axes.get_xlim() for axes in figure.axes}) == 1
     (_, half) = figure.axes[0].get_xlim()
@@ -257,7 +256,7 @@ def test_panels_share_one_scale_and_are_centred_on_the_centroid():
 
 def test_a_field_that_no_ray_survives_says_so(double_gauss):
     blind = double_gauss.replace(6, apertures=(Aperture("circular", (0.0, 20.0), obscures=True),))
-    assert "no ray reaches" in words(plot.spot_diagram(blind, pupil=PUPIL))
+    assert "no ray reaches" in words(rt.spot(blind, rings=4).plot())
     plot.through_focus_curve(blind, pupil=PUPIL)
     plot.layout(blind)
 
@@ -387,7 +386,7 @@ def test_the_lens_keeps_its_gradients(double_gauss):
     lens = double_gauss.at(sensor_distance=thickness)
     for figure in (
         plot.layout(lens, rays=3),
-        plot.spot_diagram(lens, pupil=PUPIL),
+        rt.spot(lens, rings=4).plot(),
         plot.through_focus_curve(lens, pupil=PUPIL),
     ):
         assert figure.axes

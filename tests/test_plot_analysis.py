@@ -11,6 +11,7 @@ from matplotlib.colors import to_hex
 from page import outside
 from problems import number
 
+import raytrace as rt
 from raytrace import analysis, plot, read_lens
 from raytrace.cli import main
 from raytrace.optics.focus import image_rays
@@ -27,7 +28,8 @@ def drawn(monkeypatch):
 
     def run(*words: str):
         figures = []
-        monkeypatch.setattr(plot, "save", lambda figure, path: figures.append(figure))
+        for place in (plot, plot.style):
+            monkeypatch.setattr(place, "save", lambda figure, path: figures.append(figure))
         assert main([*words, "--plot", "figure.png"]) == 0
         return figures[-1]
 
@@ -66,7 +68,7 @@ def test_titles_longer_than_the_page_are_broken():
     for figure in (
         plot.curvature_curves(lens, analysis.field_curvature(lens)),
         plot.wavefront_maps(lens, analysis.wavefront_map(lens, wavelengths=number([0.55]), size=16)),
-        plot.spot_diagram(lens),
+        rt.spot(lens).plot(),
         plot.layout(lens),
         plot.through_focus_curve(lens),
     ):

@@ -104,7 +104,7 @@ def test_stochastic_rules_fill_the_area_evenly(name, tolerance):
 
 @pytest.mark.parametrize("name", pupil.SAMPLINGS)
 def test_samplings_by_name_take_one_size_and_a_dtype(name):
-    points, weights = pupil.SAMPLINGS[name](4, dtype=torch.float32)
+    points, weights = pupil.SAMPLINGS[name][0](4, dtype=torch.float32)
     assert points.dtype == weights.dtype == torch.float32
 
 

@@ -9,11 +9,11 @@ import torch
 from problems import floats, number
 from test_hardcases import of_kind
 
-from raytrace.analysis import chief_reference
 from raytrace.cli import main
 from raytrace.files import shipped
 from raytrace.formats import read_lens
 from raytrace.maths import pupil
+from raytrace.optics.arrivals import chief_reference
 from raytrace.optics.focus import image_rays
 from raytrace.optics.spot import EmptySpot, spot_of, spot_of_points
 from raytrace.system.rays import Rays

@@ -19,7 +19,6 @@
 from raytrace.analysis.chief import Distortion as Distortion
 from raytrace.analysis.chief import FieldCurvature as FieldCurvature
 from raytrace.analysis.chief import LateralColour as LateralColour
-from raytrace.analysis.chief import chief_reference as chief_reference
 from raytrace.analysis.chief import distortion as distortion
 from raytrace.analysis.chief import field_curvature as field_curvature
 from raytrace.analysis.chief import lateral_colour as lateral_colour

@@ -7,6 +7,7 @@ from raytrace.analysis.setting import field_range, in_object_space, primary_numb
 from raytrace.maths.numerics import dot_2, safe_divide, safe_sqrt
 from raytrace.maths.result import Result, axis, masked
 from raytrace.maths.value import value
+from raytrace.optics.arrivals import chief_points, keeps_coordinates
 from raytrace.optics.focus import image_rays
 from raytrace.optics.launch import is_at_infinity
 from raytrace.system.lens import Lens
@@ -121,7 +122,7 @@ def _close_foci(lens: Lens, fields: Tensor, wavelengths: Tensor, along: Tensor) 
     pupil = torch.cat([along, -along, across, -across], 1) * _NEAR_CHIEF
     rays = image_rays(lens, pupil, fields=fields, wavelengths=wavelengths)
     slope = safe_divide(rays.direction[:2], rays.direction[2].expand_as(rays.direction[:2]))
-    foci, valid = [], (rays.valid | _kept(rays.direction)).all(-1)
+    foci, valid = [], (rays.valid | keeps_coordinates(rays.direction)).all(-1)
     for section, pair in ((along, slice(0, 2)), (across, slice(2, 4))):
         place, tilt = (dot_2(part[..., pair], section[:, :, None, None]) for part in (rays.position[:2], slope))
         opening = tilt[..., 0] - tilt[..., 1]
@@ -144,19 +145,6 @@ def lateral_colour(
     return LateralColour(shift, fields, wavelengths, valid)
 
 
-def chief_points(lens: Lens, fields: Tensor, wavelengths: Tensor) -> tuple[Tensor, Tensor]:
-    """Where chief rays of fields (2, F) meet the sensor, (2, F, W) mm; whether they arrive or were only vignetted."""
-    rays = image_rays(lens, fields.new_zeros(2, 1), fields=fields, wavelengths=wavelengths)
-    on_axis = (fields == 0).all(0)[:, None]
-    return rays.position[:2, ..., 0], (rays.valid | _kept(rays.direction))[..., 0] | on_axis
-
-
-def chief_reference(lens: Lens, fields: Tensor) -> Tensor:
-    """Where the primary wavelength's chief rays of fields (2, F) meet the sensor, (2, F, 1) mm; nan where none does."""
-    points, valid = chief_points(lens, fields, lens.wavelengths[lens.primary_wavelength][None])
-    return torch.where(valid, points, torch.nan)
-
-
 def _height(lens: Lens, fields: Tensor, wavelengths: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
     """Heights (F, W) of chief rays in the meridians of `along` (2, F), and whether they arrive or are but vignetted."""
     points, valid = chief_points(lens, fields, wavelengths)
@@ -169,11 +157,6 @@ def _meridian(fields: Tensor) -> Tensor:
     side = torch.where((y < 0) | (y == 0) & (x < 0), -1.0, 1.0)
     length = safe_sqrt(dot_2(fields, fields))
     return torch.stack([safe_divide(side * x, length), safe_divide(side * y, length)])
-
-
-def _kept(direction: Tensor) -> Tensor:
-    """Whether rays keep their coordinates: a ray that missed a surface has become an axial one."""
-    return (direction[:2] != 0).any(0)
 
 
 def _relative(height: Tensor, ideal: Tensor) -> Tensor:

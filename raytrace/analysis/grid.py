@@ -3,11 +3,11 @@
 import torch
 from torch import Tensor
 
-from raytrace.analysis.chief import chief_points
 from raytrace.analysis.setting import field_range, in_object_space, unvignetted
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.result import Result, axis, masked
 from raytrace.maths.value import value
+from raytrace.optics.arrivals import chief_points
 from raytrace.optics.launch import is_at_infinity
 from raytrace.system.lens import Lens
 

@@ -11,14 +11,11 @@ from raytrace.cli.options import (
     file_name,
     json,
     lens,
-    many,
-    memory,
     object_distance,
     output,
     plot,
     positive,
     positive_finite,
-    ray_aiming,
     sampling,
     size,
     wavelength,
@@ -37,42 +34,6 @@ def _layout(parser):
     conditions(parser)
     fields(parser)
     plot(parser, "the cross section (default LENS_layout.png in this folder)")
-
-
-def _spot(parser):
-    lens(parser)
-    conditions(parser)
-    fields(parser)
-    sampling(parser, rings=12)
-    parser.add_argument(
-        "--rays",
-        metavar="N",
-        type=many,
-        help="instead of --points, any number of sobol or random rays for each field and wavelength, as 1e9: "
-        "traced in chunks, none kept",
-    )
-    parser.add_argument(
-        "--max-bytes",
-        metavar="BYTES",
-        type=memory,
-        help="memory that may be taken, as 200MB (default with --rays 256MB, else half of what is free)",
-    )
-    parser.add_argument(
-        "--reference",
-        choices=("centroid", "chief"),
-        default="centroid",
-        help="radii about the centroid (default), or about the chief ray of the primary wavelength",
-    )
-    parser.add_argument(
-        "--weights",
-        choices=("area", "equal"),
-        default="area",
-        help="rays count by their share of the pupil's area (default) or all alike; OpticStudio's spots are "
-        "--sampling hexapolar --rings 6 --weights equal --reference chief",
-    )
-    ray_aiming(parser)
-    output(parser, "table of the rays to write (.csv): field, wavelength, pupil point, x, y, weight, status")
-    plot(parser, "the spot diagram")
 
 
 def _focus(parser):
@@ -208,20 +169,7 @@ COMMANDS = (
         _layout,
         "cli.lens_commands.layout",
     ),
-    Command(
-        "spot",
-        "spot sizes and the spot diagram",
-        "Trace each field and wavelength to the sensor: centroid, RMS and geometric radius about it. -o writes the "
-        "rays: field_x,field_y,wavelength,pupil_x,pupil_y,x,y,weight,status; x and y are empty for a ray that "
-        "does not reach the sensor. status: ok, vignetted, miss, tir, unaimed.",
-        """examples:
-  raytrace spot double_gauss --plot spot.png
-  raytrace spot lens.zmx --object-distance 25000 --field 0 10 14 --json
-  raytrace spot double_gauss --field 0,10 7,7 --sampling hexapolar --rings 6 -o rays.csv
-  raytrace spot double_gauss --field 14 --rays 1e9 --max-bytes 200MB""",
-        _spot,
-        "cli.spot_commands.spot",
-    ),
+    Command.of("cli.spot"),
     Command(
         "focus",
         "find the best sensor distance",

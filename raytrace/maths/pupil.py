@@ -130,11 +130,37 @@ def _tensors(points: np.ndarray, weights: np.ndarray, dtype, device) -> tuple[Te
     return torch.as_tensor(points, dtype=dtype, device=device), torch.as_tensor(weights, dtype=dtype, device=device)
 
 
-#: Samplings by name, each called with one size: rings, points across, or points.
+#: Samplings by name, each called with one size: rings, points across, or points; and that size where none is given.
 SAMPLINGS = {
-    "gauss": gauss_rings,
-    "hexapolar": hexapolar,
-    "square": square,
-    "sobol": sobol,
-    "random": random,
+    "gauss": (gauss_rings, "rings", 12),
+    "hexapolar": (hexapolar, "rings", 12),
+    "square": (square, "points", 32),
+    "sobol": (sobol, "points", 1024),
+    "random": (random, "points", 1024),
 }
+
+
+def sampled(
+    sampling: str = "gauss",
+    *,
+    rings: int | None = None,
+    points: int | None = None,
+    seed: int = 0,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Points (2, P) and weights (P,) of a rule of SAMPLINGS.
+
+    rings: of gauss and hexapolar, 12 by default; points: across the pupil of square (32), in all of sobol and random
+    (1024), whose generator takes the seed. Raises ValueError for another sampling, or the size of another.
+    """
+    if sampling not in SAMPLINGS:
+        raise ValueError(f"sampling {sampling!r}: expected one of {', '.join(SAMPLINGS)}")
+    rule, counted, size = SAMPLINGS[sampling]
+    given = {"rings": rings, "points": points}
+    wrong = "points" if counted == "rings" else "rings"
+    if given[wrong] is not None:
+        takers = ", ".join(name for name, (_, what, _) in SAMPLINGS.items() if what == wrong)
+        raise ValueError(f"--{wrong} belongs to --sampling {takers}; {sampling} takes --{counted}")
+    own = {"seed": seed} if rule in (sobol, random) else {}
+    return rule(size if given[counted] is None else given[counted], **own, dtype=dtype, device=device)

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from raytrace.maths.result import Result, axis, masked
 from raytrace.maths.value import value
+from raytrace.optics.focus import image_rays
 from raytrace.optics.launch import launch
 from raytrace.optics.losses import STATUS, fates
 from raytrace.optics.trace import media
@@ -83,3 +84,21 @@ def _field(lens: Lens, pupil: Tensor, field: Tensor, ray_aiming: str | None) -> 
         reached = reached & ~crossing.missed & ~crossing.totally_reflected
         found = crossing.rays, status, reached
     return found
+
+
+def chief_points(lens: Lens, fields: Tensor, wavelengths: Tensor) -> tuple[Tensor, Tensor]:
+    """Where chief rays of fields (2, F) meet the sensor, (2, F, W) mm; whether they arrive or were only vignetted."""
+    rays = image_rays(lens, fields.new_zeros(2, 1), fields=fields, wavelengths=wavelengths)
+    on_axis = (fields == 0).all(0)[:, None]
+    return rays.position[:2, ..., 0], (rays.valid | keeps_coordinates(rays.direction))[..., 0] | on_axis
+
+
+def chief_reference(lens: Lens, fields: Tensor) -> Tensor:
+    """Where the primary wavelength's chief rays of fields (2, F) meet the sensor, (2, F, 1) mm; nan where none does."""
+    points, valid = chief_points(lens, fields, lens.wavelengths[lens.primary_wavelength][None])
+    return torch.where(valid, points, torch.nan)
+
+
+def keeps_coordinates(direction: Tensor) -> Tensor:
+    """Whether rays keep their coordinates: a ray that missed a surface has become an axial one."""
+    return (direction[:2] != 0).any(0)

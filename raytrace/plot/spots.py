@@ -12,14 +12,15 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from torch import Tensor
 
-from raytrace.analysis import chief_reference
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings, hexapolar, with_rim
+from raytrace.optics.arrivals import chief_reference
 from raytrace.optics.focus import image_rays
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.spot import Spot, spot_of_points
+from raytrace.optics.spots import Spots
 from raytrace.plot import style
-from raytrace.system.lens import Lens, with_object_distance
+from raytrace.system.lens import Lens
 
 _DOT_RINGS = 12  # 469 dots of a wavelength
 
@@ -78,34 +79,17 @@ def shares_of(lens: Lens, wavelengths: Tensor | None, weights: Tensor | None) ->
 
 
 @style.styled
-def spot_diagram(
-    lens: Lens,
-    *,
-    fields: Tensor | None = None,
-    wavelengths: Tensor | None = None,
-    wavelength_weights: Tensor | None = None,
-    pupil: tuple[Tensor, Tensor] | None = None,
-    object_distance: Tensor | float | None = None,
-    reference: str = "centroid",
-) -> Figure:
+def spot_diagram(found: Spots) -> Figure:
     """Spot diagram: one panel a field, one colour and marker a wavelength, the Airy disc at the primary wavelength.
 
-    All panels have the same scale, are centred on the centroid over all wavelengths or, as `reference` says, on the
-    "chief" ray of the primary one, and print the RMS and the geometric radius about it. fields: (2, F) in the lens's
-    own kind of field; wavelengths: (W,) µm; both by default those of the lens. wavelength_weights: (W,), by default the
-    lens's, equal for wavelengths that are given. pupil: points (2, P) and weights (P,) that make the RMS radius;
-    object_distance: mm from surface 1, inf allowed.
+    All panels have the same scale, are centred on the centroid over all wavelengths or, as the reference says, on the
+    chief ray of the primary one, and print the RMS and the geometric radius about it.
     """
-    lens = style.detached(lens)
-    if object_distance is not None:
-        lens = with_object_distance(lens, object_distance)
-    rule = {"wavelengths": wavelengths, "wavelength_weights": wavelength_weights, "pupil": pupil}
-    points = style.lens_fields(lens, fields)
-    about = chief_reference(lens, points)[..., 0] if reference == "chief" else None
-    whole, dots = field_spots(lens, fields=fields, about=about, **rule)
+    lens, points, rays = style.detached(found.lens), found.fields.detach(), found.arrivals
+    about = chief_reference(lens, points)[..., 0] if found.reference == "chief" else None
+    whole, dots = field_spots(lens, fields=points, pupil=(rays.pupil, rays.weight.detach().sum(0)), about=about)
     whole = whole if about is None else dataclasses.replace(whole, centroid=about)  # what panels are centred on
-    fields = style.array(points)
-    wavelengths = style.array(lens.wavelengths if wavelengths is None else wavelengths)
+    fields, wavelengths = style.array(points), style.array(lens.wavelengths)
     airy = float(airy_radius(lens))
     half = panel_size(style.array(whole.geometric_radius), airy)
     columns = min(fields.shape[1], 4 if fields.shape[1] % 3 or fields.shape[1] == 12 else 3)

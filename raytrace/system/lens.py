@@ -189,7 +189,7 @@ def _below_90_degrees(lens: Lens, fields: Tensor) -> Tensor:
     for angle in fields.T.flatten().tolist() if lens.fields.kind == "angle" else ():
         if abs(angle) >= 90:
             raise ValueError(
-                f"field {angle:g}: a field angle is below 90 degrees, for rays start from the plane of the entrance "
+                f"--field {angle:g}: a field angle is below 90 degrees, for rays start from the plane of the entrance "
                 "pupil"
             )
     return fields
@@ -206,11 +206,11 @@ def vector(numbers: Tensor | Iterable[Tensor | float] | float, *, like: Lens) ->
 
 
 def wavelengths_of(lens: Lens, wavelengths: Tensor | Iterable[float] | float | None) -> Tensor:
-    """The wavelengths (W,) µm: the lens's own, or those given, checked as by `check_media`."""
+    """The wavelengths (W,) µm: the lens's own, or those given; its media are checked at new ones, as `check_media`."""
     if wavelengths is None:
         return lens.wavelengths
     found = vector(wavelengths, like=lens)
-    check_media(lens, found)
+    check_media(lens, found[~torch.isin(found, lens.wavelengths)])
     return found
 
 
@@ -240,7 +240,7 @@ def with_wavelengths(
 
     Those that the lens does not have yet are checked as by `check_media`, whose place `where` is.
     """
-    wavelengths = torch.as_tensor(wavelengths, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device).reshape(-1)
+    wavelengths = vector(wavelengths, like=lens).to(lens.wavelengths)
     check_media(lens, wavelengths[~torch.isin(wavelengths, lens.wavelengths)], where=where)
     weights = torch.ones_like(wavelengths) if weights is None else weights
     return dataclasses.replace(lens, wavelengths=wavelengths, wavelength_weights=weights, primary_wavelength=0)
