@@ -7,7 +7,6 @@ also take the same decisions and fail together. What runs in one process needs n
 """
 
 import contextlib
-import contextvars
 import dataclasses
 import importlib
 import os
@@ -22,7 +21,6 @@ from torch import Tensor, distributed
 _NUMBERS = 8  # agreed on at once, at most
 _PATIENCE = 600.0  # s that processes wait for each other to begin
 _COURTESY = 10.0  # s that one with an error waits for the first process to say it
-_is_agreeing = contextvars.ContextVar("raytrace.shards.is_agreeing", default=False)
 
 
 class ProcessLost(ConnectionError):
@@ -79,45 +77,23 @@ def gathered(part: Tensor) -> Tensor:
 
 
 @contextlib.contextmanager
-def agreeing() -> Iterator[None]:
-    """Each process computes a part of one thing; `largest` holds for all parts, and an error in one is raised by all.
+def agreeing() -> Iterator[Callable[[Tensor], Tensor]]:
+    """Each process computes a part of one thing, with the same decisions; and an error in one is raised by all.
 
-    Every process has to call `largest` equally often in the block. Errors of others arrive there, or when it ends.
+    Yields what they decide by: of numbers () or (K,), K < 8, each the largest that a process has, without gradient.
+    Every process has to call it equally often in the block. Errors of others arrive there, or when it ends.
     """
     if share().processes == 1:
-        yield
+        yield lambda numbers: numbers
         return
-    token = _is_agreeing.set(True)
     try:
-        yield
+        yield _agree
         _agree(torch.zeros(0))
     except (ProcessLost, FailedElsewhere):
         raise
     except Exception as error:
         _agree(torch.zeros(0), error)
         raise
-    finally:
-        _is_agreeing.reset(token)
-
-
-@contextlib.contextmanager
-def alone() -> Iterator[None]:
-    """Within a block of `agreeing`: what follows is decided by this process for itself."""
-    token = _is_agreeing.set(False)
-    try:
-        yield
-    finally:
-        _is_agreeing.reset(token)
-
-
-def largest(numbers: Tensor) -> Tensor:
-    """The numbers, () or (K,), K < 8; within `agreeing`, each the largest that a process has; then without gradient."""
-    return _agree(numbers) if _is_agreeing.get() else numbers
-
-
-def everywhere(condition: Tensor) -> bool:
-    """Whether a condition () holds; within `agreeing`, whether it does in every process."""
-    return not bool(largest(~condition))
 
 
 def _agree(numbers: Tensor, error: Exception | None = None) -> Tensor:

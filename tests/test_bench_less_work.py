@@ -10,7 +10,7 @@ from raytrace.bench.less_work import cases, measure, with_spheres_for_planes
 from raytrace.bench.speed import Sizes, double_gauss
 from raytrace.bench.speed_own import with_sensor_leaf
 from raytrace.fused import prepare, tracing
-from raytrace.kernels import fourier, ladder, psf
+from raytrace.kernels import MODELS, fourier, psf
 from raytrace.maths.pupil import sobol
 from raytrace.optics.launch import rays_of_field
 from raytrace.optics.reuse import Memo, trace_bundle
@@ -123,7 +123,7 @@ def test_a_tolerance_computes_an_order_twice_only_for_a_derivative(monkeypatch, 
         orders.append(order)
         return fourier.kernels(batch, pixels, order=order, zernike=zernike)
 
-    monkeypatch.setitem(ladder.MODELS, "fourier", dataclasses.replace(ladder.MODELS["fourier"], kernels=counted))
+    monkeypatch.setitem(MODELS, "fourier", dataclasses.replace(MODELS["fourier"], kernels=counted))
     lens, leaf = with_sensor_leaf(with_object_distance(double_gauss(), 25e3))
     leaf.requires_grad_(varies)
     found = psf(lens, "fourier", fields=torch.zeros(2, 1, dtype=torch.float64), tol=1e-2)

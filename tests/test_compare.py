@@ -1,5 +1,6 @@
 """The models side by side: one sensor, kernels as `psf` gives them, and numbers that show what each can represent."""
 
+import importlib
 import json
 import math
 import warnings
@@ -10,7 +11,7 @@ import torch
 from problems import MICROMETRE, NANOMETRE
 
 from raytrace import analysis, read_lens
-from raytrace.cli import main, psf_commands
+from raytrace.cli import main
 from raytrace.kernels import NotConverged, psf
 from raytrace.maths.grid import grid
 from raytrace.maths.pupil import gauss_rings
@@ -29,7 +30,7 @@ def opened(name: str, focus_distance: float = 25_000.0, **options):
 def compared(lens, *distances: float):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotConverged)
-        return analysis.compare(lens, lens.wavelengths.new_tensor(distances))
+        return analysis.side_by_side(lens, lens.wavelengths.new_tensor(distances))
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +150,8 @@ def strict(text: str) -> dict:
 
 
 def test_json_and_figure(capsys, tmp_path, monkeypatch, measured):
-    monkeypatch.setattr(psf_commands, "abilities", lambda lens, pixels: measured)  # seconds of work done above
+    comparing = importlib.import_module("raytrace.analysis.compare")
+    monkeypatch.setattr(comparing, "abilities", lambda lens, pixels: measured)  # seconds of work done above
     picture = tmp_path / "compare.png"
     words = ["compare", "singlet", "--object-distance", "20000", "inf", "--start", "rms", "--plot", str(picture)]
     assert main([*words, "--json"]) == 0

@@ -1,5 +1,6 @@
 """Figures of kernels: what is drawn is the light of the model, in windows it fills, and every word is on the page."""
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -28,7 +29,7 @@ def seen(name: str, model: str, **options):
     lens = read_lens(LENSES / f"{name}.zmx")
     fields, distances = options.pop("fields", own_fields(lens)), options.pop("object_distances", number([math.inf]))
     found = psf(lens, model, fields=fields, object_distances=distances, center="chief", **options)
-    return found, close_up(lens, found, fields=fields, object_distances=distances), fields
+    return found, close_up(found), fields
 
 
 @pytest.mark.parametrize(("name", "model"), [("phone", "wave"), ("hubble", "wave"), ("telephoto", "gaussian")])
@@ -60,7 +61,7 @@ def test_windows_are_alike_unless_the_light_is_not():
     distances = number([math.inf, 2000.0])
     _, light, _ = seen("telephoto", "gaussian", object_distances=distances)
     assert float(light.half[1, 0]) > 4 * float(light.half[0, 0])
-    axes = plot.psf_grid(found, [math.inf], ["a", "b", "c"]).axes
+    axes = plot.psf_grid(dataclasses.replace(found, framed=True)).axes
     assert {tuple(np.round(panel.get_xlim(), 9)) for panel in axes if panel.images} == {(-0.0525, 0.0525)}
 
 
@@ -71,9 +72,8 @@ def phone():
 
 @pytest.mark.parametrize("log", [False, True])
 def test_panels_show_the_light_with_the_edges_of_the_pixels(phone, log):
-    found, light, fields = phone
-    labels = [f"{y:g}°" for y in fields[1].tolist()]
-    figure = plot.psf_grid(found, [math.inf], labels, close_up=light, log=log, title="Phone camera: wave PSF")
+    found, light, _ = phone
+    figure = plot.psf_grid(found, close_up=light, log=log)
     panels = [panel for panel in figure.axes if panel.images]
     assert len(panels) == 2
     for f, panel in enumerate(panels):
@@ -93,8 +93,7 @@ def test_panels_show_the_light_with_the_edges_of_the_pixels(phone, log):
 
 def test_kernels_of_each_wavelength_are_rows_fields_outermost():
     found, light, _ = seen("telephoto", "gaussian", per_wavelength=True, object_distances=number([math.inf, 1e5]))
-    labels = [f"{f} {w}" for f in range(3) for w in range(3)]
-    figure = plot.psf_grid(found, [math.inf, 1e5], labels, close_up=light, title="each")
+    figure = plot.psf_grid(found, close_up=light)
     panels = [panel for panel in figure.axes if panel.images]
     assert len(panels) == 18
     for row in range(9):
@@ -109,10 +108,10 @@ def test_every_word_is_on_the_page(count, distances):
     lens = read_lens(LENSES / "telephoto.zmx")
     fields = torch.stack([torch.zeros(count, dtype=torch.float64), torch.linspace(0, 3, count, dtype=torch.float64)])
     found = psf(lens, "gaussian", fields=fields, object_distances=number(distances), center="chief")
-    title = "A lens with a name that is much longer than its figure is wide, f = 99.9 mm, F/4: gaussian PSF"
-    figure = plot.psf_grid(found, distances, [f"{y:.3f}°" for y in fields[1].tolist()], title=title)
+    name = "A lens with a name that is much longer than its figure is wide, f = 99.9 mm, F/4"
+    figure = plot.psf_grid(dataclasses.replace(found, lens=dataclasses.replace(lens, name=name), framed=True))
     assert outside(figure) == []
-    assert "".join(figure.get_suptitle().split()) == "".join(title.split())
+    assert "".join(figure.get_suptitle().split()) == "".join(f"{name}: gaussian PSF".split())
 
 
 def test_lines_are_as_wide_as_the_page():
@@ -126,10 +125,10 @@ def test_lines_are_as_wide_as_the_page():
 
 def test_the_pixels_of_a_comparison_are_those_asked_for(tmp_path, capsys):
     lens = analysis.common_focus(read_lens(LENSES / "singlet.zmx"), 25e3, wavelength=0.53)
-    found = analysis.compare(lens, number([2e4]), pixels=grid(number(0.002), 11))
+    found = analysis.side_by_side(lens, number([2e4]), pixels=grid(number(0.002), 11))
     assert all(one.kernel.shape[-2:] == (11, 11) for one in found.psfs)
     assert all(float(one.grid.pitch) == 0.002 for one in found.psfs)
-    figure = plot.model_grid(found, log=True, title="A title")
+    figure = plot.model_grid(found, log=True)
     panels = [panel for panel in figure.axes if panel.images]
     assert panels[0].get_xlim() == pytest.approx((-0.011, 0.011))
     assert "11 × 11 pixels of 2 µm" in figure.get_supxlabel()
@@ -138,7 +137,7 @@ def test_the_pixels_of_a_comparison_are_those_asked_for(tmp_path, capsys):
 
 def test_the_command_draws_the_light_or_the_pixels_asked_for(tmp_path, monkeypatch, capsys):
     drawn = []
-    monkeypatch.setattr(plot, "save", lambda figure, path: drawn.append(figure))
+    monkeypatch.setattr(plot.style, "save", lambda figure, path: drawn.append(figure))
     words = ["psf", "phone", "--model", "gaussian", "--plot", str(tmp_path / "a.png")]
     for more in ([], ["--pixel", "0.001"], ["--size", "31"], ["--per-wavelength"]):
         assert main([*words, *more]) == 0

@@ -8,7 +8,7 @@ import torch
 from problems import double_gauss, scalar, vector
 
 from raytrace.kernels import gaussian, raymap
-from raytrace.kernels.ladder import MODELS
+from raytrace.kernels.models import MODELS
 from raytrace.kernels.rays import energy_of_fans
 from raytrace.maths.grid import Grid
 from raytrace.media.glass import model_glass

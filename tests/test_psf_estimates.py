@@ -16,12 +16,12 @@ from problems import number
 from raytrace.formats import read_lens
 from raytrace.kernels import NotConverged, diffraction, fourier, psf, raymap
 from raytrace.kernels.clear import between, clear_arms
-from raytrace.kernels.ladder import polychromatic
 from raytrace.kernels.pixels import gaussian_pixels
+from raytrace.kernels.result import Kernels, polychromatic
 from raytrace.maths.grid import grid
 from raytrace.maths.value import to
 from raytrace.optics.launch import stop_radius
-from raytrace.optics.scene import Kernels, Scene, beam_share, scene, trace_scene
+from raytrace.optics.scene import Scene, beam_share, scene, trace_scene
 from raytrace.system.lens import Lens, SystemAperture
 from raytrace.system.surface import Aperture
 
@@ -45,7 +45,7 @@ class Case:
     colours: str = "primary"
 
 
-#: The constants of `ladder.MODELS` were chosen on these.
+#: The constants of `models.MODELS` were chosen on these.
 FITTED = (
     *(Case("double_gauss", (0.0, y), d, 0.005) for y in (0.0, 14.0) for d in (1e4, 25e3)),
     *(Case("cooke_triplet", (0.0, y), d, 0.005) for y in (0.0, 14.0) for d in (2e4, INF)),

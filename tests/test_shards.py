@@ -16,6 +16,7 @@ from raytrace import shards
 from raytrace.cli import main
 from raytrace.files import shipped
 from raytrace.kernels import psf, sharing
+from raytrace.kernels.result import mixture
 from raytrace.maths.grid import grid
 from raytrace.shards import Share
 from raytrace.system.lens import Lens
@@ -82,10 +83,10 @@ def work(folder: str) -> None:
         found = {f"{name}/{key}": t for name, numbers in cases().items() for key, t in numbers.items()}
         np.savez(Path(folder, f"{share.rank}.npz"), **found)
         try:
-            with shards.agreeing():
+            with shards.agreeing() as largest:
                 if share.rank == 1:
                     raise ValueError("the share of 1 makes no sense")
-                shards.largest(torch.zeros(()))
+                largest(torch.zeros(()))
             said = "nothing"
         except ValueError as error:
             said = f"{type(error).__name__}: {error}"
@@ -216,7 +217,7 @@ def test_parts_of_a_row_are_all_of_it():
         assert found == list(range(count))
 
 
-def test_moments_of_parts_are_those_of_all_light(monkeypatch):
+def test_moments_of_parts_are_those_of_all_light():
     """A spot of 1 nm at 1 m off the axis, in three parts, one of them dark, against numbers of 1 nm about the axis."""
     generator = torch.Generator().manual_seed(0)
     points = torch.randn(2, 300, generator=generator, dtype=torch.float64)
@@ -231,9 +232,7 @@ def test_moments_of_parts_are_those_of_all_light(monkeypatch):
         return energy, mean, torch.stack([(share * p * q).sum() for p, q in ((a, a), (a, b), (b, b))])
 
     parts = [moments(*points[:, n : n + 100], weights[n : n + 100]) for n in (0, 100, 200)]
-    rows = iter([torch.stack(column) for column in zip(*parts, strict=True)])
-    monkeypatch.setattr(sharing, "gathered", lambda part: next(rows))
-    mean, covariance = sharing.pooled(*parts[0])
+    mean, covariance = mixture(*(torch.stack(column, -1) for column in zip(*parts, strict=True)))
     _, expected_mean, expected = moments(*points, weights)
     torch.testing.assert_close(mean, expected_mean, rtol=1e-14, atol=1e-14)
     torch.testing.assert_close(covariance, expected, rtol=1e-14, atol=1e-14)

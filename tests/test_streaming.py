@@ -12,12 +12,14 @@ import torch
 from problems import NANOMETRE, PICOMETRE, aspheric_singlet, double_gauss, fields, lens, scalar, surface, vector
 
 from raytrace.kernels import psf
-from raytrace.kernels.streaming import stream_psf
+from raytrace.kernels import rays as plain
+from raytrace.kernels.streaming import stream_kernels
 from raytrace.maths import pupil
 from raytrace.maths.grid import grid
 from raytrace.maths.value import to
 from raytrace.optics import streaming
 from raytrace.optics.launch import launch
+from raytrace.optics.scene import scene
 from raytrace.optics.spot import EmptySpot, spot_of
 from raytrace.optics.stream_gradient import mean_square_gradient, stream_gradient
 from raytrace.optics.streaming import Moments, chunk_size, merge, moments, pupil_chunks, shot, stream_spot, stream_spots
@@ -27,6 +29,7 @@ from raytrace.system.surface import Aperture
 
 LIKE = torch.zeros((), dtype=torch.float64)
 SMALL = 512 * 768  # bytes: chunks of 512 rays
+FEW = SMALL + 10**6  # and of a few kernels
 COLOURS = vector(0.48, 0.65)
 
 
@@ -252,37 +255,46 @@ def test_psf_is_that_of_all_rays_at_once(width):
     pixels = grid(0.05, (15, 21), centre=vector(0.0, 25.0))
     batch = {"fields": vector(0.0, 14.0).expand(2, 2) * vector(0.0, 1.0)[:, None], "wavelengths": COLOURS}
     batch |= {"object_distances": vector(float("inf"), 3000.0), "wavelength_weights": vector(1.0, 2.0)}
-    found = stream_psf(system, 1501, grid=pixels, max_bytes=SMALL + 10**6, width=width, **batch)
     if width:
-        whole = psf(system, "drt", rays=1501, grid=pixels, **batch)
-        assert float((found.psf.kernel - whole.kernel).abs().max()) < 1e-9
-        assert torch.allclose(found.psf.error, whole.error, rtol=1e-6, atol=0, equal_nan=True)
-        assert float((found.psf.centroid - whole.centroid).abs().max()) < PICOMETRE
-        assert torch.allclose(found.psf.covariance, whole.covariance, rtol=1e-8, atol=1e-11)
-        assert torch.equal(found.psf.grid.centre, whole.grid.centre)
-    assert float(found.psf.energy[:, 1].min()) > 0.05
+        whole, found = (psf(system, "drt", rays=1501, grid=pixels, max_bytes=most, **batch) for most in (None, FEW))
+        assert float((found.kernel - whole.kernel).abs().max()) < 1e-9
+        assert torch.allclose(found.error, whole.error, rtol=1e-6, atol=0, equal_nan=True)
+        assert float((found.centroid - whole.centroid).abs().max()) < PICOMETRE
+        assert torch.allclose(found.covariance, whole.covariance, rtol=1e-8, atol=1e-11)
+        assert torch.allclose(found.arrived, whole.arrived, rtol=1e-12)
+        assert torch.equal(found.grid.centre, whole.grid.centre)
+        assert float(found.energy[:, 1].min()) > 0.05
+    for distance in batch["object_distances"].split(1):
+        one = scene(system, batch["fields"], distance, COLOURS)
+        found, half = stream_kernels(one, pixels, 1501, max_bytes=FEW, width=width)
+        whole, first = (plain.kernels(one, pixels, rays=n, width=width) for n in (1501, 750))
+        assert float((found.kernel - whole.kernel).abs().max()) < 1e-9
+        assert float((half.kernel - first.kernel).abs().max()) < 1e-9
 
 
 def test_energy_of_a_psf_is_accounted_for():
     """A window that holds all that arrives holds `arrived`, which is the share of rays that were not lost."""
     system = clipped(field=fields("angle", (10.0,)))
     centroid = stream_spot(system, 2000).centroid[:, 0]
-    found = stream_psf(system, 2000, grid=grid(0.5, 9, centre=centroid[:, None]))
+    options = {"rays": 2000, "max_bytes": FEW, "center": "axis"}
+    found = psf(system, "drt", grid=grid(0.5, 9, centre=centroid[:, None]), **options)
     rays = stream_spot(system, 2000).rays
     assert float(found.arrived) == pytest.approx(float(rays) / 2000, rel=1e-14)
-    assert float(found.psf.energy) == pytest.approx(float(found.arrived), rel=1e-12)
+    assert float(found.energy) == pytest.approx(float(found.arrived), rel=1e-12)
     assert 0.3 < float(found.arrived) < 0.99
-    narrow = stream_psf(system, 2000, grid=grid(0.005, 3, centre=centroid[:, None]))
-    assert float(narrow.psf.energy) < 0.5 * float(narrow.arrived)
+    narrow = psf(system, "drt", grid=grid(0.005, 3, centre=centroid[:, None]), **options)
+    assert float(narrow.energy) < 0.5 * float(narrow.arrived)
 
 
 def test_psf_counts_vignetting_factors():
     system = SCENES["vignetting factors"]
     pixels = grid(0.5, 9, centre=stream_spot(system, 500).centroid[..., 0][:, None])
-    found = stream_psf(system, 500, grid=pixels, object_distances=vector(float("inf")))
+    options = {"grid": pixels, "object_distances": vector(float("inf")), "center": "axis"}
     share = torch.tensor([[0.9, 0.7 * 0.8]], dtype=torch.float64)
-    assert torch.allclose(found.arrived, share, rtol=1e-12)
-    assert torch.allclose(found.psf.energy, share, rtol=1e-12)
+    for most in (None, FEW):
+        found = psf(system, "drt", rays=500, max_bytes=most, **options)
+        assert torch.allclose(found.arrived, share, rtol=1e-12)
+        assert torch.allclose(found.energy, share, rtol=1e-12)
 
 
 # ---------------------------------------------------------------- gradients
@@ -362,7 +374,7 @@ sys.path.insert(0, "tests")
 from problems import double_gauss, aspheric_singlet, vector
 from raytrace.optics import streaming
 from raytrace.maths.grid import grid
-from raytrace.kernels.streaming import stream_psf
+from raytrace.kernels import psf
 from raytrace.optics.stream_gradient import mean_square_gradient
 import dataclasses
 
@@ -392,7 +404,7 @@ print(growth(run, 2**16, 2**16 * 768))
 print(growth(lambda n, b: mean_square_gradient(bent, [curvature], n, max_bytes=b), 2**13, 2**13 * 9216))
 if RAYS > 10**7:
     pixels = grid(0.005, 21)
-    print(growth(lambda n, b: stream_psf(gauss, n, grid=pixels, fields=field, max_bytes=b), 2**17, 2**17 * 768))
+    print(growth(lambda n, b: psf(gauss, "drt", rays=n, grid=pixels, fields=field, max_bytes=b), 2**17, 2**17 * 768))
     print(growth(lambda n, b: streaming.stream_spot(gauss, n, max_bytes=b, **aim), 2**15, 2**15 * 8192))
 """
 

@@ -22,13 +22,12 @@ from raytrace.analysis.chief import LateralColour as LateralColour
 from raytrace.analysis.chief import distortion as distortion
 from raytrace.analysis.chief import field_curvature as field_curvature
 from raytrace.analysis.chief import lateral_colour as lateral_colour
-from raytrace.analysis.compare import PIXEL as PIXEL
-from raytrace.analysis.compare import SIZE as SIZE
 from raytrace.analysis.compare import Abilities as Abilities
 from raytrace.analysis.compare import Comparison as Comparison
 from raytrace.analysis.compare import abilities as abilities
 from raytrace.analysis.compare import common_focus as common_focus
 from raytrace.analysis.compare import compare as compare
+from raytrace.analysis.compare import side_by_side as side_by_side
 from raytrace.analysis.encircled import EncircledEnergy as EncircledEnergy
 from raytrace.analysis.encircled import encircled_energy as encircled_energy
 from raytrace.analysis.fans import Fan as Fan

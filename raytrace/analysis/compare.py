@@ -2,38 +2,91 @@
 
 import dataclasses
 import math
+import warnings
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from raytrace.kernels import Psf, psf
+from raytrace.kernels.compute import PIXEL, SIZE, psf
+from raytrace.kernels.ladder import NotConverged
+from raytrace.kernels.models import MODELS, Model
+from raytrace.kernels.result import Psf
 from raytrace.maths.grid import Grid, grid
 from raytrace.maths.numerics import safe_divide, safe_sqrt
-from raytrace.maths.result import Result, axis
+from raytrace.maths.result import Result, axis, number, numbers
 from raytrace.maths.value import value
-from raytrace.optics.focus import focused
+from raytrace.optics.focus import NoImage, focused, real_image_distance
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.trace import media
 from raytrace.system.lens import Lens, SystemAperture, with_sensor_distance, with_wavelengths
 
-#: The models by the names of their rows, with what drives them; the last one is the reference of the others.
-ROWS = {
-    "DRT": {"model": "drt", "rays": 256},
-    "Gaussian DRT": {"model": "gaussian", "tol": 1e-3},
-    "paraxial": {"model": "paraxial"},
-    "Fourier": {"model": "fourier", "tol": 1e-3},
-    "wave": {"model": "wave", "tol": 1e-3},
-}
 STARTS = ("paraxial", "rms")
 DISTANCES = (10e3, 20e3, 30e3, 40e3, 50e3)  # mm
-PIXEL, SIZE = 0.005, 21  # mm; a window of 105 µm
 
-# The counting noise of 256 rays would pass for aberrations and for rings: abilities are those of many rays.
-_CONVERGED = {**ROWS, "DRT": {"model": "drt", "tol": 0.01}}
-_IDEAL = ("paraxial", "Fourier")  # these place the light of a field where a lens without distortion would
+_ROWS = sorted(MODELS.values(), key=lambda model: model.row)  # the last one is the reference of the others
+_TOLERANCE = 0.01  # of abilities: the counting noise of a few rays would pass for aberrations and for rings
 _CONIC = 0.2  # by how much the conic of the most curved surface grows
 _SLOW = 16.0  # F-number, or the lens's own if it is slower, at which the first dark ring is looked for
 _AIRY_PIXELS = 24  # pixels in the radius of the ideal ring
+
+
+#: What is asked of each model: attribute, heading of its column; and what of it is a whole number.
+_SHOWN = {
+    "conic": "Δ conic",
+    "anisotropy": "σ long/short",
+    "asymmetry": "asymmetry",
+    "dark_ring": "dark ring/Airy",
+    "parameters": "parameters",
+    "rays": "rays",
+}
+_WHOLE = ("parameters", "rays")
+
+
+@value
+class Abilities(Result):
+    """What each model can represent: one number (M,) for each model and question, of the object in focus.
+
+    conic: relative L1 change of the kernel when the conic of the most curved surface grows by 0.2 (aberrations).
+    anisotropy: longer over shorter σ of the largest field, before pixels and window (of "wave": of its rays);
+        asymmetry: relative L1 difference of that field's kernel from itself turned by 180° about the centroid of the
+        light (off axis).
+    dark_ring: radius of the first minimum at F/16 in radii of the Airy disc, nan where there is none (diffraction).
+    parameters: how many curvatures, conics and thicknesses move the kernel: have a derivative other than 0.
+    rays: traced for one kernel on the axis.
+    """
+
+    conic: Tensor
+    anisotropy: Tensor
+    asymmetry: Tensor
+    dark_ring: Tensor
+    parameters: Tensor
+    rays: Tensor
+    models: tuple[str, ...]
+
+    def columns(self) -> dict[str, Tensor]:
+        model = torch.arange(len(self.models), device=self.conic.device)
+        return {"model": model, **{name: getattr(self, name) for name in _SHOWN}}
+
+    def words(self) -> dict:
+        return {"model": self.models}
+
+    def of(self, m: int) -> dict[str, float | int | None]:
+        """The answers of one model."""
+        return {name: (int if name in _WHOLE else number)(getattr(self, name)[m]) for name in _SHOWN}
+
+    def __str__(self) -> str:
+        said = ["what each model can represent: see `raytrace compare --help`"]
+        said.append(f"{'':>14} " + " ".join(f"{heading:>15}" for heading in _SHOWN.values()))
+        for m, name in enumerate(self.models):
+            said.append(f"{name:>14} " + " ".join(f"{_cell(shown):>15}" for shown in self.of(m).values()))
+        return "\n".join(said)
+
+
+def _cell(shown: float | int | None) -> str:
+    if shown is None:
+        return "none"
+    return f"{shown}" if isinstance(shown, int) else "0" if abs(shown) < 1e-12 else f"{shown:.4f}"
 
 
 @value
@@ -42,6 +95,7 @@ class Comparison(Result):
 
     psfs: of each model, kernels (D, 1, rows, columns); models: their names.
     object_distances: (D,) mm; sensor_distance: () mm from the last surface; wavelength: () µm.
+    abilities: what each model can represent, if that was asked.
     """
 
     psfs: tuple[Psf, ...]
@@ -49,6 +103,9 @@ class Comparison(Result):
     sensor_distance: Tensor
     wavelength: Tensor
     models: tuple[str, ...]
+    abilities: Abilities | None = None
+
+    FIGURE = "plot.psf.model_grid"
 
     @property
     def sigma(self) -> Tensor:
@@ -84,35 +141,70 @@ class Comparison(Result):
     def words(self) -> dict:
         return {"model": self.models}
 
+    @property
+    def sensor(self) -> str:
+        """Where the one sensor stands, and for what light, in words."""
+        return f"one sensor at {float(self.sensor_distance):.7f} mm, {float(self.wavelength):g} µm"
 
-@value
-class Abilities(Result):
-    """What each model can represent: one number (M,) for each model and question, of the object in focus.
+    def document(self) -> dict:
+        """Every model by its name: what it can represent, its differences and its kernels."""
+        models = {
+            name: {
+                **({} if self.abilities is None else self.abilities.of(m)),
+                "difference": numbers(self.difference[m]),
+                "results": self.psfs[m].document()["results"],
+            }
+            for m, name in enumerate(self.models)
+        }
+        place = {"sensor_distance": number(self.sensor_distance), "wavelength": number(self.wavelength)}
+        return {**place, "models": models}
 
-    conic: relative L1 change of the kernel when the conic of the most curved surface grows by 0.2 (aberrations).
-    anisotropy: longer over shorter σ of the largest field, before pixels and window (of "wave": of its rays);
-        asymmetry: relative L1 difference of that field's kernel from itself turned by 180° about the centroid of the
-        light (off axis).
-    dark_ring: radius of the first minimum at F/16 in radii of the Airy disc, nan where there is none (diffraction).
-    parameters: how many curvatures, conics and thicknesses move the kernel: have a derivative other than 0.
-    rays: traced for one kernel on the axis.
+    def __str__(self) -> str:
+        pixels = self.psfs[-1].grid
+        size = f"{pixels.columns} × {pixels.rows} pixels of {1000 * float(pixels.pitch):g} µm"
+        distances = " ".join(f"{f'{distance / 1000:g} m':>24}" for distance in self.object_distances.tolist())
+        said = [
+            f"{self.sensor}; on the axis, {size}",
+            f"σ in µm (Fourier, wave: of the light inside the window), relative L1 difference from {self.models[-1]}, "
+            "estimated error of the kernel (Gaussian DRT: of σ)",
+            f"{'object at':>14} {distances}",
+        ]
+        columns = (values.tolist() for values in (self.sigma, self.difference, self.error))
+        for name, *row in zip(self.models, *columns, strict=True):
+            cells = (f"{1000 * s:>8.3f} {d:>6.3f} {e:>8.1e}" for s, d, e in zip(*row, strict=True))
+            said.append(f"{name:>14} " + " ".join(cells))
+        return "\n".join([*said, *([] if self.abilities is None else [str(self.abilities)])])
+
+
+def compare(
+    lens: Lens,
+    *,
+    object_distances: Tensor | Sequence[float] = DISTANCES,
+    focus_distance: float = 25e3,
+    wavelengths: Sequence[float] = (0.53,),
+    start: str = "paraxial",
+    pixel: float = PIXEL,
+    size: int = SIZE,
+) -> Comparison:
+    """The PSF models side by side on the axis over object distances (D,) mm, and what each of them can represent.
+
+    focus_distance, start: of the one sensor, see `common_focus`; wavelengths: µm, of which the first is taken; pixel:
+    mm, size: of the window. Raises NoImage for a distance of which the lens forms no real image.
     """
-
-    conic: Tensor
-    anisotropy: Tensor
-    asymmetry: Tensor
-    dark_ring: Tensor
-    parameters: Tensor
-    rays: Tensor
-    models: tuple[str, ...]
-
-    def columns(self) -> dict[str, Tensor]:
-        names = [field.name for field in dataclasses.fields(self) if field.name != "models"]
-        model = torch.arange(len(self.models), device=self.conic.device)
-        return {"model": model, **{name: getattr(self, name) for name in names}}
-
-    def words(self) -> dict:
-        return {"model": self.models}
+    distances = torch.as_tensor(object_distances, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
+    try:
+        lens = common_focus(lens, focus_distance, wavelength=wavelengths[0], start=start)
+        real_image_distance(lens, distances)
+    except NoImage as error:
+        length = float(first_order(lens).effective_focal_length)
+        raise NoImage(
+            f"{error}; its focal length is {length:.6g} mm, give --focus-distance and --object-distance beyond, or inf"
+        ) from error
+    pixels = grid(lens.wavelengths.new_tensor(pixel), size)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotConverged)  # the estimated errors are part of the result
+        found = side_by_side(lens, distances, pixels=pixels)
+        return dataclasses.replace(found, abilities=abilities(lens, pixels=pixels))
 
 
 def common_focus(lens: Lens, focus_distance: float, *, wavelength: float | Tensor, start: str = "paraxial") -> Lens:
@@ -126,18 +218,17 @@ def common_focus(lens: Lens, focus_distance: float, *, wavelength: float | Tenso
     return focused(with_wavelengths(lens, [float(wavelength)]), focus_distance, on=start)
 
 
-def compare(lens: Lens, object_distances: Tensor, *, pixels: Grid | None = None) -> Comparison:
+def side_by_side(lens: Lens, object_distances: Tensor, *, pixels: Grid | None = None) -> Comparison:
     """Kernels of every model on the axis for objects at distances (D,) mm, sensor as it is.
 
     pixels: about the axis, by default 21 × 21 of 5 µm.
     """
-    given = _given(lens, pixels)
     return Comparison(
-        psfs=tuple(_psf(lens, work, object_distances, grid=given) for work in ROWS.values()),
+        psfs=tuple(_psf(lens, m, object_distances=object_distances, grid=pixels, **m.compared) for m in _ROWS),
         object_distances=object_distances,
         sensor_distance=lens.surfaces[-2].thickness,
         wavelength=lens.wavelengths[lens.primary_wavelength],
-        models=tuple(ROWS),
+        models=tuple(model.title for model in _ROWS),
     )
 
 
@@ -146,35 +237,28 @@ def abilities(lens: Lens, *, pixels: Grid | None = None) -> Abilities:
 
     pixels: about the axis, by default 21 × 21 of 5 µm.
     """
-    changed, upright, given = _with_conic(lens), _largest_field(lens), _given(lens, pixels)
-    rows = []
-    for name, work in _CONVERGED.items():
-        focused = _psf(lens, work, grid=given)
-        about = _about_light(lens, upright, given, ideal=name in _IDEAL)
-        away = _psf(lens, work, fields=upright, grid=about)
+    changed, upright, rows = _with_conic(lens), _largest_field(lens), []
+    for model in _ROWS:
+        work = {"tol": _TOLERANCE} if "rays" in model.compared else model.compared
+        focused = _psf(lens, model, grid=pixels, **work)
+        away = _psf(lens, model, fields=upright, grid=_about_light(lens, upright, focused.grid, model), **work)
         rows.append(
             {
-                "conic": _relative(_psf(changed, work, grid=given).kernel, focused.kernel),
+                "conic": _relative(_psf(changed, model, grid=pixels, **work).kernel, focused.kernel),
                 "anisotropy": _anisotropy(away.ray_covariance[:, 0, 0]),
                 "asymmetry": _relative(away.kernel.flip(-2, -1), away.kernel),
-                "dark_ring": _dark_ring(lens, work),
-                "parameters": _parameters(lens, work),
-                "rays": ROWS[name].get("rays", focused.rays),
+                "dark_ring": _dark_ring(lens, model, work),
+                "parameters": _parameters(lens, model, work),
+                "rays": model.compared.get("rays", focused.rays),
             }
         )
-    like = lens.wavelengths
-    table = {key: like.new_tensor([float(row[key]) for row in rows]) for key in rows[0]}
-    return Abilities(**table, models=tuple(ROWS))
+    table = {key: lens.wavelengths.new_tensor([float(row[key]) for row in rows]) for key in _SHOWN}
+    return Abilities(**table, models=tuple(model.title for model in _ROWS))
 
 
-def _given(lens: Lens, pixels: Grid | None) -> Grid:
-    return grid(lens.wavelengths.new_tensor(PIXEL), SIZE) if pixels is None else pixels
-
-
-def _psf(lens: Lens, work: dict, object_distances: Tensor | None = None, **others) -> Psf:
+def _psf(lens: Lens, model: Model, **options) -> Psf:
     """Kernels as `psf` gives them; on the axis and at the lens's own object distance unless told otherwise."""
-    distances = lens.surfaces[0].thickness.reshape(1) if object_distances is None else object_distances
-    return psf(lens, object_distances=distances, **work, **{"fields": lens.wavelengths.new_zeros(2, 1), **others})
+    return psf(lens, model.name, **{"fields": lens.wavelengths.new_zeros(2, 1), **options})
 
 
 def _relative(one: Tensor, other: Tensor) -> Tensor:
@@ -193,9 +277,10 @@ def _largest_field(lens: Lens) -> Tensor:
     return torch.stack([torch.zeros_like(size), size])[:, None]
 
 
-def _about_light(lens: Lens, fields: Tensor, pixels: Grid, *, ideal: bool) -> Grid:
-    """The pixels about the centroid of the light of a field (2, 1)."""
-    found = _psf(lens, ROWS["paraxial" if ideal else "Gaussian DRT"], fields=fields, grid=pixels)
+def _about_light(lens: Lens, fields: Tensor, pixels: Grid, model: Model) -> Grid:
+    """The pixels about the centroid of the light of a field (2, 1), as the least model that traces, or not, has it."""
+    least = next(other for other in MODELS.values() if other.traces == model.traces)
+    found = _psf(lens, least, fields=fields, grid=pixels, **least.compared)
     return dataclasses.replace(found.grid, centre=found.centroid[:, 0, 0].detach())
 
 
@@ -211,18 +296,17 @@ def _most_curved(lens: Lens) -> int:
 
 
 def _with_conic(lens: Lens) -> Lens:
-    surfaces, k = list(lens.surfaces), _most_curved(lens)
-    conic = torch.zeros_like(surfaces[k].thickness) if surfaces[k].conic is None else surfaces[k].conic
-    surfaces[k] = dataclasses.replace(surfaces[k], conic=conic + _CONIC)
-    return dataclasses.replace(lens, surfaces=tuple(surfaces))
+    k = _most_curved(lens)
+    conic = lens.surfaces[k].conic
+    return lens.replace(k, conic=_CONIC if conic is None else conic + _CONIC)
 
 
-def _dark_ring(lens: Lens, work: dict) -> float:
+def _dark_ring(lens: Lens, model: Model, work: dict) -> float:
     """First minimum along x of the kernel of the slowed lens, below a twentieth of the peak; nan without one."""
     slow = torch.clamp(first_order(lens).f_number, min=_SLOW)
     slowed = dataclasses.replace(lens, aperture=SystemAperture("image_f_number", slow))
     airy = 1.2197e-3 * lens.wavelengths[0] * first_order(slowed).working_f_number
-    line = _psf(slowed, work, grid=grid(airy / _AIRY_PIXELS, (1, 4 * _AIRY_PIXELS + 1)))
+    line = _psf(slowed, model, grid=grid(airy / _AIRY_PIXELS, (1, 4 * _AIRY_PIXELS + 1)), **work)
     line = line.kernel[0, 0, 0, 2 * _AIRY_PIXELS :].tolist()
     for i in range(1, len(line) - 1):
         a, b, c = line[i - 1 : i + 2]
@@ -232,7 +316,7 @@ def _dark_ring(lens: Lens, work: dict) -> float:
     return math.nan
 
 
-def _parameters(lens: Lens, work: dict) -> int:
+def _parameters(lens: Lens, model: Model, work: dict) -> int:
     """How many numbers of the lens move the kernel on a sensor 8 λN² behind its own, where no model has a point."""
     surfaces, numbers = list(lens.surfaces), []
     for k, surface in enumerate(surfaces[:-1]):
@@ -248,6 +332,6 @@ def _parameters(lens: Lens, work: dict) -> int:
     blur = 1e-3 * lens.wavelengths[0] * number
     lens = with_sensor_distance(lens, surfaces[-2].thickness + 8 * blur * number)
     work = {**work, "tol": 0.05} if "tol" in work else work
-    found = _psf(lens, work, grid=grid(2 * blur, 5))
+    found = _psf(lens, model, grid=grid(2 * blur, 5), **work)
     gradients = torch.autograd.grad(found.kernel.square().sum(), numbers, allow_unused=True)
     return sum(gradient is not None and math.isfinite(gradient) and float(gradient) != 0 for gradient in gradients)

@@ -17,10 +17,11 @@ from torch.autograd import forward_ad
 from raytrace.bench.measure import clock
 from raytrace.kernels import MODELS, fourier, paraxial, rays
 from raytrace.kernels.pixels import gaussian_pixels
+from raytrace.kernels.result import Kernels
 from raytrace.maths import pupil
 from raytrace.maths.grid import Grid, grid
 from raytrace.maths.numerics import safe_divide
-from raytrace.optics.scene import Kernels, Scene, scene, trace_scene
+from raytrace.optics.scene import Scene, scene, trace_scene
 from raytrace.system.lens import Lens, with_sensor_distance
 
 FIELDS = (0.0, 9.8, 14.0)  # degrees: the axis, 0.7 and all of the double Gauss's field

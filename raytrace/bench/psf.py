@@ -21,10 +21,11 @@ from raytrace.bench.psf_cases import DIRECT, RANDOM, Case, Method, doors, method
 from raytrace.kernels import MODELS, NotConverged, Psf, diffraction, paraxial, raymap
 from raytrace.kernels.dft import nodes_per_pixel, rings_and_arms
 from raytrace.kernels.pixels import gaussian_pixels
+from raytrace.kernels.result import Kernels
 from raytrace.maths.grid import Grid
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to
-from raytrace.optics.scene import Kernels, Scene
+from raytrace.optics.scene import Scene
 from raytrace.optics.wavefront import wavefront_of
 from raytrace.system.lens import Lens
 

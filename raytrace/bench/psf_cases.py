@@ -10,10 +10,11 @@ from torch import Tensor
 
 from raytrace.kernels import MODELS, Psf, paraxial, psf, rays
 from raytrace.kernels.gaussian import kernels as gaussian_kernels
+from raytrace.kernels.result import Kernels
 from raytrace.maths import pupil
 from raytrace.maths.grid import Grid, grid
 from raytrace.optics.paraxial import first_order
-from raytrace.optics.scene import Kernels, Scene, scene
+from raytrace.optics.scene import Scene, scene
 from raytrace.system.lens import Lens, with_object_distance
 
 PIXELS = 21  # across every window

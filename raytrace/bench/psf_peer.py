@@ -25,9 +25,10 @@ from optiland.psf.huygens_fresnel import ScalarHuygensPSF
 from raytrace.bench.peer import Optiland
 from raytrace.bench.psf import Truth
 from raytrace.bench.psf_cases import Case, Method
+from raytrace.kernels.result import Kernels
 from raytrace.maths.grid import Grid
 from raytrace.optics.paraxial import first_order
-from raytrace.optics.scene import Kernels, Scene
+from raytrace.optics.scene import Scene
 from raytrace.system.lens import with_object_distance
 
 _RANDOM = (10_000, 100_000, 1_000_000)

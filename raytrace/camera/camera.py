@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from raytrace.camera.image import blur
 from raytrace.camera.noise import add_noise
 from raytrace.camera.variables import Variables
-from raytrace.kernels import NotConverged, psf
+from raytrace.kernels import MODELS, NotConverged, psf
 from raytrace.maths.grid import Grid, grid
 from raytrace.optics.reuse import Memo
 from raytrace.optics.scene import scene, trace_scene
@@ -95,7 +95,7 @@ class Camera(nn.Module):
     def _psf(self, distances: Tensor, fields: Tensor, **work):
         # These know of a field only where its image lies: about their own chief ray it is the image on the axis, while
         # the traced chief ray is as far from it as the lens distorts.
-        fields = torch.zeros_like(fields) if self.model in ("paraxial", "fourier") else fields
+        fields = fields if MODELS[self.model].traces else torch.zeros_like(fields)
         lens, distances = self.variables(), distances.to(self.fields.dtype)
         return psf(
             lens,

@@ -2,11 +2,26 @@
 
 import argparse
 import difflib
-from collections.abc import Iterable
+import importlib
+from collections.abc import Iterable, Iterator
 from pathlib import PurePath
 
 SAMPLINGS = ("gauss", "hexapolar", "square", "sobol", "random")
 PICTURES = (".png", ".pdf", ".svg")
+
+
+class Names:
+    """The names of a table of the library, as `choices` of an option; it is imported when one is given."""
+
+    def __init__(self, module: str, table: str, *others: str):
+        self._place, self._others = (module, table), others
+
+    def __iter__(self) -> Iterator[str]:
+        module, table = self._place
+        return iter((*self._others, *getattr(importlib.import_module(f"raytrace.{module}"), table)))
+
+    def __contains__(self, name: str) -> bool:
+        return name in tuple(self)
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
@@ -253,6 +268,13 @@ def ray_aiming(parser: argparse.ArgumentParser) -> None:
 
 def plot(parser: argparse.ArgumentParser, what: str) -> None:
     parser.add_argument("--plot", metavar="FILE", type=picture_file, help=f"save {what} as .png, .pdf or .svg")
+
+
+def log(parser: argparse.ArgumentParser) -> None:
+    """--log of the figure."""
+    parser.add_argument(
+        "--log", dest="plot_log", action="store_true", help="draw brightness on a logarithmic scale of four decades"
+    )
 
 
 def output(parser: argparse.ArgumentParser, what: str) -> None:

@@ -4,6 +4,7 @@ import argparse
 import inspect
 import math
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -12,6 +13,7 @@ import raytrace
 from raytrace.cli.door import CommandError, open_lens, print_json, say
 from raytrace.cli.progress import progress
 from raytrace.maths.result import Result
+from raytrace.shards import processes, share
 
 #: Options that are for the runner: they set the lens, or say where the result goes. A verb that has one gets it too.
 _RUNNERS = (
@@ -25,8 +27,14 @@ _DRAWING = "plot_"  # options of the figure begin with it: --log, dest="plot_log
 def carry_out(command: ModuleType, arguments: argparse.Namespace) -> None:
     """Run a command; its verb gets every option as the keyword of the same name.
 
-    Several object distances go to the verb where it takes `object_distances`, else one result follows the other.
+    Several object distances go to the verb where it takes `object_distances`, else one result follows the other. Under
+    torchrun processes share the work of a verb that takes a `share`, and the first one tells what was found.
     """
+    with processes() if takes(command, "share") else nullcontext():
+        _carry_out(command, arguments)
+
+
+def _carry_out(command: ModuleType, arguments: argparse.Namespace) -> None:
     run = getattr(command, "run", None) or partial(verb_of_lens, command)
     distances = getattr(arguments, "object_distances", None)
     if not distances or takes(command, "object_distances"):
@@ -67,6 +75,8 @@ def options_of(command: ModuleType, arguments: argparse.Namespace) -> dict:
     }
     if takes(command, "progress"):
         wanted["progress"] = partial(progress, what=arguments.command)
+    if takes(command, "share"):
+        wanted["share"] = share()
     return wanted
 
 
@@ -81,7 +91,7 @@ def verb_of_lens(command: ModuleType, arguments: argparse.Namespace) -> Result:
 
 def present(found: Result | None, arguments: argparse.Namespace) -> None:
     """Save a result where --plot and -o ask for it, then print it, as text or as JSON."""
-    if found is None:
+    if found is None or share().rank:
         return
     save(found, arguments)
     if getattr(arguments, "json", False):

@@ -7,13 +7,14 @@ import torch
 from torch import Tensor
 
 from raytrace.kernels.compute import psf
-from raytrace.kernels.ladder import NotConverged, Psf
+from raytrace.kernels.ladder import NotConverged
+from raytrace.kernels.models import MODELS
+from raytrace.kernels.result import EmptyPsf, Psf, mixture
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_sqrt
 from raytrace.maths.value import value
 from raytrace.optics.paraxial import first_order
-from raytrace.optics.scene import EmptyPsf
-from raytrace.system.lens import Lens, with_object_distance
+from raytrace.system.lens import with_object_distance
 
 _SIGMAS = 3.0  # of the rays, and Airy radii, that half a window holds: a uniform disc reaches 2 σ, a caustic 3
 _RADII = 3.0
@@ -37,25 +38,25 @@ class CloseUp:
 
 
 @torch.no_grad()
-def close_up(lens: Lens, found: Psf, *, fields: Tensor, object_distances: Tensor, **options) -> CloseUp:
-    """The light that the kernels `found` of these fields (2, F) and distances (D,) mm are made of.
+def close_up(found: Psf) -> CloseUp:
+    """The light that kernels are made of.
 
     Windows stand about the centroid of the rays and hold three of their σ, with diffraction three Airy radii more, but
     no less than a pixel where the light is a point. All have one size, but where kernels differ by more than four
     times in width each has its own. Where waves would need too many samples for that, windows are smaller, down to
-    the pixels of `found`. options: rho and zernike, if `psf` was given them.
+    the pixels of `found`.
     """
-    half, centre = windows(lens, found, object_distances)
-    half = _affordable(lens, found, half, object_distances)
-    work = {"rays": _RAYS} if found.model == "drt" else {"order": found.order}
-    work |= {"wavelengths": found.wavelengths, "wavelength_weights": found.wavelength_weights}
-    work |= {"per_wavelength": not found.wavelengths_summed, **options}
+    half, centre = _windows(found)
+    half = _affordable(found, half)
+    work = {"rays": _RAYS} if MODELS[found.model].plain is not None else {"order": found.order}
+    work |= {"wavelengths": found.wavelengths, "wavelength_weights": found.wavelength_weights, **found.options}
+    work |= {"per_wavelength": not found.wavelengths_summed, "center": "axis"}
 
     def light(distances: slice, chosen: slice) -> Tensor:
         grid = Grid(2 * half[distances, chosen].max() / _SAMPLES, _SAMPLES, _SAMPLES, centre[:, distances, chosen])
-        where = {"fields": fields[:, chosen], "object_distances": object_distances[distances], "center": "axis"}
+        where = {"fields": found.fields[:, chosen], "object_distances": found.object_distances[distances]}
         try:
-            return psf(lens, found.model, grid=grid, **where, **work).kernel
+            return psf(found.lens, found.model, grid=grid, **where, **work).kernel
         except EmptyPsf:  # no light: nothing to see
             return found.kernel.new_zeros(*found.energy[distances, chosen].shape, _SAMPLES, _SAMPLES)
 
@@ -70,17 +71,19 @@ def close_up(lens: Lens, found: Psf, *, fields: Tensor, object_distances: Tensor
         return CloseUp(of_all(), half, centre)
 
 
-def windows(lens: Lens, found: Psf, object_distances: Tensor) -> tuple[Tensor, Tensor]:
+def _f_number(found: Psf) -> Tensor:
+    """Working F-number (D, 1)."""
+    return first_order(with_object_distance(found.lens, found.object_distances[:, None])).working_f_number.abs()
+
+
+def _windows(found: Psf) -> tuple[Tensor, Tensor]:
     """Half widths (D, F) mm and centres (2, D, F) mm of windows that the kernels fill."""
     centroid, covariance = (moment.nan_to_num(0.0) for moment in (found.ray_centroid, found.ray_covariance))
     if not found.wavelengths_summed:
-        shares = found.wavelength_weights
-        apart = centroid - (shares * centroid).sum(-1, keepdim=True)
-        centroid = (shares * centroid).sum(-1)
-        covariance = (shares * (covariance + apart[[0, 0, 1]] * apart[[0, 1, 1]])).sum(-1)
+        centroid, covariance = mixture(found.wavelength_weights.expand(found.energy.shape), centroid, covariance)
     half = _SIGMAS * safe_sqrt(torch.maximum(covariance[0], covariance[2]))
-    if found.model in ("fourier", "wave"):
-        number = first_order(with_object_distance(lens, object_distances[:, None])).working_f_number.abs()
+    if found.waves:
+        number = _f_number(found)
         airy = 1.22e-3 * found.wavelengths.max() * torch.where(torch.isfinite(number), number, 0.0)
         half = half + _RADII * airy
     half = torch.where(half > 1e-9, half, found.grid.pitch)
@@ -88,16 +91,16 @@ def windows(lens: Lens, found: Psf, object_distances: Tensor) -> tuple[Tensor, T
     return (half.max().expand_as(half) if alike else half), centroid
 
 
-def _affordable(lens: Lens, found: Psf, half: Tensor, object_distances: Tensor) -> Tensor:
+def _affordable(found: Psf, half: Tensor) -> Tensor:
     """The half widths, or smaller ones where waves would take more than `_WORK`; not below those of the pixels.
 
     The pupil points of a kernel grow with the square of blur and window (`phase_along_radius`), the nodes of the sensor
     with the square of the window over the finest fringes of the light.
     """
     least = 0.5 * found.grid.pitch * max(found.grid.shape)
-    if found.model not in ("fourier", "wave"):
+    if not found.waves:
         return half
-    number = first_order(with_object_distance(lens, object_distances[:, None])).working_f_number.abs()
+    number = _f_number(found)
     cutoff = 1e3 / (found.wavelengths.min() * torch.where(torch.isfinite(number), number, 1.0))
     blur = 2 * safe_sqrt(torch.maximum(found.ray_covariance[0], found.ray_covariance[2]).nan_to_num(0.0))
     blur = blur if found.wavelengths_summed else blur.amax(-1)

@@ -1,43 +1,44 @@
 """One call for every PSF model, driven by a tolerance instead of a number of rays."""
 
+import contextlib
 import dataclasses
+import functools
+import math
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
-from torch.utils import _pytree as pytree
 
+from raytrace.budget import within
 from raytrace.kernels import gaussian
-from raytrace.kernels.ladder import (
-    MODELS,
-    Psf,
-    by_order,
-    by_rays,
-    by_tolerance,
-    climb,
-    polychromatic,
-    with_options,
-    with_shares,
-    without_dark,
-)
+from raytrace.kernels.ladder import between, by_order, by_rays, by_tolerance, climb
+from raytrace.kernels.models import MODELS, RUNGS, Model
+from raytrace.kernels.result import EmptyPsf, Psf, combined, polychromatic, without_dark
+from raytrace.kernels.sharing import check_shares, shared_model
+from raytrace.kernels.streaming import stream_kernels
 from raytrace.maths.grid import Grid
 from raytrace.maths.grid import grid as make_grid
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
-from raytrace.optics.losses import beam_hint, losses
+from raytrace.optics.losses import beam_hint, losses, warn_of_losses
 from raytrace.optics.reuse import Memo
-from raytrace.optics.scene import EmptyPsf, Scene, scene, trace_scene
+from raytrace.optics.scene import Scene, scene, trace_scene
 from raytrace.shards import Share
-from raytrace.system.lens import Lens, with_object_distance
+from raytrace.system.lens import Lens, field_points, with_object_distance
+
+PIXEL, SIZE = 0.005, 21  # mm; a window of 105 µm
 
 
 def psf(
     lens: Lens,
     model: str = "auto",
     *,
-    fields: Tensor | None = None,
-    object_distances: Tensor | None = None,
-    wavelengths: Tensor | None = None,
-    wavelength_weights: Tensor | None = None,
+    fields: Tensor | Sequence | None = None,
+    object_distances: Tensor | Sequence[float] | None = None,
+    wavelengths: Tensor | Sequence[float] | None = None,
+    wavelength_weights: Tensor | Sequence[float] | None = None,
+    pixel: float | None = None,
+    size: int | tuple[int, int] | None = None,
     grid: Grid | None = None,
     center: str | None = None,
     tol: float | None = None,
@@ -49,17 +50,21 @@ def psf(
     zernike: Tensor | None = None,
     memo: Memo | None = None,
     share: Share | None = None,
+    max_bytes: float | None = None,
+    progress: Callable | None = None,
     empty: str = "nan",
 ) -> Psf:
     """PSFs of a lens, differentiable in every number of the lens, its sensor distance and the grid.
 
-    model: a key of MODELS, or "auto".
-    fields: (2, F) in the lens's kind of field, its own by default; object_distances: (D,) mm, inf allowed, the lens's
-    by default; wavelengths: (W,) µm with wavelength_weights: (W,), the lens's own by default. Kernels are summed over
-    the wavelengths; per_wavelength: each has a kernel instead, (D, F, W, rows, columns) of energy 1 for all its light.
-    grid: pixels, by default 21 × 21 of 5 µm, its centre (2,) or (2, D, F); center: what the grid's centre counts from:
-    "axis", "chief" (the chief ray at the primary wavelength) or "centroid" (of the rays). By default "axis" for fields
-    that are given and "chief" for the lens's own.
+    model: a name of MODELS, or "auto".
+    fields: y, pairs (x, y) or (2, F) in the lens's kind of field, its own by default; object_distances: (D,) mm, inf
+    allowed, the lens's by default; wavelengths: (W,) µm with wavelength_weights: (W,), the lens's own by default.
+    Kernels are summed over the wavelengths; per_wavelength: each has a kernel instead, (D, F, W, rows, columns) of
+    energy 1 for all its light.
+    pixel, size: pitch in mm, 0.005 by default, and number, one or (rows, columns), 21 by default; grid: instead, pixels
+    whose centre is (2,) or (2, D, F); center: what the grid's centre counts from: "axis", "chief" (the chief ray at the
+    primary wavelength) or "centroid" (of the rays). By default "axis" for fields that are given, and "chief" for the
+    lens's own, which may lie far from it.
     tol: bound on the estimated error, 0.01 by default; the coarsest order that meets it is returned. rays: instead,
     about that many rays per kernel (`drt`: plain Sobol rays), the error then estimated from half of them.
     order: instead, an order of the model's ladder, as `Psf.order` of an earlier call tells it: for loops, it estimates
@@ -69,49 +74,91 @@ def psf(
     memo: rays of earlier calls, which are not traced again where nothing before them has changed.
     share: of this process (`shards.share()`), if all processes call psf alike to compute the kernels together; each
     gets all of them, equal to those of one process to rounding, without gradient.
+    max_bytes: memory that may be taken. Plain rays are then traced in pieces, any number of them, without gradient;
+    progress: (how many, unit) -> a bar of them, see `cli.progress`.
     empty: what a PSF of a batch is that no ray reaches: "nan", its kernel 0 and its moments nan, all with gradient 0,
     or "error". Raises ValueError for arguments that make no sense, EmptyPsf if no ray at all reaches the sensor. Warns
     NotConverged.
     """
-    center = default_center(fields) if center is None else center
-    _check(model, center, normalise, tol=tol, rays=rays, order=order)
-    fields = torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields
-    distances = lens.surfaces[0].thickness.reshape(1) if object_distances is None else object_distances
-    weights = lens.wavelength_weights if wavelengths is None else None
-    weights = wavelength_weights if wavelength_weights is not None else weights
-    wavelengths = lens.wavelengths if wavelengths is None else wavelengths
-    weights = torch.ones_like(wavelengths) if weights is None else weights
+    center = center or ("chief" if fields is None else "axis")
+    _check(model, center, normalise, tol=tol, rays=rays, order=order, grid=grid, pixel=pixel, size=size)
+    like = lens.wavelengths
+    framed = (grid, pixel, size) != (None, None, None)
+    base = make_grid(like.new_tensor(pixel or PIXEL), size or SIZE) if grid is None else grid
+    fields = fields if isinstance(fields, Tensor) else field_points(fields, like=lens)
+    distances = lens.surfaces[0].thickness if object_distances is None else object_distances
+    distances = distances.reshape(1) if object_distances is None else _row(distances, like)
+    weights = lens.wavelength_weights if wavelengths is None and wavelength_weights is None else wavelength_weights
+    wavelengths = like if wavelengths is None else _row(wavelengths, like)
+    weights = torch.ones_like(wavelengths) if weights is None else _row(weights, like)
     _check_batch(fields, distances, wavelengths, weights)
-    base = make_grid(wavelengths.new_tensor(0.005), 21) if grid is None else grid
-    models = with_options({"paraxial": {"rho": rho}, "fourier": {"zernike": zernike}})
+    options = {"rho": rho, "zernike": zernike}
+    drive = _driver(model, options, tol, rays, order, share, max_bytes, progress)
     if share is not None and share.processes > 1:
-        _check_shares(lens, rho, zernike)
-        models = with_shares(models, share, kernels=len(distances) * fields.shape[1] * len(wavelengths))
-    drive = {
-        "auto": lambda *scene: climb(*scene, models, tol or 0.01),
-        "order": lambda *scene: by_order(*scene, models, model, order),
-        "rays": lambda *scene: by_rays(*scene, models, model, rays),
-        "tol": lambda *scene: by_tolerance(*scene, models, model, tol or 0.01),
-    }["auto" if model == "auto" else "order" if order is not None else "rays" if rays is not None else "tol"]
+        check_shares(lens, (rho, zernike))
     shares = weights / weights.sum()
     kept = None if per_wavelength else shares
 
     def compute(chosen: Tensor) -> Psf:
         centre = base.centre[:, chosen] if base.centre.dim() > 1 else base.centre
-        own = dataclasses.replace(base, centre=centre)
-        return drive(*_group(lens, fields, distances[chosen], wavelengths, shares, own, center, memo), kept)
+        batch = scene(lens, fields, distances[chosen], wavelengths, memo)
+        centre = _with_centre(centre, _centre(batch, lens, center, shares), len(wavelengths))
+        return drive(batch, dataclasses.replace(base, centre=centre), kept)
 
     infinite = torch.isinf(distances)
-    if bool(infinite.any()) and not bool(infinite.all()):
-        found = _merge(compute(~infinite), compute(infinite), infinite)
-    else:
-        found = compute(torch.ones_like(infinite))
+    with within(max_bytes) if max_bytes is not None else contextlib.nullcontext():
+        if bool(infinite.any()) and not bool(infinite.all()):
+            found = _merged(compute(~infinite), compute(infinite), infinite)
+        else:
+            found = compute(torch.ones_like(infinite))
     # Only traced light can be lost; light beside the window is not.
     if found.rays and not bool((found.energy > 0).any()) and not bool((found.ray_covariance != 0).any()):
         raise EmptyPsf(f"no ray reaches the sensor: {_lost(lens, fields, distances, wavelengths)}")
     if normalise == "window":
         found = dataclasses.replace(found, kernel=_of_its_window(found.kernel), normalised="window")
-    return dataclasses.replace(without_dark(found, empty), wavelengths=wavelengths, wavelength_weights=shares)
+    found = without_dark(found, empty)
+    _warn_of_dark(lens, fields, distances, wavelengths, found)
+    return dataclasses.replace(
+        found,
+        lens=lens,
+        fields=fields,
+        object_distances=distances,
+        wavelengths=wavelengths,
+        wavelength_weights=shares,
+        options=options,
+        framed=framed,
+    )
+
+
+def _driver(model, options: Mapping, tol, rays, order, share: Share | None, max_bytes, progress):
+    """What computes a Psf of (scene, grid, weights), as the arguments of `psf` say."""
+    streams = rays is not None and max_bytes is not None and MODELS[model].plain is not None
+
+    def own(name: str) -> Model:
+        row = MODELS[name]
+        if row.options:
+            given = {option: options[option] for option in row.options}
+            row = dataclasses.replace(row, kernels=functools.partial(row.kernels, **given))
+        return shared_model(row, share) if share is not None and share.processes > 1 else row
+
+    def stream(batch: Scene, pixels: Grid, weights: Tensor | None) -> Psf:
+        with progress(rays * math.prod(batch.shape), "ray") if progress else contextlib.nullcontext() as bar:
+            found = stream_kernels(batch, pixels, rays, max_bytes=max_bytes, progress=bar and bar.update)
+        return between(*found, weights, MODELS[model])
+
+    if model == "auto":
+        return functools.partial(climb, rungs=[own(name) for name in RUNGS], tol=tol or 0.01)
+    if streams:
+        return stream
+    if order is not None:
+        return functools.partial(by_order, model=own(model), order=order)
+    if rays is not None:
+        return functools.partial(by_rays, model=own(model), count=rays)
+    return functools.partial(by_tolerance, model=own(model), tol=tol or 0.01)
+
+
+def _row(numbers: Tensor | Sequence[float], like: Tensor) -> Tensor:
+    return numbers if isinstance(numbers, Tensor) else like.new_tensor(numbers)
 
 
 def _lost(lens: Lens, fields: Tensor, distances: Tensor, wavelengths: Tensor) -> str:
@@ -122,11 +169,17 @@ def _lost(lens: Lens, fields: Tensor, distances: Tensor, wavelengths: Tensor) ->
     return "; ".join(filter(None, (found.words(0, 0), beam_hint(lens))))
 
 
-def default_center(fields: Tensor | None) -> str:
-    """What windows are centred on by default: the axis for fields that are given, and else, of the lens's own fields,
-    which may lie far from it, the chief ray.
-    """
-    return "chief" if fields is None else "axis"
+def _warn_of_dark(lens: Lens, fields: Tensor, distances: Tensor, wavelengths: Tensor, found: Psf) -> None:
+    """Warn LostRays of every field that no ray of a wavelength brings to the sensor, and where they end."""
+    dark = found.ray_centroid[0].detach().isnan()
+    if not bool(dark.any()):
+        return
+    dark = dark if dark.dim() > 2 else dark[..., None].expand(*dark.shape, len(wavelengths))
+    points = gauss_rings(6, dtype=fields.dtype, device=fields.device)[0]
+    for distance, lost in zip(distances.detach(), dark, strict=True):
+        at = f"object at {float(distance):g} mm, " if len(distances) > 1 else ""
+        trial = with_object_distance(lens, distance)
+        warn_of_losses(trial, points, lost, fields=fields.detach(), wavelengths=wavelengths.detach(), at=at)
 
 
 def _of_its_window(kernel: Tensor) -> Tensor:
@@ -137,25 +190,32 @@ def _of_its_window(kernel: Tensor) -> Tensor:
     return safe_divide(scaled, scaled.sum((-2, -1), keepdim=True))
 
 
-def _check(model: str, center: str, normalise: str, *, tol: float | None, rays: int | None, order: int | None) -> None:
-    if model != "auto" and model not in MODELS:
-        raise ValueError(f"model {model!r} is not known; expected auto, {', '.join(MODELS)}")
-    if center not in ("axis", "chief", "centroid"):
-        raise ValueError(f"center {center!r} is not known; expected axis, chief or centroid")
-    if normalise not in ("energy", "window"):
-        raise ValueError(f"normalise {normalise!r} is not known; expected energy or window")
-    if tol is not None and rays is not None:
-        raise ValueError("tol and rays exclude each other: a tolerance chooses the number of rays")
-    if order is not None and (tol is not None or rays is not None or model == "auto"):
-        raise ValueError("order belongs to one model and excludes tol and rays: an order says how much work is done")
-    if tol is not None and not tol > 0:
-        raise ValueError(f"tol {tol:g}: expected a number above 0")
-    if rays is not None and rays < 1:
-        raise ValueError(f"rays {rays}: expected a whole number above 0")
-    if rays is not None and model == "auto":
-        raise ValueError("auto chooses by a tolerance: give tol, or rays and a model that traces them")
-    if rays is not None and model in ("paraxial", "fourier"):
-        raise ValueError(f"{model} traces no rays: leave rays out")
+def _check(model: str, center: str, normalise: str, *, tol, rays, order, grid, pixel, size) -> None:
+    known = {"model": (model, ("auto", *MODELS)), "center": (center, ("axis", "chief", "centroid"))}
+    for name, (word, words) in {**known, "normalise": (normalise, ("energy", "window"))}.items():
+        if word not in words:
+            raise ValueError(f"{name} {word!r} is not known; expected {', '.join(words)}")
+    for refused, said in (
+        (
+            tol is not None and rays is not None,
+            "tol and rays exclude each other: a tolerance chooses the number of rays",
+        ),
+        (
+            order is not None and (tol is not None or rays is not None or model == "auto"),
+            "order belongs to one model and excludes tol and rays: an order says how much work is done",
+        ),
+        (tol is not None and not tol > 0, f"tol {tol}: expected a number above 0"),
+        (rays is not None and rays < 1, f"rays {rays}: expected a whole number above 0"),
+        (
+            rays is not None and model == "auto",
+            "auto chooses by a tolerance: give tol, or rays and a model that traces them",
+        ),
+        (rays is not None and model != "auto" and not MODELS[model].traces, f"{model} traces no rays: leave rays out"),
+        (grid is not None and (pixel, size) != (None, None), "grid says pixel and size: leave them out, or the grid"),
+        (pixel is not None and not pixel > 0, f"pixel {pixel}: expected a number above 0"),
+    ):
+        if refused:
+            raise ValueError(said)
 
 
 def _check_batch(fields: Tensor, distances: Tensor, wavelengths: Tensor, weights: Tensor) -> None:
@@ -172,22 +232,6 @@ def _check_batch(fields: Tensor, distances: Tensor, wavelengths: Tensor, weights
         raise ValueError(f"wavelength_weights {weights.tolist()} are below 0 or sum to 0")
 
 
-def _check_shares(*numbers) -> None:
-    """What processes cannot share: derivatives, and options that differ between kernels."""
-    leaves = [leaf for leaf in pytree.tree_leaves(numbers) if isinstance(leaf, Tensor)]
-    if torch.is_grad_enabled() and any(leaf.requires_grad for leaf in leaves):
-        raise ValueError("kernels that processes share have no gradient: leave share out, or use torch.no_grad()")
-    if any(isinstance(option, Tensor) and option.dim() > 1 for option in numbers):
-        raise ValueError("processes share kernels of one rho and one zernike only: leave share out")
-
-
-def _group(lens, fields, distances, wavelengths, weights, base, center, memo) -> tuple[Scene, Grid]:
-    """The scene and the pixels of object distances (D,) that are all finite or all infinite."""
-    batch = scene(lens, fields, distances, wavelengths, memo)
-    place = _centre(batch, lens, center, weights)
-    return batch, dataclasses.replace(base, centre=_with_centre(base.centre, place, len(wavelengths)))
-
-
 def _centre(batch: Scene, lens: Lens, center: str, weights: Tensor) -> Tensor | None:
     """Where the grids stand: None for the axis, else (2, D, F) mm, not differentiated: a sensor does not move."""
     if center == "axis":
@@ -195,7 +239,7 @@ def _centre(batch: Scene, lens: Lens, center: str, weights: Tensor) -> Tensor | 
     with torch.no_grad():
         if center == "centroid":
             pixel = make_grid(batch.wavelengths.new_tensor(1.0), 1)
-            return polychromatic(gaussian.kernels_alone(batch, pixel, order=6), weights, "gaussian").centroid
+            return polychromatic(gaussian.kernels_alone(batch, pixel, order=6), weights, "").centroid
         primary = lens.wavelengths[lens.primary_wavelength][None]
         rays = trace_scene(dataclasses.replace(batch, wavelengths=primary), batch.fields.new_zeros(2, 1))
         return rays.position[:2, :, :, 0, 0]
@@ -210,28 +254,15 @@ def _with_centre(base: Tensor, place: Tensor | None, wavelengths: int) -> Tensor
     return centre[..., None].expand(*centre.shape, wavelengths)
 
 
-def _merge(finite: Psf, infinite: Psf, mask: Tensor) -> Psf:
-    """Put the PSFs of finite and of infinite object distances back in their order."""
+def _merged(finite: Psf, infinite: Psf, mask: Tensor) -> Psf:
+    """The PSFs of finite and of infinite object distances, put back in their order."""
+    order = torch.argsort(torch.cat([torch.nonzero(~mask)[:, 0], torch.nonzero(mask)[:, 0]]))
 
-    def place(one: Tensor, other: Tensor, axis: int) -> Tensor:
-        joined = torch.cat([one, other], axis)
-        order = torch.argsort(torch.cat([torch.nonzero(~mask)[:, 0], torch.nonzero(mask)[:, 0]]))
-        return joined.index_select(axis, order)
+    def in_order(parts: Sequence[Tensor], axis: int) -> Tensor:
+        return torch.cat(parts, axis).index_select(axis, order)
 
-    centre = finite.grid.centre
+    found, centre = combined([finite, infinite], in_order), finite.grid.centre
     if centre.dim() > 1:
-        centre = place(centre, infinite.grid.centre, 1)
-    return dataclasses.replace(
-        finite,
-        kernel=place(finite.kernel, infinite.kernel, 0),
-        grid=dataclasses.replace(finite.grid, centre=centre),
-        energy=place(finite.energy, infinite.energy, 0),
-        error=place(finite.error, infinite.error, 0),
-        centroid=place(finite.centroid, infinite.centroid, 1),
-        covariance=place(finite.covariance, infinite.covariance, 1),
-        ray_centroid=place(finite.ray_centroid, infinite.ray_centroid, 1),
-        ray_covariance=place(finite.ray_covariance, infinite.ray_covariance, 1),
-        residual=None if finite.residual is None else place(finite.residual, infinite.residual, 0),
-        rays=max(finite.rays, infinite.rays),
-        reason="; ".join(dict.fromkeys(filter(None, (finite.reason, infinite.reason)))),
-    )
+        centre = in_order([centre, infinite.grid.centre], 1)
+    reason = "; ".join(dict.fromkeys(filter(None, (finite.reason, infinite.reason))))
+    return dataclasses.replace(found, grid=dataclasses.replace(finite.grid, centre=centre), reason=reason)

@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import itertools
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -31,15 +32,14 @@ from raytrace.kernels.dft import (
     window_moments,
 )
 from raytrace.kernels.radial import is_centred, radii_of_waves, round_moments, second_moments_of_waves, unfold
-from raytrace.kernels.sharing import symmetry
+from raytrace.kernels.result import Kernels, combined
 from raytrace.maths import zernike
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to, value
-from raytrace.optics.scene import Kernels, Scene, trace_scene
+from raytrace.optics.scene import Scene, symmetry, trace_scene
 from raytrace.optics.wavefront import Wavefront, wavefront_of
-from raytrace.shards import everywhere, largest
 
 _MOST_RAYS = 400_000  # rays of one kernel; beyond, the phase is refused
 _DEGREE = 10  # of the map from the pupil to directions
@@ -71,9 +71,7 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0) -> Kernels:
     Raises ValueError where the window or the blur would need too many rays.
     """
     fields = [_field_kernels(one_field(scene, f), one_field_grid(grid, f), order) for f in range(scene.shape[1])]
-    axes = {"kernel": 1, "centroid": 2, "covariance": 2, "residual": 1, "ray_centroid": 2, "ray_covariance": 2}
-    joined = {name: torch.cat([getattr(one, name) for one in fields], axis) for name, axis in axes.items()}
-    found = Kernels(grid=grid, rays=max(one.rays for one in fields), **joined)
+    found = combined(fields, lambda parts, before: torch.cat(parts, before + 1))
     return dataclasses.replace(to(found, dtype=grid.pitch.dtype), grid=grid)
 
 
@@ -88,7 +86,7 @@ def waves(scene: Scene, reach: Tensor | float, *, order: int = 0) -> Waves:
 
 def _waves(scene: Scene, probe: Wavefront, reach: Tensor | float, order: int) -> Waves:
     fold = symmetry(scene)
-    pupil, weights = _rays(scene, probe, fold, phase_along_radius(probe, reach), order)
+    pupil, weights = _rays(scene, probe, fold, phase_along_radius(probe, reach, scene.largest), order)
     front = wavefront_of(scene, pupil, weights)
     solid = math.pi * weights * _jacobian(_direction_map(probe), pupil)
     return Waves(safe_sqrt(front.energy * solid), front, fold)
@@ -120,10 +118,13 @@ def strehl(scene: Scene, *, order: int = 0) -> Tensor:
     return torch.cat(ratios, 1).to(scene.wavelengths.dtype)
 
 
-def phase_along_radius(probe: Wavefront, reach: Tensor | float) -> float:
+def phase_along_radius(
+    probe: Wavefront, reach: Tensor | float, largest: Callable[[Tensor], Tensor] = torch.Tensor.detach
+) -> float:
     """Largest change of phase in radians along a pupil radius, seen from points up to `reach` mm from the centre.
 
     dΦ/dp = (2πn/λ) |∂(L, M)/∂p · (x_ray - x)|: directions times the distance between ray and point.
+    largest: as `Scene` has it.
     """
     with torch.no_grad():
         spread = half_spread(probe)[..., None]
@@ -137,8 +138,8 @@ def _field_kernels(scene: Scene, grid: Grid, order: int) -> Kernels:
     probe = _probe(scene)
     centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))) - probe.centre[:2]
     local = Grid(grid.pitch, grid.rows, grid.columns, centre)
-    cutoff = 2e3 * float(largest((half_spread(probe) * probe.index / probe.wavelength).max()))
-    is_round = symmetry(scene) == "round" and is_centred(grid)
+    cutoff = 2e3 * float(scene.largest((half_spread(probe) * probe.index / probe.wavelength).max()))
+    is_round = symmetry(scene) == "round" and is_centred(grid, scene)
     if is_round:
         # One radius tells all: as a row of points, without pixels.
         radii, matrix = radii_of_waves(grid, cutoff, order)
@@ -148,7 +149,7 @@ def _field_kernels(scene: Scene, grid: Grid, order: int) -> Kernels:
         nodes = nodes_per_pixel(float(grid.pitch.detach()), cutoff, order)
         afford_sensor("the wave PSF", scene, grid, nodes)
         x, y, weight = sub_pixels(local, nodes)
-        corner = largest(torch.hypot(x.detach().abs().amax(-1), y.detach().abs().amax(-1)).max())
+        corner = scene.largest(torch.hypot(x.detach().abs().amax(-1), y.detach().abs().amax(-1)).max())
     light = _waves(scene, probe, corner, order)
     U = amplitude(light, x, y)
     intensity = U.real**2 + U.imag**2
@@ -263,7 +264,7 @@ def _rays(scene: Scene, probe: Wavefront, fold: str, phase: float, order: int) -
         right = points[0] > 0
         points, weights, unit = points[:, right], 2 * weights[right], unit[:, unit[0] > 0]
     with torch.no_grad():
-        if everywhere(probe.valid.all()) and everywhere(trace_scene(scene, _RIM * unit).valid.all()):
+        if scene.everywhere(probe.valid.all()) and scene.everywhere(trace_scene(scene, _RIM * unit).valid.all()):
             return points, weights
     return between(*clear_arms(scene, unit), unit, rings=rings)
 

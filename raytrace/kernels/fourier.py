@@ -33,15 +33,14 @@ from raytrace.kernels.dft import (
 )
 from raytrace.kernels.paraxial import chief_ray_height
 from raytrace.kernels.radial import is_centred, radii_of_waves, reach, round_moments, second_moments_of_waves, unfold
-from raytrace.kernels.sharing import symmetry
+from raytrace.kernels.result import Kernels, moments
 from raytrace.maths import zernike as polynomials
 from raytrace.maths.grid import Grid
 from raytrace.maths.pupil import gauss_rings, with_rim
 from raytrace.maths.value import to, value
 from raytrace.optics.paraxial import first_order, signed
-from raytrace.optics.scene import Kernels, Scene
+from raytrace.optics.scene import Scene, symmetry
 from raytrace.optics.trace import media
-from raytrace.shards import largest
 
 _MOST_POINTS = 400_000  # pupil points of one kernel; beyond, the phase is refused
 
@@ -75,7 +74,7 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0, zernike: Tensor | None 
     _refuse_without_pupil(lens)
     waves = None if zernike is None else _aberrations(scene, zernike.to(torch.float64))
     shift, blur = _moments(lens, waves)
-    if waves is None and symmetry(scene) == "round" and is_centred(window):
+    if waves is None and symmetry(scene) == "round" and is_centred(window, scene):
         kernel, centroid, covariance = _round_kernels(scene, lens, window, order)
     else:
         kernel, centroid, covariance = _kernels(scene, lens, window, waves, order)
@@ -100,7 +99,7 @@ def _kernels(
     """Kernels (D, F, W, rows, columns), one after the other, for each has its own phases; centroid and covariance."""
     shape = lens.defocus.shape
     centre = window.centre.reshape(2, *(window.centre.shape[1:] or (1, 1, 1))) - lens.chief
-    steepest = float(largest(lens.frequency.detach().abs().max()))
+    steepest = float(scene.largest(lens.frequency.detach().abs().max()))
     nodes = nodes_per_pixel(float(window.pitch.detach()), 2 * steepest, order)
     afford_sensor("the Fourier PSF", scene, window, nodes)
     x, y, weight = sub_pixels(Grid(window.pitch, window.rows, window.columns, centre), nodes)
@@ -125,10 +124,10 @@ def _round_kernels(scene: Scene, lens: Paraxial, window: Grid, order: int) -> tu
     """
     shared = bool((lens.frequency == lens.frequency[:1]).all())
     frequency = (lens.frequency[:1] if shared else lens.frequency)[..., None]
-    steepest = float(largest(lens.frequency.detach().abs().max()))
+    steepest = float(scene.largest(lens.frequency.detach().abs().max()))
     radii, matrix = radii_of_waves(window, 2 * steepest, order)
     corner = float(window.pitch.detach()) * reach(window)
-    phase = 2 * math.pi * steepest * corner + 2 * float(largest(lens.defocus.detach().abs().max()))
+    phase = 2 * math.pi * steepest * corner + 2 * float(scene.largest(lens.defocus.detach().abs().max()))
     rings = rings_and_arms(phase, order)[0]
     afford_rings("the Fourier PSF", scene, rings, phase)
     radius, weights = _rings(rings, like=radii)
@@ -199,9 +198,7 @@ def _moments(lens: Paraxial, waves: Tensor | None) -> tuple[Tensor, Tensor]:
         (torch.einsum("j...,jp->...p", waves, g) + (lens.defocus / math.pi)[..., None] * p) / lens.frequency[..., None]
         for g, p in zip(slopes, points, strict=True)
     )
-    mean_x, mean_y = (x @ weights, y @ weights)
-    x, y = x - mean_x[..., None], y - mean_y[..., None]
-    return torch.stack([mean_x, mean_y]), torch.stack([(x * x) @ weights, (x * y) @ weights, (y * y) @ weights])
+    return moments(x, y, weights)
 
 
 def _orders(count: int) -> list[tuple[int, int]]:

@@ -11,14 +11,13 @@ from torch import Tensor
 
 from raytrace.kernels.clear import between, clear_arms, rays_of_search
 from raytrace.kernels.pixels import gaussian_pixels
-from raytrace.kernels.sharing import symmetry, trace_shared
+from raytrace.kernels.result import Kernels
 from raytrace.kernels.splat import histogram
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings, sobol
 from raytrace.maths.value import value
-from raytrace.optics.scene import Kernels, Scene, beam_share
-from raytrace.shards import Share, everywhere
+from raytrace.optics.scene import Scene, beam_share, symmetry, trace_scene
 from raytrace.system.aperture import stands_inside
 
 _MAP_POINTS = 4096  # of the ray map that the residual is computed from
@@ -43,7 +42,7 @@ class Light:
     outer: Tensor | None = None
 
 
-def kernels(scene: Scene, grid: Grid, *, order: int, share: Share | None = None) -> Kernels:
+def kernels(scene: Scene, grid: Grid, *, order: int) -> Kernels:
     """Gaussians with the centroid and covariance of `order` Gauss rings of 4·(order - 1) arms, 8 at least.
 
     Only what the scene's symmetry does not give is traced: `order` rays of one meridian if every field is on the axis
@@ -52,18 +51,18 @@ def kernels(scene: Scene, grid: Grid, *, order: int, share: Share | None = None)
     Where rays are lost, rings follow the clear part of every arm, see `trace_light`.
     The energy is the transmitted fraction of the light through the whole entrance pupil, of which vignetting factors
     leave the share (1 - VCX)(1 - VCY). Where no ray arrives it is 0, and so is every derivative.
-    residual: see `residual`. share: of the rays that this process traces, if others trace the rest.
+    residual: see `residual`.
     """
     fold = symmetry(scene)
-    light = trace_light(scene, order, fold, share=share)
+    light = trace_light(scene, order, fold)
     shape, found = _kernels_of_light(scene, grid, light, fold)
     return dataclasses.replace(found, residual=residual(light, grid, shape, order, fold))
 
 
-def kernels_alone(scene: Scene, grid: Grid, *, order: int, share: Share | None = None) -> Kernels:
+def kernels_alone(scene: Scene, grid: Grid, *, order: int) -> Kernels:
     """The same without their residual, which takes half of the time."""
     fold = symmetry(scene)
-    return _kernels_of_light(scene, grid, trace_light(scene, order, fold, share=share), fold)[1]
+    return _kernels_of_light(scene, grid, trace_light(scene, order, fold), fold)[1]
 
 
 def _kernels_of_light(scene: Scene, grid: Grid, light: Light, fold: str) -> tuple[Tensor, Kernels]:
@@ -74,7 +73,7 @@ def _kernels_of_light(scene: Scene, grid: Grid, light: Light, fold: str) -> tupl
     return shape, Kernels(energy[..., None, None] * shape, grid, centroid, covariance, light.rays)
 
 
-def trace_light(scene: Scene, order: int, fold: str, *, share: Share | None = None) -> Light:
+def trace_light(scene: Scene, order: int, fold: str) -> Light:
     """The rays of an order, of the part of the pupil that stands for all of it.
 
     If all rays arrive, those at the rim too that are added for a lens with apertures, that is all. If some are lost, or
@@ -86,16 +85,22 @@ def trace_light(scene: Scene, order: int, fold: str, *, share: Share | None = No
     if not any(stands_inside(aperture) for aperture in apertures):
         points, weights = fold_pupil(order, fold, scene.wavelengths)
         rim = rim_points(order, fold, scene.wavelengths) if apertures else points[:, :0]
-        hits, valid = trace_shared(scene, torch.cat([points, rim], 1), share)
+        hits, valid = _traced(scene, torch.cat([points, rim], 1))
         inside, count = points.shape[1], points.shape[1] + rim.shape[1]
-        if everywhere(valid.all()):
+        if scene.everywhere(valid.all()):
             return Light(hits[..., :inside], valid[..., :inside], weights, count)
     unit = directions(32 * max(order - 1, 1), fold, scene.wavelengths)
     inner, outer = clear_arms(scene, unit)
     points, weights = between(inner, outer, unit, rings=2 * order)
-    hits, valid = trace_shared(scene, points, share)
+    hits, valid = _traced(scene, points)
     count += rays_of_search(unit.shape[1], inner.shape[-1]) + points.shape[-1]
     return Light(hits, valid, weights, count, inner, outer)
+
+
+def _traced(scene: Scene, pupil: Tensor) -> tuple[Tensor, Tensor]:
+    """Hits (2, D, F, W, P) on the sensor and which rays arrive (D, F, W, P)."""
+    rays = trace_scene(scene, pupil)
+    return rays.position[:2], rays.valid
 
 
 def arms_of(order: int) -> int:

@@ -4,19 +4,20 @@ import torch
 from torch import Tensor
 
 from raytrace.kernels.pixels import gaussian_pixels
+from raytrace.kernels.result import Kernels
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide
 from raytrace.optics.launch import object_field
 from raytrace.optics.paraxial import first_order, signed, system_matrix
-from raytrace.optics.scene import Kernels, Scene, is_on_axis
+from raytrace.optics.scene import Scene, is_on_axis
 from raytrace.optics.trace import media
 
 
-def kernels(scene: Scene, grid: Grid, *, rho: float | Tensor = 0.5) -> Kernels:
+def kernels(scene: Scene, grid: Grid, *, order: int = 0, rho: float | Tensor = 0.5) -> Kernels:
     """Isotropic Gaussians of σ = ρ ε around the paraxial chief ray, with all the light of the entrance pupil.
 
-    rho: 0.5 gives the second moment per axis of a uniform disc of radius ε. In focus σ is 0 and so is its gradient:
-    the Gaussian's energy moves between pixels with σ², so nothing is lost.
+    order: 0, the only one; rho: 0.5 gives the second moment per axis of a uniform disc of radius ε. In focus σ is 0 and
+    so is its gradient: the Gaussian's energy moves between pixels with σ², so nothing is lost.
     """
     sigma = rho * blur_radius(scene)
     variance = (sigma * sigma).expand(scene.shape)

@@ -17,15 +17,19 @@ from torch import Tensor
 from raytrace.budget import afford, forewarn
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide
-from raytrace.optics.scene import varies
-from raytrace.shards import everywhere
+from raytrace.optics.scene import Scene, varies
 
 _STEPS = 64  # of the table of g in a pixel
 
 
-def is_centred(grid: Grid) -> bool:
-    """Whether every window is centred on the axis, to a billionth of a pixel, and stays there under differentiation."""
-    return not varies(grid.centre) and everywhere((grid.centre.abs() <= 1e-9 * grid.pitch.abs()).all())
+def is_centred(grid: Grid, scene: Scene | None = None) -> bool:
+    """Whether every window (of the whole scene) is centred on the axis, to a billionth of a pixel, and stays there
+    under differentiation.
+    """
+    if varies(grid.centre):
+        return False
+    centred = (grid.centre.abs() <= 1e-9 * grid.pitch.abs()).all()
+    return bool(centred) if scene is None else scene.everywhere(centred)
 
 
 def reach(grid: Grid) -> float:

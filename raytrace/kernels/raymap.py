@@ -28,13 +28,12 @@ from raytrace.kernels.rays import (
     trace_fans,
     turned,
 )
-from raytrace.kernels.sharing import symmetry
+from raytrace.kernels.result import Kernels
 from raytrace.kernels.splat import cell_widths
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.value import value
-from raytrace.optics.scene import Kernels, Scene, beam_share, varies
-from raytrace.shards import largest
+from raytrace.optics.scene import Scene, beam_share, symmetry, varies
 from raytrace.system.aperture import Aperture, clearance
 
 _LINES = 32  # round the pupil at least, and half as many cells on each
@@ -84,8 +83,8 @@ def kernels_and_reason(scene: Scene, grid: Grid, *, order: int = 3) -> tuple[Ker
     why = ""
     for degree in _degrees(order):
         found = fit(scene, degree)
-        error = float(largest((found.residual / pitch).amax()))
-        edge_error = float(largest(found.edge_residual.amax()))
+        error = float(scene.largest((found.residual / pitch).amax()))
+        edge_error = float(scene.largest(found.edge_residual.amax()))
         if error <= limit and edge_error <= limit:
             return _kernels_of_map(scene, grid, found, order), (
                 f"map of degree {degree} through {found.rays} rays, within {error:.1e} pixels"
@@ -185,11 +184,11 @@ def _degrees(order: int) -> list[int]:
 
 
 def _kernels_of_map(scene: Scene, grid: Grid, ray_map: RayMap, order: int) -> Kernels:
-    if ray_map.axial and is_centred(grid):
+    if ray_map.axial and is_centred(grid, scene):
         return _kernels_of_meridian(scene, grid, ray_map, order)
     # Order 0 has cells as wide as a pixel, measured on a coarse map; each order makes them √2 narrower.
     coarse = fans_of_map(ray_map, 2 * _LINES, _LINES)
-    *widths, both = cell_widths(grid, coarse.points)
+    *widths, both = cell_widths(grid, coarse.points, scene.largest)
     across, along = (
         2 * math.ceil(min(_MOST_LINES, max(least, width * count) * both * 2 ** (order / 2)) / 2)
         for width, count, least in zip(widths, (2 * _LINES, _LINES), (_LINES, _LINES // 2), strict=True)

@@ -7,6 +7,7 @@ image of the cell is spread over the pixels, and cut by the apertures, in closed
 vignetting edges are thus crossed smoothly: no blur is needed for a derivative, and none is there.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 
@@ -15,15 +16,13 @@ import torch
 from torch import Tensor
 
 from raytrace.kernels.cost import afford_cells
-from raytrace.kernels.sharing import pooled, symmetry
+from raytrace.kernels.result import Kernels, moments
 from raytrace.kernels.splat import cell_energy, cell_widths, cells, clear_share, histogram, splat_cells, splat_smooth
 from raytrace.maths import pupil
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.value import value
-from raytrace.optics.scene import Kernels, Scene, beam_share, cross_scene, trace_scene
-from raytrace.optics.spot import spot_of
-from raytrace.shards import Share, total
+from raytrace.optics.scene import Scene, beam_share, cross_scene, symmetry, trace_scene
 from raytrace.system.aperture import Aperture, clearance
 
 _LINES = (16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512)  # round the pupil, by order; half as many nodes on each
@@ -57,20 +56,20 @@ def kernels(
     rays: int | None = None,
     sampling: Callable[..., tuple[Tensor, Tensor]] = pupil.sobol,
     width: float = 0.25,
-    share: Share | None = None,
 ) -> Kernels:
     """Ray-traced PSFs, differentiable in every number of the lens, the sensor distance and the grid.
 
     order: 0 … 10; each has twice the rays of the one before, and half its error.
     rays: instead, that many plain rays of `sampling` (`pupil.sobol`, `pupil.random`), each blurred by the kernel of
     `splat_smooth` of half width `width` pixels; a width of 0 is the histogram, which has no derivative.
-    share: of the plain rays that this process traces, if others trace the rest; then without gradient.
     A kernel that no ray reaches has energy 0 and gradient 0. Vignetting factors of a field shrink the beam, and its
     energy with it.
     """
     if rays is None:
         return kernels_of_fans(scene, grid, trace_fans(scene, order), width=cell_width(order))
-    return _kernels_of_points(scene, grid, rays, sampling, width, share or Share())
+    like = scene.lens.surfaces[-2].thickness
+    points, weights = sampling(rays, dtype=like.dtype, device=like.device)
+    return dataclasses.replace(kernels_of_points(scene, grid, points, weights, width=width), rays=rays)
 
 
 def trace_fans(scene: Scene, order: int) -> Fans:
@@ -152,7 +151,7 @@ def kernels_of_fans(scene: Scene, grid: Grid, fans: Fans, *, width: float = 1.0)
 
     Cells wider than `width` pixels (at most 1) are cut, the image point running linearly between rays.
     """
-    *widths, both = cell_widths(grid, fans.points)
+    *widths, both = cell_widths(grid, fans.points, scene.largest)
     fine = refined(fans, [math.ceil(found * max(1 / width, both)) for found in widths])
     centroid, covariance = moments_of_fans(fans)
     kernel = energy_of_fans(grid, fine) * beam_share(scene)[..., None, None]
@@ -238,22 +237,23 @@ def moments_of_fans(fans: Fans) -> tuple[Tensor, Tensor]:
     return torch.where(lit, centroid, 0.0), covariance
 
 
-def _kernels_of_points(scene: Scene, grid: Grid, count: int, sampling: Callable, width: float, share: Share) -> Kernels:
-    thickness = scene.lens.surfaces[-2].thickness
-    disc, weights = sampling(count, dtype=thickness.dtype, device=thickness.device)
-    mine = share.part(count)
-    disc, weights = disc[:, mine], weights[mine]
+def kernels_of_points(scene: Scene, grid: Grid, disc: Tensor, weights: Tensor, *, width: float) -> Kernels:
+    """Kernels of plain rays through pupil points (2, P), by their weights (P,), shares of the light."""
     traced = trace_scene(scene, disc)
     energy = torch.where(traced.valid, weights, 0.0).expand(*scene.shape, -1)
     points = torch.where(traced.valid, traced.position[:2], 0.0).expand(2, *scene.shape, -1)
-    kernel = splat_smooth(grid, points, energy, width=width) if width else histogram(grid, points, energy)
-    light = spot_of(traced, weights)
-    found = torch.where(light.rays > 0, light.centroid, 0.0)
-    part = safe_divide(energy, energy.sum(-1, keepdim=True))
-    x, y = torch.where(energy > 0, points - found[..., None], 0.0)
-    covariance = torch.stack([(part * a * b).sum(-1) for a, b in ((x, x), (x, y), (y, y))])
-    centroid = found.expand(2, *scene.shape)
-    if share.processes > 1:
-        kernel, (centroid, covariance) = total(kernel), pooled(energy.sum(-1), centroid, covariance)
-    kernel = kernel * beam_share(scene)[..., None, None]
-    return Kernels(kernel, grid, centroid, covariance, count)
+    light = beam_share(scene)
+    kernel = deposit(grid, points, energy, width) * light[..., None, None]
+    arrived = energy.sum(-1)
+    share = safe_divide(energy, arrived[..., None].expand(energy.shape))
+    # Counted from the first ray that arrives, a small spot far off the axis keeps its digits.
+    first = (energy > 0) & ((energy > 0).to(torch.int64).cumsum(-1) == 1)
+    reference = torch.where(first, points, 0.0).sum(-1, keepdim=True)
+    centroid, covariance = moments(*torch.where(energy > 0, points - reference, 0.0), share)
+    centroid = centroid + reference[..., 0]
+    return Kernels(kernel, grid, centroid, covariance, disc.shape[-1], arrived=arrived * light)
+
+
+def deposit(grid: Grid, points: Tensor, energy: Tensor, width: float) -> Tensor:
+    """Energy in pixels of points blurred by a kernel of half width `width` pixels; 0: not blurred, no derivative."""
+    return splat_smooth(grid, points, energy, width=width) if width else histogram(grid, points, energy)

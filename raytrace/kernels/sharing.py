@@ -1,32 +1,46 @@
 """Sharing: kernels of a scene computed by several processes, a block of object distances × fields × wavelengths each.
 
-Each model decides some things for its whole scene: how many rays, how fine a cell, whether anything is clipped. Within
-`shards.agreeing` those decisions are taken for all blocks (`largest`, `everywhere`), so that the kernels are those of
-one process to rounding.
+Each model decides some things for its whole scene: how many rays, how fine a cell, whether anything is clipped. It asks
+`Scene.largest` for them, which holds for all blocks here, so that the kernels are those of one process to rounding.
 """
 
-import contextlib
 import dataclasses
+import functools
 import itertools
 import math
 from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
+from raytrace.kernels.models import Model
+from raytrace.kernels.result import Kernels, combined, mixture
+from raytrace.maths import pupil
 from raytrace.maths.grid import Grid
-from raytrace.maths.numerics import safe_divide
-from raytrace.optics.scene import Kernels, Scene, trace_scene
-from raytrace.optics.scene import symmetry as symmetry_of_part
-from raytrace.shards import Share, agreeing, alone, gathered, largest, total
-from raytrace.system.lens import with_object_distance
-
-_FOLDS = ("round", "mirror", "none")
+from raytrace.optics.scene import Scene
+from raytrace.shards import Share, agreeing, gathered, total
+from raytrace.system.lens import Lens, with_object_distance
 
 
-def symmetry(scene: Scene) -> str:
-    """`scene.symmetry`, of the whole scene where this one is a block of it: the least that any block has."""
-    return _FOLDS[int(largest(torch.tensor(_FOLDS.index(symmetry_of_part(scene)))))]
+def shared_model(model: Model, share: Share) -> Model:
+    """The model, computed together by processes that all call it alike and all get the kernels, without gradient.
+
+    Each process computes some of the kernels, and whole fields of a model that decides `by_field`; or some of the rays
+    where they are plain. A single kernel without plain rays is not cut: every process computes it.
+    """
+    deal = functools.partial(shared, share=share, by_field=model.by_field)
+    plain = model.plain and functools.partial(_plain_rays, model.plain, share)
+    return dataclasses.replace(model, kernels=deal(model.kernels), lean=model.lean and deal(model.lean), plain=plain)
+
+
+def check_shares(lens: Lens, options: Sequence) -> None:
+    """Raise ValueError for what processes cannot share: derivatives, and options that differ between kernels."""
+    leaves = [leaf for leaf in pytree.tree_leaves((lens, options)) if isinstance(leaf, Tensor)]
+    if torch.is_grad_enabled() and any(leaf.requires_grad for leaf in leaves):
+        raise ValueError("kernels that processes share have no gradient: leave share out, or use torch.no_grad()")
+    if any(isinstance(option, Tensor) and option.dim() > 1 for option in options):
+        raise ValueError("processes share kernels of one rho and one zernike only: leave share out")
 
 
 def shared(kernels: Callable[..., Kernels], share: Share, *, by_field: bool = False) -> Callable[..., Kernels]:
@@ -41,40 +55,31 @@ def shared(kernels: Callable[..., Kernels], share: Share, *, by_field: bool = Fa
             return kernels(scene, grid, **options)
         # Processes beyond the number of blocks repeat one, so that all take part in all decisions.
         block = _block(scene.shape, cut, share.rank % math.prod(cut))
-        with agreeing():
-            with alone() if by_field and cut[1] > 1 else contextlib.nullcontext():
-                found = kernels(_part(scene, block), _window(grid, block), **options)
+        own = _part(scene, block)
+        with agreeing() as largest:
+            if not (by_field and cut[1] > 1):
+                own = dataclasses.replace(own, largest=largest)
+            found = kernels(own, _window(grid, block), **options)
             rays = int(largest(torch.tensor(found.rays)))
-        return _joined(found, grid, scene.shape, block if share.rank < math.prod(cut) else None, rays)
+        found = _joined(found, scene.shape, block if share.rank < math.prod(cut) else None)
+        return dataclasses.replace(found, grid=grid, rays=rays)
 
     return compute
 
 
-def trace_shared(scene: Scene, pupil: Tensor, share: Share | None) -> tuple[Tensor, Tensor]:
-    """Hits (2, D, F, W, P) on the sensor and which rays arrive (D, F, W, P); each process traces some of the P rays."""
-    if share is None or share.processes == 1:
-        rays = trace_scene(scene, pupil)
-        return rays.position[:2], rays.valid
-    part = share.part(pupil.shape[-1])
-    rays = trace_scene(scene, pupil[..., part])
-    hits = rays.position.new_zeros(3, *scene.shape, pupil.shape[-1])
-    hits[:2, ..., part], hits[2, ..., part] = rays.position[:2], rays.valid.to(hits.dtype)
-    hits = total(hits)
-    return hits[:2], hits[2] > 0.5
+def _plain_rays(plain: Callable[..., Kernels], share: Share, scene: Scene, grid: Grid, *, rays: int) -> Kernels:
+    """Kernels of so many Sobol rays, each process tracing some of them."""
 
+    def some(count: int, **like) -> tuple[Tensor, Tensor]:
+        points, weights = pupil.sobol(count, **like)
+        return points[:, share.part(count)], weights[share.part(count)]
 
-def pooled(energy: Tensor, centroid: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
-    """Centroid (2, ...) and covariance (3, ...) of all light, from those of each process and its energy (...).
-
-        m = Σ_k s_k m_k,   C = Σ_k s_k (C_k + (m_k - m)(m_k - m)ᵀ),   s_k = E_k / Σ E
-
-    Nothing large is subtracted (Chan, Golub and LeVeque, Updating formulae, Stanford STAN-CS-79-773, 1979, eq. 2.1).
-    """
-    energy, centroid, covariance = (gathered(t) for t in (energy, centroid, covariance))
-    share = safe_divide(energy, energy.sum(0).expand_as(energy))[:, None]
-    mean = (share * centroid).sum(0)
-    x, y = (centroid - mean).unbind(1)
-    return mean, (share * (covariance + torch.stack([x * x, x * y, y * y], 1))).sum(0)
+    found = plain(scene, grid, rays=rays, sampling=some)
+    arrived, *moments = (gathered(t).movedim(0, -1) for t in (found.arrived, found.centroid, found.covariance))
+    centroid, covariance = mixture(arrived, *moments)
+    return dataclasses.replace(
+        found, kernel=total(found.kernel), arrived=arrived.sum(-1), centroid=centroid, covariance=covariance
+    )
 
 
 def _cuts(shape: Sequence[int], processes: int, *, by_field: bool) -> tuple[int, int, int]:
@@ -118,17 +123,14 @@ def _window(grid: Grid, block: tuple[slice, ...]) -> Grid:
     return dataclasses.replace(grid, centre=centre)
 
 
-def _joined(found: Kernels, grid: Grid, shape: Sequence[int], block: tuple[slice, ...] | None, rays: int) -> Kernels:
+def _joined(found: Kernels, shape: Sequence[int], block: tuple[slice, ...] | None) -> Kernels:
     """All kernels from the blocks of all processes; block: where those of this one belong, None if another has it."""
 
-    def whole(part: Tensor, before: int) -> Tensor:
+    def whole(parts: list[Tensor], before: int) -> Tensor:
+        (part,) = parts
         joined = part.new_zeros(*part.shape[:before], *shape, *part.shape[before + 3 :])
         if block is not None:
             joined[(slice(None),) * before + block] = part.detach()
         return total(joined)
 
-    axes = {"kernel": 0, "centroid": 1, "covariance": 1, "residual": 0, "ray_centroid": 1, "ray_covariance": 1}
-    parts = {name: getattr(found, name) for name in axes}
-    return Kernels(
-        grid=grid, rays=rays, **{name: None if t is None else whole(t, axes[name]) for name, t in parts.items()}
-    )
+    return combined([found], whole)

@@ -4,14 +4,13 @@ Positions are counted in pixels before anything else. Whatever lies outside the 
 edge, so the sum of an image is the energy inside the window.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide
-from raytrace.shards import largest
 
 
 def splat(grid: Grid, points: Tensor, weights: Tensor) -> Tensor:
@@ -80,11 +79,11 @@ def splat_cells(
     return _deposit(grid, [(i, j, energy * share) for i, j, share in deposits], axes=2)
 
 
-def cell_widths(grid: Grid, points: Tensor) -> tuple[float, float, float]:
+def cell_widths(grid: Grid, points: Tensor, largest: Callable[[Tensor], Tensor]) -> tuple[float, float, float]:
     """Width in pixels of the widest cell of points (2, ..., A, N), across the lines and along them; and their sum.
 
     The sum, 1 … 2, is that of both parts of one cell along x or y, each in units of its largest: cut into that many
-    times as many parts as its widths alone ask for, no cell is wider than a pixel.
+    times as many parts as its widths alone ask for, no cell is wider than a pixel. largest: as `Scene` has it.
     """
     w = points.detach() / grid.pitch.detach()
     across, along = (torch.roll(w, -1, -2) - w).abs(), w.diff().abs()

@@ -1,11 +1,13 @@
-"""Scene: object distance × field × wavelength, the rays of one, and what every PSF model gives back."""
+"""Scene: object distance × field × wavelength, and the rays of one."""
 
+from collections.abc import Callable
+
+import torch
 from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.autograd import forward_ad
 
 from raytrace.budget import RAY_BYTES, afford
-from raytrace.maths.grid import Grid
 from raytrace.maths.value import value
 from raytrace.optics.reuse import Bundle, Memo, cross_bundle, trace_bundle
 from raytrace.optics.trace import Crossing
@@ -16,8 +18,8 @@ from raytrace.system.rays import Rays
 from raytrace.system.surface import is_round
 
 
-class EmptyPsf(ValueError):
-    """No ray of a field reaches the sensor: there is no PSF to compute."""
+def _own(number: Tensor) -> Tensor:
+    return number
 
 
 @value
@@ -27,61 +29,24 @@ class Scene:
     lens: its object distance is (D, 1, 1), all finite or all inf.
     fields: (2, F) in the lens's kind of field; wavelengths: (W,) µm.
     memo: rays of earlier scenes to go on from, if any.
+    largest: of numbers () or (K,) that this scene has, those of the whole that it is a block of: what is decided for
+        all kernels together is decided by these. The scene is the whole unless told otherwise.
     """
 
     lens: Lens
     fields: Tensor
     wavelengths: Tensor
     memo: Memo | None = None
+    largest: Callable[[Tensor], Tensor] = _own
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """(D, F, W)."""
         return len(self.lens.surfaces[0].thickness), self.fields.shape[1], len(self.wavelengths)
 
-
-@value
-class Kernels:
-    """PSFs of one model, one for each object distance, field and wavelength.
-
-    kernel: (D, F, W, rows, columns), energy in each pixel; 1 = all light through the entrance pupil.
-    grid: its centre is (2,) or (2, D, F, W).
-    centroid: (2, D, F, W) mm; covariance: (3, D, F, W) mm², xx, xy, yy, of the model's distribution before it is
-        integrated over pixels; of waves, of what lies inside the window: behind a hard edge there is no second moment.
-    ray_centroid, ray_covariance: of waves, the same of the rays they follow, whatever the window; else None.
-    rays: how many rays were traced for each kernel; 0 if none.
-    residual: (D, F, W) how wrong the model itself is here, where it can tell (relative L1), or None.
-    """
-
-    kernel: Tensor
-    grid: Grid
-    centroid: Tensor
-    covariance: Tensor
-    rays: int
-    residual: Tensor | None = None
-    ray_centroid: Tensor | None = None
-    ray_covariance: Tensor | None = None
-
-    @property
-    def ray_moments(self) -> tuple[Tensor, Tensor]:
-        """Centroid and covariance of geometric optics: of the rays that waves follow, else the model's own."""
-        if self.ray_centroid is None:
-            return self.centroid, self.covariance
-        return self.ray_centroid, self.ray_covariance
-
-    @property
-    def dark(self) -> Tensor:
-        """Which kernels no traced ray reaches, (D, F, W): their moments are 0 and mean nothing."""
-        return is_dark(self.kernel, *self.ray_moments, self.rays, of_waves=self.ray_centroid is not None)
-
-
-def is_dark(kernel: Tensor, centroid: Tensor, covariance: Tensor, rays: int, *, of_waves: bool) -> Tensor:
-    """Which kernels (..., rows, columns) no ray reaches, by their light and the moments of their rays, all exactly 0.
-
-    Light beside the window is not lost: it has a place. of_waves: whose reference, the chief ray, has one in any case.
-    """
-    empty = (kernel == 0).all(-1).all(-1) & (covariance == 0).all(0)
-    return empty & (of_waves | (centroid == 0).all(0)) & (rays > 0)
+    def everywhere(self, condition: Tensor) -> bool:
+        """Whether a condition () holds in all of the whole."""
+        return not bool(self.largest(~condition))
 
 
 def scene(lens: Lens, fields: Tensor, object_distances: Tensor, wavelengths: Tensor, memo: Memo | None = None) -> Scene:
@@ -121,13 +86,20 @@ def _bundle(scene: Scene, pupil: Tensor) -> Bundle:
     return lens, scene.fields[:, :, None, None], scene.wavelengths[:, None], pupil
 
 
+_FOLDS = ("round", "mirror", "none")
+
+
 def symmetry(scene: Scene) -> str:
-    """What the light of every field has in common with its images: "round", "mirror" or "none".
+    """What the light of every field has in common with its images: "round", "mirror" or "none", of the whole scene.
 
     "round": symmetric about the axis, a meridian of the pupil stands for all of it; "mirror": symmetric in x, the half
     of x > 0 stands for the other. Fields and vignetting factors to be differentiated have none: moving one breaks it;
     nor has a lens with a surface of a kind that is not round, whatever its numbers are.
     """
+    return _FOLDS[int(scene.largest(torch.tensor(_FOLDS.index(_symmetry(scene)))))]
+
+
+def _symmetry(scene: Scene) -> str:
     if not all(is_round(surface) for surface in scene.lens.surfaces):
         return "none"
     apertures = [aperture for surface in scene.lens.surfaces for aperture in surface.apertures]

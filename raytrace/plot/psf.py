@@ -11,8 +11,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from raytrace.analysis import Comparison
-from raytrace.kernels import CloseUp, Psf
+from raytrace.kernels.closeup import CloseUp
+from raytrace.kernels.closeup import close_up as light_of
+from raytrace.kernels.result import Psf
 from raytrace.maths.grid import Grid
+from raytrace.plot.panels import field_labels
 from raytrace.plot.style import GREY, INK, array, bar_on_dark, fill, new_figure, round_length, styled
 
 DECADES = 4  # of light on a logarithmic scale
@@ -20,21 +23,20 @@ _MOST_PIXELS = 16  # across a panel, whose edges are drawn
 
 
 @styled
-def psf_grid(
-    found: Psf,
-    object_distances: Sequence[float],
-    labels: Sequence[str],
-    *,
-    close_up: CloseUp | None = None,
-    log: bool = False,
-    title: str = "",
-) -> Figure:
-    """Kernels over object distance (columns) and field (rows, named by `labels`), each on its own brightness scale.
+def psf_grid(found: Psf, *, close_up: CloseUp | None = None, log: bool = False) -> Figure:
+    """Kernels over object distance (columns) and field (rows), each on its own brightness scale.
 
-    close_up: draw this light, in its own windows, with the edges of the pixels, instead of the pixels of the kernels.
+    Where its pixels were asked for, or its rays are plain, pixels are drawn; else the light itself in windows that it
+    fills, with the edges of the pixels. close_up: that light, if it is there already.
     Kernels of each wavelength have a row each, fields outermost. log: four decades of brightness below the peak.
     Below each: the energy inside the window of the kernel (or the energy it was normalised by), and its peak.
     """
+    if close_up is None and not found.framed and found.order is not None:
+        close_up = light_of(found)
+    distances, labels = found.object_distances.tolist(), field_labels(found.lens, found.fields)
+    if not found.wavelengths_summed:
+        labels = [f"{row}\n{1e3 * wavelength:.4g} nm" for row in labels for wavelength in found.wavelengths.tolist()]
+    title = ": ".join(filter(None, (found.lens.name, f"{found.model} PSF")))
     energy, kernels = _rows(array(found.energy), 0), _rows(array(found.kernel), 2)
     notes = [
         [f"energy {e:.3f}, peak {kernel.max():.3g}" for e, kernel in zip(*row, strict=True)]
@@ -43,13 +45,11 @@ def psf_grid(
     pitch = float(found.grid.pitch)
     half = 0.5 * pitch * found.grid.columns
     if close_up is None:
-        figure, _ = _panels(
-            kernels, [[half] * len(object_distances)] * len(labels), object_distances, labels, notes, log
-        )
+        figure, _ = _panels(kernels, [[half] * len(distances)] * len(labels), distances, labels, notes, log)
         return _worded(figure, title, [_window(found.grid), _brightness(log)])
     drawn, each = _rows(array(close_up.light), 2), len(kernels) // close_up.half.shape[1]
     halves = np.repeat(array(close_up.half).T, each, 0)
-    figure, axes = _panels(drawn, halves, object_distances, labels, notes, log)
+    figure, axes = _panels(drawn, halves, distances, labels, notes, log)
     centre = array(found.grid.centre).reshape(2, *(found.grid.centre.shape[1:] or (1, 1)))
     offset = np.repeat(np.moveaxis(centre - array(close_up.centre), 2, 0), each, 0)  # field × (x, y) × distance
     for row, place in zip(axes, offset, strict=True):
@@ -67,7 +67,7 @@ def _rows(values: np.ndarray, kept: int) -> np.ndarray:
 
 
 @styled
-def model_grid(found: Comparison, *, log: bool = False, title: str = "") -> Figure:
+def model_grid(found: Comparison, *, log: bool = False) -> Figure:
     """Kernels over object distance (columns) and model (rows, with the number of its rays).
 
     Below each kernel: its energy inside the window, and its relative L1 difference from the last row, the reference.
@@ -89,6 +89,7 @@ def model_grid(found: Comparison, *, log: bool = False, title: str = "") -> Figu
     pitch, distances = float(grid.pitch), found.object_distances.tolist()
     half = 0.5 * pitch * grid.columns
     figure, _ = _panels(kernels, [[half] * len(distances)] * len(labels), distances, labels, notes, log)
+    title = ": ".join(filter(None, (found.psfs[-1].lens.name, found.sensor)))
     return _worded(
         figure, title, [_window(grid), _brightness(log), f"Δ: relative L¹ difference from {found.models[-1]}"]
     )

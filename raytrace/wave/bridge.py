@@ -28,10 +28,11 @@ from raytrace.kernels.diffraction import (
     waves,
 )
 from raytrace.kernels.radial import is_centred, radii_of_waves, unfold
+from raytrace.kernels.result import Kernels
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
-from raytrace.maths.value import to, value
+from raytrace.maths.value import to
 from raytrace.maths.zernike import noll
 from raytrace.media.glass import index
 from raytrace.optics.launch import rays_of_field
@@ -55,24 +56,6 @@ _WIDER = 1.05  # beam over element
 
 class TooCoarse(ValueError):
     """An element needs more rays than there can be."""
-
-
-@value
-class StopPsf:
-    """Kernels of a lens with elements at its stop.
-
-    kernel: (D, F, W, rows, columns), light in each pixel, 1 = all through the entrance pupil; grid: the pixels, centre
-    (2,) or (2, D, F, W) mm; rays: for each kernel.
-    """
-
-    kernel: Tensor
-    grid: Grid
-    rays: int
-
-    @property
-    def energy(self) -> Tensor:
-        """(D, F, W): light inside the window."""
-        return self.kernel.sum((-2, -1))
 
 
 # -- an element as a lens ----------------------------------------------------------------------------------------------
@@ -147,12 +130,12 @@ def surfaces_of(element: Element, *, substrate: Tensor | float = 0.0) -> tuple[S
 # -- elements at the stop of a lens ------------------------------------------------------------------------------------
 
 
-def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: int = 0) -> StopPsf:
+def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: int = 0) -> Kernels:
     """Wave PSFs of a scene whose lens carries elements in contact at its stop.
 
     Differentiable in the numbers of the elements and of the lens. order: as for the wave model (`psf.diffraction`);
     the rays follow the phase of the lens and of the elements together. Kernels of flat pixels, rings and wrapped
-    heights converge slowly in it, by the rays across a step.
+    heights converge slowly in it, by the rays across a step. Moments are left out.
     Raises ValueError for a stop between other media than air, a beam wider than an element at the stop (beyond a margin
     of 5 %, in which the outermost height goes on), TooCoarse where more than 400,000 rays would be needed.
     """
@@ -162,7 +145,7 @@ def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: i
         _field_kernels(one_field(scene, f), elements, one_field_grid(grid, f), order) for f in range(scene.shape[1])
     ]
     kernel = torch.cat([kernel for _, kernel in found], 1).to(grid.pitch.dtype)
-    return StopPsf(kernel, grid, max(rays for rays, _ in found))
+    return Kernels(kernel, grid, None, None, max(rays for rays, _ in found))
 
 
 def _field_kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, order: int) -> tuple[int, Tensor]:
