@@ -12,8 +12,9 @@ from test_wave_propagation import PLASTIC, R, lens, relative, scene
 from raytrace.kernels.dft import Aliased, integrate
 from raytrace.wave import pupil
 from raytrace.wave.element import Element, EvenPowers, Pixels, Zernike
-from raytrace.wave.plan import ENGINES, AliasedSampling, blur, plan
+from raytrace.wave.plan import ENGINES, AliasedSampling, plan
 from raytrace.wave.psf import psf
+from raytrace.wave.spread import blur
 
 TILTED = Element(Zernike(vector(0, 0, 0, 0, 0, 0, 1e-4)), scalar(R), PLASTIC)
 

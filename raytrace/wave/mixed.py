@@ -17,12 +17,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.kernels.dft import bessel_j0, phasor, sub_pixels
-from raytrace.kernels.radial import is_centred
+from raytrace.kernels.dft import bessel_j0, phasor
 from raytrace.maths.value import value
 from raytrace.wave.element import Element, is_radial, is_smooth, path
-from raytrace.wave.pupil import halves, light_of, waves_at
-from raytrace.wave.radial import edges, rule, slope
+from raytrace.wave.pupil import cells_at, light_of, to_pixels
+from raytrace.wave.radial import phasors, slope, to_radii
 from raytrace.wave.scene import WaveScene, aperture, millimetres, spheres
 
 _POINTS = 12  # of the table of F per wave of its finest ripple
@@ -98,37 +97,28 @@ def prepare(
     scene: WaveScene, cells: int, nodes: int, *, extent: float, radii: int, band: tuple[float, float]
 ) -> MixedSums:
     """Constants of cells × cells over `extent` apertures; radii: Gauss radii between steps; band: P₀, P₁ mm."""
-    R, z, wavelength = aperture(scene), scene.sensor_distance, millimetres(scene)[:, None, None]
+    R, wavelength = aperture(scene), millimetres(scene)[:, None, None]
     edge, _ = slope(scene, R)
-    r, weight = rule(edges(round_part(scene)), radii)
-    t, light = slope(scene, r)
     count = radii_of_band(scene, band)
     place, share = (R.new_tensor(a) for a in np.polynomial.legendre.leggauss(count))
     rho, part = 0.5 * band[1] * (place + 1), 0.5 * band[1] * share
     middle, width = 0.5 * sum(band), (band[1] - band[0]) / (2 * _STEEP)
     part = part * rho * 0.5 * torch.erfc((rho - middle) / width)
-    scale = 2 * math.sqrt(math.pi) / (R * wavelength)
-    forward = scale * weight * light * bessel_j0(2 * math.pi * rho[:, None] * t / wavelength)
+    r, forward = to_radii(round_part(scene), rho, radii)
     dt = 2 * edge * extent / cells
     axis = (torch.arange(cells, dtype=R.dtype, device=R.device) - 0.5 * (cells - 1)) * dt
-    t2 = axis * axis + (axis * axis)[:, None]
     step = float(millimetres(scene).detach().min()) / (_POINTS * band[1])
     table = step * torch.arange(math.ceil(float(edge) * extent * math.sqrt(2) / step) + 4).to(R)
     back = 2 * math.pi / wavelength**2 * part * bessel_j0(2 * math.pi * table[:, None] * rho / wavelength)
-    u, v, pixel = sub_pixels(scene.grid, nodes)
-    folded = is_centred(scene.grid)
-    along_x, along_y = ((halves if folded else waves_at)(s, axis, wavelength[:, 0, 0]) for s in (u, v))
-    stretch = 1 / torch.sqrt(1 - torch.clamp(t2, max=0.99)) if scene.exact else torch.ones_like(t2)
-    x, y = z * axis * stretch, z * axis[:, None] * stretch
-    sphere = spheres(scene, r * r)
-    return MixedSums(r, sphere, forward, back * dt * dt, torch.sqrt(t2) / step, x, y, along_x, along_y, pixel, folded)
+    x, y, _ = cells_at(scene, axis)
+    place = torch.sqrt(axis * axis + (axis * axis)[:, None]) / step
+    return MixedSums(r, spheres(scene, r * r), forward, back * dt * dt, place, x, y, *to_pixels(scene, axis, nodes))
 
 
 def intensity(scene: WaveScene, sums: MixedSums) -> Tensor:
     """Light per mm² (D, W, Y, X) at the nodes of the pixels, 1 = all through the aperture."""
     wavelength = millimetres(scene)[:, None]
-    waves = path(round_part(scene).elements, sums.r, torch.zeros_like(sums.r), scene.wavelengths) + sums.sphere[:, None]
-    rays = torch.view_as_real(phasor(waves / wavelength))  # (D, W, J, 2)
+    rays = torch.view_as_real(phasors(round_part(scene), sums.r, sums.sphere))  # (D, W, J, 2)
     tables = torch.view_as_complex((sums.back @ (sums.forward @ rays)).contiguous())
     free = phasor(path(_free_part(scene), sums.x, sums.y, scene.wavelengths) / wavelength[..., None])
     found = [light_of(scene, sums, _between(table, sums.place) * free) for table in tables]

@@ -5,28 +5,41 @@
     fresnel    dx <= λz/(D + blur) samples the converging field; |f| < L/(2λz) keeps light from wrapping round
     pixels     Gauss nodes by the cutoff D/(λz) of the intensity
 
-Errors are relative L2 norms, fitted to converged references of two dozen scenes: half to five times what is measured
-where that is above 1e-4. Stray light, spread evenly with a density ε per mm², errs by √(2 ε A), A the area of the light
-(`spread`). A PSF wider than its window leaves light out, which is no error here.
+Errors are relative L2 norms (`sampling`). A PSF wider than its window leaves light out, which is no error here.
 """
 
 import math
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
-import torch
+from torch import Tensor
 
-from raytrace.kernels.dft import Aliased, rings_and_arms
+from raytrace.kernels.dft import Aliased, integrate, rings_and_arms
 from raytrace.kernels.ladder import NotConverged
 from raytrace.kernels.radial import is_centred, reach
-from raytrace.wave import propagate, radial
-from raytrace.wave.element import Pixels, is_flat, is_smooth
+from raytrace.wave import mixed, propagate, pupil, radial
+from raytrace.wave.element import Pixels, is_smooth
 from raytrace.wave.mixed import deflection, extent_of, is_mixed, radii_of_band, round_part
 from raytrace.wave.pupil import cells_across
+from raytrace.wave.sampling import (
+    Setting,
+    bessel,
+    cut_error,
+    edge_error,
+    gauss_count,
+    half_phases,
+    node_error,
+    only_pixels,
+    radius_error,
+    setting_of,
+    step_error,
+    transfer_error,
+)
 from raytrace.wave.scene import WaveScene, aperture, check, is_round, millimetres
-from raytrace.wave.spread import blur, blur_of_pixels, is_free, slopes, spread
+from raytrace.wave.spread import blur
 
-ENGINES = "pupil", "radial", "fresnel", "angular_spectrum"
 _FINEST = 4096  # cells across the aperture
 
 
@@ -61,39 +74,6 @@ class Plan:
     band: tuple[float, float] = (0.0, 0.0)
 
 
-@dataclass(frozen=True)
-class _Setting:
-    """Numbers of a scene that sampling depends on; mm."""
-
-    diameter: float
-    distance: float
-    shortest: float
-    blur: float  # radius on the sensor
-    reach: float  # from the axis to the farther edge of the window
-    kernels: tuple[int, int]
-    size: int
-    pixels: int
-    bytes: int
-    band: float  # π · cutoff · pixel: half the phase of the finest intensity across a pixel
-    width: float  # radius of an even disc as wide as the light
-    core: float  # of one as large in area, beyond a core in focus
-    sharpest: float  # the least of it over kernels
-    scatter: float  # √(2 A S/12)/(λz), mm^-1.5: what steps S/mm scatter
-    features: tuple[float, ...]  # pitches of rings and pixels, mm
-    speckle: bool  # whether there are features that no period wraps
-    lattice: bool  # cells can share the edges of all steps: those of one map of pixels
-    edge: float  # √(2 A λz (1 + S R/2)/(2π³ R)), mm^1.5: what edges and steps send far away
-
-    @property
-    def airy(self) -> float:
-        """λz/D, mm."""
-        return self.shortest * self.distance / self.diameter
-
-    def period(self, samples: float) -> float:
-        """Distance mm of the copies of the image that so many cells across the aperture make."""
-        return self.shortest * self.distance * samples / self.diameter
-
-
 def plan(
     scene: WaveScene,
     *,
@@ -121,85 +101,51 @@ def plan(
         raise ValueError(f"no engine {engine!r}; choose among auto, {', '.join(ENGINES)}")
     if engine == "radial" and not round_scene:
         raise ValueError("the radial engine needs round elements and a grid centred on the axis; use engine='pupil'")
-    setting = _setting(scene)
-    chosen = nodes if nodes is not None else _count(setting.band, 0.4 * tol / 0.15)
-    if engine == "radial":
-        found = _radial(scene, setting, samples, nodes, tol)
-    elif engine == "pupil":
-        found = _pupil(scene, setting, samples, chosen, tol)
-    else:
-        return _transfer(setting, engine, samples, chosen, pad, band_limit)
-    if samples is None and nodes is None and found.error > tol:
+    setting = setting_of(scene)
+    found = ENGINES[engine].plan(
+        scene, setting, engine=engine, samples=samples, nodes=nodes, tol=tol, pad=pad, band_limit=band_limit
+    )
+    if not ENGINES[engine].is_reference and samples is None and nodes is None and found.error > tol:
         message = f"predicted error {found.error:.2g} above the tolerance {tol:.2g} with {found.samples} samples"
         warnings.warn(f"{message}; the worst light lies within ±{setting.width:.3g} mm", NotConverged, stacklevel=2)
     return found
 
 
-def _setting(scene: WaveScene) -> _Setting:
-    centre = [abs(float(c)) for c in scene.grid.centre.detach()]
-    pitch = float(scene.grid.pitch.detach())
-    sides = (0.5 * pitch * n for n in scene.grid.shape[::-1])
-    stepped = [element for element in scene.elements if not is_smooth(element)]
-    R, z = (float(number.detach()) for number in (aperture(scene), scene.sensor_distance))
-    light, focal = spread(scene), z * millimetres(scene).detach().double()
-    core = (light.area / math.pi - (2.4 * focal / (2 * R)) ** 2 / math.pi).clamp(min=0.0).sqrt()
-    far = 2 * light.area * focal * (1 + 0.5 * R * light.steps) / (2 * math.pi**3 * R)
-    return _Setting(
-        diameter=2 * R,
-        distance=z,
-        shortest=float(millimetres(scene).detach().min()),
-        blur=float((blur_of_pixels(scene) if _only_pixels(scene) else blur(scene)).max()),
-        reach=max(c + side for c, side in zip(centre, sides, strict=True)),
-        kernels=(len(scene.depths), len(scene.wavelengths)),
-        size=max(scene.grid.shape),
-        pixels=scene.grid.rows * scene.grid.columns,
-        bytes=scene.sensor_distance.element_size(),
-        band=math.pi * radial.cutoff(scene) * pitch,
-        width=float(light.width.max()),
-        core=float(core.max()),
-        sharpest=float(core.min()),
-        scatter=float((torch.sqrt(light.area * light.steps / 6) / focal).max()),
-        features=tuple(float(e.profile.pitch.detach()) for e in stepped if is_flat(e)),
-        speckle=any(is_free(element) for element in stepped),
-        lattice=not scene.exact and len(stepped) == 1 and isinstance(stepped[0].profile, Pixels),
-        edge=float(far.sqrt().max()),
-    )
-
-
 # -- the engines -------------------------------------------------------------------------------------------------------
 
 
-def _pupil(scene: WaveScene, s: _Setting, samples: int | None, nodes: int, tol: float) -> Plan:
+def _pupil(scene: WaveScene, s: Setting, *, samples: int | None, nodes: int | None, tol: float, **_) -> Plan:
+    nodes = nodes or _nodes(s, tol)
     if samples is None and is_mixed(scene):
         return _mixed(scene, s, nodes, tol)
     least = s.diameter * (s.reach + s.blur) / (s.shortest * s.distance)
-    if samples is not None and samples < least and not _only_pixels(scene):
+    if samples is not None and samples < least and not only_pixels(scene):
         raise AliasedSampling(
             f"{samples} cells across the aperture repeat the image every {1e3 * s.period(samples):.0f} µm, inside the "
             f"window of ±{1e3 * s.reach:.0f} µm with a blur of ±{1e3 * s.blur:.0f} µm: take at least "
             f"{math.ceil(least)} samples, or a smaller window"
         )
     kind, extent, inner, parts = "smooth", 1.0, 1, 1
-    if _only_pixels(scene):
+    if only_pixels(scene):
         profile, kind = scene.elements[0].profile, "flat"
         across = max(cells_across(profile.pitch, n, aperture(scene)) for n in profile.heights.shape)
         bare = float(blur(scene).max())
-        wanted = samples or _least(lambda n: _cut_error(s, n, bare), 0.5 * tol)
+        wanted = samples or _least(lambda n: cut_error(s, n, bare), 0.5 * tol)
         parts = max(1, math.ceil(wanted / across))
         samples, pitch = parts * across, float(profile.pitch.detach()) / parts
         near = 1 / float(scene.depths.detach().min()) + 1 / s.distance
         half_phase = math.pi / s.shortest * pitch * (0.5 * s.diameter * near + s.reach / s.distance)
-        inner = _count(half_phase, 0.1 * tol)
-        error = _bessel(half_phase, inner) + _cut_error(s, samples, bare)
+        inner = gauss_count(half_phase, 0.1 * tol)
+        error = bessel(half_phase, inner) + cut_error(s, samples, bare)
     elif all(is_smooth(element) for element in scene.elements):
-        samples = samples or _even(max(1.05 * least, _least(lambda n: _edge_error(s, n), 0.5 * tol)))
-        error = min(1.0, 1.4 * _edge_error(s, samples, s.width**0.75 * s.core**0.25))
+        samples = samples or _even(max(1.05 * least, _least(lambda n: edge_error(s, n), 0.5 * tol)))
+        error = min(1.0, 1.4 * edge_error(s, samples, s.width**0.75 * s.core**0.25))
     else:
         kind = "sampled"
-        samples = samples or _even(max(1.05 * least, _least(lambda n: _step_error(s, n), 0.5 * tol)))
+        samples = samples or _even(max(1.05 * least, _least(lambda n: step_error(s, n), 0.5 * tol)))
         samples, extent = _aligned(scene, s, samples)
-        error = _step_error(s, samples / extent)
-    error += _node_error(s, nodes)
+        error = step_error(s, samples / extent)
+    error += node_error(s, nodes)
     D, W = s.kernels
     K = s.size * nodes
     cells = samples + 6 if kind == "smooth" else samples
@@ -208,7 +154,7 @@ def _pupil(scene: WaveScene, s: _Setting, samples: int | None, nodes: int, tol: 
     return Plan("pupil", samples, nodes, error, flops, memory, cells=kind, extent=extent, inner=inner, parts=parts)
 
 
-def _mixed(scene: WaveScene, s: _Setting, nodes: int, tol: float) -> Plan:
+def _mixed(scene: WaveScene, s: Setting, nodes: int, tol: float) -> Plan:
     """Smooth cells behind a round part that is known within a band: what the free part takes into the window's corner,
     and 25 Airy radii beyond, where light diffracted at the rim has faded."""
     longest = float(millimetres(scene).detach().max())
@@ -218,9 +164,9 @@ def _mixed(scene: WaveScene, s: _Setting, nodes: int, tol: float) -> Plan:
     extent = extent_of(scene, band)
     period = band[1] + deflection(scene, extent) + beyond + s.reach
     samples = _even(extent * s.diameter * period / (s.shortest * s.distance))
-    half, turned = _half_phases(round_part(scene), replace(s, reach=band[1] / math.sqrt(2)))
-    inner = _count(half, 0.1 * tol)
-    error = _node_error(s, nodes) + _radius_error(turned, inner) + 3e-4
+    half, turned = half_phases(round_part(scene), replace(s, reach=band[1] / math.sqrt(2)))
+    inner = gauss_count(half, 0.1 * tol)
+    error = node_error(s, nodes) + radius_error(turned, inner) + 3e-4
     D, W = s.kernels
     K, J, n = s.size * nodes, inner * (len(radial.edges(round_part(scene))) - 1), radii_of_band(scene, band)
     T = 20 * n
@@ -229,14 +175,14 @@ def _mixed(scene: WaveScene, s: _Setting, nodes: int, tol: float) -> Plan:
     return Plan("pupil", samples, nodes, error, flops, memory, cells="mixed", extent=extent, inner=inner, band=band)
 
 
-def _radial(scene: WaveScene, s: _Setting, samples: int | None, nodes: int | None, tol: float) -> Plan:
-    half, turned = _half_phases(scene, s)
+def _radial(scene: WaveScene, s: Setting, *, samples: int | None, nodes: int | None, tol: float, **_) -> Plan:
+    half, turned = half_phases(scene, s)
     if samples is None:
-        samples = _count(half, 0.1 * tol) if half < 20 else rings_and_arms(2 * half, 0 if tol > 1e-6 else 1)[0]
+        samples = gauss_count(half, 0.1 * tol) if half < 20 else rings_and_arms(2 * half, 0 if tol > 1e-6 else 1)[0]
     # Nodes of the rule of pixels from order -2 on (`radii_of_waves`).
     base = math.ceil(0.5 * s.band) + 4
-    nodes = max(base - 2, _count(s.band, 0.5 * tol / 0.15)) if nodes is None else max(nodes, base - 2)
-    error = _node_error(s, nodes) + _radius_error(turned, samples)
+    nodes = max(base - 2, gauss_count(s.band, 0.5 * tol / 0.15)) if nodes is None else max(nodes, base - 2)
+    error = node_error(s, nodes) + radius_error(turned, samples)
     D, W = s.kernels
     J = samples * (len(radial.edges(scene)) - 1)
     K = math.ceil(s.band * reach(scene.grid) + 1.5 * (4 + (2 * s.band * reach(scene.grid)) ** (1 / 3)))
@@ -244,7 +190,8 @@ def _radial(scene: WaveScene, s: _Setting, samples: int | None, nodes: int | Non
     return Plan("radial", samples, nodes, error + 1e-7, flops, s.bytes * (3 * W * K * J + K * s.pixels / 8))
 
 
-def _transfer(s: _Setting, engine: str, samples: int | None, nodes: int, pad: float, band_limit: bool) -> Plan:
+def _transfer(scene: WaveScene, s: Setting, *, engine, samples, nodes, tol, pad, band_limit) -> Plan:
+    nodes = nodes or _nodes(s, tol)
     least, slope = s.diameter * (s.diameter + 2 * s.blur) / (s.shortest * s.distance), 0.5 * s.diameter / s.distance
     if samples is None:
         samples = _even(1.3 * least)
@@ -257,7 +204,7 @@ def _transfer(s: _Setting, engine: str, samples: int | None, nodes: int, pad: fl
             stacklevel=3,
         )
     size = propagate.padded(samples, pad)
-    error = _node_error(s, nodes) + min(1.0, _transfer_error(s, samples, pad, band_limit))
+    error = node_error(s, nodes) + min(1.0, transfer_error(s, samples, pad, band_limit))
     seen = s.diameter * (s.diameter + 2 * s.core) / (s.shortest * s.distance)
     error += max(0.0, 1 - (samples / seen) ** 2) + (0.08 * slope**2 if engine == "angular_spectrum" else 0.0)
     D, W = s.kernels
@@ -266,113 +213,7 @@ def _transfer(s: _Setting, engine: str, samples: int | None, nodes: int, pad: fl
     return Plan(engine, samples, nodes, error, 2 * D * W * transform, memory, pad=pad, band_limit=band_limit)
 
 
-# -- their errors ------------------------------------------------------------------------------------------------------
-
-
-def _edge_error(s: _Setting, samples: int, width: float | None = None) -> float:
-    """Of N cells with weights of sixth order at the rim: fitted over blurs and windows.
-
-    The edge counts for more where the blur is few waves of defocus, or much wider than the window. width: radius mm of
-    the light; by default that of its farthest rays, which is enough for any shape.
-    """
-    period, width = s.period(samples), s.blur if width is None else width
-    waves = max(0.5, 0.25 * width / s.airy)
-    share = 0.016 * (1 + 4 / waves) * max(1.0, width / s.reach) ** 0.6
-    return min(1.0, share * (2 * width / period) ** 3.7 + 2e-4 * (s.reach / period) ** 2 + _tail(s, samples))
-
-
-def _step_error(s: _Setting, samples: float) -> float:
-    """Of N cells over a profile with steps; where cells lie in flat pixels, the smooth rest bends across them."""
-    bent = 0.25 * ((s.blur + 0.5 * s.reach) / s.period(samples)) ** 2
-    return min(1.0, _area_error(s, samples) + (bent if s.lattice else _scattered(s, samples)))
-
-
-def _scattered(s: _Setting, samples: float) -> float:
-    """A cell cut by an edge into f and 1 - f holds the field of one side: in the mean over a cell |jump|²/12 of light,
-    scattered evenly over a period. What repeats with the cells adds up: up to four times as much.
-    """
-    shares = [pitch * samples / s.diameter for pitch in s.features]
-    whole = [min(abs(n - round(n)) / n for n in (share, 1 / share) if n > 0.5) < 0.01 for share in shares]
-    if s.lattice and all(whole) and min(shares) > 0.5:
-        return 0.0
-    return (2.0 if any(whole) else 1.1) * s.scatter * (s.diameter / samples) ** 1.5
-
-
-def _transfer_error(s: _Setting, samples: int, pad: float, band_limit: bool) -> float:
-    """Of the sampled field, its interpolation beyond 3/4 of the band, and the light that wraps round or is cut off.
-
-    Edges and steps send light to a distance ρ with a density ∝ 1/ρ³: without a limit six neighbouring copies bring it
-    back, with one its sharp end rings, by the gap that is left to the window.
-    """
-    width, aside = pad * s.diameter, 0.5 * s.diameter + s.reach
-    error = _area_error(s, samples) + _scattered(s, samples)
-    error += 0.0025 * max(0.0, (s.diameter / (s.airy * samples) - 0.7) / 0.2) ** 5
-    if band_limit:
-        return error + 2.6 * s.edge * (0.5 * width) ** -1.5 * s.airy / max(s.airy, 0.5 * width - aside)
-    wraps = aside + 0.5 * s.period(samples) > width
-    return error + (1.3 * math.sqrt(6) * s.edge * width**-1.5 if wraps else 0.0)
-
-
-def _node_error(s: _Setting, nodes: int) -> float:
-    """Of n Gauss nodes a pixel. Free features make speckle, as fine as the cutoff; blur leaves less light there."""
-    share = 1.0 if s.speckle else (2 / nodes) ** 1.4 / (1 + s.sharpest / (40 * s.airy))
-    return 0.2 * share * _bessel(s.band, nodes)
-
-
-def _radius_error(half: float, samples: int) -> float:
-    """Of n Gauss radii between steps that the phase turns by 2·half."""
-    if half < 20:
-        return min(1.0, _bessel(half, samples))
-    enough = rings_and_arms(2 * half, 0)[0]
-    return 1e-7 if samples >= enough else 0.3 * min(1.0, 10 ** (7 - 10 * samples / enough))
-
-
-def _tail(s: _Setting, samples: int) -> float:
-    """Of the light diffracted at the edge of the copies next to the window, which falls as the square of the gap."""
-    gap = s.period(samples) - s.blur - s.reach
-    return 0.3 * (s.airy / gap) ** 2 if gap > s.airy else 1.0
-
-
-def _area_error(s: _Setting, samples: float) -> float:
-    """Of N cells that count at the rim by their area inside, fitted likewise."""
-    period = s.period(samples)
-    return min(1.0, 0.2 * (2 * s.core / period) ** 2 + 5e-4 * (s.reach / period) ** 2 + _tail(s, samples))
-
-
-def _cut_error(s: _Setting, samples: int, bare: float) -> float:
-    """Of cells of flat pixels cut by the rim: across them turns the bare sphere, with a blur of `bare` mm."""
-    return min(1.0, 0.8 * (s.core + 0.1 * s.airy) * bare / s.period(samples) ** 2 + _tail(s, samples))
-
-
-def _bessel(a: float, nodes: int) -> float:
-    """Error of n Gauss nodes for exp(iat) over [-1, 1], about J_2n(a) <= (a/2)^2n/(2n)!."""
-    return min(1.0, math.exp(2 * nodes * math.log(max(a, 1e-9) / 2) - math.lgamma(2 * nodes + 1)))
-
-
-def _count(a: float, tol: float) -> int:
-    """Gauss nodes for that error to be at most tol."""
-    return next(n for n in range(max(1, math.ceil(a / 2)), 10_000) if _bessel(a, n) <= tol)
-
-
-def _half_phases(scene: WaveScene, s: _Setting) -> tuple[float, float]:
-    """Largest half of the phase, radians, that the integrand of the radial engine turns between two steps: a bound,
-    the slope at the farther one times their distance, and what it turns."""
-    edges = radial.edges(scene).detach()
-    r = torch.linspace(0, 1, 513, dtype=edges.dtype, device=edges.device) * edges[-1]
-    bent = slopes(scene, r, torch.zeros_like(r))[0].abs().amax((0, 1)) + math.sqrt(2) * s.reach / s.distance
-    turned = torch.cumsum(bent, 0) * (edges[-1] / 512)
-    place = edges / edges[-1] * 512
-    low = place.long().clamp(max=511)
-    across = torch.lerp(turned[low], turned[low + 1], place - low).diff()
-    bound = across if len(edges) == 2 else edges.diff() * bent[place[1:].long()]
-    return tuple(float(math.pi / s.shortest * half.max()) for half in (bound, across))
-
-
-def _only_pixels(scene: WaveScene) -> bool:
-    return not scene.exact and len(scene.elements) == 1 and isinstance(scene.elements[0].profile, Pixels)
-
-
-def _aligned(scene: WaveScene, s: _Setting, samples: int) -> tuple[int, float]:
+def _aligned(scene: WaveScene, s: Setting, samples: int) -> tuple[int, float]:
     """At least so many cells, a whole number to each pixel of a map, and their extent over the diameter."""
     maps = [e.profile for e in scene.elements if isinstance(e.profile, Pixels)]
     if not maps or scene.exact:
@@ -389,3 +230,68 @@ def _least(error, tol: float) -> int:
 
 def _even(number: float) -> int:
     return max(16, 2 * math.ceil(0.5 * number))
+
+
+def _nodes(s: Setting, tol: float) -> int:
+    """Per pixel and axis."""
+    return gauss_count(s.band, 0.4 * tol / 0.15)
+
+
+# -- what carries them out ---------------------------------------------------------------------------------------------
+
+
+def _pupil_sums(scene: WaveScene, plan: Plan) -> pupil.PupilSums | mixed.MixedSums:
+    if plan.cells == "mixed":
+        return mixed.prepare(scene, plan.samples, plan.nodes, extent=plan.extent, radii=plan.inner, band=plan.band)
+    if plan.cells == "flat":
+        return pupil.prepare_pixels(scene, plan.nodes, plan.inner, parts=plan.parts)
+    return pupil.prepare(scene, plan.samples, plan.nodes, extent=plan.extent)
+
+
+def _pupil_kernels(scene: WaveScene, sums, plan: Plan) -> Tensor:
+    light = (mixed if plan.cells == "mixed" else pupil).intensity(scene, sums)
+    return integrate(light, sums.pixel, scene.grid.pitch)
+
+
+def _radial_sums(scene: WaveScene, plan: Plan) -> radial.RadialSums:
+    return radial.prepare(scene, plan.samples, radial.order_of(scene, plan.nodes))
+
+
+def _sent(scene: WaveScene, sums: None, plan: Plan) -> Tensor:
+    how = {"pad": plan.pad, "band_limit": plan.band_limit, "spectrum": plan.engine == "angular_spectrum"}
+    light, weight = propagate.intensity(scene, samples=plan.samples, nodes=plan.nodes, **how)
+    return integrate(light, weight, scene.grid.pitch)
+
+
+class Engine(NamedTuple):
+    """A way from the elements to the pixels.
+
+    assumes: of the scene; errs: by what; plan: (scene, its numbers, what is asked for) -> Plan, with cost and error;
+    kernels: (scene, sums, plan) -> light in the pixels (D, W, rows, columns); prepare: (scene, plan) -> sums, what the
+    heights do not change, if there is anything.
+    """
+
+    assumes: str
+    errs: str
+    plan: Callable[..., Plan]
+    kernels: Callable[[WaveScene, Any, Plan], Tensor]
+    prepare: Callable[[WaveScene, Plan], Any] | None = None
+
+    @property
+    def is_reference(self) -> bool:
+        """Whether it samples the converging field itself: never chosen, and not held to a tolerance."""
+        return self.prepare is None
+
+
+ENGINES = {
+    "pupil": Engine("nothing", "copies of the image; cells at rim and steps", _pupil, _pupil_kernels, _pupil_sums),
+    "radial": Engine(
+        "round elements, a window on the axis",
+        "phase between two radii",
+        _radial,
+        lambda scene, sums, plan: radial.kernels(scene, sums),
+        _radial_sums,
+    ),
+    "fresnel": Engine("paraboloids", "light that wraps round, or the band limit cuts off", _transfer, _sent),
+    "angular_spectrum": Engine("true spheres", "the same, and paraboloids elsewhere", _transfer, _sent),
+}

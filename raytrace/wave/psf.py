@@ -2,15 +2,10 @@
 
 from torch import Tensor
 
-from raytrace.kernels.dft import integrate
 from raytrace.maths.grid import Grid
 from raytrace.maths.value import value
-from raytrace.wave import mixed, propagate, pupil, radial
 from raytrace.wave import plan as planning
-from raytrace.wave.mixed import MixedSums
 from raytrace.wave.plan import Plan
-from raytrace.wave.pupil import PupilSums
-from raytrace.wave.radial import RadialSums
 from raytrace.wave.reuse import Memo
 from raytrace.wave.scene import WaveScene
 
@@ -76,30 +71,9 @@ def psf(
     return WavePsf(_kernels(scene, plan, memo), scene.depths, scene.wavelengths, scene.grid, plan)
 
 
-def prepare(scene: WaveScene, plan: Plan) -> RadialSums | PupilSums | MixedSums:
-    """What the heights do not change, of the engines that have it."""
-    if plan.engine == "radial":
-        return radial.prepare(scene, plan.samples, radial.order_of(scene, plan.nodes))
-    if plan.cells == "mixed":
-        return mixed.prepare(scene, plan.samples, plan.nodes, extent=plan.extent, radii=plan.inner, band=plan.band)
-    if plan.cells == "flat":
-        return pupil.prepare_pixels(scene, plan.nodes, plan.inner, parts=plan.parts)
-    return pupil.prepare(scene, plan.samples, plan.nodes, extent=plan.extent)
-
-
 def _kernels(scene: WaveScene, plan: Plan, memo: Memo | None) -> Tensor:
-    if plan.engine in ("fresnel", "angular_spectrum"):
-        light, weight = propagate.intensity(
-            scene,
-            samples=plan.samples,
-            nodes=plan.nodes,
-            pad=plan.pad,
-            band_limit=plan.band_limit,
-            spectrum=plan.engine == "angular_spectrum",
-        )
-        return integrate(light, weight, scene.grid.pitch)
-    sums = prepare(scene, plan) if memo is None else memo.find(scene, plan, prepare)
-    if plan.engine == "radial":
-        return radial.kernels(scene, sums)
-    light = (mixed if plan.cells == "mixed" else pupil).intensity(scene, sums)
-    return integrate(light, sums.pixel, scene.grid.pitch)
+    engine = planning.ENGINES[plan.engine]
+    if engine.prepare is None:
+        return engine.kernels(scene, None, plan)
+    sums = engine.prepare(scene, plan) if memo is None else memo.find(scene, plan, engine.prepare)
+    return engine.kernels(scene, sums, plan)

@@ -58,16 +58,26 @@ def prepare(scene: WaveScene, samples: int, nodes: int, *, extent: float = 1.0) 
         cells = disc_cells(samples, extent)
     edge = R / torch.sqrt(R * R + z * z) if scene.exact else R / z
     t = edge * R.new_tensor((2 * np.arange(len(cells)) + 1) / len(cells) - 1) * extent
-    u, v, pixel = sub_pixels(scene.grid, nodes)
-    folded = is_centred(scene.grid)
-    along_x, along_y = ((halves if folded else waves_at)(s, t, wavelength) for s in (u, v))
-    t2 = t * t + (t * t)[:, None]
-    stretch = 1 / torch.sqrt(1 - torch.clamp(t2, max=0.99)) if scene.exact else torch.ones_like(t2)
-    x, y = z * t * stretch, z * t[:, None] * stretch
+    x, y, stretch = cells_at(scene, t)
     # dA cos θ/|x - u| = z dt² paraxially, z dt²/(1 - t²) for a true sphere.
     light = R.new_tensor(cells) * edge**2 * stretch**2 * z / (math.sqrt(math.pi) * R)
     light = light / wavelength[:, None, None]
-    return PupilSums(x, y, light, spheres(scene, x * x + y * y), along_x, along_y, pixel, folded)
+    return PupilSums(x, y, light, spheres(scene, x * x + y * y), *to_pixels(scene, t, nodes))
+
+
+def cells_at(scene: WaveScene, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """x, y (N, N) mm of cells at t (N,) on both axes, and √(r² + z²)/z there; paraxially x = z t and 1."""
+    t2, z = t * t + (t * t)[:, None], scene.sensor_distance
+    stretch = 1 / torch.sqrt(1 - torch.clamp(t2, max=0.99)) if scene.exact else torch.ones_like(t2)
+    return z * t * stretch, z * t[:, None] * stretch, stretch
+
+
+def to_pixels(scene: WaveScene, t: Tensor, nodes: int) -> tuple[Tensor, Tensor, Tensor, bool]:
+    """From cells at t (N,) on both axes to the nodes of the pixels: along_x, along_y, pixel and folded of the sums."""
+    u, v, pixel = sub_pixels(scene.grid, nodes)
+    folded = is_centred(scene.grid)
+    along_x, along_y = ((halves if folded else waves_at)(s, t, millimetres(scene)) for s in (u, v))
+    return along_x, along_y, pixel, folded
 
 
 def prepare_pixels(scene: WaveScene, nodes: int, inner: int, *, parts: int = 1) -> PupilSums:

@@ -39,13 +39,19 @@ class RadialSums:
 
 def prepare(scene: WaveScene, nodes: int, order: int) -> RadialSums:
     """Constants for `nodes` Gauss radii between steps, and an order of the radii on the sensor (`radii_of_waves`)."""
-    R, wavelength = aperture(scene), millimetres(scene)[:, None, None]
+    rho, to_pixels = radii_of_waves(scene.grid, cutoff(scene), order)
+    r, bessel = to_radii(scene, rho, nodes)
+    return RadialSums(r, spheres(scene, r * r), bessel, to_pixels)
+
+
+def to_radii(scene: WaveScene, rho: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
+    """Radii r (J,) mm of the element, `nodes` between steps, and the matrix (W, K, J) from the phasors there to U, |U|²
+    per mm², at radii rho (K,) mm of the sensor."""
+    wavelength = millimetres(scene)[:, None, None]
     r, weight = rule(edges(scene), nodes)
     t, light = slope(scene, r)
-    rho, to_pixels = radii_of_waves(scene.grid, cutoff(scene), order)
-    scale = 2 * math.sqrt(math.pi) / (R * wavelength)
-    bessel = scale * weight * light * bessel_j0(2 * math.pi * rho[:, None] * t / wavelength)
-    return RadialSums(r, spheres(scene, r * r), bessel, to_pixels)
+    scale = 2 * math.sqrt(math.pi) / (aperture(scene) * wavelength)
+    return r, scale * weight * light * bessel_j0(2 * math.pi * rho[:, None] * t / wavelength)
 
 
 def kernels(scene: WaveScene, sums: RadialSums) -> Tensor:
@@ -55,8 +61,7 @@ def kernels(scene: WaveScene, sums: RadialSums) -> Tensor:
 
 def intensity(scene: WaveScene, sums: RadialSums) -> Tensor:
     """Light per mm² (D, W, K) at the radii of the sensor."""
-    waves = path(scene.elements, sums.r, torch.zeros_like(sums.r), scene.wavelengths) + sums.sphere[:, None]
-    U = phasor(waves / millimetres(scene)[:, None])
+    U = phasors(scene, sums.r, sums.sphere)
     # A real matrix on the columns Re U, Im U of all depths.
     parts = torch.view_as_real(U).permute(1, 2, 0, 3).flatten(2)
     parts = (sums.bessel @ parts).unflatten(-1, (-1, 2))
@@ -65,14 +70,15 @@ def intensity(scene: WaveScene, sums: RadialSums) -> Tensor:
 
 def field(scene: WaveScene, rho: Tensor, nodes: int) -> Tensor:
     """U (D, W, K) at radii rho (K,) mm on the sensor, |U|² per mm² as `intensity`."""
-    r, weight = rule(edges(scene), nodes)
-    t, light = slope(scene, r)
-    wavelength = millimetres(scene)
-    waves = path(scene.elements, r, torch.zeros_like(r), scene.wavelengths) + spheres(scene, r * r)[:, None]
-    scale = 2 * math.sqrt(math.pi) / (aperture(scene) * wavelength)[:, None, None]
-    bessel = scale * weight * light * bessel_j0(2 * math.pi * rho[:, None] * t / wavelength[:, None, None])
-    U = phasor(waves / wavelength[:, None])
+    r, bessel = to_radii(scene, rho, nodes)
+    U = phasors(scene, r, spheres(scene, r * r))
     return (bessel.to(U.dtype) @ U[..., None])[..., 0]
+
+
+def phasors(scene: WaveScene, r: Tensor, sphere: Tensor) -> Tensor:
+    """exp(ik W_residual) (D, W, J) at radii r (J,) of the element; sphere: of `spheres`."""
+    waves = path(scene.elements, r, torch.zeros_like(r), scene.wavelengths) + sphere[:, None]
+    return phasor(waves / millimetres(scene)[:, None])
 
 
 def slope(scene: WaveScene, r: Tensor) -> tuple[Tensor, Tensor]:
