@@ -232,12 +232,12 @@ def test_reader_that_leaves_early_is_no_error(tmp_path):
 
 
 def test_interrupt_is_one_line(run, monkeypatch):
-    from raytrace.cli import lens_commands
+    from raytrace.optics import views
 
-    def interrupted(arguments):
+    def interrupted(lens):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(lens_commands, "info", interrupted)
+    monkeypatch.setattr(views, "info", interrupted)
     assert run("info", "double_gauss") == (130, "", "raytrace: error: interrupted\n")
 
 

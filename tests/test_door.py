@@ -205,6 +205,65 @@ def test_a_spot_is_differentiable_and_a_table_and_draws_itself(tmp_path):
         rt.spot(lens, fields=[80])
 
 
+def test_a_lens_is_focused_by_every_criterion(tmp_path):
+    lens = rt.read_lens("double_gauss").at(object_distance=25e3)
+    found = rt.focus(lens)
+    assert float(found.lens.surfaces[-2].thickness) == pytest.approx(57.66201, abs=1e-5)
+    assert float(found.rms_radius()) < float(found.rms_radius(57.0))
+    paraxial = rt.focus(lens, criterion="paraxial").sensor_distance
+    assert float(paraxial) == pytest.approx(float(rt.first_order(lens).paraxial_image_distance), rel=1e-12)
+    mean = rt.focus(lens, criterion="mean").sensor_distance
+    assert 0 < abs(float(mean - found.sensor_distance)) < 0.2
+    several = rt.focus(lens, object_distances=[10e3, float("inf")], distance_weights=[1, 3], fields=[0, 10])
+    assert several.document()["object_distance"] == [10e3, None]
+    assert several.to_frame().place.tolist()[:2] == ["before", "after"]
+    found.save(tmp_path / "focused.zmx")
+    assert float(rt.read_lens(tmp_path / "focused.zmx").surfaces[-2].thickness) == float(found.sensor_distance)
+    assert found.plot().axes
+    for wrong, said in (({"criterion": "best"}, "rms, paraxial, mean"), ({"field_weights": [1, 2]}, "expected 1, one")):
+        with pytest.raises(ValueError, match=said):
+            rt.focus(lens, **wrong)
+    with pytest.raises(rt.NoFocus, match="no ray reaches the image"), pytest.warns(rt.LostRays):
+        rt.focus(lens, fields=[80])
+
+
+def test_a_curvature_goes_through_every_verb():
+    """lens.replace with a tensor that requires a gradient, and the same number through the verbs of rays."""
+    lens = rt.read_lens("cooke_triplet")
+    curvature = lens.surfaces[3].curvature.clone().requires_grad_()
+    bent = lens.replace(3, curvature=curvature)
+    for found in (
+        rt.trace(bent).position,
+        rt.trace(bent, rt.rays(bent, fields=[0, 14])).position,
+        rt.focus(bent).sensor_distance,
+        rt.spot(rt.focus(bent).lens).mean_square_radius,
+    ):
+        (slope,) = torch.autograd.grad(found.sum(), curvature)
+        assert torch.isfinite(slope)
+        assert slope != 0
+    for shown in (rt.info(bent), rt.layout(bent), rt.trace(bent), rt.spot(bent), rt.focus(bent)):
+        assert str(shown)
+        json.dumps(shown.document())
+    assert rt.layout(bent).plot().axes
+
+
+def test_a_lens_shows_itself():
+    lens = rt.read_lens("cooke_triplet")
+    shown = str(lens)
+    assert shown == str(rt.info(lens))
+    assert "effective focal length" in shown
+    assert len(shown.splitlines()) > len(lens.surfaces) + len(rt.FirstOrder.__dataclass_fields__) - 4
+    page = lens._repr_html_()
+    assert "<svg" in page
+    assert page.count("<tr") == len(lens.surfaces) + 1
+    table = rt.info(lens).to_frame()
+    assert table.radius[1] == pytest.approx(float(1 / lens.surfaces[1].curvature))
+    assert table.glass[1] == lens.surfaces[1].glass.name
+    batch = rt.with_object_distance(lens, torch.tensor([[1e3], [2e3]], dtype=torch.float64))
+    assert str(batch).startswith("Lens(")  # what is no single lens shows its numbers
+    assert "<pre>" in batch._repr_html_()
+
+
 # -- one verb, one door ------------------------------------------------------------------------------------------------
 
 #: Commands that are a verb, each in a file of its own.

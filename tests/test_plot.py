@@ -82,7 +82,7 @@ def test_a_stop_behind_the_first_vertex_does_not_fold_the_rays():
 
 
 def test_the_glass_of_the_figure_is_bounded_by_the_sag(double_gauss):
-    figure = plot.layout(double_gauss)
+    figure = rt.layout(double_gauss).plot()
     z = outline.vertices(double_gauss)
     elements = {int(artist.get_gid().split()[1]): artist.get_xy() for artist in by_gid(figure, "glass")}
     assert set(elements) == {1, 3, 4, 7, 8, 10}
@@ -98,7 +98,7 @@ def test_the_glass_of_the_figure_is_bounded_by_the_sag(double_gauss):
 def test_global_vertices_follow_negative_thicknesses_and_infinite_ones_are_refused(double_gauss):
     np.testing.assert_allclose(outline.vertices(read_lens("hubble"))[1:], [0, 4906.071, 0, 6406.2])
     with pytest.raises(ValueError, match="surface 11 has a thickness of inf"):
-        plot.layout(with_sensor_distance(double_gauss, math.inf))
+        rt.layout(with_sensor_distance(double_gauss, math.inf)).plot()
 
 
 def test_a_surface_without_semi_diameter_is_drawn_as_far_as_its_rays_reach(double_gauss):
@@ -160,7 +160,7 @@ def test_a_lost_ray_ends_at_the_surface_that_lost_it(curvature, aperture, apertu
         assert abs(path.y[-1]) == pytest.approx(aperture)  # the rays are parallel to the axis
         depth = 0.0 if status == "miss" else float(sag(lens.surfaces[2], number(aperture**2)))
         assert path.z[-1] == pytest.approx(5.0 + depth)
-    figure = plot.layout(lens, rays=3)
+    figure = rt.layout(lens, rays=3).plot()
     assert len(by_gid(figure, "lost ray")) == 2
     assert len(by_gid(figure, "ray")) == 1
 
@@ -185,21 +185,21 @@ def test_rays_of_a_near_object_start_on_it_and_those_of_a_far_one_in_front_of_th
     )
     near = with_object_distance(near, 200.0)
     near = with_sensor_distance(near, paraxial_image_distance(near, number(200.0)))
-    figure = plot.layout(near)
+    figure = rt.layout(near).plot()
     starts = [(line.get_xdata()[0], line.get_ydata()[0]) for line in by_gid(figure, "ray")]
     assert {round(z, 9) for z, _ in starts} == {-200.0}
     assert {round(y, 9) + 0.0 for _, y in starts} == {0.0, -5.0, -9.0}
-    far = plot.layout(double_gauss, object_distance=25000.0)
+    far = rt.layout(double_gauss.at(object_distance=25000.0)).plot()
     lengths = {round(line.get_xdata()[0], 6) for line in by_gid(far, "ray")}
     assert len(lengths) == 1
     assert -50 < lengths.pop() < 0
 
 
 def test_layout_says_what_it_shows(double_gauss):
-    text = words(plot.layout(double_gauss, object_distance=25000.0))
+    text = words(rt.layout(double_gauss.at(object_distance=25000.0)).plot())
     for expected in (double_gauss.name, "EFL 99.51 mm", "F/2.99", "object at 25 m", "0°", "10°", "14°", "20 mm"):
         assert expected in text
-    colours = {line.get_color() for line in by_gid(plot.layout(double_gauss), "ray")}
+    colours = {line.get_color() for line in by_gid(rt.layout(double_gauss).plot(), "ray")}
     assert colours == set(style.FIELD_COLOURS[:3])
 
 
@@ -258,7 +258,7 @@ def test_a_field_that_no_ray_survives_says_so(double_gauss):
     blind = double_gauss.replace(6, apertures=(Aperture("circular", (0.0, 20.0), obscures=True),))
     assert "no ray reaches" in words(rt.spot(blind, rings=4).plot())
     plot.through_focus_curve(blind, pupil=PUPIL)
-    plot.layout(blind)
+    rt.layout(blind).plot()
 
 
 # through focus
@@ -298,12 +298,8 @@ def test_curves_by_wavelength_find_the_axial_colour():
 
 
 def test_focus_report_prints_the_sensor_and_the_spot_before_and_after(double_gauss):
-    points, weights = gauss_rings(6)
-    axis = torch.zeros(2, 1, dtype=torch.float64)
-    after = with_sensor_distance(
-        double_gauss, focus_of_rms(double_gauss, points, weights, object_distances=[25000.0], fields=axis)
-    )
-    figure = plot.focus_report(double_gauss, after, object_distances=25000.0)
+    found = rt.focus(double_gauss, object_distances=[25000.0], rings=6)
+    figure = found.plot()
     text = words(figure)
     for expected in ("sensor before: 58.5000 mm", "sensor after: 57.6620 mm, 7.075 µm", "RMS 7.075 µm", "RMS 100.2 µm"):
         assert expected in text
@@ -315,14 +311,13 @@ def test_focus_report_prints_the_sensor_and_the_spot_before_and_after(double_gau
         if axes.get_title().startswith("Spot ")
     }
     assert len(scales) == 1
-    assert {line.get_xdata()[-1] for line in by_gid(figure, "ray")} == {outline.vertices(after)[-1]}
+    assert {line.get_xdata()[-1] for line in by_gid(figure, "ray")} == {outline.vertices(found.lens)[-1]}
 
 
 def test_focus_report_takes_several_objects_and_fields(double_gauss):
     fields = number([[0.0, 0.0], [0.0, 14.0]])
-    after = with_sensor_distance(double_gauss, 57.9)
-    figure = plot.focus_report(double_gauss, after, object_distances=[25000.0, math.inf], fields=fields, pupil=PUPIL)
-    text = words(figure)
+    found = rt.focus(double_gauss, object_distances=[25000.0, math.inf], fields=fields, rings=4)
+    text = words(dataclasses.replace(found, lens=with_sensor_distance(double_gauss, 57.9)).plot())
     for label in ("25 m, 0°:", "25 m, 14°:", "infinity, 0°:", "infinity, 14°:", "paraxial foci"):
         assert label in text
     assert text.count("RMS ") - text.count("RMS spot radius") - text.count("least RMS") == 8
@@ -336,7 +331,7 @@ def test_focus_report_takes_several_objects_and_fields(double_gauss):
 )
 def test_save_writes_the_format_of_the_suffix_and_the_same_bytes_again(double_gauss, tmp_path, suffix, start):
     for name in ("a", "b"):
-        plot.save(plot.layout(double_gauss, rays=3), tmp_path / f"{name}.{suffix}", dpi=60)
+        plot.save(rt.layout(double_gauss, rays=3).plot(), tmp_path / f"{name}.{suffix}", dpi=60)
     first, second = ((tmp_path / f"{name}.{suffix}").read_bytes() for name in ("a", "b"))
     assert first.startswith(start)
     assert first == second
@@ -372,9 +367,8 @@ def test_figures_touch_neither_pyplot_nor_the_settings_of_the_reader():
     script = (
         "import sys, matplotlib\n"
         "before = dict(dict.items(matplotlib.rcParams))  # raw: looking up the backend would load pyplot\n"
-        "from raytrace import plot\n"
-        "from raytrace.formats import read_lens\n"
-        f"plot.layout(read_lens({str(LENSES / 'singlet.zmx')!r}), rays=3)\n"
+        "import raytrace as rt\n"
+        "rt.layout(rt.read_lens('singlet'), rays=3).plot()\n"
         "assert 'matplotlib.pyplot' not in sys.modules\n"
         "assert dict(dict.items(matplotlib.rcParams)) == before\n"
     )
@@ -385,7 +379,7 @@ def test_the_lens_keeps_its_gradients(double_gauss):
     thickness = double_gauss.surfaces[-2].thickness.clone().requires_grad_()
     lens = double_gauss.at(sensor_distance=thickness)
     for figure in (
-        plot.layout(lens, rays=3),
+        rt.layout(lens, rays=3).plot(),
         rt.spot(lens, rings=4).plot(),
         plot.through_focus_curve(lens, pupil=PUPIL),
     ):

@@ -69,7 +69,7 @@ def test_titles_longer_than_the_page_are_broken():
         plot.curvature_curves(lens, analysis.field_curvature(lens)),
         plot.wavefront_maps(lens, analysis.wavefront_map(lens, wavelengths=number([0.55]), size=16)),
         rt.spot(lens).plot(),
-        plot.layout(lens),
+        rt.layout(lens).plot(),
         plot.through_focus_curve(lens),
     ):
         assert outside(figure) == []

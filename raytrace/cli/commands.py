@@ -4,48 +4,13 @@ from raytrace.cli import wave
 from raytrace.cli.analysis_table import ANALYSES
 from raytrace.cli.command import Command
 from raytrace.cli.options import (
-    conditions,
     count,
-    fields,
     file_name,
     json,
-    lens,
     output,
     plot,
-    positive_finite,
-    sampling,
 )
 from raytrace.cli.studies import words
-
-
-def _info(parser):
-    lens(parser)
-    conditions(parser)
-
-
-def _layout(parser):
-    lens(parser)
-    conditions(parser)
-    fields(parser)
-    plot(parser, "the cross section (default LENS_layout.png in this folder)")
-
-
-def _focus(parser):
-    lens(parser)
-    conditions(parser, several="several are focused together")
-    fields(parser)
-    parser.add_argument(
-        "--criterion",
-        choices=("rms", "paraxial", "mean"),
-        default="rms",
-        help="least RMS spot radius (default), paraxial image, or least mean distance from the centroid",
-    )
-    parser.add_argument("--distance-weights", metavar="W", type=positive_finite, nargs="+", help="one a distance")
-    parser.add_argument("--field-weights", metavar="W", type=positive_finite, nargs="+", help="one a field")
-    parser.add_argument("--wavelength-weights", metavar="W", type=positive_finite, nargs="+", help="one a wavelength")
-    sampling(parser, rings=12)
-    plot(parser, "the through-focus curve, the spots before and after, and the layout")
-    output(parser, "lens file to write with the new sensor distance")
 
 
 def _bench(parser):
@@ -80,41 +45,12 @@ def _bench(parser):
 
 
 COMMANDS = (
-    Command(
-        "info",
-        "first-order data and the surfaces of a lens",
-        "Print focal lengths, pupils, magnification and the prescription of a lens.",
-        """examples:
-  raytrace info double_gauss
-  raytrace info lenses/double_gauss.zmx --object-distance 25000 --f-number 4
-  raytrace info lens.zmx --json | python3 -m json.tool""",
-        _info,
-        "cli.lens_commands.info",
-    ),
+    Command.of("cli.info"),
     Command.of("cli.check"),
     Command.of("cli.convert"),
-    Command(
-        "layout",
-        "draw the lens with rays",
-        "Draw the cross section of a lens with the rays of its fields.",
-        """examples:
-  raytrace layout double_gauss --plot layout.png
-  raytrace layout lens.zmx --field 0 14 -14,0 --plot layout.pdf""",
-        _layout,
-        "cli.lens_commands.layout",
-    ),
+    Command.of("cli.layout"),
     Command.of("cli.spot"),
-    Command(
-        "focus",
-        "find the best sensor distance",
-        "Find the sensor distance of the least RMS spot (closed form, nothing is retraced), on axis and at the primary "
-        "wavelength unless told otherwise.",
-        """examples:
-  raytrace focus lenses/double_gauss.zmx --object-distance 25000 --plot focus.png
-  raytrace focus lens.zmx --object-distance 10000 25000 50000 --field 0 10 14 -o focused.zmx""",
-        _focus,
-        "cli.focus_commands.focus",
-    ),
+    Command.of("cli.focus"),
     Command.of("cli.trace"),
     Command.of("cli.psf"),
     Command.of("cli.compare"),

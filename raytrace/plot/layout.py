@@ -14,9 +14,10 @@ from raytrace.maths.pupil import fan
 from raytrace.optics.launch import stop_radius
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.trace import media
+from raytrace.optics.views import Layout
 from raytrace.plot import outline, style
 from raytrace.system.aperture import reach
-from raytrace.system.lens import Lens, with_object_distance
+from raytrace.system.lens import Lens
 
 _LEAD = 0.14  # of the length of the lens: how far in front of it rays of a far object start
 _NEAR = 1.5  # an object nearer than this many lengths of the lens is drawn
@@ -24,36 +25,23 @@ _GLASS = ("#e9f2f8", "#86b3d1")  # tints at n = 1.4 and n = 2.0
 
 
 @style.styled
-def layout(
-    lens: Lens,
-    *,
-    fields: Tensor | None = None,
-    wavelength: Tensor | float | None = None,
-    rays: int = 7,
-    object_distance: Tensor | float | None = None,
-) -> Figure:
+def layout(found: Layout) -> Figure:
     """The lens in cross section: glass filled by index, mirrors hatched, the stop marked, rays coloured by field.
 
-    fields: (2, F) in the lens's own kind of field, by default its own; wavelength: µm, the primary one by default;
-    rays: how many of the meridional fan are drawn for each field; object_distance: mm from surface 1, inf allowed,
-    by default that of the lens. Lost rays are drawn faint and dashed up to where they are lost, with a cross where
-    a surface is missed or reflects totally. Raises ValueError for a lens with an infinite thickness inside.
+    Rays are those of the primary wavelength. Lost ones are drawn faint and dashed up to where they are lost, with a
+    cross where a surface is missed or reflects totally. Raises ValueError for a lens with an infinite thickness inside.
     """
-    lens = style.detached(lens)
-    if object_distance is not None:
-        lens = with_object_distance(lens, object_distance)
+    lens, fields = style.detached(found.lens), found.fields.detach()
     figure = style.new_figure(8.0, 4.0)
     axes = figure.add_subplot()
-    draw_layout(axes, lens, fields=fields, wavelength=wavelength, rays=rays)
+    draw_layout(axes, lens, fields=fields, rays=found.rays)
     (z0, z1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
     shape = (y1 - y0) / (z1 - z0)
     width = min(max(6.0 / shape, 5.5), 8.0)
     figure.set_size_inches(width, min(max(0.98 * width * shape, 1.2), 6.0) + 1.1)
     figure.suptitle(style.fill(lens.name, width, 11, bold=True) or "Lens", fontsize=11, fontweight="bold")
     axes.set_title(style.first_order_text(lens, first_order(lens)), fontsize=8.5, color=style.GREY, pad=4)
-    labels = [
-        style.field_label(lens, field) for field in zip(*style.array(style.lens_fields(lens, fields)), strict=True)
-    ]
+    labels = [style.field_label(lens, field) for field in style.array(fields).T]
     colours = style.field_colours(len(labels))
     handles = [Line2D([], [], color=colour, label=label) for colour, label in zip(colours, labels, strict=True)]
     figure.legend(

@@ -1,8 +1,5 @@
 """Focus report: one page that shows what moving the sensor did."""
 
-from collections.abc import Sequence
-from numbers import Number
-
 import numpy as np
 import torch
 from matplotlib.axes import Axes
@@ -10,6 +7,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from raytrace.maths.result import object_text
+from raytrace.optics.focusing import Focus
 from raytrace.optics.paraxial import first_order, paraxial_image_distance
 from raytrace.plot import style
 from raytrace.plot.curve import FocusRays, draw_curves, focus_rays, focus_span
@@ -25,35 +23,18 @@ _MAGNIFY = 4.0  # where the spot after is smaller than its panel by more than th
 
 
 @style.styled
-def focus_report(
-    lens_before: Lens,
-    lens_after: Lens,
-    *,
-    object_distances: Sequence[Tensor | float] | Tensor | float | None = None,
-    fields: Tensor | None = None,
-    wavelengths: Tensor | None = None,
-    wavelength_weights: Tensor | None = None,
-    pupil: tuple[Tensor, Tensor] | None = None,
-) -> Figure:
+def focus_report(found: Focus) -> Figure:
     """One page: the lens, the RMS spot radius through focus, and the spots before and after on one scale.
 
-    The two lenses differ in their sensor distance only. object_distances: one or several, mm from surface 1, inf
-    allowed, by default that of the lens; fields: (2, F) in the lens's own kind of field, by default the axis;
-    wavelengths: (W,) µm, by default the primary one, with weights (W,), by default equal; pupil: points (2, P),
-    weights (P,). Every object distance and field is a curve and a pair of spots.
+    Every object distance and field is a curve and a pair of spots.
     """
-    lens_before, lens_after = style.detached(lens_before), style.detached(lens_after)
-    lens = lens_before
-    distances = [lens.surfaces[0].thickness] if object_distances is None else object_distances
-    distances = [distances] if isinstance(distances, Number) else distances
-    distances = [
-        float(distance) for distance in (distances.reshape(-1) if isinstance(distances, Tensor) else distances)
-    ]
-    fields = torch.zeros_like(style.lens_fields(lens, None)[:, :1]) if fields is None else fields
-    wavelengths = lens.wavelengths[lens.primary_wavelength].reshape(1) if wavelengths is None else wavelengths
+    lens_before, lens_after = style.detached(found.before), style.detached(found.lens)
+    lens, fields, wavelengths = lens_before, found.fields.detach(), found.wavelengths.detach()
+    distances = found.object_distances.tolist()
     labels = _labels(lens, distances, fields)
     rule = {
-        "fields": fields, "wavelengths": wavelengths, "wavelength_weights": wavelength_weights, "pupil": pupil
+        "fields": fields, "wavelengths": wavelengths, "wavelength_weights": found.wavelength_weights,
+        "pupil": (found.points, found.weights),
     }  # fmt: skip
 
     columns = max(len(labels), 1)

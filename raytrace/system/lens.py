@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import torch
 from torch import Tensor
 
+from raytrace.maths.result import lent
 from raytrace.maths.value import value
 from raytrace.media.glass import check_unit, check_wavelengths, refractive_index
 from raytrace.system.shapes import EVEN, KINDS
@@ -88,6 +89,9 @@ class Lens:
     notes: tuple[str, ...] = ()
     catalogs: tuple[str, ...] = ()
     ray_aiming: str = "off"
+
+    __str__ = lent("optics.views.text")
+    _repr_html_ = lent("plot.notebook.page")
 
     def at(
         self,

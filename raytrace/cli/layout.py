@@ -1,0 +1,27 @@
+"""`raytrace layout`."""
+
+from raytrace.cli import options as words
+
+SUMMARY = "draw the lens with rays"
+DESCRIPTION = "Draw the cross section of a lens with the rays of its fields."
+EXAMPLES = """examples:
+  raytrace layout double_gauss --plot layout.png
+  raytrace layout lens.zmx --field 0 14 -14,0 --plot layout.pdf"""
+
+
+def options(parser):
+    words.lens(parser)
+    words.conditions(parser)
+    words.fields(parser)
+    words.plot(parser, "the cross section (default LENS_layout.png in this folder)")
+
+
+def run(arguments):
+    """The cross section, which has a name of its own if it is given none."""
+    import sys
+    from pathlib import Path
+
+    from raytrace.cli.run import verb_of_lens
+
+    arguments.plot = arguments.plot or f"{Path(arguments.lens).stem}_layout{arguments.suffix}.png"
+    return verb_of_lens(sys.modules[__name__], arguments)

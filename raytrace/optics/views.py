@@ -1,0 +1,197 @@
+"""Views of a lens as it stands: first-order data and prescription, and the cross section."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from raytrace.maths.result import Result, number, numbers
+from raytrace.maths.value import value
+from raytrace.optics.f_number import real_working_f_number
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.trace import media
+from raytrace.system.lens import FIELD_UNITS, Lens, field_points, name_of_field
+from raytrace.system.shapes import EVEN
+from raytrace.system.surface import vertex_curvature
+
+#: Lines of `raytrace info`: words, entry of FirstOrder (and the real working F/#), unit.
+FIRST_ORDER_LINES = (
+    ("effective focal length", "effective_focal_length", "mm"),
+    ("back focal distance", "back_focal_distance", "mm, from the last surface before the image"),
+    ("front focal distance", "front_focal_distance", "mm, from surface 1"),
+    ("F/#", "f_number", "focal length / entrance pupil diameter"),
+    ("working F/#", "working_f_number", "1/(2 n' u')"),
+    ("real working F/#", "real_working_f_number", "1/(2 n' sin θ') of the real marginal ray"),
+    ("entrance pupil position", "entrance_pupil_position", "mm, from surface 1"),
+    ("entrance pupil diameter", "entrance_pupil_diameter", "mm"),
+    ("exit pupil position", "exit_pupil_position", "mm, from the image"),
+    ("exit pupil diameter", "exit_pupil_diameter", "mm"),
+    ("paraxial image distance", "paraxial_image_distance", "mm, from the last surface before the image"),
+    ("magnification", "magnification", ""),
+    ("angular magnification", "angular_magnification", "u'/u of the chief ray"),
+    ("optical invariant", "optical_invariant", "mm, of the largest field"),
+    ("object NA", "object_na", ""),
+    ("image NA", "image_na", ""),
+    ("Petzval radius", "petzval_radius", "mm"),
+)
+
+
+@value
+class Info(Result):
+    """First-order data and the prescription of a lens; the table has a row a surface: mm, the index at the primary
+    wavelength."""
+
+    lens: Lens
+
+    def columns(self) -> dict[str, Tensor]:
+        surfaces, like = self.lens.surfaces, self.lens.wavelengths
+        number_of = torch.arange(len(surfaces))
+        rows = [
+            (_radius(s), float(s.thickness), math.nan if s.semi_diameter is None else s.semi_diameter) for s in surfaces
+        ]
+        radius, thickness, size = like.new_tensor(rows).T
+        return {
+            "surface": number_of, "radius": radius, "thickness": thickness, "glass": number_of,
+            "index": like.new_tensor(_indices(self.lens)), "semi_diameter": size, "note": number_of,
+        }  # fmt: skip
+
+    def words(self) -> dict[str, Sequence[str]]:
+        surfaces = self.lens.surfaces
+        return {
+            "glass": [s.glass.name for s in surfaces],
+            "note": [_remarks(self.lens, k) for k in range(len(surfaces))],
+        }
+
+    def document(self) -> dict:
+        lens, indices = self.lens, media(self.lens, self.lens.wavelengths)
+        return {
+            "name": lens.name,
+            **{name: number(figure) for (_, name, _), figure in zip(FIRST_ORDER_LINES, _figures(lens), strict=True)},
+            "wavelengths": numbers(lens.wavelengths),
+            "wavelength_weights": numbers(lens.wavelength_weights),
+            "primary_wavelength": lens.primary_wavelength,
+            "field_type": lens.fields.kind,
+            "field_unit": FIELD_UNITS[lens.fields.kind],
+            "fields": [
+                {"x": number(x), "y": number(y), "weight": number(weight)}
+                for x, y, weight in zip(lens.fields.x, lens.fields.y, lens.fields.weight, strict=True)
+            ],
+            "aperture": {"kind": lens.aperture.kind, "value": number(lens.aperture.value)},
+            "stop_surface": lens.stop,
+            "surfaces": [
+                {
+                    "surface": k,
+                    "curvature": number(0.0 if surface.curvature is None else surface.curvature),
+                    "conic": number(0.0 if surface.conic is None else surface.conic),
+                    "coefficients": [] if surface.coefficients is None else numbers(surface.coefficients),
+                    **({} if surface.kind == EVEN else {"kind": surface.kind}),
+                    "thickness": number(surface.thickness),
+                    "glass": surface.glass.name or None,
+                    "indices": numbers(indices[k].expand_as(lens.wavelengths)),
+                    "semi_diameter": number(surface.semi_diameter),
+                    "comment": surface.comment,
+                }
+                for k, surface in enumerate(lens.surfaces)
+            ],
+        }
+
+    def __str__(self) -> str:
+        lens = self.lens
+        lines = [lens.name or "Lens", ""]
+        for (words, _, unit), figure in zip(FIRST_ORDER_LINES, _figures(lens), strict=True):
+            lines.append(f"  {words:<24} {_quantity(figure):>16}  {unit}".rstrip())
+        points = ", ".join(f"({x:g}, {y:g})" for x, y in field_points(None, like=lens).T.tolist())
+        several = len(lens.wavelengths) > 1
+        shown = [
+            f"{w:g}" + ("*" if i == lens.primary_wavelength and several else "")
+            for i, w in enumerate(lens.wavelengths.tolist())
+        ]
+        lines += [
+            f"  {'wavelengths':<24} {', '.join(shown)} µm" + ("  (* primary)" if several else ""),
+            f"  {'fields':<24} {points} {FIELD_UNITS[lens.fields.kind]}, {lens.fields.kind.replace('_', ' ')}",
+            "",
+            f"  {'surface':>7} {'radius':>13} {'thickness':>12} {'glass':<12} {'index':>9} {'semi-dia.':>10}  note",
+        ]
+        for k, (surface, index) in enumerate(zip(lens.surfaces, _indices(lens), strict=True)):
+            radius, size = _radius(surface), surface.semi_diameter
+            lines.append(
+                f"  {k:>7} {'inf' if math.isinf(radius) else f'{radius:.6g}':>13} {float(surface.thickness):>12.7g} "
+                f"{surface.glass.name:<12} {index:>9.6f} {'' if size is None else f'{size:.5g}':>10}  "
+                f"{_remarks(lens, k)}".rstrip()
+            )
+        return "\n".join(lines)
+
+
+@value
+class Layout(Result):
+    """The cross section of a lens with rays of fields (2, F), so many of each."""
+
+    lens: Lens
+    fields: Tensor
+    rays: int = 7
+
+    FIGURE = "plot.layout.layout"
+
+    def document(self) -> dict:
+        return {"fields": [numbers(point) for point in self.fields.unbind(1)]}
+
+    def __str__(self) -> str:
+        points = ", ".join(map(name_of_field, self.fields.unbind(1)))
+        return f"{self.lens.name or 'Lens'}: field {points} {FIELD_UNITS[self.lens.fields.kind]}"
+
+
+def info(lens: Lens) -> Info:
+    """First-order data and prescription; what `print(lens)` shows."""
+    return Info(lens)
+
+
+def layout(lens: Lens, *, fields: Tensor | Sequence | None = None, rays: int = 7) -> Layout:
+    """The cross section, to be drawn by `plot`: glass filled by index, the stop marked, rays coloured by field.
+
+    fields: y, (x, y) or (2, F), in the lens's own kind of field, by default its own; rays: how many of the meridional
+    fan of each.
+    """
+    return Layout(lens, field_points(fields, like=lens), rays)
+
+
+def text(lens: Lens) -> str:
+    """What `print(lens)` shows: the lens as `info` tells it, or its bare numbers where it cannot be traced."""
+    try:
+        return str(info(lens))
+    except (ValueError, RuntimeError):
+        return repr(lens)
+
+
+def _radius(surface) -> float:
+    """mm, of the vertex where the surface has no curvature of its own; inf of a plane."""
+    curvature = float(vertex_curvature(surface)) if surface.curvature is None else float(surface.curvature)
+    return math.inf if curvature == 0 else 1 / curvature
+
+
+def _indices(lens: Lens) -> list[float]:
+    return [float(index) for index in media(lens, lens.wavelengths[lens.primary_wavelength])]
+
+
+def _quantity(value: float) -> str:
+    """A number, "infinite", which has no sign, or - for one that does not exist."""
+    if math.isnan(value):
+        return "-"
+    return "infinite" if math.isinf(value) else f"{value + 0.0:.9g}"
+
+
+def _figures(lens: Lens) -> list[float]:
+    """The numbers of FIRST_ORDER_LINES; nan or infinite where a quantity does not exist."""
+    data, real = first_order(lens), real_working_f_number(lens)
+    return [float(getattr(data, name, real).detach()) for _, name, _ in FIRST_ORDER_LINES]
+
+
+def _remarks(lens: Lens, k: int) -> str:
+    surface = lens.surfaces[k]
+    parts = {0: ["object"], lens.stop: ["stop"], len(lens.surfaces) - 1: ["image"]}.get(k, [])
+    if surface.conic is not None:
+        parts.append(f"conic {float(surface.conic):g}")
+    if surface.coefficients is not None:
+        parts.append(surface.kind)
+    parts += [f"{a.shape} {'obscuration' if a.obscures else 'aperture'}" for a in surface.apertures]
+    return ", ".join(dict.fromkeys(filter(None, [*parts, surface.comment])))

@@ -1,0 +1,22 @@
+"""A lens in a notebook: its drawing, first-order data and prescription."""
+
+import html
+import io
+
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.views import Info, Layout, text
+from raytrace.plot.layout import layout
+from raytrace.plot.style import first_order_text
+from raytrace.system.lens import Lens, field_points
+
+
+def page(lens: Lens) -> str:
+    """HTML with the cross section as an inline SVG and the prescription as a table; plain text where it has none."""
+    try:
+        title, drawing = first_order_text(lens, first_order(lens)), io.StringIO()
+        layout(Layout(lens, field_points(None, like=lens))).savefig(drawing, format="svg")
+        table = Info(lens).to_frame().to_html(index=False, float_format="{:.7g}".format, na_rep="")
+    except (ValueError, RuntimeError):
+        return f"<pre>{html.escape(text(lens))}</pre>"
+    svg = drawing.getvalue()
+    return f"<b>{html.escape(lens.name)}</b><br>{html.escape(title)}{svg[svg.index('<svg') :]}{table}"
