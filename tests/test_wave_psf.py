@@ -12,10 +12,10 @@ from raytrace.kernels.dft import phasor
 from raytrace.maths.value import to
 from raytrace.media.catalog import find_glass
 from raytrace.media.glass import InvalidIndex, OutOfRange, sellmeier
+from raytrace.optics.reuse import Memo
 from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike
 from raytrace.wave.plan import plan
 from raytrace.wave.psf import psf
-from raytrace.wave.reuse import Memo
 
 
 def random(*shape, scale=2e-4):

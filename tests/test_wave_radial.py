@@ -9,11 +9,11 @@ from problems import scalar, vector
 from test_wave_propagation import PLASTIC, R, Z, lens, relative, scene
 
 from raytrace.kernels.dft import bessel_j0, bessel_j1
+from raytrace.optics.reuse import Memo
 from raytrace.wave import radial
 from raytrace.wave.element import Element, EvenPowers, Rings
 from raytrace.wave.plan import plan
 from raytrace.wave.psf import psf
-from raytrace.wave.reuse import Memo
 
 
 def rings(count=40, pitch=None, radius=R):

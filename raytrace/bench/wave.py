@@ -19,12 +19,12 @@ from raytrace.kernels.dft import Aliased, phasor
 from raytrace.maths.grid import grid
 from raytrace.maths.value import to
 from raytrace.media.glass import index
+from raytrace.optics.reuse import Memo
 from raytrace.wave import radial
 from raytrace.wave.designs import aim, singlet
 from raytrace.wave.plan import AliasedSampling
 from raytrace.wave.plan import plan as plan_of
 from raytrace.wave.psf import psf
-from raytrace.wave.reuse import Memo
 from raytrace.wave.scene import WaveScene
 
 WAVELENGTH, DEPTH, PIXEL, SIZE = 0.46, 500.0, 0.00369, 128

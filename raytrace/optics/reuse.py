@@ -48,11 +48,11 @@ class _Front:
 
 @dataclasses.dataclass(frozen=True)
 class _Kept:
-    """A front, and the numbers of the bundle that it holds for; None stands for a variable."""
+    """What was found, and the numbers that it holds for; None stands for a variable."""
 
     structure: Any
     constants: list[Tensor | None]
-    front: _Front
+    found: Any
 
     def holds_for(self, numbers: Sequence[Tensor], structure: Any) -> bool:
         return self.structure == structure and all(
@@ -62,12 +62,14 @@ class _Kept:
 
 
 class Memo:
-    """Rays that stay as they are from one call to the next: `psf(..., memo=memo)` in a loop of optimisation.
+    """What stays as it is from one call to the next: `psf(..., memo=memo)` in a loop of optimisation.
 
-    Every number of the lens, the fields and the wavelengths that requires a gradient is a variable. The others are
-    compared at each call, and rays for which one has changed are traced anew; so a memo changes no result.
-    most: so many bundles are kept, and the oldest is forgotten first. crossed: surfaces that bundles have been traced
-    through so far. Under the transforms of `torch.func`, which hide what they vary, it is passed by.
+    Of a lens these are rays: every number of the lens, the fields and the wavelengths that requires a gradient is a
+    variable. The others are compared at each call, and rays for which one has changed are traced anew; so a memo
+    changes no result. Of a wave scene it is what the heights of its elements do not change.
+    most: so many bundles are kept, and the oldest is forgotten first. made: how many were made so far; crossed:
+    surfaces that rays have been traced through. Under the transforms of `torch.func`, which hide what they vary, it is
+    passed by.
     object_distances: smallest and largest, mm, of scenes that draw theirs anew at every call. Rays of such a scene are
     a polynomial in 1/distance through ten traced ones, where it errs by less than 1e-9 mm; else they are traced.
     """
@@ -76,7 +78,20 @@ class Memo:
         self._kept: list[_Kept] = []
         self._most = most
         self._range = object_distances
-        self.crossed = 0
+        self.made = self.crossed = 0
+
+    def find(
+        self, numbers: Sequence[Tensor], structure: Any, make: Callable[[], Any], *, most: int | None = None
+    ) -> Any:
+        """`make()`, from memory where structure and numbers, but for variables, are what they were then."""
+        for kept in self._kept:
+            if kept.holds_for(numbers, structure):
+                return kept.found
+        found = make()
+        self.made += 1
+        constants = [None if n.requires_grad else n.detach().clone() for n in numbers]
+        self._kept = [*self._kept, _Kept(structure, constants, found)][-(most or self._most) :]
+        return found
 
     def front(self, bundle: Bundle, *, recorded: bool) -> _Front:
         """The rays as far as no variable reaches, from memory or traced now; recorded: with their crossings."""
@@ -95,15 +110,13 @@ class Memo:
         numbers, structure = pytree.tree_flatten((bundle, recorded))
         structure = (structure, tuple(None if isinstance(n, Tensor) else n for n in numbers))
         numbers = [n for n in numbers if isinstance(n, Tensor)]
-        for kept in self._kept:
-            if kept.holds_for(numbers, structure):
-                return kept.front
-        front = _constant_front(bundle, recorded)
-        front = dataclasses.replace(front, smooth=judge(front))
-        self.crossed += front.count
-        constants = [None if n.requires_grad else n.detach().clone() for n in numbers]
-        self._kept = [*self._kept, _Kept(structure, constants, front)][-self._most :]
-        return front
+
+        def trace() -> _Front:
+            front = _constant_front(bundle, recorded)
+            self.crossed += front.count
+            return dataclasses.replace(front, smooth=judge(front))
+
+        return self.find(numbers, structure, trace)
 
 
 def trace_bundle(bundle: Bundle, memo: Memo | None = None) -> Rays:

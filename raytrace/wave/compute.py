@@ -6,24 +6,19 @@ import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from raytrace.budget import afford, allowed_bytes, forewarn
-from raytrace.files import write_atomically
-from raytrace.maths.grid import Grid, centres, grid
-from raytrace.maths.result import Result, number, object_text, rows
-from raytrace.maths.value import value
+from raytrace.maths.grid import grid
 from raytrace.media.glass import Glass, check_unit, check_wavelengths, from_table
 from raytrace.wave.designs import BASELINES, STEPPED, aim, baseline
 from raytrace.wave.element import Element
 from raytrace.wave.element_file import read_element
 from raytrace.wave.exchange import FORMATS
 from raytrace.wave.plan import Plan, plan
-from raytrace.wave.psf import psf
+from raytrace.wave.psf import ElementPsf, psf
 from raytrace.wave.scene import WaveScene, aperture
 
 COLOURS = (0.46, 0.55, 0.64)
@@ -38,116 +33,6 @@ Progress = Callable[[Sequence, str], Iterable]
 
 def _silent(items: Sequence, unit: str) -> Sequence:
     return items
-
-
-@value
-class ElementPsf(Result):
-    """PSFs of an element for points on the axis, over depth and colour.
-
-    kernel: (D, W, rows, columns), light in each pixel, 1 = all through the aperture; scene: the camera; plan: how it
-    was computed, with the predicted error; element: its name.
-    """
-
-    FIGURE: ClassVar[str] = "plot.wave.element_figure"
-
-    kernel: Tensor
-    scene: WaveScene
-    plan: Plan
-    element: str = ""
-
-    @property
-    def depths(self) -> Tensor:
-        return self.scene.depths
-
-    @property
-    def wavelengths(self) -> Tensor:
-        return self.scene.wavelengths
-
-    @property
-    def grid(self) -> Grid:
-        return self.scene.grid
-
-    @property
-    def pitch(self) -> Tensor:
-        return self.grid.pitch
-
-    @property
-    def energy(self) -> Tensor:
-        """(D, W): light inside the window."""
-        return self.kernel.sum((-2, -1))
-
-    @property
-    def half_energy_radius(self) -> Tensor:
-        """(D, W) mm about the axis that holds half of all light through the aperture; inf where the window does not.
-
-        Pixels count by the distance of their centres: good to half a pixel.
-        """
-        x, y = centres(self.grid)
-        distance, order = torch.sqrt(x * x + (y * y)[:, None]).flatten().sort()
-        inside = (self.kernel.flatten(-2)[..., order].cumsum(-1) < 0.5).sum(-1)
-        return torch.where(inside < len(distance), distance[inside.clamp(max=len(distance) - 1)], math.inf)
-
-    def columns(self) -> dict[str, Tensor]:
-        return {
-            "depth": self.depths[:, None],
-            "wavelength": self.wavelengths,
-            "energy": self.energy,
-            "peak": self.kernel.amax((-2, -1)),
-            "half_energy_radius": self.half_energy_radius,
-        }
-
-    def document(self) -> dict:
-        return {
-            "element": self.element,
-            "engine": self.plan.engine,
-            "samples": self.plan.samples,
-            "error": number(self.plan.error),
-            "pixel_pitch": number(self.pitch),
-            "size": self.grid.rows,
-            "exact": self.scene.exact,
-            "results": rows(self.columns()),
-        }
-
-    @property
-    def title(self) -> str:
-        across, z = 2 * float(aperture(self.scene)), float(self.scene.sensor_distance)
-        return f"{Path(self.element).name}, ⌀ {across:g} mm, sensor at {z:g} mm"
-
-    def __str__(self) -> str:
-        return "\n".join(
-            [
-                self.title,
-                f"{self.plan.engine} engine, {self.plan.samples} samples, predicted error {self.plan.error:.1e}; "
-                f"{self.grid.columns} × {self.grid.rows} pixels of {1e3 * float(self.pitch):g} µm",
-                f"{'object':>12} {'wavelength':>11} {'energy':>8} {'peak':>10} {'half-energy':>12}",
-                f"{'':>12} {'µm':>11} {'window':>8} {'pixel':>10} {'radius, µm':>12}",
-                *(_row(**{name: number(cell) for name, cell in row.items()}) for row in rows(self.columns())),
-            ]
-        )
-
-    def save(self, path: str | os.PathLike) -> None:
-        """Write the arrays, psf[depth, wavelength, y, x] and what belongs to it, as .npz."""
-        if Path(path).suffix.lower() != ".npz":
-            raise ValueError(f"{path}: expected a name that ends in .npz")
-        arrays = {
-            "psf": self.kernel.detach().numpy(),
-            "pixel_pitch": float(self.pitch),
-            "centre": self.grid.centre.detach().numpy(),
-            "energy": self.energy.detach().numpy(),
-            "depths": self.depths.detach().numpy(),
-            "wavelengths": self.wavelengths.detach().numpy(),
-            "engine": self.plan.engine,
-            "samples": self.plan.samples,
-            "error": self.plan.error,
-            "element": self.element,
-        }
-        write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
-
-
-def _row(depth: float | None, wavelength: float, energy: float, peak: float, half_energy_radius: float | None) -> str:
-    half = "–" if half_energy_radius is None else f"{1e3 * half_energy_radius:.2f}"
-    place = object_text(math.inf if depth is None else depth)
-    return f"{place:>12} {wavelength:>11g} {energy:>8.4f} {peak:>10.6f} {half:>12}"
 
 
 def wave_psf(

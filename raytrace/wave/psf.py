@@ -1,38 +1,59 @@
 """PSFs of a wave scene: depth × wavelength, integrated over the pixels of the sensor, by the engine that fits."""
 
-from torch import Tensor
+import dataclasses
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
 
-from raytrace.maths.grid import Grid
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils import _pytree as pytree
+
+from raytrace.files import write_atomically
+from raytrace.maths.grid import Grid, centres
+from raytrace.maths.result import Result, number, object_text, rows
 from raytrace.maths.value import value
+from raytrace.optics.reuse import Memo
 from raytrace.wave import plan as planning
+from raytrace.wave.element import EvenPowers
 from raytrace.wave.plan import Plan
-from raytrace.wave.reuse import Memo
-from raytrace.wave.scene import WaveScene
+from raytrace.wave.scene import WaveScene, aperture
+
+_KEPT = 8  # sums that a memo keeps
 
 
 @value
-class WavePsf:
-    """Kernels of a wave scene.
+class ElementPsf(Result):
+    """PSFs of an element for points on the axis, over depth and colour.
 
-    kernel: (D, W, rows, columns), light in each pixel, 1 = all through the aperture, so that its sum is the light
-    inside the window; depths: (D,) mm; wavelengths: (W,) µm; grid: the pixels; plan: how it was computed, with the
-    predicted error.
+    kernel: (D, W, rows, columns), light in each pixel, 1 = all through the aperture; scene: the camera; plan: how it
+    was computed, with the predicted error, relative L2 of the worst kernel; element: its name.
     """
 
+    FIGURE: ClassVar[str] = "plot.wave.element_figure"
+
     kernel: Tensor
-    depths: Tensor
-    wavelengths: Tensor
-    grid: Grid
+    scene: WaveScene
     plan: Plan
+    element: str = ""
 
     @property
-    def energy(self) -> Tensor:
-        """(D, W): light inside the window."""
-        return self.kernel.sum((-2, -1))
+    def depths(self) -> Tensor:
+        return self.scene.depths
+
+    @property
+    def wavelengths(self) -> Tensor:
+        return self.scene.wavelengths
+
+    @property
+    def grid(self) -> Grid:
+        return self.scene.grid
 
     @property
     def pitch(self) -> Tensor:
-        """Of the pixels, mm."""
         return self.grid.pitch
 
     @property
@@ -41,8 +62,85 @@ class WavePsf:
 
     @property
     def error(self) -> float:
-        """Predicted, relative L2 of the worst kernel."""
         return self.plan.error
+
+    @property
+    def energy(self) -> Tensor:
+        """(D, W): light inside the window."""
+        return self.kernel.sum((-2, -1))
+
+    @property
+    def half_energy_radius(self) -> Tensor:
+        """(D, W) mm about the axis that holds half of all light through the aperture; inf where the window does not.
+
+        Pixels count by the distance of their centres: good to half a pixel.
+        """
+        x, y = centres(self.grid)
+        distance, order = torch.sqrt(x * x + (y * y)[:, None]).flatten().sort()
+        inside = (self.kernel.flatten(-2)[..., order].cumsum(-1) < 0.5).sum(-1)
+        return torch.where(inside < len(distance), distance[inside.clamp(max=len(distance) - 1)], math.inf)
+
+    def columns(self) -> dict[str, Tensor]:
+        return {
+            "depth": self.depths[:, None],
+            "wavelength": self.wavelengths,
+            "energy": self.energy,
+            "peak": self.kernel.amax((-2, -1)),
+            "half_energy_radius": self.half_energy_radius,
+        }
+
+    def document(self) -> dict:
+        return {
+            "element": self.element,
+            "engine": self.plan.engine,
+            "samples": self.plan.samples,
+            "error": number(self.plan.error),
+            "pixel_pitch": number(self.pitch),
+            "size": self.grid.rows,
+            "exact": self.scene.exact,
+            "results": rows(self.columns()),
+        }
+
+    @property
+    def title(self) -> str:
+        across, z = 2 * float(aperture(self.scene)), float(self.scene.sensor_distance)
+        return f"{Path(self.element).name}, ⌀ {across:g} mm, sensor at {z:g} mm"
+
+    def __str__(self) -> str:
+        return "\n".join(
+            [
+                self.title,
+                f"{self.plan.engine} engine, {self.plan.samples} samples, predicted error {self.plan.error:.1e}; "
+                f"{self.grid.columns} × {self.grid.rows} pixels of {1e3 * float(self.pitch):g} µm",
+                f"{'object':>12} {'wavelength':>11} {'energy':>8} {'peak':>10} {'half-energy':>12}",
+                f"{'':>12} {'µm':>11} {'window':>8} {'pixel':>10} {'radius, µm':>12}",
+                *(_row(**{name: number(cell) for name, cell in row.items()}) for row in rows(self.columns())),
+            ]
+        )
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the arrays, psf[depth, wavelength, y, x] and what belongs to it, as .npz."""
+        if Path(path).suffix.lower() != ".npz":
+            raise ValueError(f"{path}: expected a name that ends in .npz")
+        arrays = {
+            "psf": self.kernel.detach().numpy(),
+            "pixel_pitch": float(self.pitch),
+            "centre": self.grid.centre.detach().numpy(),
+            "energy": self.energy.detach().numpy(),
+            "depths": self.depths.detach().numpy(),
+            "wavelengths": self.wavelengths.detach().numpy(),
+            "engine": self.plan.engine,
+            "samples": self.plan.samples,
+            "error": self.plan.error,
+            "element": self.element,
+        }
+        write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
+
+
+def _row(depth: float | None, wavelength: float, energy: float, peak: float, half_energy_radius: float | None) -> str:
+    half = "–" if half_energy_radius is None else f"{1e3 * half_energy_radius:.2f}"
+    place = object_text(math.inf if depth is None else depth)
+    return f"{place:>12} {wavelength:>11g} {energy:>8.4f} {peak:>10.6f} {half:>12}"
 
 
 def psf(
@@ -56,7 +154,7 @@ def psf(
     band_limit: bool = True,
     plan: Plan | None = None,
     memo: Memo | None = None,
-) -> WavePsf:
+) -> ElementPsf:
     """PSFs of a scene, differentiable in every number of it.
 
     engine, samples, nodes, tol, pad, band_limit: as `plan.plan` takes them. plan: of an earlier call, instead of them:
@@ -68,12 +166,37 @@ def psf(
         plan = planning.plan(
             scene, engine=engine, samples=samples, nodes=nodes, tol=tol, pad=pad, band_limit=band_limit
         )
-    return WavePsf(_kernels(scene, plan, memo), scene.depths, scene.wavelengths, scene.grid, plan)
+    return ElementPsf(_kernels(scene, plan, memo), scene, plan)
 
 
 def _kernels(scene: WaveScene, plan: Plan, memo: Memo | None) -> Tensor:
     engine = planning.ENGINES[plan.engine]
     if engine.prepare is None:
         return engine.kernels(scene, None, plan)
-    sums = engine.prepare(scene, plan) if memo is None else memo.find(scene, plan, engine.prepare)
+    sums = engine.prepare(scene, plan) if memo is None else _remembered(memo, scene, plan, engine.prepare)
     return engine.kernels(scene, sums, plan)
+
+
+def _remembered(memo: Memo, scene: WaveScene, plan: Plan, make: Callable[[WaveScene, Plan], Any]) -> Any:
+    """`make(scene, plan)` without graph, from memory where nothing but heights and coefficients has changed."""
+    numbers, structure = _constants(scene)
+    if torch._C._are_functorch_transforms_active() or any(n.requires_grad for n in numbers):
+        memo.made += 1
+        return make(scene, plan)
+    with torch.no_grad():
+        return memo.find(numbers, (structure, plan), lambda: make(scene, plan), most=_KEPT)
+
+
+def _constants(scene: WaveScene) -> tuple[list[Tensor], Any]:
+    """All numbers of a scene that sums depend on, and its structure."""
+    leaves, structure = pytree.tree_flatten(dataclasses.replace(scene, elements=()))
+    for element in scene.elements:
+        profile = element.profile
+        free = element.numbers
+        # Of free heights only how many there are counts; where a wrapped smooth one jumps moves with its coefficients.
+        jumps = isinstance(profile, EvenPowers) and element.period is not None
+        held = [free.detach()] if jumps else []
+        parts = [element.radius, getattr(profile, "pitch", None), element.period]
+        leaves += [t for t in (*parts, *held) if t is not None]
+        structure = (structure, type(profile), free.shape, free.dtype, free.device, element.levels)
+    return leaves, structure

@@ -12,7 +12,7 @@ from raytrace.studies.edof.scene import Deep
 from raytrace.studies.edof.table import NAMES, PUBLISHED
 from raytrace.studies.edof.world import Quality, World
 from raytrace.wave.element import Element, height
-from raytrace.wave.psf import WavePsf
+from raytrace.wave.psf import ElementPsf
 
 _LEARNED = ("learned", "learned-16", "learned-smooth")
 _MARGIN = 1e-5  # of the brightest pixel, what is black
@@ -62,7 +62,7 @@ def gain_figure(found: Mapping[str, Mapping[str, Quality]]) -> Figure:
 
 
 @styled
-def element_figure(elements: Sequence[Element], found: WavePsf, own: Quality, world: World) -> Figure:
+def element_figure(elements: Sequence[Element], found: ElementPsf, own: Quality, world: World) -> Figure:
     """Height over the radius, kernels over depth × colour, PSNR over depth, of one element."""
     figure = new_figure(9.2, 7.0)
     top, bottom = figure.subfigures(2, 1, height_ratios=(1, 1.75))
@@ -130,7 +130,7 @@ def _draw_profile(axes: Axes, elements: Sequence[Element]) -> None:
     axes.legend(fontsize=8)
 
 
-def _draw_kernels(figure, found: WavePsf) -> None:
+def _draw_kernels(figure, found: ElementPsf) -> None:
     kernel = array(found.kernel.detach())
     D, W = kernel.shape[:2]
     axes = figure.subplots(W, D, squeeze=False)

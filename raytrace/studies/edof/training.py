@@ -24,12 +24,12 @@ from raytrace.files import write_atomically
 from raytrace.formats.pictures import Pictures, crop, draws
 from raytrace.media.catalog import find_glass
 from raytrace.media.glass import index
+from raytrace.optics.reuse import Memo
 from raytrace.studies.edof.world import World, best_of_starts, expected_error, mirrored, restored, scene, transfer
 from raytrace.wave.designs import aim, converging
 from raytrace.wave.element import ETCHED, Element, EvenPowers, Zernike, as_rings, wrapped
 from raytrace.wave.plan import plan
 from raytrace.wave.psf import psf
-from raytrace.wave.reuse import Memo
 
 KINDS = ("smooth", "rings", "zernike")
 LOSSES = ("spectral", "images")

@@ -19,11 +19,11 @@ from raytrace.camera.deconvolve import blind_error, blind_filter, errors, power_
 from raytrace.camera.image import transfer_functions
 from raytrace.formats.pictures import Pictures, draws
 from raytrace.maths.grid import grid
+from raytrace.optics.reuse import Memo
 from raytrace.studies.descent import NoOptimum, minimise
 from raytrace.wave.element import Element, Rings
 from raytrace.wave.plan import plan
-from raytrace.wave.psf import WavePsf, psf
-from raytrace.wave.reuse import Memo
+from raytrace.wave.psf import ElementPsf, psf
 from raytrace.wave.scene import WaveScene, is_round
 
 FILTERS = ("wiener", "blind")
@@ -62,7 +62,7 @@ def scene(elements: Sequence[Element], world: World, *, depths: Sequence[float] 
     )
 
 
-def kernels(elements: Sequence[Element], world: World, *, depths: Sequence[float] | None = None) -> WavePsf:
+def kernels(elements: Sequence[Element], world: World, *, depths: Sequence[float] | None = None) -> ElementPsf:
     """PSFs of elements in a world. Where they are not round, depth by depth, for memory, to half a per cent; rings with
     anything else are sampled at their own pitch (2,500 cells across 5 mm of 2 µm rings).
     """
@@ -76,10 +76,10 @@ def kernels(elements: Sequence[Element], world: World, *, depths: Sequence[float
     parts = [
         psf(dataclasses.replace(own, depths=depth[None]), tol=5e-3, samples=samples) for depth in own.depths.unbind()
     ]
-    return dataclasses.replace(parts[0], kernel=torch.cat([part.kernel for part in parts]), depths=own.depths)
+    return ElementPsf(torch.cat([part.kernel for part in parts]), own, parts[0].plan)
 
 
-def transfer(found: WavePsf, size: int) -> Tensor:
+def transfer(found: ElementPsf, size: int) -> Tensor:
     """H (D, W, size, size) of kernels normalised by the light through the aperture; what misses the window is haze."""
     H = transfer_functions(found.kernel, size)
     haze = torch.zeros_like(H.real)
@@ -138,7 +138,7 @@ def quality(
     train: Tensor,
     test: Tensor,
     seed: int = 0,
-    found: WavePsf | None = None,
+    found: ElementPsf | None = None,
 ) -> Quality:
     """Restore test pictures (B, N, N) with noise drawn once, filters made for training pictures (A, N, N) alone."""
     found = kernels(elements, world) if found is None else found

@@ -21,13 +21,13 @@ from raytrace.kernels.dft import phasor
 from raytrace.maths.grid import grid
 from raytrace.media.catalog import find_glass
 from raytrace.media.glass import index
+from raytrace.optics.reuse import Memo
 from raytrace.wave.designs import Aim, aim, ideal
 from raytrace.wave.element import Element, Pixels, height
 from raytrace.wave.plan import Plan
 from raytrace.wave.plan import plan as plan_of
 from raytrace.wave.psf import psf
 from raytrace.wave.pupil import disc_cells
-from raytrace.wave.reuse import Memo
 from raytrace.wave.scene import WaveScene, millimetres, residual
 
 #: Rates of learning by method, on the phase in radians.

@@ -20,13 +20,13 @@ from raytrace.camera.deconvolve import blind_filter, errors, psnr
 from raytrace.camera.phase import PhaseVariables
 from raytrace.camera.training import DamagedRun, Record, load_state, read_json
 from raytrace.formats.pictures import Pictures, draws
+from raytrace.optics.reuse import Memo
 from raytrace.studies.edof.training import EdofCamera, Settings, begin, learn_element, scheduled
 from raytrace.studies.edof.world import World, expected_error, scene, spectrum, transfer
 from raytrace.studies.edof.world import kernels as kernels_of
 from raytrace.wave.element import Element, Pixels, Rings, period, with_tolerance, wrapped
 from raytrace.wave.plan import plan
 from raytrace.wave.psf import psf
-from raytrace.wave.reuse import Memo
 from raytrace.wave.scene import residual
 
 WAVELENGTH = 0.55  # µm: at which heights are wrapped, and whose period is stepped

@@ -24,6 +24,7 @@ from raytrace.camera.phase import PhaseVariables
 from raytrace.formats.pictures import Pictures, draws
 from raytrace.media.catalog import find_glass
 from raytrace.media.glass import index
+from raytrace.optics.reuse import Memo
 from raytrace.studies.descent import minimise
 from raytrace.studies.edof.world import World, scene, spectrum
 from raytrace.studies.superres.inversion import (
@@ -40,7 +41,6 @@ from raytrace.wave.designs import aim, baseline
 from raytrace.wave.element import Element, Pixels, Zernike
 from raytrace.wave.plan import plan
 from raytrace.wave.psf import psf
-from raytrace.wave.reuse import Memo
 
 #: Pixels of the picture along a small scene, of its dark border, and of the window of one place.
 FIELD, BORDER, TILE = 96, 16, 47
