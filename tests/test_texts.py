@@ -9,7 +9,7 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from raytrace.formats import LensFileError, LensFileWarning, read_lens, texts, write_lens
+from raytrace.formats import LensFileError, LensFileWarning, read_lens, spelling, write_lens
 from raytrace.formats.frame import lens_from_frame, to_frame
 
 LENSES = Path(__file__).parents[1] / "lenses"
@@ -81,12 +81,12 @@ def test_any_text_comes_back_from_pandas(name, note, comment):
 @settings(max_examples=500)
 @given(st.lists(NASTY.filter(bool), min_size=1))
 def test_words_come_back(listed):
-    assert texts.words(" ".join(map(texts.word, listed))) == listed
+    assert spelling.words(" ".join(map(spelling.word, listed))) == listed
 
 
 def test_plain_texts_stay_plain():
     for text in ("Größe 2: λ", "a, b", "# 1", "it's", 'the "front" lens', "表面\u30001", "a  b"):
-        assert texts.written(text) == text
+        assert spelling.quoted(text) == text
 
 
 @pytest.mark.parametrize(

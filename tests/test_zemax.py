@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from raytrace.formats import LensFileError, UnsupportedSurface, read_lens, read_lens_with_report, write_lens, zemax
+from raytrace.formats import LensFileError, UnsupportedSurface, read_lens, read_lens_with_report, write_lens, zemax_read
 from raytrace.formats.source import Place, decode
 from raytrace.media.catalog import UnknownGlass, find_glass
 from raytrace.media.glass import MIRROR, mil_glass
@@ -43,7 +43,7 @@ def _indented(text: str) -> list[str]:
 
 
 def read(text: str, **options):
-    return zemax.read(text, "lens.zmx", **options)
+    return zemax_read.read(text, "lens.zmx", **options)
 
 
 def lens(**changes):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from raytrace.files import shipped, write_atomically
-from raytrace.formats import table, table_write, zemax, zemax_write
+from raytrace.formats import table, table_write, zemax_read, zemax_write
 from raytrace.formats.report import ImportReport as ImportReport
 from raytrace.formats.source import LensFileError as LensFileError
 from raytrace.formats.source import LensFileWarning as LensFileWarning
@@ -31,7 +31,7 @@ class Format(NamedTuple):
 
 #: The formats by suffix, in lower case.
 FORMATS = {
-    ".zmx": Format(zemax.read, zemax_write.write),
+    ".zmx": Format(zemax_read.read, zemax_write.write),
     ".csv": Format(table.read, table_write.write_comma),
     ".tsv": Format(table.read, table_write.write_tab),
     ".txt": Format(table.read, table_write.write_tab),

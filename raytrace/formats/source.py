@@ -1,4 +1,4 @@
-"""The text of a lens file, read with care: size, encoding, numbers, and the errors that name file, line and surface."""
+"""The text of a lens file, read with care: size and encoding, and the errors that name file, line and surface."""
 
 import os
 import re
@@ -18,11 +18,6 @@ MAX_SURFACES = 1000
 MAX_LINES = 200_000
 MAX_LINE = 100_000
 
-#: More characters than any number needs.
-_DIGITS = 400
-
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d{1,4})?", re.ASCII)
-_INFINITE = re.compile(r"[+-]?(inf|infinity|infinite|∞|1\.#inf)", re.ASCII | re.IGNORECASE)
 _NOT_TEXT = re.compile(r"[\x00-\x08\x0e-\x1f\ufffd]")
 
 
@@ -103,36 +98,6 @@ def decode(content: bytes, place: Place) -> str:
         found = f"{len(lines)} lines, the longest of {max(map(len, lines))} characters"
         raise LensFileError(f"{found}; more than any lens file ({MAX_LINES}, {MAX_LINE})", place)
     return text
-
-
-def number(text: str, what: str, place: Place) -> float:
-    """A finite decimal number, Fortran's D exponent included. Raises LensFileError for anything else."""
-    if len(text) > _DIGITS or not _NUMBER.fullmatch(text):
-        raise LensFileError(f"{what} is {shown(text)}, expected a finite number", place)
-    result = float(text.replace("D", "E").replace("d", "e"))
-    if result in (float("inf"), float("-inf")):
-        raise LensFileError(f"{what} is {shown(text)}, too large for a 64-bit number", place)
-    return result
-
-
-def integer(text: str, what: str, place: Place) -> int:
-    """A whole number below a million in size, written with or without a decimal point."""
-    result = number(text, what, place)
-    if result != int(result) or abs(result) >= 1e6:
-        raise LensFileError(f"{what} is {shown(text)}, expected a whole number", place)
-    return int(result)
-
-
-def is_number(text: str) -> bool:
-    """True if `number` would accept the text."""
-    if len(text) > _DIGITS or not _NUMBER.fullmatch(text):
-        return False
-    return abs(float(re.sub("[dD]", "e", text))) != float("inf")
-
-
-def is_infinite(text: str) -> bool:
-    """True for the spellings of infinity met in lens files."""
-    return bool(_INFINITE.fullmatch(text))
 
 
 def shown(text: str) -> str:

@@ -28,14 +28,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from raytrace.formats import table_surface, table_system, texts
-from raytrace.formats.finite import refuse_overflow
+from raytrace.formats import spelling, table_surface, table_system
 from raytrace.formats.media import report_missing_catalogs
 from raytrace.formats.report import Draft, ImportReport
-from raytrace.formats.source import LensFileError, Place, integer, is_infinite, is_number, number, shown
+from raytrace.formats.source import LensFileError, Place, shown
+from raytrace.formats.spelling import MILLIMETRES, integer, is_infinite, is_number, number, refuse_overflow
 from raytrace.formats.table_rows import cleaned
 from raytrace.formats.table_text import Row, Table, parse
-from raytrace.formats.zemax_keywords import MILLIMETRES
 from raytrace.media.glass import AIR
 from raytrace.system.lens import Lens
 from raytrace.system.surface import Surface
@@ -60,7 +59,7 @@ def build(table: Table, report: Draft, *, catalogs: Sequence[Path] = ()) -> Lens
     metadata, place = table.metadata, table.place
     unit = _unit(metadata)
     rows = _numbered(table)
-    names = tuple(texts.words(metadata.get("catalogs", ("", place))[0]))
+    names = tuple(spelling.words(metadata.get("catalogs", ("", place))[0]))
     report_missing_catalogs(names, catalogs, report)
     surfaces = [table_surface.build(row, unit, names, catalogs, report) for row in rows]
     _refuse_all_air(table, surfaces)
@@ -77,7 +76,7 @@ def build(table: Table, report: Draft, *, catalogs: Sequence[Path] = ()) -> Lens
         wavelengths=wavelengths,
         wavelength_weights=weights,
         primary_wavelength=primary,
-        name=texts.read(metadata.get("title", ("", place))[0]),
+        name=spelling.plain_text(metadata.get("title", ("", place))[0]),
         notes=tuple(table.notes),
         catalogs=names,
         ray_aiming=table_system.ray_aiming(metadata),

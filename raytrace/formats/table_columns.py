@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from raytrace.formats.report import IGNORED, READ, UNKNOWN, Draft
 from raytrace.formats.source import LensFileError, Place, shown
-from raytrace.formats.zemax_keywords import MILLIMETRES
+from raytrace.formats.spelling import MILLIMETRES
 from raytrace.media.glass import LINES
 from raytrace.system.shapes import KINDS
 

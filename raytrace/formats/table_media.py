@@ -3,7 +3,8 @@
 import numpy as np
 
 from raytrace.formats.report import Draft
-from raytrace.formats.source import LensFileError, Place, number, shown
+from raytrace.formats.source import LensFileError, Place, shown
+from raytrace.formats.spelling import number
 from raytrace.media.formulas import MODEL_LINES
 from raytrace.media.glass import AIR, LINES, Glass, constant, model_glass
 

@@ -3,7 +3,8 @@
 import re
 import unicodedata
 
-from raytrace.formats.source import LensFileError, is_infinite, is_number, shown
+from raytrace.formats.source import LensFileError, shown
+from raytrace.formats.spelling import is_infinite, is_number
 from raytrace.formats.table_columns import order
 from raytrace.formats.table_text import Row
 

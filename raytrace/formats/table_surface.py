@@ -9,7 +9,8 @@ from torch import Tensor
 
 from raytrace.formats.media import listed_glass
 from raytrace.formats.report import Draft
-from raytrace.formats.source import LensFileError, Place, UnsupportedSurface, is_infinite, is_number, number, shown
+from raytrace.formats.source import LensFileError, Place, UnsupportedSurface, shown
+from raytrace.formats.spelling import is_infinite, is_number, number
 from raytrace.formats.table_columns import order
 from raytrace.formats.table_media import figures as figures_of
 from raytrace.formats.table_media import medium

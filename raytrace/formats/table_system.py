@@ -26,7 +26,8 @@ import torch
 from torch import Tensor
 
 from raytrace.formats.report import Draft
-from raytrace.formats.source import LensFileError, Place, integer, is_number, number, shown
+from raytrace.formats.source import LensFileError, Place, shown
+from raytrace.formats.spelling import integer, is_number, number
 from raytrace.media.glass import LINES
 from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, RAY_AIMING, Fields, SystemAperture
 

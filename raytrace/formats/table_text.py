@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
-from raytrace.formats import texts
+from raytrace.formats import spelling
 from raytrace.formats.report import READ, Draft
-from raytrace.formats.source import MAX_SURFACES, LensFileError, Place, is_number, shown
+from raytrace.formats.source import MAX_SURFACES, LensFileError, Place, shown
+from raytrace.formats.spelling import is_number
 from raytrace.formats.table_columns import UNREAD, columns, is_header, squeezed
 from raytrace.formats.table_system import KEYS, key_of
 
@@ -81,7 +82,7 @@ def add_row(table: Table, cells: Sequence[str], place: Place) -> None:
         raise LensFileError(f"{len(cells)} cells under {count} headings; {shown(extra[0])} has no column", place)
     named: dict[str, str] = {}
     for heading, column, cell in zip(table.headings, table.columns, cells, strict=False):
-        cell = texts.read(cell) if column == "comment" else " ".join(cell.split())
+        cell = spelling.plain_text(cell) if column == "comment" else " ".join(cell.split())
         if column == UNREAD and is_number(cell.replace(",", ".").strip("*")):
             message = f"column {shown(heading)} holds numbers ({cell}), but what they are is not known"
             fix = f"name it, as radius, thickness, nd, Vd, conic, A4, or write the header line '# ignore: {heading}'"
@@ -123,7 +124,7 @@ def add_metadata(table: Table, name: str, value: str, place: Place, report: Draf
         report.met("note", READ, place)
     elif KEYS[key] == "repeated":
         if value:
-            table.notes.append(texts.read(value))
+            table.notes.append(spelling.plain_text(value))
         report.met(key, READ, place)
     else:
         if key in table.metadata:

@@ -5,19 +5,11 @@ import io
 from collections.abc import Sequence
 from pathlib import Path
 
-from raytrace.formats import texts
+from raytrace.formats import spelling
+from raytrace.formats.media import catalogs_needed, is_left_out, is_listed, listed_name
 from raytrace.formats.source import LensFileError, Place
+from raytrace.formats.spelling import exact, exact_list, refuse_departure, thickness
 from raytrace.formats.table_columns import order
-from raytrace.formats.writing import (
-    catalogs_needed,
-    exact,
-    exact_list,
-    is_left_out,
-    is_listed,
-    listed_name,
-    refuse_departure,
-    thickness,
-)
 from raytrace.media.glass import Glass, mil_glass
 from raytrace.system.aperture import Aperture
 from raytrace.system.lens import Lens
@@ -56,8 +48,8 @@ def _write(lens: Lens, separator: str, file: str, catalogs: Sequence[Path]) -> b
 def header(lens: Lens, place: Place, catalogs: Sequence[Path] = ()) -> Metadata:
     """The system of a lens as keys and values of header lines."""
     fields = lens.fields
-    lines = [("title", texts.written(lens.name))] if lens.name else []
-    lines += [("note", texts.written(note)) for note in lens.notes]
+    lines = [("title", spelling.quoted(lens.name))] if lens.name else []
+    lines += [("note", spelling.quoted(note)) for note in lens.notes]
     size = exact(lens.aperture.value, "system aperture", place)
     lines.append(("aperture", f"{lens.aperture.kind.replace('_', ' ')} {size}"))
     x, y = exact_list(fields.x, "field", place), exact_list(fields.y, "field", place)
@@ -74,7 +66,7 @@ def header(lens: Lens, place: Place, catalogs: Sequence[Path] = ()) -> Metadata:
     lines.append(("primary wavelength", str(lens.primary_wavelength + 1)))
     names = catalogs_needed(lens, catalogs, place.file)
     if names:
-        lines.append(("catalogs", " ".join(map(texts.word, names))))
+        lines.append(("catalogs", " ".join(map(spelling.word, names))))
     if lens.ray_aiming != "off":
         lines.append(("ray aiming", lens.ray_aiming))
     return lines
@@ -111,7 +103,7 @@ def _row(lens: Lens, number: int, surface: Surface, place: Place) -> dict[str, s
         row |= {f"a{kind.step * j}": term for j, term in enumerate(found, 1)}
     if surface.apertures:
         row["apertures"] = " + ".join(_aperture(aperture, place) for aperture in surface.apertures)
-    return row | {"comment": texts.written(surface.comment)} if surface.comment else row
+    return row | {"comment": spelling.quoted(surface.comment)} if surface.comment else row
 
 
 def _glass(glass: Glass, place: Place) -> str:

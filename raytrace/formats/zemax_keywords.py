@@ -1,5 +1,11 @@
-"""The keywords of a .zmx file: which are read, and which are known and left out, with the reason."""
+"""The keywords of a .zmx file, a row each, and a text sorted by them: the system, the surfaces, what follows them."""
 
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from raytrace.formats.report import IGNORED, READ, UNKNOWN, Draft
+from raytrace.formats.source import MAX_SURFACES, LensFileError, Place, shown
+from raytrace.formats.spelling import integer, number
 from raytrace.system.aperture import SHAPES
 from raytrace.system.shapes import KINDS
 
@@ -8,136 +14,111 @@ def _words(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
-#: Keywords of the system that are read.
+#: Keywords of the system and of a surface that are read; an aperture's are in the rows of `aperture.SHAPES`.
 SYSTEM_READ = _words(
-    "VERS MODE NAME NOTE UNIT GCAT ENVD GFAC RAIM FTYP PWAV MNUM"
-    " ENPD FNUM OBNA FLOA"
-    " XFLN YFLN FWGN XFLD YFLD FWGT"
-    " VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN VDX VDY VCX VCY VAN"
-    " WAVM WAVL WAVN WWGT WWGN"
+    "VERS MODE NAME NOTE UNIT GCAT ENVD GFAC RAIM FTYP PWAV MNUM ENPD FNUM OBNA FLOA XFLN YFLN FWGN XFLD YFLD FWGT"
+    " VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN VDX VDY VCX VCY VAN WAVM WAVL WAVN WWGT WWGN"
 )
-
-#: Keywords of a surface that are read, beside those of its aperture.
 _SURFACE_READ = _words("SURF TYPE CURV CONI DISZ GLAS DIAM STOP PARM COMM FLAP OBDC USAP USOB UDAD SCBD IGNR")
 
 #: Keywords that may stand more than once in the system or in one surface.
-REPEATED = _words("NOTE WAVM PARM UDAD XDAT PPAR VPAR SCBD")
+REPEATED = ("NOTE", "WAVM", "PARM", "UDAD", "XDAT", "PPAR", "VPAR", "SCBD")
 
-_SETTING = "setting of the program, says nothing about the lens"
-_DISPLAY = "how the program draws it"
-_SOLVE = "solve or variable: the file stores the solved value, which is read"
-_TOLERANCE = "tolerance"
-_COATING = "coatings do not bend rays"
-_WAVES = "sampling of wave propagation"
 
-#: Keywords of the system that are known and left out.
-SYSTEM_IGNORED = {
-    "PFIL": _SETTING,
-    "LANG": _SETTING,
-    "HYPR": _SETTING,
-    "ROPD": _SETTING,
-    "PICB": _SETTING,
-    "SDMA": "how semi-diameters are recomputed; the stored ones are read",
-    "OMMA": "how mechanical semi-diameters are recomputed",
-    "PUSH": "shift of the pupil for the program's own ray aiming",
-    "GLRS": "global coordinate reference: changes no ray",
-    "GSTD": "default tolerances and glass substitution",
-    "NSCD": "settings of non-sequential mode",
-    "COFN": "names of coating and scatter files",
-    "POLS": "polarisation",
-    "EERA": _SETTING,
-    "LUID": _SETTING,
-    "IWDP": _SETTING,
-    "AUTH": "author; not carried",
-    "STUD": _SETTING,
-    "FSVY": _SETTING,
-    "FCOM": "comment on a field point; not carried",
-    "DBDT": "entry of the vendor's catalog",
-    "CSUM": "checksum of the program",
-}
+def _left_out(rows: dict[str, str]) -> dict[str, str]:
+    return {word: reason for reason, words in rows.items() for word in words.split()}
 
-#: Keywords of a surface that are known and left out.
-SURFACE_IGNORED = {
-    "FIMP": _SETTING,
-    "HIDE": _DISPLAY,
-    "SCOL": _DISPLAY,
-    "MIRR": "substrate of a mirror, for drawing",
-    "SLAB": "label for the program's macros",
-    "SSID": "label for the program's macros",
-    "POPS": _WAVES,
-    "MEMA": "mechanical semi-diameter: for drawing and mounting, never clips a ray",
-    "OEMA": "edge of the mechanical part",
-    "EDGE": "edge of the part, for drawing",
-    "COAT": _COATING,
-    "TCED": "coefficient of thermal expansion",
-    "TOLE": _TOLERANCE,
-    "XDAT": "extra data, which this type of surface does not use",
-    "VCON": _SOLVE,
-    "VDSZ": _SOLVE,
-    "VPAR": _SOLVE,
-    "PZUP": _SOLVE,
-    "PPAR": _SOLVE,
-    "MAZH": _SOLVE,
-}
+
+#: Keywords that are known and left out, with the reason.
+SYSTEM_IGNORED = _left_out(
+    {
+        "setting of the program, says nothing about the lens": "PFIL LANG HYPR ROPD PICB EERA LUID IWDP STUD FSVY",
+        "how semi-diameters are recomputed; the stored ones are read": "SDMA",
+        "how mechanical semi-diameters are recomputed": "OMMA",
+        "shift of the pupil for the program's own ray aiming": "PUSH",
+        "global coordinate reference: changes no ray": "GLRS",
+        "default tolerances and glass substitution": "GSTD",
+        "settings of non-sequential mode": "NSCD",
+        "names of coating and scatter files": "COFN",
+        "polarisation": "POLS",
+        "author; not carried": "AUTH",
+        "comment on a field point; not carried": "FCOM",
+        "entry of the vendor's catalog": "DBDT",
+        "checksum of the program": "CSUM",
+    }
+)
+SURFACE_IGNORED = _left_out(
+    {
+        "setting of the program, says nothing about the lens": "FIMP",
+        "how the program draws it": "HIDE SCOL",
+        "substrate of a mirror, for drawing": "MIRR",
+        "label for the program's macros": "SLAB SSID",
+        "sampling of wave propagation": "POPS",
+        "mechanical semi-diameter: for drawing and mounting, never clips a ray": "MEMA",
+        "edge of the mechanical part": "OEMA",
+        "edge of the part, for drawing": "EDGE",
+        "coatings do not bend rays": "COAT",
+        "coefficient of thermal expansion": "TCED",
+        "tolerance": "TOLE",
+        "extra data, which this type of surface does not use": "XDAT",
+        "solve or variable: the file stores the solved value, which is read": "VCON VDSZ VPAR PZUP PPAR MAZH",
+    }
+)
 
 #: What follows the last surface belongs to these, and not to the lens.
 TAIL_REASON = "merit function, tolerances or configurations: not part of the lens"
 
 #: Types of surface by what OpticStudio calls them; modelled are STANDARD and those of the rows of `shapes.KINDS`.
-TYPE_NAMES = {
-    "COORDBRK": "coordinate break",
-    "PARAXIAL": "paraxial lens",
-    "PARAX_XY": "paraxial XY",
-    "TOROIDAL": "toroidal",
-    "DGRATING": "diffraction grating",
-    "EGRATING": "elliptical grating",
-    "TILTSURF": "tilted",
-    "ODDASPHE": "odd asphere",
-    "XASPHERE": "extended asphere",
-    "XOSPHERE": "extended odd asphere",
-    "BICONICX": "biconic",
-    "IRREGULA": "irregular",
-    "ZERNSAG": "Zernike sag",
-    "SZERNSAG": "Zernike standard sag",
-    "FZERNSAG": "Zernike fringe sag",
-    "SZERNPHA": "Zernike standard phase",
-    "FZERNPHA": "Zernike fringe phase",
-    "XPOLYNOM": "extended polynomial",
-    "POLYNOMI": "polynomial",
-    "BINARY_1": "binary 1",
-    "BINARY_2": "binary 2",
-    "BINARY_3": "binary 3",
-    "FRESNELS": "Fresnel",
-    "CFRESNEL": "cylindrical Fresnel",
-    "GRINSUR1": "gradient index 1",
-    "GRINSUR5": "gradient index 5",
-    "GRADIUM": "gradient index",
-    "HOLOGRM1": "hologram 1",
-    "HOLOGRM2": "hologram 2",
-    "CONJUGAT": "conjugate",
-    "RETROREF": "retro-reflector",
-    "JONES_MA": "Jones matrix",
-    "ATMOSPHR": "atmospheric",
-    "GRIDSAG": "grid sag",
-    "GRID_SAG": "grid sag",
-    "ALTERNAT": "alternate",
-    "QTYPE": "Q-type asphere",
-    "NONSEQCO": "non-sequential component",
-    "USERSURF": "user-defined (DLL)",
-    "BIREFR_I": "birefringent in",
-    "BIREFR_O": "birefringent out",
-    "BICONIC": "biconic",
-    "CUBICSPL": "cubic spline",
-    "DATASURF": "data",
-    "BLACKBOX": "black box",
-}
+_TYPES = (
+    "COORDBRK coordinate break, PARAXIAL paraxial lens, PARAX_XY paraxial XY, TOROIDAL toroidal, "
+    "DGRATING diffraction grating, EGRATING elliptical grating, TILTSURF tilted, ODDASPHE odd asphere, "
+    "XASPHERE extended asphere, XOSPHERE extended odd asphere, BICONICX biconic, IRREGULA irregular, "
+    "ZERNSAG Zernike sag, SZERNSAG Zernike standard sag, FZERNSAG Zernike fringe sag, "
+    "SZERNPHA Zernike standard phase, FZERNPHA Zernike fringe phase, XPOLYNOM extended polynomial, "
+    "POLYNOMI polynomial, BINARY_1 binary 1, BINARY_2 binary 2, BINARY_3 binary 3, FRESNELS Fresnel, "
+    "CFRESNEL cylindrical Fresnel, GRINSUR1 gradient index 1, GRINSUR5 gradient index 5, GRADIUM gradient index, "
+    "HOLOGRM1 hologram 1, HOLOGRM2 hologram 2, CONJUGAT conjugate, RETROREF retro-reflector, JONES_MA Jones matrix, "
+    "ATMOSPHR atmospheric, GRIDSAG grid sag, GRID_SAG grid sag, ALTERNAT alternate, QTYPE Q-type asphere, "
+    "NONSEQCO non-sequential component, USERSURF user-defined (DLL), BIREFR_I birefringent in, "
+    "BIREFR_O birefringent out, BICONIC biconic, CUBICSPL cubic spline, DATASURF data, BLACKBOX black box"
+)
+TYPE_NAMES = dict(name.split(" ", 1) for name in _TYPES.split(", "))
 
-#: Millimetres in the unit of length named by UNIT.
-MILLIMETRES = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "INCH": 25.4, "M": 1e3, "METER": 1e3}
+#: System apertures: keyword, and the number after the size if it has one.
+SYSTEM_APERTURES = {
+    "entrance_pupil_diameter": ("ENPD", None),
+    "image_f_number": ("FNUM", 0),
+    "working_f_number": ("FNUM", 1),
+    "object_na": ("OBNA", 0),
+    "object_cone_angle": ("OBNA", 1),
+    "float_by_stop": ("FLOA", None),
+}
 
 #: Kind of field by the number of FTYP, and back.
 FIELD_KINDS = ("angle", "object_height", "paraxial_image_height", "real_image_height")
 FIELD_NAMES = {4: "theodolite angle"}
+
+
+class FieldList(NamedTuple):
+    """Numbers a field point each: keywords, the first of which is written; what a missing one is; and what it is."""
+
+    keywords: tuple[str, ...]
+    default: float
+    what: str
+
+
+FIELD_LISTS = {
+    "x": FieldList(("XFLN", "XFLD"), 0.0, "field"),
+    "y": FieldList(("YFLN", "YFLD"), 0.0, "field"),
+    "weight": FieldList(("FWGN", "FWGT"), 1.0, "weight of a field"),
+    **{
+        name: FieldList((f"{name}N", f"Z{name}", name), 0.0, "vignetting factor")
+        for name in ("VDX", "VDY", "VCX", "VCY", "VAN")
+    },
+}
+
+#: OpticStudio cuts a long note into pieces of this many characters.
+NOTE_PIECE = 200
 
 
 def modelled_types() -> dict[str, str]:
@@ -154,3 +135,132 @@ def aperture_keywords() -> dict[str, tuple[str, bool]]:
 def surface_read() -> frozenset[str]:
     """Keywords of a surface that are read."""
     return _SURFACE_READ | aperture_keywords().keys()
+
+
+# -- records --------------------------------------------------------------------------------------------------------
+
+
+class Record(NamedTuple):
+    """One line: its keyword, the words after it, and the raw text after the keyword and one space."""
+
+    keyword: str
+    words: tuple[str, ...]
+    text: str
+    place: Place
+    indented: bool
+
+    def number(self, position: int, what: str, default: float | None = None) -> float:
+        """The finite number at a position (0 is the first after the keyword), or `default` where the line ends."""
+        if position < len(self.words):
+            return number(self.words[position], f"{self.keyword}: {what}", self.place)
+        if default is None:
+            raise LensFileError(f"{self.keyword} has {len(self.words)} values; {what} is missing", self.place)
+        return default
+
+    def integer(self, position: int, what: str, default: int | None = None) -> int:
+        """The whole number at a position, or `default` where the line ends."""
+        if position >= len(self.words) and default is not None:
+            return default
+        self.number(position, what)
+        return integer(self.words[position], f"{self.keyword}: {what}", self.place)
+
+
+class Block:
+    """The records of the system or of one surface, by keyword."""
+
+    def __init__(self, place: Place):
+        self.place = place
+        self.records: dict[str, list[Record]] = {}
+
+    def all(self, *keywords: str) -> list[Record]:
+        """Every record of these keywords, in the order of the file."""
+        found = [record for keyword in keywords for record in self.records.get(keyword, ())]
+        return sorted(found, key=lambda record: record.place.line)
+
+    def last(self, *keywords: str) -> Record | None:
+        """The last record of the first of these keywords that is there."""
+        for keyword in keywords:
+            if keyword in self.records:
+                return self.records[keyword][-1]
+        return None
+
+
+class Sections(NamedTuple):
+    """A file sorted: the system, one block per surface, and the multi-configuration operands that follow."""
+
+    system: Block
+    surfaces: list[Block]
+    tail: list[Record]
+
+
+def records(text: str, file: str) -> Iterator[Record]:
+    """The lines of a text that hold something."""
+    for line_number, line in enumerate(text.split("\n"), 1):
+        held = line.strip()
+        if held:
+            keyword = held.split(None if "\t" in held else " ", 1)[0]
+            raw, words = line.lstrip()[len(keyword) + 1 :], held[len(keyword) :].split()
+            yield Record(keyword, tuple(words), raw, Place(file, line_number), line[0] in " \t")
+
+
+def sections(text: str, file: str, report: Draft) -> Sections:
+    """The records sorted by the keyword tables, each of them reported.
+
+    A surface's records are indented in files of OpticStudio; in files that lost the indentation the keyword decides.
+    After the last surface come merit function, tolerances and configurations, whose operands have names of their own.
+    """
+    found, of_surface = list(records(text, file)), surface_read()
+    start = next((position for position, record in enumerate(found, 1) if record.keyword == "SURF"), None)
+    if start is None:
+        hint = "is it a sequential lens file of OpticStudio (.zmx)?"
+        raise LensFileError(f"no SURF line in {len(found)} lines; {hint}", Place(file))
+    system, surfaces, tail = Block(Place(file)), [], []
+    indents = any(record.indented for record in found[start:])
+    block, after_surfaces = system, False
+    for record in found:
+        word = record.keyword
+        if word == "SURF":
+            block, after_surfaces = _next_surface(record, surfaces), False
+            surfaces.append(block)
+            report.met("SURF", READ, block.place)
+        elif block is not system and (record.indented if indents else word in of_surface or word in SURFACE_IGNORED):
+            record = record._replace(place=record.place._replace(surface=block.place.surface))
+            _classify(record, block, of_surface, SURFACE_IGNORED, report)
+        elif word not in SYSTEM_READ and (after_surfaces or (surfaces and word not in SYSTEM_IGNORED)):
+            block, after_surfaces = system, True
+            tail.append(record)
+            report.met(word, IGNORED, record.place, TAIL_REASON)
+        else:
+            block = system
+            _classify(record, system, SYSTEM_READ, SYSTEM_IGNORED, report)
+    _warn_of_repeats([system, *surfaces], report)
+    return Sections(system, surfaces, tail)
+
+
+def _next_surface(record: Record, surfaces: list[Block]) -> Block:
+    place = record.place
+    if len(surfaces) >= MAX_SURFACES:
+        raise LensFileError(f"more than {MAX_SURFACES} surfaces; no sequential lens has so many", place)
+    found = record.integer(0, "surface number")
+    if found != len(surfaces):
+        message = f"SURF {shown(record.words[0])} where surface {len(surfaces)} should follow; lines lost or reordered?"
+        raise LensFileError(message, place)
+    return Block(place._replace(surface=found))
+
+
+def _classify(record: Record, block: Block, read: frozenset[str], ignored: dict[str, str], report: Draft) -> None:
+    status = READ if record.keyword in read else IGNORED if record.keyword in ignored else UNKNOWN
+    if status != UNKNOWN:
+        block.records.setdefault(record.keyword, []).append(record)
+    report.met(
+        record.keyword[: 40 if status == UNKNOWN else None], status, record.place, ignored.get(record.keyword, "")
+    )
+
+
+def _warn_of_repeats(blocks: list[Block], report: Draft) -> None:
+    once = (SYSTEM_READ | surface_read()) - {*REPEATED}
+    for block in blocks:
+        for keyword, found in block.records.items():
+            if len(found) > 1 and keyword in once:
+                first = found[0].place.line
+                report.warn(f"{keyword} stands again (first in line {first}); the last is used", found[-1].place)

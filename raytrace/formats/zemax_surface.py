@@ -3,15 +3,14 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
-from raytrace.formats.media import listed_glass
+from raytrace.formats.media import by_figures, is_code, listed_glass
 from raytrace.formats.report import Draft
-from raytrace.formats.source import LensFileError, UnsupportedSurface, is_infinite, shown
-from raytrace.formats.zemax_keywords import TYPE_NAMES, aperture_keywords, modelled_types
-from raytrace.formats.zemax_records import Block, Record
-from raytrace.media.glass import AIR, MIRROR, Glass, constant, mil_glass, model_glass
+from raytrace.formats.source import LensFileError, UnsupportedSurface, shown
+from raytrace.formats.spelling import double, is_infinite
+from raytrace.formats.zemax_keywords import TYPE_NAMES, Block, Record, aperture_keywords, modelled_types
+from raytrace.media.glass import AIR, MIRROR, Glass, mil_glass
 from raytrace.system.aperture import Aperture
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface
@@ -89,14 +88,14 @@ def _thickness(record: Record, millimetres: float) -> Tensor:
     if is_infinite(word):
         if record.place.surface != 0 or word.startswith("-"):
             raise LensFileError(f"DISZ is {shown(word)}; only the object may be at infinity", record.place)
-        return _scalar(float("inf"))
-    return _scalar(record.number(0, "thickness") * millimetres)
+        return double(float("inf"))
+    return double(record.number(0, "thickness") * millimetres)
 
 
 def _nonzero(block: Block, keyword: str, what: str, divisor: float) -> Tensor | None:
     record = block.last(keyword)
     found = record.number(0, what) / divisor if record else 0.0
-    return _scalar(found) if found else None
+    return double(found) if found else None
 
 
 def _coefficients(block: Block, millimetres: float, report: Draft) -> Tensor | None:
@@ -117,7 +116,7 @@ def _coefficients(block: Block, millimetres: float, report: Draft) -> Tensor | N
             message = f"PARM {j}: an {kind.zemax} has parameters 1 to {kind.parameters}{kind.powers}; left out"
             report.warn(message, record.place)
     count = max(terms, default=kind.parameters)
-    return torch.tensor([terms.get(j, 0.0) for j in range(1, count + 1)], dtype=torch.float64)
+    return double([terms.get(j, 0.0) for j in range(1, count + 1)])
 
 
 def semi_diameter(block: Block, millimetres: float) -> float | None:
@@ -147,7 +146,7 @@ def _medium(block: Block, catalogs: tuple[str, ...], user: Sequence[Path], repor
     blank = name.upper() == "___BLANK"
     if blank or record.integer(1, "flag", 0) == 1:
         return _model(record, "" if blank else name, report)
-    if len(name) == 6 and name.isascii() and name.isdigit():
+    if is_code(name):
         report.glass(surface, name, "six-digit code: nd and Vd by its digits")
         return mil_glass(name)
     return listed_glass(name, catalogs=catalogs, user=user, place=record.place, report=report)
@@ -159,7 +158,7 @@ def _model(record: Record, name: str, report: Draft) -> Glass:
     if nd <= 0 or vd < 0:
         raise LensFileError(f"model glass of nd {nd:g}, Vd {vd:g}; expected nd > 0 and Vd ≥ 0", record.place)
     report.glass(record.place.surface, name, f"model glass nd {nd!r}, Vd {vd!r}, ΔPgF {dpgf!r}")
-    return constant(nd, name) if vd == dpgf == 0 else model_glass(nd, vd, dpgf, name=name)
+    return by_figures(nd, vd, dpgf, name)
 
 
 def _apertures(block: Block, millimetres: float, report: Draft) -> tuple[Aperture, ...]:
@@ -190,7 +189,3 @@ def _apertures(block: Block, millimetres: float, report: Draft) -> tuple[Apertur
     centre = block.last("OBDC")
     x, y = (centre.number(axis, "decentre") * millimetres for axis in (0, 1)) if centre else (0.0, 0.0)
     return (Aperture(shape, (first, second), obscures, (x, y)),)
-
-
-def _scalar(number: float) -> Tensor:
-    return torch.tensor(number, dtype=torch.float64)

@@ -3,19 +3,10 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from raytrace.formats.media import catalogs_needed, is_code, is_left_out, listed_name
 from raytrace.formats.source import LensFileError, Place
-from raytrace.formats.writing import (
-    catalogs_needed,
-    exact,
-    exact_list,
-    is_left_out,
-    listed_name,
-    one_line,
-    refuse_departure,
-    thickness,
-)
-from raytrace.formats.zemax_keywords import FIELD_KINDS
-from raytrace.formats.zemax_system import NOTE_PIECE
+from raytrace.formats.spelling import exact, exact_list, one_line, refuse_departure, thickness
+from raytrace.formats.zemax_keywords import FIELD_KINDS, FIELD_LISTS, NOTE_PIECE, SYSTEM_APERTURES
 from raytrace.media.glass import Glass, mil_glass
 from raytrace.system.aperture import SHAPES, Aperture
 from raytrace.system.lens import RAY_AIMING, Lens
@@ -24,15 +15,6 @@ from raytrace.system.surface import Surface
 
 #: OpticStudio has this many wavelengths.
 _WAVELENGTHS = 24
-
-_APERTURE_LINES = {
-    "entrance_pupil_diameter": "ENPD {}",
-    "image_f_number": "FNUM {} 0",
-    "working_f_number": "FNUM {} 1",
-    "object_na": "OBNA {} 0",
-    "object_cone_angle": "OBNA {} 1",
-    "float_by_stop": "FLOA",
-}
 
 
 def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
@@ -55,7 +37,8 @@ def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
     if len(lens.wavelengths) > _WAVELENGTHS:
         message = f"{len(lens.wavelengths)} wavelengths, a .zmx file has at most {_WAVELENGTHS}; write a table (.csv)"
         raise LensFileError(message, place)
-    size = exact(aperture.value, "system aperture", place)
+    keyword, flag = SYSTEM_APERTURES[aperture.kind]
+    words = [keyword, exact(aperture.value, "system aperture", place), *([] if flag is None else [str(flag)])]
     _check_floating_stop(lens, place)
     vignetting = fields.vignetting if fields.vignetting is not None else fields.x.new_zeros(5, len(fields.x))
     kind = FIELD_KINDS.index(fields.kind)
@@ -69,7 +52,7 @@ def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
         "PFIL 0 0 0",
         "LANG 0",
         "UNIT MM X W X CM MR CPMM",
-        _APERTURE_LINES[aperture.kind].format(size),
+        keyword if keyword == "FLOA" else " ".join(words),
         "ENVD 20 1 0",
         "GFAC 0 0",
         f"GCAT {' '.join(catalogs_needed(lens, catalogs, place.file))}".rstrip(),
@@ -79,12 +62,9 @@ def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
         f"FTYP {kind} {int(fields.telecentric)} {len(fields.x)} {len(lens.wavelengths)} 0 0 0",
         "ROPD 2",
         "PICB 1",
-        f"XFLN {' '.join(exact_list(fields.x, 'field', place))}",
-        f"YFLN {' '.join(exact_list(fields.y, 'field', place))}",
-        f"FWGN {' '.join(exact_list(fields.weight, 'weight of a field', place))}",
         *(
-            f"{keyword} {' '.join(exact_list(row, 'vignetting factor', place))}"
-            for keyword, row in zip(("VDXN", "VDYN", "VCXN", "VCYN", "VANN"), vignetting, strict=True)
+            f"{row.keywords[0]} {' '.join(exact_list(numbers, row.what, place))}"
+            for row, numbers in zip(FIELD_LISTS.values(), (fields.x, fields.y, fields.weight, *vignetting), strict=True)
         ),
         *(f"WAVM {slot} {wavelength} {weight}" for slot, (wavelength, weight) in enumerate(waves, 1)),
         f"PWAV {lens.primary_wavelength + 1}",
@@ -159,9 +139,8 @@ def _glass(glass: Glass, place: Place) -> list[str]:
     flag, name = 1, listed_name(glass, place) if glass.name else "___BLANK"
     if name.upper() in ("AIR", "MIRROR"):
         raise LensFileError(f"a glass of index {figures[0]} is named {name!r}; give it another name", place)
-    if len(name) == 6 and name.isascii() and name.isdigit():
-        listed = exact_list(mil_glass(name).coefficients, "model glass", place)
-        flag = 0 if listed == figures else 1
+    if is_code(name) and exact_list(mil_glass(name).coefficients, "model glass", place) == figures:
+        flag = 0
     return [f"  GLAS {name} {flag} 0 {' '.join(figures)} 0 0 0 0 0"]
 
 

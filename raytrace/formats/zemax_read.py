@@ -1,24 +1,113 @@
-"""The system of a .zmx file: unit, aperture, fields, wavelengths, notes, configurations."""
+"""Read a sequential lens file of Zemax OpticStudio (.zmx).
+
+Three stages: text -> records with line numbers -> the keyword table -> Lens. Conventions, each settled against numbers
+that OpticStudio itself stored:
+
+- The file carries solved values; nothing is solved again. Lengths are in the file's UNIT and become mm.
+- DIAM is a semi-diameter, and alone clips no ray. CLAP, FLAP, SQAP, ELAP clip, OBSC, SQOB, ELOB obscure, about OBDC.
+  FLAP, the floating aperture, is the circle of the surface's DIAM.
+- A surface without TYPE is STANDARD. CURV 0 and CONI 0 become None: a plane, a sphere.
+- EVENASPH: PARM j is the coefficient of r^(2j), from r² on.
+- WAVM has padded slots, field lists are padded; FTYP tells how many are used. PWAV counts from 1.
+- The surfaces of a multi-configuration file hold the configuration active when it was saved, normally the first.
+"""
 
 import re
+from collections.abc import Sequence
+from pathlib import Path
 
-import torch
 from torch import Tensor
 
-from raytrace.formats.report import Draft
-from raytrace.formats.source import LensFileError, is_number, shown
-from raytrace.formats.zemax_keywords import FIELD_KINDS, FIELD_NAMES, MILLIMETRES
-from raytrace.formats.zemax_records import Block, Record
-from raytrace.system.lens import RAY_AIMING, Fields, SystemAperture
-
-#: OpticStudio cuts a long note into pieces of this many characters.
-NOTE_PIECE = 200
+from raytrace.formats import zemax_surface
+from raytrace.formats.media import report_missing_catalogs
+from raytrace.formats.report import Draft, ImportReport
+from raytrace.formats.source import LensFileError, UnsupportedSurface, shown
+from raytrace.formats.spelling import MILLIMETRES, double, is_number, refuse_overflow
+from raytrace.formats.zemax_keywords import (
+    FIELD_KINDS,
+    FIELD_LISTS,
+    FIELD_NAMES,
+    NOTE_PIECE,
+    SYSTEM_APERTURES,
+    Block,
+    Record,
+    Sections,
+    sections,
+)
+from raytrace.system.lens import RAY_AIMING, Fields, Lens, SystemAperture
 
 #: More field points or wavelengths than any file has.
 _MOST = 1000
 
 
-def millimetres(system: Block, report: Draft) -> float:
+def read(text: str, file: str, *, catalogs: Sequence[Path] = (), strict: bool = False) -> tuple[Lens, ImportReport]:
+    """The lens of a .zmx text and the report of its import.
+
+    file: its name, for messages. catalogs: further glass catalogs (.agf). strict: every warning is an error.
+    Raises LensFileError, UnsupportedSurface (a type that is not modelled) and UnknownGlass.
+    """
+    report = Draft(file, "zmx")
+    found = sections(text, file, report)
+    _refuse_incomplete(found)
+    zemax_surface.refuse_unsupported(found.surfaces)
+    system = found.system
+    unit = _millimetres(system, report)
+    stop = _stop(found.surfaces)
+    names = tuple(name for record in system.all("GCAT") for name in record.words)
+    report_missing_catalogs(names, catalogs, report)
+    surfaces = [
+        zemax_surface.build(block, unit, catalogs=names, user=catalogs, report=report) for block in found.surfaces
+    ]
+    wavelengths, weights = _wavelengths(system, report)
+    primary = _primary(system, len(wavelengths), report)
+    name = system.last("NAME")
+    lens = Lens(
+        surfaces=tuple(surfaces),
+        stop=stop,
+        aperture=_aperture(system, surfaces[stop].semi_diameter, unit, report),
+        fields=_fields(system, unit, report),
+        wavelengths=wavelengths,
+        wavelength_weights=weights,
+        primary_wavelength=primary,
+        name=name.text.strip() if name else "",
+        notes=_notes(system),
+        catalogs=names,
+        ray_aiming=_ray_aiming(system),
+    )
+    refuse_overflow(lens, file)
+    _remarks(found, report)
+    return lens, report.finished(strict=strict)
+
+
+def _refuse_incomplete(found: Sections) -> None:
+    mode = found.system.last("MODE")
+    if mode and mode.words[:1] != ("SEQ",):
+        message = f"MODE {' '.join(mode.words)[:40]}: only sequential files (MODE SEQ) are modelled"
+        raise UnsupportedSurface(message, mode.place)
+    surfaces = found.surfaces
+    if len(surfaces) < 3:
+        message = f"{len(surfaces)} surfaces, expected at least object, one surface and image; file cut off?"
+        raise LensFileError(message, surfaces[-1].place)
+    image = surfaces[-1].last("DISZ")
+    if image and image.words and image.words[0].strip("+-0.eE") != "":
+        message = f"the last surface has thickness {image.words[0][:40]}, but the image has DISZ 0; image cut off?"
+        raise LensFileError(message, image.place)
+
+
+def _stop(surfaces: Sequence[Block]) -> int:
+    stops = [block.last("STOP") for block in surfaces if block.last("STOP")]
+    if not stops:
+        raise LensFileError("no surface is marked STOP; add the line STOP to the aperture stop", surfaces[0].place)
+    if len(stops) > 1:
+        first = stops[0].place.surface
+        raise LensFileError(f"a second STOP; surface {first} is the stop already", stops[1].place)
+    stop = stops[0].place
+    if not 0 < stop.surface < len(surfaces) - 1:
+        raise LensFileError("STOP on the object or the image; expected a surface between them", stop)
+    return stop.surface
+
+
+def _millimetres(system: Block, report: Draft) -> float:
     """Millimetres in the file's unit of length."""
     record = system.last("UNIT")
     if record is None:
@@ -32,7 +121,7 @@ def millimetres(system: Block, report: Draft) -> float:
     return MILLIMETRES[unit]
 
 
-def aperture(system: Block, stop_semi_diameter: float | None, unit: float, report: Draft) -> SystemAperture:
+def _aperture(system: Block, stop_semi_diameter: float | None, unit: float, report: Draft) -> SystemAperture:
     """The system aperture: ENPD, FNUM (0 image space, 1 working), OBNA (0 sine, 1 cone angle) or FLOA (by the stop)."""
     found = system.all("ENPD", "FNUM", "OBNA", "FLOA")
     if not found:
@@ -44,17 +133,15 @@ def aperture(system: Block, stop_semi_diameter: float | None, unit: float, repor
     if record.keyword == "FLOA":
         if not stop_semi_diameter:
             raise LensFileError("FLOA (float by stop size), but the stop surface has no DIAM", record.place)
-        return SystemAperture("float_by_stop", _tensor(stop_semi_diameter))
+        return SystemAperture("float_by_stop", double(stop_semi_diameter))
     size = record.number(0, "size of the aperture")
     if size <= 0:
         raise LensFileError(f"{record.keyword} is {shown(record.words[0])}, expected a positive number", record.place)
-    if record.keyword == "ENPD":
-        return SystemAperture("entrance_pupil_diameter", _tensor(size * unit))
-    kinds = ("image_f_number", "working_f_number") if record.keyword == "FNUM" else ("object_na", "object_cone_angle")
-    flag = record.integer(1, "kind of the aperture", 0)
-    if flag not in (0, 1):
+    flag = None if record.keyword == "ENPD" else record.integer(1, "kind of the aperture", 0)
+    kind = next((kind for kind, row in SYSTEM_APERTURES.items() if row == (record.keyword, flag)), None)
+    if kind is None:
         raise LensFileError(f"{record.keyword} of kind {flag}, expected 0 or 1", record.place)
-    return SystemAperture(kinds[flag], _tensor(size))
+    return SystemAperture(kind, double(size * unit if flag is None else size))
 
 
 def _count(system: Block, position: int, what: str) -> int | None:
@@ -67,34 +154,28 @@ def _count(system: Block, position: int, what: str) -> int | None:
     return count
 
 
-def fields(system: Block, unit: float, report: Draft) -> Fields:
+def _fields(system: Block, unit: float, report: Draft) -> Fields:
     """The field points: FTYP (kind, telecentric, count), XFLN, YFLN, weights and vignetting factors."""
     record = system.last("FTYP")
     kind = record.integer(0, "kind of field", 0) if record else 0
     if not 0 <= kind < len(FIELD_KINDS):
         name = f" ({FIELD_NAMES[kind]})" if kind in FIELD_NAMES else ""
         raise LensFileError(f"FTYP {kind}{name} is not modelled; expected a kind of field from 0 to 3", record.place)
-    x, y = system.last("XFLN", "XFLD"), system.last("YFLN", "YFLD")
+    points = [system.last(*FIELD_LISTS[axis].keywords) for axis in "xy"]
     count = _count(system, 2, "number of fields")
     if count is None:
-        count = max([1, *(_used(line) for line in (x, y) if line)])
+        count = max([1, *(_used(line) for line in points if line)])
         place = record.place if record else system.place
         report.warn(f"the number of fields is not stated (FTYP, third value); {count} taken", place)
     length = 1.0 if kind == 0 else unit
-
-    def values(name: str, *keywords: str, default: float | None = 0.0) -> list[float]:
-        return _list(system, keywords, count, f"{name} of field", default, report)
-
-    columns = (("VDX", 0.0), ("VDY", 0.0), ("VCX", 0.0), ("VCY", 0.0), ("VAN", 0.0))
-    vignetting = torch.tensor(
-        [values(name, f"{name}N", f"Z{name}", name, default=default) for name, default in columns], dtype=torch.float64
-    )
+    found = {name: _list(system, name, count, report) for name in sorted(FIELD_LISTS, key=str.islower)}
+    factors = double([found[name] for name in FIELD_LISTS if name.isupper()])
     return Fields(
         kind=FIELD_KINDS[kind],
-        x=_tensor([length * value for value in values("x", "XFLN", "XFLD")]),
-        y=_tensor([length * value for value in values("y", "YFLN", "YFLD")]),
-        weight=_tensor(values("weight", "FWGN", "FWGT", default=1.0)),
-        vignetting=vignetting if bool(vignetting.any()) else None,
+        x=double([length * value for value in found["x"]]),
+        y=double([length * value for value in found["y"]]),
+        weight=double(found["weight"]),
+        vignetting=factors if bool(factors.any()) else None,
         telecentric=bool(record.integer(1, "telecentric", 0)) if record else False,
     )
 
@@ -107,22 +188,22 @@ def _used(record: Record) -> int:
     return len(words)
 
 
-def _list(
-    system: Block, keywords: tuple[str, ...], count: int, what: str, default: float, report: Draft
-) -> list[float]:
+def _list(system: Block, name: str, count: int, report: Draft) -> list[float]:
+    """A list over the field points, a row of FIELD_LISTS."""
+    keywords, default, _ = FIELD_LISTS[name]
     record = system.last(*keywords)
     if record is None:
         return [default] * count
-    if len(record.words) < count and what.split()[0] in ("x", "y"):
-        raise LensFileError(f"{record.keyword} has {len(record.words)} values for {count} fields", record.place)
     if len(record.words) < count:
-        message = f"{record.keyword} has {len(record.words)} values for {count}; the others are taken as {default:g}"
-        report.warn(message, record.place)
-    return [record.number(position, what, default) for position in range(count)]
+        found = f"{record.keyword} has {len(record.words)} values for {count}"
+        if name in "xy":
+            raise LensFileError(f"{found} fields", record.place)
+        report.warn(f"{found}; the others are taken as {default:g}", record.place)
+    return [record.number(position, f"{name} of field", default) for position in range(count)]
 
 
-def wavelengths(system: Block, report: Draft) -> tuple[Tensor, Tensor, int]:
-    """Wavelengths in µm, their weights, and the 0-based position of the primary one.
+def _wavelengths(system: Block, report: Draft) -> tuple[Tensor, Tensor]:
+    """Wavelengths in µm and their weights.
 
     WAVM holds padded slots of which FTYP tells the number in use; older files carry lists (WAVN or WAVL).
     """
@@ -144,7 +225,7 @@ def wavelengths(system: Block, report: Draft) -> tuple[Tensor, Tensor, int]:
             raise LensFileError(f"wavelength {wavelength:g} µm, expected a positive number", place)
         if weight < 0:
             raise LensFileError(f"weight {weight:g} of a wavelength, expected 0 or more", place)
-    return _tensor([pair[0] for pair in pairs]), _tensor([pair[1] for pair in pairs]), _primary(system, count, report)
+    return double([pair[0] for pair in pairs]), double([pair[1] for pair in pairs])
 
 
 def _guessed_count(system: Block, slots: dict[int, Record], report: Draft) -> int:
@@ -158,6 +239,7 @@ def _guessed_count(system: Block, slots: dict[int, Record], report: Draft) -> in
 
 
 def _primary(system: Block, count: int, report: Draft) -> int:
+    """The 0-based position of the primary wavelength."""
     record = system.last("PWAV")
     if record is None:
         if count > 1:
@@ -169,7 +251,7 @@ def _primary(system: Block, count: int, report: Draft) -> int:
     return primary - 1
 
 
-def notes(system: Block) -> tuple[str, ...]:
+def _notes(system: Block) -> tuple[str, ...]:
     """The notes: NOTE 0 holds text in pieces of 200 characters, any other number ends a note."""
     found, continues = [], False
     for record in system.all("NOTE"):
@@ -186,7 +268,7 @@ def notes(system: Block) -> tuple[str, ...]:
     return tuple(note for note in stripped if note and note != "Notes...")
 
 
-def ray_aiming(system: Block) -> str:
+def _ray_aiming(system: Block) -> str:
     """Whether RAIM, in its second number, asks for rays aimed at the stop: 0 off, 1 paraxial, 2 real reference."""
     record = system.last("RAIM")
     kind = record.integer(1, "ray aiming", 0) if record else 0
@@ -195,31 +277,30 @@ def ray_aiming(system: Block) -> str:
     return list(RAY_AIMING)[kind]
 
 
-def remarks(system: Block, surfaces: list[Block], tail: list[Record], report: Draft) -> None:
+def _remarks(found: Sections, report: Draft) -> None:
     """Say what the file asks for and the lens does not carry: environment, apodisation, afocal, configurations."""
-    environment = system.last("ENVD")
+    environment = found.system.last("ENVD")
     if environment and environment.words:
         celsius, pressure = environment.number(0, "temperature"), environment.number(1, "pressure", 1.0)
         if (celsius, pressure) != (20.0, 1.0):
             message = f"environment of {celsius:g} °C and {pressure:g} atm; indices are those of 20 °C and 1 atm"
             report.warn(message, environment.place)
-    apodisation = system.last("GFAC")
-    if apodisation and apodisation.integer(1, "kind of apodisation", 0):
-        report.warn("the beam is apodised (GFAC); taken as uniform", apodisation.place)
-    field_type = system.last("FTYP")
-    if field_type and field_type.integer(6, "afocal", 0):
-        report.warn("afocal image space (FTYP, seventh value); the image is taken as a plane", field_type.place)
-    configurations = system.last("MNUM")
-    count = configurations.integer(0, "number of configurations", 1) if configurations else 1
-    if configurations:
-        operands = [other for other in tail if _is_operand(other, configurations)]
-        active = (
-            1 if count == 1 else configurations.integer(1, "active configuration", 0) or _active(surfaces, operands)
-        )
+    for keyword, position, what, message in (
+        ("GFAC", 1, "kind of apodisation", "the beam is apodised (GFAC); taken as uniform"),
+        ("FTYP", 6, "afocal", "afocal image space (FTYP, seventh value); the image is taken as a plane"),
+    ):
+        record = found.system.last(keyword)
+        if record and record.integer(position, what, 0):
+            report.warn(message, record.place)
+    head = found.system.last("MNUM")
+    if head:
+        count = head.integer(0, "number of configurations", 1)
+        operands = [other for other in found.tail if _is_operand(other, head)]
+        active = 1 if count == 1 else head.integer(1, "active configuration", 0) or _active(found.surfaces, operands)
         if count > 1:
-            _say_which(configurations, count, active, operands, report)
+            _say_which(head, count, active, operands, report)
         else:
-            _only_configuration(operands, surfaces, report)
+            _only_configuration(operands, found.surfaces, report)
         _environment([other for other in operands if not active or int(other.words[1]) == active], report)
 
 
@@ -285,7 +366,3 @@ def _active(surfaces: list[Block], operands: list[Record]) -> int:
             agrees[configuration] = agrees.get(configuration, True) and same
     active = [configuration for configuration, same in agrees.items() if same]
     return active[0] if len(active) == 1 else 0
-
-
-def _tensor(numbers: float | list[float]) -> Tensor:
-    return torch.tensor(numbers, dtype=torch.float64)
