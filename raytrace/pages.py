@@ -1,27 +1,52 @@
-"""What the pages of benchmarks share: rows as CSV, the line about the measurement, and what stands below the mark."""
+"""Pages of results in Markdown: what is measured is written anew, what stands below the mark is kept."""
 
-import csv
-import dataclasses
-import io
+import math
 import os
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
 
+from raytrace import files
+
 #: What stands below this line is written by hand: a page that is made again keeps it.
 KEPT = "<!-- kept when this page is made again -->"
 
+#: Rows of one kind as CSV, a column for each of their fields; empty where a quantity does not exist.
+table = partial(files.table, floats="{:.6g}".format)
 
-def table(rows: Iterable) -> str:
-    """Rows of one kind as CSV, a column for each of their fields; empty where a quantity does not exist."""
-    mappings = [dataclasses.asdict(row) for row in rows]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(mappings[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({key: _cell(value) for key, value in mapping.items()} for mapping in mappings)
-    return text.getvalue()
+
+def markdown(parts: Iterable[str], kept: str = "") -> str:
+    """A page of parts with a blank line between them, empty ones left out; the mark, and `kept` below it."""
+    return "\n\n".join([*filter(None, parts), f"{KEPT}\n{kept}".strip()]) + "\n"
+
+
+def kept_of(page: str) -> str:
+    """What a page made before keeps."""
+    return page.partition(KEPT)[2].strip()
+
+
+def write_page(path: Path, parts: Iterable[str]) -> None:
+    """Write a page, or write it anew above what it keeps."""
+    files.write_text(path, markdown(parts, kept_of(path.read_text(encoding="utf-8")) if path.exists() else ""))
+
+
+def grid(header: Sequence, rows: Iterable[Sequence]) -> str:
+    """A table of Markdown."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
+
+
+def picture(place: str, caption: str) -> str:
+    """A figure with its caption below it."""
+    return f"![{caption}]({place})\n\n*{caption}*"
+
+
+def shown(value: float, digits: int) -> str:
+    """A number with so many digits behind the point; ∞, and – for none."""
+    return f"{value:.{digits}f}" if math.isfinite(value) else "∞" if math.isinf(value) else "–"
 
 
 def measured(what: str, about: Mapping[str, str | int]) -> str:
@@ -32,10 +57,6 @@ def measured(what: str, about: Mapping[str, str | int]) -> str:
 def page(lines: Iterable[str], kept: str) -> str:
     """Lines, the mark, and `kept` below it."""
     return "\n".join([*lines, "", KEPT, kept]).rstrip() + "\n"
-
-
-def _cell(value):
-    return "" if value is None else f"{value:.6g}" if isinstance(value, float) else value
 
 
 def machine() -> dict[str, str | int]:

@@ -14,7 +14,8 @@ import torch
 import raytrace
 from raytrace import analysis, budget
 from raytrace.budget import OverBudget, TakesLong, afford, free_bytes, in_words, piece, within
-from raytrace.cli import COMMANDS, build_parser, main
+from raytrace.cli import build_parser, main
+from raytrace.cli.commands import COMMANDS
 from raytrace.files import shipped
 from raytrace.kernels import psf
 from raytrace.kernels.dft import rings_to_grid, to_grid, to_grid_mirrored

@@ -34,7 +34,6 @@ from raytrace.studies.codesign.closed_form import (
 from raytrace.studies.codesign.experiment import (
     Batches,
     Outcome,
-    Settings,
     absolute_error,
     batch,
     camera,
@@ -44,6 +43,7 @@ from raytrace.studies.codesign.experiment import (
     run_model,
     write_outcome,
 )
+from raytrace.studies.codesign.settings import Settings
 from raytrace.system.lens import with_object_distance
 
 LENS = Path(__file__).parents[1] / "lenses" / "double_gauss.zmx"

@@ -18,9 +18,8 @@ from raytrace.formats import read_lens
 from raytrace.formats.pictures import dead_leaves
 from raytrace.optics.paraxial import paraxial_image_distance
 from raytrace.studies.codesign import setup as codesign_setup
-from raytrace.studies.codesign import study
-from raytrace.studies.codesign import words as codesign_table
-from raytrace.studies.codesign.experiment import Settings, lens_at_start
+from raytrace.studies.codesign.experiment import lens_at_start
+from raytrace.studies.codesign.settings import AFTER_PARAXIAL, Settings
 
 _LITTLE = "--depth 4 --width 4 --patch 16 --size 7 --epochs 1 --crops 4 --batch 4 --precision float32"
 SMALL = tuple(_LITTLE.split(" "))
@@ -305,7 +304,7 @@ def test_two_processes_find_what_one_does(run, pictures, tmp_path):
 
 def test_compare_writes_the_table_and_the_page(run, pictures):
     """Paraxial, and Gaussian DRT begun where that ended; then the page again with a seed that is missing."""
-    after = study.AFTER_PARAXIAL
+    after = AFTER_PARAXIAL
     command = ("compare", "double_gauss", "--data", pictures, "-o", "study", "--docs", "docs")
     code, out, err = run(*command, *SMALL, "--models", after, "paraxial", "--seeds", "3", "--json")
     assert code == 0, err
@@ -353,11 +352,6 @@ def again(run, command, page):
     code, _, err = run(*command, *SMALL, "--noise", "0.2", "--models", "paraxial", "--seeds", "3")
     assert code == 1
     assert "study holds another run: noise was 0.1, now 0.2" in err
-
-
-def test_the_command_line_knows_the_rows_of_a_study():
-    """They are written twice, for the help imports no torch."""
-    assert (*codesign_table.MODELS, codesign_table.AFTER_PARAXIAL) == study.ROWS
 
 
 def test_precision_that_was_found_is_kept(run, pictures, monkeypatch):

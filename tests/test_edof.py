@@ -14,8 +14,9 @@ from raytrace.formats.pictures import dead_leaves
 from raytrace.maths.zernike import polynomials
 from raytrace.media.glass import index
 from raytrace.studies.edof import table as edof_table
+from raytrace.studies.edof.settings import Settings
 from raytrace.studies.edof.table import STRENGTHS, Content, elements_of, records, table_of
-from raytrace.studies.edof.training import Settings, begin, learn_element, radial_powers, scheduled
+from raytrace.studies.edof.training import begin, learn_element, radial_powers, scheduled
 from raytrace.studies.edof.world import (
     World,
     best_gamma,

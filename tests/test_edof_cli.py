@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from raytrace.cli import main
-from raytrace.studies.edof import command as wave_edof
-from raytrace.studies.edof.table import NAMES
-from raytrace.studies.edof.words import WORDS
+from raytrace.cli.wave import SUBCOMMANDS
+from raytrace.studies.edof import report
+from raytrace.studies.edof.table import ROWS
 
 
 def run(capsys, *words):
@@ -17,7 +17,7 @@ def run(capsys, *words):
 
 
 def test_one_row_as_json(capsys, monkeypatch):
-    monkeypatch.setattr(wave_edof, "_LEAVES", 6)
+    monkeypatch.setattr(report, "_LEAVES", 6)
     code, out, err = run(capsys, "table", "--rows", "singlet", "fresnel", "--json")
     assert code == 0, err
     rows = json.loads(out)["rows"]
@@ -34,7 +34,7 @@ def test_one_row_as_json(capsys, monkeypatch):
 def test_unknown_rows_are_refused(capsys):
     code, out, err = run(capsys, "table", "--rows", "holey")
     assert (code, out) == (1, "")
-    assert f"--rows holey: expected {', '.join(NAMES)}" in err
+    assert f"--rows holey: expected {', '.join(ROWS)}" in err
 
 
 @pytest.mark.slow
@@ -55,6 +55,7 @@ def test_an_element_is_learned_kept_and_gone_on_with(capsys, tmp_path):
 
 
 def test_every_form_teaches():
-    for name, _, description, examples, *_ in WORDS:
-        assert len(description) > 200
-        assert f"raytrace wave {name}" in examples
+    for command in SUBCOMMANDS:
+        name = command.name.removeprefix("wave-")
+        assert len(command.description) > 200
+        assert f"raytrace wave {name}" in command.examples

@@ -15,9 +15,9 @@ FLOORS = {
     # knows no optics: files that travel with the package, processes that share one computation
     "files": 0,
     "budget": 0,
-    "pages": 0,
     "shards": 0,
     "maths": 1,
+    "pages": 1,
     # nouns
     "media": 2,
     "system": 3,
@@ -41,11 +41,11 @@ FLOORS = {
 }
 
 #: Commands, whose imports may wait until they run.
-COMMANDS = re.compile(r"cli(\.|$)|studies\.\w+\.command$")
+COMMANDS = re.compile(r"cli(\.|$)|studies\.\w+\.(\w+_)?command$")
 
 #: What only these files may import.
 RESERVED = {
-    "matplotlib": (r"plot", r"studies\.\w+\.(\w+_)?figures", r"bench\.figure_\w+"),
+    "matplotlib": (r"plot", r"studies\.(\w+\.)?figures", r"bench\.figure_\w+"),
     "pandas": (r"formats\.(frame|ray_table)", r"cli", r"bench"),
     "tqdm": (r"cli", r"studies\.codesign\.setup", r"bench"),
     "optiland": (r"bench",),

@@ -9,30 +9,32 @@ import math
 import pytest
 import torch
 
-from raytrace.files import shipped
+from raytrace.files import shipped, write_table
 from raytrace.formats import read_lens
 from raytrace.formats.pictures import dead_leaves
 from raytrace.optics.conjugates import paraxial_image
 from raytrace.optics.focus import best_focus
 from raytrace.optics.paraxial import first_order
+from raytrace.pages import kept_of, markdown
 from raytrace.studies.codesign import optima
 from raytrace.studies.codesign.claims import claims, is_of_paper
 from raytrace.studies.codesign.closed_form import even_distances, optimise_closed_form, power_spectrum
-from raytrace.studies.codesign.experiment import Outcome, Settings, batch, camera, lens_at_start
+from raytrace.studies.codesign.experiment import Outcome, batch, camera, lens_at_start
 from raytrace.studies.codesign.figures import _marks
-from raytrace.studies.codesign.optima import Optimum, closed_form, closed_forms, scan, write_optima
-from raytrace.studies.codesign.page import CAPTIONS, Report, below_the_mark, markdown
-from raytrace.studies.codesign.step_time import StepTime, step_time
+from raytrace.studies.codesign.optima import Optimum, closed_form, closed_forms, scan
+from raytrace.studies.codesign.page import CAPTIONS, Report
+from raytrace.studies.codesign.settings import AFTER_PARAXIAL, Settings
 from raytrace.studies.codesign.study import (
-    AFTER_PARAXIAL,
+    COLUMNS,
+    StepTime,
     blur_diameters,
     courses,
     losses_by_distance,
     outcomes,
     run_folder,
     run_settings,
+    step_time,
     summaries,
-    write_table,
 )
 from raytrace.system.lens import with_object_distance, with_sensor_distance
 
@@ -159,7 +161,7 @@ def test_summaries_are_means_and_deviations_of_the_runs(tmp_path):
     assert first.mean["focus_paraxial_m"] == pytest.approx(33.9, rel=1e-12)
     assert first.deviation["focus_paraxial_m"] == pytest.approx(0.1 * math.sqrt(2), rel=1e-9)
     assert summaries(found[:1])[0].deviation["sensor_mm"] == 0
-    write_table(found, tmp_path / "table.csv")
+    write_table(tmp_path / "table.csv", found, COLUMNS)
     with open(tmp_path / "table.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [float(row["sensor_mm"]) for row in rows] == [one.sensor_mm for one in found]
@@ -215,7 +217,7 @@ def test_optimum_is_the_least_of_its_scan(lens, spectrum, model, tmp_path):
         assert float(place) == pytest.approx(found.sensor_mm, abs=1e-3 * MICROMETRE)
     own.use("drt")
     assert scan(own, spectrum, [found.sensor_mm])[0] == pytest.approx(found.error_drt, rel=0.02)  # the plan's tolerance
-    write_optima([found], tmp_path / "spectral.csv")
+    write_table(tmp_path / "spectral.csv", [found], optima.COLUMNS)
     with open(tmp_path / "spectral.csv", newline="") as file:
         (row,) = csv.DictReader(file)
     assert (row["model"], float(row["error_drt"])) == (model, found.error_drt)
@@ -227,7 +229,7 @@ def test_closed_forms_of_rows_begin_where_the_rows_do(lens, spectrum, monkeypatc
 
     def instantly(lens, settings, spectrum):
         begun.append((settings.model, settings.start))
-        return Optimum(settings.model, 57.8, 33.0, 19.0, 0.01, 0.01, {}, ())
+        return Optimum(settings.model, 57.8, 33.0, 19.0, 0.01, 0.01)
 
     monkeypatch.setattr(optima, "closed_form", instantly)
     rows = ("gaussian", AFTER_PARAXIAL)
@@ -291,7 +293,7 @@ def test_the_page_names_settings_that_are_not_usual():
         figures=("loss.png",),
         machine={"cores": 2},
     )
-    page = markdown(report, kept="By hand.")
+    page = markdown(report.parts(), "By hand.")
     command = page.splitlines()[2].strip()
     assert command.startswith("raytrace codesign compare double_gauss --data DIR -o FOLDER --docs docs ")
     for option in ("--f-number 4.0", "--field 0 10", "--vary sensor thickness:5", "--seeds 0 1 2", "--patch 16"):
@@ -300,19 +302,19 @@ def test_the_page_names_settings_that_are_not_usual():
     assert "| paraxial | 2 | 0.0415 ± 0.0000 | 0.0504 ± 0.0000 | +21.4 % | 33.9 ± 0.1 |" in page
     assert "**Unfinished: 6 of 7 runs.** Missing, by model and seed: drt 2." in page
     assert f"![{CAPTIONS['loss.png']}](codesign/loss.png)" in page
-    assert below_the_mark(page) == "By hand."
+    assert kept_of(page) == "By hand."
     assert "codesign_sweep.md" not in page
     assert "## The paper's claims" in page
-    other = markdown(dataclasses.replace(report, of_paper=False))
+    other = markdown(dataclasses.replace(report, of_paper=False).parts())
     assert "paper" not in other
-    assert "[codesign_sweep.md](codesign_sweep.md)" in markdown(dataclasses.replace(report, sweep=True))
+    assert "[codesign_sweep.md](codesign_sweep.md)" in markdown(dataclasses.replace(report, sweep=True).parts())
     begun = dataclasses.replace(report.settings, start="spectral", rho=0.3, bounds="sensor:57,58")
-    page_of_begun = markdown(dataclasses.replace(report, settings=begun))
+    page_of_begun = markdown(dataclasses.replace(report, settings=begun).parts())
     assert "from the optimum of the closed form" in page_of_begun
     assert "--start spectral" in page_of_begun
     assert "--rho 0.3" in page_of_begun
     assert "--bounds sensor:57,58" in page_of_begun
-    assert markdown(report, kept=below_the_mark(page)) == page
+    assert markdown(report.parts(), kept_of(page)) == page
 
 
 def test_marks_of_the_focus_axis_are_round_and_apart():

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from raytrace.cli import COMMANDS, build_parser
+from raytrace.cli import build_parser
+from raytrace.cli.commands import COMMANDS
 
 ROOT = Path(__file__).parents[1]
 #: What only those who made the package would understand.
@@ -53,7 +54,7 @@ def test_the_error_axis_of_learning_has_numbers():
     from raytrace.studies.focusing.figures import focus_figure
 
     found = learn_to_focus(Setting(samples=16), steps=2, frames=(0, 2))
-    figure = focus_figure(found, title="few steps")
+    figure = focus_figure(found)
     figure.canvas.draw()
     (error,) = [axes for axes in figure.axes if axes.get_ylabel() == "mean square error"]
     low, high = error.get_ylim()

@@ -12,7 +12,6 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 
-from raytrace.cli.commands import COMMANDS
 from raytrace.cli.options import did_you_mean, max_bytes
 from raytrace.cli.several import each_distance
 
@@ -74,7 +73,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"raytrace {_version()}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for command in COMMANDS:
+    for command in importlib.import_module("raytrace.cli.commands").COMMANDS:  # they import from this room
         child = commands.add_parser(
             command.name,
             help=command.summary,

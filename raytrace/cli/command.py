@@ -5,7 +5,8 @@ A command is a file of this folder with
     SUMMARY, DESCRIPTION, EXAMPLES    its words on the help pages
     options(parser)                   its options, each named as the keyword of the verb
     VERB                              the public name it calls, by default that of the file
-    run(arguments)                    only where it is more than the verb of a lens: what gives the result
+    run(arguments)                    only where it is more than the verb of a lens: what gives the result, or the
+                                      place of it, "room.file.function"
 """
 
 import argparse

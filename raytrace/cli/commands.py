@@ -10,7 +10,7 @@ from raytrace.cli.options import (
     output,
     plot,
 )
-from raytrace.cli.studies import words
+from raytrace.cli.studies import command
 
 
 def _bench(parser):
@@ -75,6 +75,6 @@ COMMANDS = (
         "bench.command.bench",
     ),
     *(Command(*entry) for entry in ANALYSES),
-    *(Command(*entry) for entry in words("codesign")),
+    command("codesign"),
     Command("wave", wave.SUMMARY, wave.DESCRIPTION, wave.EXAMPLES, wave.options, "cli.wave.options"),
 )

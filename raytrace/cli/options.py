@@ -282,7 +282,7 @@ def output(parser: argparse.ArgumentParser, what: str) -> None:
 
 
 def output_folder(parser: argparse.ArgumentParser, what: str, *, required: bool = False) -> None:
-    parser.add_argument("-o", "--output", metavar="FOLDER", type=data_file, help=what, required=required)
+    parser.add_argument("-o", "--output", dest="folder", metavar="FOLDER", type=data_file, help=what, required=required)
 
 
 def window(group, *, normalise: str) -> None:

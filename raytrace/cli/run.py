@@ -12,7 +12,7 @@ from types import ModuleType
 import raytrace
 from raytrace.cli.door import CommandError, open_lens, print_json, say
 from raytrace.cli.progress import progress
-from raytrace.maths.result import Result
+from raytrace.maths.result import Result, called
 from raytrace.shards import processes, share
 
 #: Options that are for the runner: they set the lens, or say where the result goes. A verb that has one gets it too.
@@ -36,6 +36,7 @@ def carry_out(command: ModuleType, arguments: argparse.Namespace) -> None:
 
 def _carry_out(command: ModuleType, arguments: argparse.Namespace) -> None:
     run = getattr(command, "run", None) or partial(verb_of_lens, command)
+    run = called(run) if isinstance(run, str) else run
     distances = getattr(arguments, "object_distances", None)
     if not distances or takes(command, "object_distances"):
         present(run(arguments), arguments)
@@ -56,13 +57,17 @@ def _carry_out(command: ModuleType, arguments: argparse.Namespace) -> None:
 
 
 def takes(command: ModuleType, keyword: str) -> bool:
-    """Whether the verb of a command has a keyword."""
-    return keyword in inspect.signature(verb_of(command)).parameters
+    """Whether the verb of a command has a keyword; the command of a study is no verb."""
+    return _verb(command) in raytrace.PUBLIC and keyword in inspect.signature(verb_of(command)).parameters
 
 
 def verb_of(command: ModuleType) -> Callable:
     """The public function that a command calls."""
-    return getattr(raytrace, getattr(command, "VERB", command.__name__.rpartition(".")[2]))
+    return getattr(raytrace, _verb(command))
+
+
+def _verb(command: ModuleType) -> str:
+    return getattr(command, "VERB", command.__name__.rpartition(".")[2])
 
 
 def options_of(command: ModuleType, arguments: argparse.Namespace) -> dict:

@@ -1,8 +1,20 @@
-"""Studies: each brings the words of its command; found by name, so that nothing of the library imports a study."""
+"""Commands of studies; found by name, so that nothing of the library imports a study."""
 
-import importlib
+import dataclasses
+
+from raytrace.cli.command import Command
+
+#: The file of each command in raytrace/studies/.
+PLACES = {
+    "codesign": "codesign.command",
+    "focus": "focusing.command",
+    "edof": "edof.command",
+    "table": "edof.table_command",
+    "superres": "superres.command",
+    "quantise": "quantise.command",
+}
 
 
-def words(study: str) -> tuple:
-    """The entries of a study's command or subcommands, WORDS of `raytrace/studies/STUDY/words.py`."""
-    return importlib.import_module(f"raytrace.studies.{study}.words").WORDS
+def command(name: str) -> Command:
+    """The command of a study."""
+    return dataclasses.replace(Command.of(f"studies.{PLACES[name]}"), name=name)

@@ -4,7 +4,7 @@ import argparse
 
 from raytrace.cli.command import Command
 from raytrace.cli.options import max_bytes
-from raytrace.cli.studies import words
+from raytrace.cli.studies import command
 
 SUMMARY = "phase elements: their PSFs, and learning them"
 
@@ -19,20 +19,20 @@ EXAMPLES = """examples:
 
 SUBCOMMANDS = (
     Command.of("cli.wave_psf"),
-    *(Command(*entry) for study in ("focusing", "edof", "superres") for entry in words(study)),
+    *map(command, ("focus", "edof", "table", "superres", "quantise")),
 )
 
 
 def options(parser: argparse.ArgumentParser) -> None:
     children = parser.add_subparsers(dest="subcommand", metavar="SUB", required=True)
-    for command in SUBCOMMANDS:
+    for one in SUBCOMMANDS:
         child = children.add_parser(
-            command.name.removeprefix("wave-"),
-            help=command.summary,
-            description=command.description,
-            epilog=command.examples,
+            one.name.removeprefix("wave-"),
+            help=one.summary,
+            description=one.description,
+            epilog=one.examples,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        command.add_arguments(child)
+        one.add_arguments(child)
         max_bytes(child)
-        child.set_defaults(run=command.run)
+        child.set_defaults(run=one.run)

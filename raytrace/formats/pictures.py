@@ -52,15 +52,19 @@ def draws(*key: int) -> np.random.Generator:
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(key)))
 
 
-def files(folder: str | Path) -> list[Path]:
-    """All pictures under a folder, sorted by path. Raises NoPictures for one without any."""
+def files(folder: str | Path, most: int | None = None) -> list[Path]:
+    """All pictures under a folder, sorted by path, or `most` of them, evenly from all.
+
+    Raises NoPictures for one without any.
+    """
     folder = Path(folder)
     if not folder.is_dir():
         raise NoPictures(f"{folder}: no such folder; expected one with pictures in it, in any subfolders")
     found = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
     if not found:
         raise NoPictures(f"{folder}: no pictures found; expected {', '.join(SUFFIXES)} files in it or below")
-    return found
+    count = min(most or len(found), len(found))
+    return [found[i * len(found) // count] for i in range(count)]
 
 
 def read(paths: Sequence[str | Path], *, least: int, progress: Callable[[Iterable], Iterable] = iter) -> Pictures:

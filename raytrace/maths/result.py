@@ -106,6 +106,15 @@ def numbers(values: Tensor) -> list:
     return [number(entry) if entry.dim() == 0 else numbers(entry) for entry in values.detach()]
 
 
+def plain(document):
+    """A document for JSON: null for what is no finite number."""
+    if isinstance(document, dict):
+        return {name: plain(entry) for name, entry in document.items()}
+    if isinstance(document, list | tuple):
+        return [plain(entry) for entry in document]
+    return number(document) if isinstance(document, float) else document
+
+
 def cell(value: float, form: str) -> str:
     """A number in a table of text, or - of the same width where there is none."""
     if not math.isfinite(value):

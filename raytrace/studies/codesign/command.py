@@ -1,39 +1,45 @@
-"""`raytrace codesign`: one model; `codesign compare` and `codesign sweep` are in files of their own."""
+"""`raytrace codesign`: its words and options. Imports no torch before it runs."""
 
 import argparse
-import dataclasses
 import importlib
-import json
-import math
-from pathlib import Path
 
-from raytrace.camera.limits import Limits
-from raytrace.cli.door import CommandError, print_json, say
-from raytrace.cli.options import did_you_mean
-from raytrace.files import write_atomically
-from raytrace.formats import FORMATS, read_lens, write_lens
-from raytrace.shards import processes, share
-from raytrace.studies.codesign.closed_form import power_spectrum
-from raytrace.studies.codesign.experiment import LENS, STEPS, Outcome, variables
-from raytrace.studies.codesign.optima import Optimum, closed_form
-from raytrace.studies.codesign.optima import document as optimum_document
-from raytrace.studies.codesign.setup import (
-    Experiment,
-    experiment,
-    plain,
-    refuse_too_few,
-    settings_of,
-    settings_without_network,
-    train_run,
+from raytrace.cli.options import catalog, did_you_mean, file_name, json, output_folder, seed_number
+from raytrace.studies.codesign.settings import AFTER_PARAXIAL, MODELS, Settings
+from raytrace.studies.options import add_options, documents, pictures
+
+SUMMARY = "learn a lens and a network together"
+DESCRIPTION = """\
+Learn the sensor distance (or any variables) of a lens together with a network that restores its pictures. Step 1
+learns both with the PSFs of one model; step 2 freezes the lens and goes on with the network on PSFs of traced rays,
+as long as step 1. `compare` runs every model and seed and writes tables, figures and a page about them; `sweep` finds
+the optima of the closed form at several apertures, noises, normalisations and starts, and widths of the paraxial PSF.
+
+Models: paraxial (a Gaussian as wide as the paraxial blur), fourier (diffraction of the paraxial wavefront), gaussian
+(Gaussian DRT: centroid and covariance of traced rays), drt (differentiable ray tracing: the rays themselves). Closed
+form: the expected mean square error of pictures behind the best linear filter, from their power spectrum.
+
+A run may be stopped at any moment: the same command goes on where it was, and ends in the same numbers. Several
+processes share every batch: torchrun --nproc-per-node 2 -m raytrace codesign …"""
+EXAMPLES = """examples:
+  raytrace codesign double_gauss --loss spectral -o learned.zmx
+  raytrace codesign double_gauss --model gaussian --data pictures -o run
+  raytrace codesign double_gauss --start spectral --bounds sensor:57,58 --data pictures -o begun_in_closed_form
+  raytrace codesign lens.zmx --vary sensor thickness:5,6 curvature:1-4 --f-number 4 -o run4
+  raytrace codesign double_gauss --wavelength 0.53 0.48 0.62 --vary thickness:2,9 --air-thickness 0.5:50 -o colours
+  raytrace codesign double_gauss --field 0 10 14 --normalise energy --epochs 10 -o fields --json
+  raytrace codesign compare double_gauss --data pictures --seeds 0 1 2 -o study --docs docs
+  raytrace codesign compare double_gauss --data pictures -o study --docs docs --report-only
+  raytrace codesign sweep double_gauss --data pictures --docs docs"""
+
+_SCENE = (
+    *("vary", "bounds", "glass_thickness", "air_thickness", "edge", "start", "focus_distance", "f_number"),
+    *("wavelengths", "wavelength_weights", "near", "far", "fields", "pixel", "size", "normalise", "rho"),
+    *("noise", "tol"),
 )
+_TRAINING = ("depth", "width", "epochs", "batch", "seed", "rate_network", "rate_optics", "precision")
 
-#: The forms of the command by their word, and the options that only some of them know.
-_FORMS = {
-    "": "codesign LENS",
-    "compare": "codesign compare LENS",
-    "sweep": "codesign sweep LENS",
-}
-_MODULES = {"compare": "compare", "sweep": "sweep_command"}
+#: The forms of the command by their word, where they are carried out, and the options that only some of them know.
+_FORMS = {"": "single", "compare": "compare", "sweep": "sweep_page"}
 _BELONG = {
     "models": ("compare",),
     "seeds": ("compare",),
@@ -45,8 +51,69 @@ _BELONG = {
 }
 
 
-def codesign(arguments: argparse.Namespace) -> None:
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.usage = "raytrace codesign [compare | sweep] LENS [-o FOLDER] [options]"
+    parser.add_argument(
+        "words",
+        metavar="LENS",
+        type=file_name,
+        nargs="+",
+        help="lens file, or the name of a shipped lens; before it `compare` runs all models and seeds, "
+        "`sweep` finds optima of the closed form",
+    )
+    catalog(parser)
+    json(parser)
+    output_folder(
+        parser,
+        "folder of the run, or of all runs of compare, in each of which lens.zmx is the learned lens; or a lens file "
+        "(.zmx, .csv) for it, the run then being kept in a folder of the same name without suffix",
+    )
+    parser.add_argument("--resume", action="store_true", help="only go on with a run that was begun in FOLDER")
+    add_options(parser, Settings, "model")
+    parser.add_argument(
+        "--loss",
+        choices=("image", "spectral"),
+        default="image",
+        help="image: L1 of restored pictures, by training (default); spectral: the closed form, without a network, "
+        "in seconds",
+    )
+    what = "folder of pictures, in any subfolders; four fifths of them train, the others test"
+    pictures(parser, what, "patch", "crops", settings=Settings)
+    scene = parser.add_argument_group("lens and scene")
+    add_options(scene, Settings, *_SCENE)
+    scene.add_argument(
+        "--file-wavelengths", action="store_true", help="the file's wavelengths with their weights (default 0.53 µm)"
+    )
+    training = parser.add_argument_group("network and training")
+    training.add_argument(
+        "--preset",
+        choices=("cpu", "paper"),
+        default="cpu",
+        help="RED-Net of 10 layers of 32 maps (default), or of 30 layers of 64 maps",
+    )
+    add_options(training, Settings, *_TRAINING)
+    _compare(parser.add_argument_group("compare and sweep"))
+
+
+def _compare(group) -> None:
+    group.add_argument(
+        "--models",
+        metavar="MODEL",
+        choices=(*MODELS, AFTER_PARAXIAL),
+        nargs="+",
+        help=f"rows of the table: {', '.join(MODELS)} (default: all), and {AFTER_PARAXIAL}: Gaussian DRT that begins "
+        "where the paraxial run ended",
+    )
+    group.add_argument("--seeds", metavar="N", type=seed_number, nargs="+", help="of the runs (default 0 1 2)")
+    documents(group, "the page and of codesign/, for compare and sweep (default: FOLDER)")
+    group.add_argument("--report-only", action="store_true", help="train nothing, write what the runs say so far")
+
+
+def run(arguments: argparse.Namespace) -> None:
     """One model; with the word `compare` all of them; with `sweep` the closed form by what the paper leaves open."""
+    from raytrace.cli.door import CommandError
+    from raytrace.shards import processes
+
     *before, arguments.lens = arguments.words
     form = before[0] if before else ""
     if len(before) > 1 or form not in _FORMS:
@@ -55,137 +122,13 @@ def codesign(arguments: argparse.Namespace) -> None:
         )
     for name, forms in _BELONG.items():
         if form not in forms and getattr(arguments, name) not in (None, False):
-            raise CommandError(
-                f"--{name.replace('_', '-')} belongs to {' and '.join(_FORMS[known] for known in forms)}"
-            )
+            raise CommandError(f"--{name.replace('_', '-')} belongs to {' and '.join(map(_spelled, forms))}")
     if form and arguments.loss == "spectral":
         raise CommandError("--loss spectral belongs to codesign LENS; compare and sweep use the closed form anyway")
-    work = _spectral if arguments.loss == "spectral" else _train
-    if form:
-        work = getattr(importlib.import_module(f"raytrace.studies.codesign.{_MODULES[form]}"), form)
+    name = "spectral" if arguments.loss == "spectral" else form or "single"
     with processes():
-        work(arguments)
+        importlib.import_module(f"raytrace.studies.codesign.{_FORMS[form]}").__dict__[name](arguments)
 
 
-def _train(arguments: argparse.Namespace) -> None:
-    if not arguments.output:
-        raise CommandError("no folder to keep the run in: give -o FOLDER")
-    folder, lens_file = _outputs(arguments)
-    begun = folder / STEPS[0] / "settings.json"
-    if arguments.resume and not begun.exists():
-        raise CommandError(f"{folder}: no run was begun here; leave out --resume to begin one")
-    settings = settings_of(arguments, begun)
-    given = experiment(arguments, settings)
-    refuse_too_few(given)
-    found = train_run(given, settings, folder, f"{settings.model}, seed {settings.seed}")
-    if arguments.json:
-        document = {
-            "settings": dataclasses.asdict(settings),
-            **given.about,
-            "limits": dataclasses.asdict(limits(given)),
-            **dataclasses.asdict(found),
-        }
-        print_json(plain(document))
-    else:
-        _print_outcome(found, limits(given))
-    if lens_file and not share().rank:
-        write_lens(read_lens(folder / LENS, catalogs=given.catalogs), lens_file, catalogs=given.catalogs)
-    say(f"written: {folder / 'outcome.json'}, {lens_file or folder / LENS}")
-    refuse_none(found)
-
-
-def _outputs(arguments: argparse.Namespace) -> tuple[Path, Path | None]:
-    """The folder of -o, and the lens file where it names one."""
-    path = Path(arguments.output)
-    return (path.with_suffix(""), path) if path.suffix.lower() in FORMATS else (path, None)
-
-
-def limits(given: Experiment) -> Limits:
-    """What thicknesses are held to."""
-    return variables(given.lens, given.settings).limits
-
-
-def refuse_none(found: Outcome | Optimum) -> None:
-    """Raise where no optimum was found, after all that was found is said."""
-    if found.no_optimum:
-        raise CommandError(found.no_optimum)
-
-
-def _print_outcome(found: Outcome, held: Limits) -> None:
-    print(f"{found.model} PSFs, seed {found.seed}")
-    _print_lens(found, held)
-    print("L1 loss of test pictures:")
-    print(f"  after step 1, with its own PSFs  {found.l1_joint:.5f}")
-    print(f"  the same network with DRT PSFs   {found.l1_before:.5f}")
-    print(f"  after step 2, with DRT PSFs      {found.l1_drt:.5f}")
-    print(f"{'object at':>12} {'L1 with DRT PSFs':>18}")
-    for distance, loss in found.by_distance.items():
-        print(f"{float(distance) / 1e3:>10g} m {loss:>18.5f}")
-
-
-def _print_lens(found: Outcome | Optimum, held: Limits) -> None:
-    print(f"sensor at {found.sensor_mm:.4f} mm")
-    for name, value in found.variables.items():
-        if name != "sensor":
-            print(f"{name} = {value:.7g} {'1/mm' if name.startswith('curvature') else ''}".rstrip())
-    print(f"in focus: {_metres(found.focus_paraxial_m)} (paraxial), {_metres(found.focus_rms_m)} (least RMS spot)")
-    print(f"penalty {found.penalty:.6g} mm² beside the loss; thicknesses: {_spelled(held)}")
-
-
-def _spelled(held: Limits) -> str:
-    """Limits in words."""
-    ranges = (held.glass, held.air)
-    glass, air = (f"{low:.4g}" + (f" to {high:.4g}" if math.isfinite(high) else " at least") for low, high in ranges)
-    return f"glass {glass}, its edge {held.edge:.4g} at least, air {air} (mm)"
-
-
-def _metres(distance: float) -> str:
-    return f"{distance:.2f} m" if math.isfinite(distance) else "infinity"
-
-
-def _spectral(arguments: argparse.Namespace) -> None:
-    settings = settings_without_network(arguments)
-    given = experiment(arguments, settings)
-    found = closed_form(given.lens, settings, spectrum_of(given))
-    for name in found.at_end:
-        say(f"warning: {name} stands at an end of its bounds, and the loss still falls beyond it")
-    document = plain(
-        {
-            "settings": dataclasses.asdict(settings),
-            **given.about,
-            "limits": dataclasses.asdict(limits(given)),
-            **optimum_document(found),
-        }
-    )
-    written = _write_optimum(found, document, given, arguments) if arguments.output else ()
-    if arguments.json:
-        print_json(document)
-    else:
-        print(f"{found.model} PSFs, mean square error of a pixel behind the best linear filter")
-        print(f"{'evaluation':>12} {'error':>12} {'penalty, mm²':>13}")
-        for evaluation, (error, penalty) in enumerate(zip(found.course, found.penalties, strict=True), 1):
-            print(f"{evaluation:>12} {error:>12.8f} {penalty:>13.6g}")
-        _print_lens(found, limits(given))
-        print(f"error of this lens: {found.error:.8f} with its own PSFs, {found.error_drt:.8f} with DRT PSFs")
-    for path in written:
-        say(f"written: {path}")
-    refuse_none(found)
-
-
-def _write_optimum(found: Optimum, document: dict, given: Experiment, arguments: argparse.Namespace) -> list[Path]:
-    """The lens of -o LENS.zmx, or folder with the lens and the document; what was written."""
-    folder, lens_file = _outputs(arguments)
-    if lens_file:
-        write_lens(found.lens, lens_file, catalogs=given.catalogs)
-        return [lens_file]
-    folder.mkdir(parents=True, exist_ok=True)
-    write_lens(found.lens, folder / LENS, catalogs=given.catalogs)
-    path = folder / "spectral.json"
-    write_atomically(path, lambda file: file.write(json.dumps(document, indent=1).encode()))
-    return [path, folder / LENS]
-
-
-def spectrum_of(given: Experiment):
-    """Power spectrum of the training pictures, at the size of a patch with its margin."""
-    settings = given.settings
-    return power_spectrum(given.train, settings.patch + settings.size - 1, crops=settings.crops, seed=settings.seed)
+def _spelled(form: str) -> str:
+    return " ".join(filter(None, ("codesign", form, "LENS")))

@@ -9,62 +9,53 @@ import numpy as np
 from torch import Tensor
 
 from raytrace.camera.training import Run, share
-from raytrace.cli.door import CommandError, print_json, say
-from raytrace.files import write_atomically
+from raytrace.cli.door import CommandError, say
+from raytrace.cli.run import present
+from raytrace.files import write_table
 from raytrace.formats.pictures import dead_leaves
-from raytrace.pages import machine
+from raytrace.pages import machine, write_page
 from raytrace.plot.style import save
-from raytrace.studies.codesign import figures as figures
-from raytrace.studies.codesign.claims import Claim, claims, is_of_paper
-from raytrace.studies.codesign.command import spectrum_of
-from raytrace.studies.codesign.experiment import STEPS, Outcome, Settings, batch, camera, lens_at_start, outcome
-from raytrace.studies.codesign.optima import Optimum, closed_forms, document, scan, write_optima
-from raytrace.studies.codesign.page import CAPTIONS, Report, below_the_mark, markdown
+from raytrace.studies.codesign import figures, optima
+from raytrace.studies.codesign.claims import is_of_paper
+from raytrace.studies.codesign.experiment import STEPS, Outcome, batch, camera, lens_at_start, outcome
+from raytrace.studies.codesign.page import CAPTIONS, Report
+from raytrace.studies.codesign.settings import AFTER_PARAXIAL, MODELS, NAMES, Settings
 from raytrace.studies.codesign.setup import (
     Experiment,
     conjugates,
     experiment,
-    plain,
     recorded,
     refuse_too_few,
     settings_of,
     train_run,
 )
-from raytrace.studies.codesign.step_time import StepTime, step_time
 from raytrace.studies.codesign.study import (
-    AFTER_PARAXIAL,
-    NAMES,
-    ROWS,
+    COLUMNS,
     blur_diameters,
     courses,
     examples,
     losses_by_distance,
     outcomes,
-    rows,
     run_folder,
     run_settings,
+    step_time,
     summaries,
     trained,
-    write_table,
 )
-from raytrace.studies.codesign.words import MODELS
-
-#: Numbers by model, and whole curves by model, one for each seed.
-Values = dict[str, list[float]]
 
 
 def compare(arguments: argparse.Namespace) -> None:
     """Train what is missing, then write table, figures and page from what is there."""
-    if not arguments.output:
+    if not arguments.folder:
         raise CommandError("no folder to keep the runs in: give -o FOLDER")
-    study = Path(arguments.output)
+    study = Path(arguments.folder)
     begun = study / "settings.json"
     if (arguments.resume or arguments.report_only) and not begun.exists():
         raise CommandError(f"{study}: no study was begun here")
-    settings = _recorded_settings(begun) if arguments.report_only else settings_of(arguments, begun)
-    given = experiment(arguments, settings)
+    given = experiment(arguments, _recorded_settings(begun) if arguments.report_only else settings_of(arguments, begun))
     refuse_too_few(given)
-    _guard(study, given)
+    common = {k: v for k, v in dataclasses.asdict(given.settings).items() if k not in ("model", "seed")}
+    Run(study, {**common, **given.about})  # refuses a folder begun with other settings, lens or pictures
     models, seeds = _asked(arguments, study)
     if not arguments.report_only:
         _train(given, study, models, seeds)
@@ -72,14 +63,11 @@ def compare(arguments: argparse.Namespace) -> None:
         return  # the first process writes
     docs = Path(arguments.docs or study)
     report = _report(given, study, models, seeds, docs)
-    if arguments.json:
-        print_json(_document(report))
-    else:
-        _print(report)
+    present(report, arguments)
     say(f"written: {docs / 'codesign.md'}")
     nowhere = [one for one in (*report.optima, *report.found) if one.no_optimum]
     for one in nowhere:
-        kind = "the closed form" if isinstance(one, Optimum) else f"seed {one.seed}"
+        kind = "the closed form" if isinstance(one, optima.Optimum) else f"seed {one.seed}"
         say(f"warning: {one.model}, {kind}: {one.no_optimum}")
     if nowhere and len(nowhere) == len(report.optima) + len(report.found):
         raise CommandError("no model has an optimum; see the warnings, and choose other --near, --far, --bounds")
@@ -87,28 +75,20 @@ def compare(arguments: argparse.Namespace) -> None:
 
 def _recorded_settings(path: Path) -> Settings:
     known = {field.name for field in dataclasses.fields(Settings)}
-    found = {key: value for key, value in recorded(path).items() if key in known}
-    return Settings(**{key: tuple(value) if isinstance(value, list) else value for key, value in found.items()})
-
-
-def _guard(study: Path, given: Experiment) -> None:
-    """Refuse a folder begun with other settings, lens or pictures."""
-    common = {k: v for k, v in dataclasses.asdict(given.settings).items() if k not in ("model", "seed")}
-    Run(study, {**common, **given.about})
+    return Settings.read({key: value for key, value in recorded(path).items() if key in known})
 
 
 def _asked(arguments: argparse.Namespace, study: Path) -> tuple[list[str], list[int]]:
     """Models, in the order of the table, and seeds: those asked for; for a mere report those that were begun."""
-    begun = [(row, int(path.name[len(row) + 1 :])) for row in ROWS for path in study.glob(f"{row}-[0-9]*")]
+    begun = [(row, int(path.name[len(row) + 1 :])) for row in NAMES for path in study.glob(f"{row}-[0-9]*")]
     usual_models, usual_seeds = list(MODELS), [0, 1, 2]
     if arguments.report_only and begun:
         usual_models, usual_seeds = [row for row, _ in begun], sorted({seed for _, seed in begun})
-    models = [row for row in ROWS if row in (arguments.models or usual_models)]
+    models = [row for row in NAMES if row in (arguments.models or usual_models)]
     seeds = list(dict.fromkeys(arguments.seeds or usual_seeds))
-    if AFTER_PARAXIAL in models and "paraxial" not in models:
-        lacking = [seed for seed in seeds if outcome(run_folder(study, "paraxial", seed)) is None]
-        if lacking:
-            raise CommandError(f"{AFTER_PARAXIAL} begins where paraxial ended: add paraxial to --models")
+    is_lacking = any(outcome(run_folder(study, "paraxial", seed)) is None for seed in seeds)
+    if AFTER_PARAXIAL in models and "paraxial" not in models and is_lacking:
+        raise CommandError(f"{AFTER_PARAXIAL} begins where paraxial ended: add paraxial to --models")
     return models, seeds
 
 
@@ -124,66 +104,54 @@ def _report(given: Experiment, study: Path, models: Sequence[str], seeds: Sequen
     """Write everything; returns what the page says."""
     found = outcomes(study, models, seeds)
     done = {(one.model, one.seed) for one in found}
-    simulated = [model for model in models if model in MODELS]
-    own = [dataclasses.replace(given.settings, model=model) for model in simulated]
+    own = [dataclasses.replace(given.settings, model=model) for model in models if model in MODELS]
     say("the closed form, and the time of a step, of every model")
-    spectrum = spectrum_of(given)
-    optima = closed_forms(given.lens, given.settings, spectrum, models)
-    times = [_time(given, settings) for settings in own]
+    spectrum = given.spectrum()
+    best = optima.closed_forms(given.lens, given.settings, spectrum, models)
+    times = [step_time(camera(given.lens, s), batch(given.train, s, list(range(s.batch)), 0)) for s in own]
     drawn = _training_figures(given, study, found) | _lens_figures(given, study, found)
-    drawn |= _scan_figure(given, spectrum, optima, found)
+    drawn |= _scan_figure(given, spectrum, best, found)
     report = Report(
         lens=given.name,
         pictures=f"{len(given.train)} {given.kind} to train on, {len(given.test)} to test",
         settings=given.settings,
         found=tuple(found),
         missing=tuple((row, seed) for seed in seeds for row in models if (row, seed) not in done),
-        optima=tuple(optima),
+        optima=tuple(best),
         times=tuple(times),
         figures=tuple(name for name in CAPTIONS if name in drawn),
         machine=machine(),
         sweep=(docs / "codesign_sweep.md").exists(),
         of_paper=is_of_paper(given.lens),
     )
-    _write(report, drawn, docs)
+    folder = docs / "codesign"
+    folder.mkdir(parents=True, exist_ok=True)
+    write_table(folder / "table2.csv", found, COLUMNS)
+    write_table(folder / "spectral.csv", best, optima.COLUMNS)
+    for name, figure in drawn.items():
+        save(figure, folder / name)
+    write_page(docs / "codesign.md", report.parts())
     return report
 
 
-def _write(report: Report, drawn: Mapping[str, figures.Figure], docs: Path) -> None:
-    folder, page = docs / "codesign", docs / "codesign.md"
-    folder.mkdir(parents=True, exist_ok=True)
-    write_table(report.found, folder / "table2.csv")
-    write_optima(report.optima, folder / "spectral.csv")
-    for name, figure in drawn.items():
-        save(figure, folder / name)
-    kept = below_the_mark(page.read_text(encoding="utf-8")) if page.exists() else ""
-    write_atomically(page, lambda file: file.write(markdown(report, kept=kept).encode()))
-
-
-def _time(given: Experiment, settings: Settings) -> StepTime:
-    own = batch(given.train, settings, list(range(settings.batch)), 0)
-    return step_time(camera(given.lens, settings), own)
-
-
-def _training_figures(given: Experiment, study: Path, found: Sequence[Outcome]) -> dict[str, figures.Figure]:
+def _training_figures(given: Experiment, study: Path, found: Sequence[Outcome]) -> Mapping[str, figures.Figure]:
     joint, refined = (courses(study, found, "loss", step) for step in STEPS)
     if not joint:
         return {}
     drawn = {"loss.png": figures.loss_figure(joint, refined, given.steps_per_epoch)}
-    sensors = courses(study, found, "sensor")
-    if sensors:
+    if sensors := courses(study, found, "sensor"):
         scale = conjugates(given.lens, given.settings)
         drawn["focus.png"] = figures.focus_figure(sensors, scale, given.steps_per_epoch)
     return drawn
 
 
-def _lens_figures(given: Experiment, study: Path, found: Sequence[Outcome]) -> dict[str, figures.Figure]:
+def _lens_figures(given: Experiment, study: Path, found: Sequence[Outcome]) -> Mapping[str, figures.Figure]:
     """Blur and loss over object distance, and restored examples of the first seed."""
     if not found:
         return {}
     near, far = given.settings.near, given.settings.far
     distances, shown = np.linspace(near, far, 41), [near + part * (far - near) for part in (0, 0.25, 0.5, 1)]
-    diameters: dict[str, Values] = {}
+    diameters: dict[str, list[list[float]]] = {}
     restored: dict[str, dict[str, np.ndarray]] = {}
     leaves = dead_leaves(2, size=2 * (given.settings.patch + given.settings.size))
     for one in found:
@@ -197,63 +165,24 @@ def _lens_figures(given: Experiment, study: Path, found: Sequence[Outcome]) -> d
             patches = examples(own, leaves, settings, shown)
             restored[one.model] = {key: patch.float().numpy() for key, patch in patches.items()}
     means = {model: np.mean(seeds, 0).tolist() for model, seeds in diameters.items()}
-    tested, losses = losses_by_distance(found)
     return {
         "blur.png": figures.blur_figure(distances.tolist(), means, given.settings.pixel),
-        "distance.png": figures.distance_figure(tested, losses),
+        "distance.png": figures.distance_figure(*losses_by_distance(found)),
         "examples.png": figures.examples_figure(restored, shown),
     }
 
 
 def _scan_figure(
-    given: Experiment, spectrum: Tensor, optima: Sequence[Optimum], found: Sequence[Outcome]
-) -> dict[str, figures.Figure]:
+    given: Experiment, spectrum: Tensor, best: Sequence[optima.Optimum], found: Sequence[Outcome]
+) -> Mapping[str, figures.Figure]:
     """The closed form over the sensor's place, if the sensor is what varies."""
-    if given.settings.vary.split() != ["sensor"] or not optima:
+    if given.settings.vary.split() != ["sensor"] or not best:
         return {}
     ends = {one.model: one.mean["sensor_mm"] for one in summaries(found)}
     start = float(lens_at_start(given.lens, given.settings).surfaces[-2].thickness)
-    places = [start, *(one.sensor_mm for one in optima), *ends.values()]
+    places = [start, *(one.sensor_mm for one in best), *ends.values()]
     margin = 0.15 * (max(places) - min(places)) + 0.02
     sensors = np.linspace(min(places) - margin, max(places) + margin, 41).tolist()
-    errors = {
-        one.model: scan(camera(given.lens, dataclasses.replace(given.settings, model=one.model)), spectrum, sensors)
-        for one in optima
-        if one.model in MODELS
-    }
+    own = {m: camera(given.lens, dataclasses.replace(given.settings, model=m)) for m in MODELS}
+    errors = {one.model: optima.scan(own[one.model], spectrum, sensors) for one in best if one.model in MODELS}
     return {"scan.png": figures.scan_figure(sensors, errors, ends)}
-
-
-def _document(report: Report) -> dict:
-    """What `raytrace codesign compare --json` writes."""
-    return plain(
-        {
-            "settings": dataclasses.asdict(report.settings),
-            "rows": rows(report.found),
-            "missing": [{"model": row, "seed": seed} for row, seed in report.missing],
-            "models": [dataclasses.asdict(one) for one in summaries(report.found)],
-            "claims": [{**dataclasses.asdict(one), "answer": one.answer} for one in _claims(report)],
-            "closed_form": [document(one) for one in report.optima],
-            "times": [dataclasses.asdict(one) for one in report.times],
-        }
-    )
-
-
-def _claims(report: Report) -> list[Claim]:
-    """Those of the paper, if the lens is its."""
-    return claims(report.found, report.times) if report.of_paper else []
-
-
-def _print(report: Report) -> None:
-    columns = ("L1 step 1", "L1 step 2", "paraxial m", "RMS m", "sensor mm")
-    print(f"{'model':>26} {'seeds':>5} " + " ".join(f"{column:>10}" for column in columns))
-    for one in summaries(report.found):
-        mean = one.mean
-        print(
-            f"{NAMES[one.model]:>26} {one.seeds:>5} {mean['l1_joint']:>10.5f} {mean['l1_drt']:>10.5f} "
-            f"{mean['focus_paraxial_m']:>10.2f} {mean['focus_rms_m']:>10.2f} {mean['sensor_mm']:>10.4f}"
-        )
-    for claim in _claims(report):
-        print(f"{claim.answer:>11}: {claim.text}; {claim.figures}")
-    if report.missing:
-        print(f"not finished: {', '.join(f'{row} {seed}' for row, seed in report.missing)}")

@@ -7,7 +7,6 @@ Every sample is keyed by its number: crop, object distance and noise are the sam
 """
 
 import dataclasses
-import json
 import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -23,13 +22,15 @@ from raytrace.camera.limits import parse_range
 from raytrace.camera.network import RedNet, RedNetShape
 from raytrace.camera.training import DamagedRun, Record, Run, Share, read_json, train
 from raytrace.camera.variables import Variables, parse_bounds
-from raytrace.files import write_atomically
+from raytrace.files import write_json
 from raytrace.formats import write_lens
 from raytrace.formats.pictures import Pictures, crop, draws
 from raytrace.maths.grid import grid
+from raytrace.maths.result import plain
 from raytrace.optics.conjugates import distance_in_focus, paraxial_image
 from raytrace.optics.focus import best_focus, focused, real_image_distance
 from raytrace.studies.codesign.closed_form import optimise_closed_form, out_of_focus, power_spectrum
+from raytrace.studies.codesign.settings import Settings
 from raytrace.studies.descent import NoOptimum
 from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance, with_wavelengths
 
@@ -38,55 +39,6 @@ _TEST_EPOCH = 2**20  # test samples are those of an epoch that no training reach
 STEPS = ("joint", "refine")
 LENS = "lens.zmx"  # of a run: the lens as it was learned
 _INFINITE = ("focus_paraxial_m", "focus_rms_m")  # of an outcome; null in its file
-
-
-@dataclasses.dataclass(frozen=True)
-class Settings:
-    """All that decides the result of a run. Lengths in mm but for wavelengths in µm; angles in degrees.
-
-    model: PSF model of step 1; vary: variables of the lens; bounds: of some of them, "sensor:57.5,58 thickness_5:8,12".
-    glass_thickness, air_thickness: least, or least and greatest, "2:15"; edge: least of glass at its edge; those that
-    are not given go with the size of the lens (`limits.limits_of`).
-    start: "paraxial" (the sensor at the paraxial image of `focus_distance`), "rms" (at its best focus), "spectral"
-    (from the paraxial image to the optimum of the closed form), or a sensor distance; f_number: EFL over entrance pupil
-    diameter, None for that of the file; wavelengths, the first being the primary one, of which PSFs are sums by
-    wavelength_weights; near, far: object distances, drawn evenly; noise: standard deviation in a range of 1.
-    patch: pixels of what is restored; crops: a picture and epoch; precision: of the network, "float32" or "bfloat16"
-    (`network.faster_precision` tells which this machine prefers).
-    fields: field points in y, samples take them in turn; rate_network, rate_optics: of Adam; tol: of the PSFs; rho: of
-    the paraxial model, σ over the radius of the blur.
-    """
-
-    model: str = "gaussian"
-    seed: int = 0
-    vary: str = "sensor"
-    bounds: str = ""
-    glass_thickness: str = ""
-    air_thickness: str = ""
-    edge: float | None = None
-    start: str = "paraxial"
-    focus_distance: float = 25e3
-    f_number: float | None = None
-    wavelengths: tuple[float, ...] = (0.53,)
-    wavelength_weights: tuple[float, ...] = (1.0,)
-    near: float = 10e3
-    far: float = 50e3
-    fields: tuple[float, ...] = (0.0,)
-    pixel: float = 0.005
-    size: int = 21
-    normalise: str = "window"
-    noise: float = 0.1
-    depth: int = 10
-    width: int = 32
-    epochs: int = 30
-    batch: int = 32
-    patch: int = 64
-    crops: int = 4
-    rate_network: float = 1e-3
-    rate_optics: float = 1e-3
-    precision: str = "float32"
-    tol: float = 1e-2
-    rho: float = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,6 +64,9 @@ class Outcome:
     by_distance: dict[str, float]
     penalty: float = 0.0
     no_optimum: str = ""
+
+    def document(self) -> dict:
+        return dataclasses.asdict(self)
 
 
 def lens_at_start(lens: Lens, settings: Settings) -> Lens:
@@ -334,9 +289,7 @@ def run_model(
 
 def write_outcome(found: Outcome, folder: Path) -> None:
     """Write `outcome.json`; a focus at infinity is null there."""
-    document = dataclasses.asdict(found)
-    document |= {key: None for key in _INFINITE if math.isinf(document[key])}
-    write_atomically(Path(folder) / "outcome.json", lambda file: file.write(json.dumps(document, indent=1).encode()))
+    write_json(folder / "outcome.json", plain(found.document()))
 
 
 def outcome(folder: Path) -> Outcome | None:

@@ -12,8 +12,11 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from raytrace.plot.style import GREY, LOOKS, new_figure, styled
-from raytrace.studies.codesign.study import NAMES, PAPER
-from raytrace.studies.codesign.sweep import FACTORS, Factor, Reading
+from raytrace.studies.codesign.settings import NAMES
+from raytrace.studies.codesign.study import PAPER
+from raytrace.studies.codesign.sweep import FACTORS, Factor
+from raytrace.studies.codesign.sweep_page import Sweep
+from raytrace.studies.figures import picture as draw
 
 #: Object distances in m that may be marked on an axis, the roundest first.
 _MARKS = (10, 100, 20, 50, 200, 500, 30, 40, 15, 25, 70, 35, 150, 300, 60, 80, 45, 12, 1000, *range(11, 50))
@@ -113,11 +116,8 @@ def examples_figure(rows: Mapping[str, Mapping[str, np.ndarray]], distances: Seq
         for image, restored in zip(found["image"], found["restored"], strict=True):
             pictures += [image, restored]
         for panel, picture in zip(panels, pictures, strict=True):
-            panel.imshow(picture, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
-            panel.set(xticks=[], yticks=[])
-            for spine in panel.spines.values():
-                spine.set_visible(False)
-        panels[0].set_ylabel(NAMES.get(model, model).replace(" from ", "\nfrom "))
+            draw(panel, picture)
+        panels[0].set_ylabel(NAMES[model].replace(" from ", "\nfrom "))
     axes[0][0].set_title("picture", fontsize=8)
     for number, distance in enumerate(distances):
         axes[0][2 * number + 1].set_title(f"{distance / 1e3:g} m: image", fontsize=8)
@@ -151,15 +151,14 @@ def scan_figure(
 
 
 @styled
-def sweep_figure(found: Sequence[Reading], *, of_paper: bool = True) -> Figure:
+def sweep_figure(found: Sweep) -> Figure:
     """Focus of the closed form's optima: a column of panels for each factor, a row for each definition of focus.
 
-    of_paper: whether the lens is the paper's, whose numbers are lines then.
-
-    Distances stand as they do behind the lens, evenly in 1/z, so that infinity has a place.
+    Distances stand as they do behind the lens, evenly in 1/z, so that infinity has a place; of the paper's lens its
+    numbers are lines.
     """
-    papers = PAPER if of_paper else {}
-    groups = {factor: [one for one in found if one.factor == factor.name] for factor in FACTORS}
+    papers = PAPER if found.of_paper else {}
+    groups = {factor: [one for one in found.readings if one.factor == factor.name] for factor in FACTORS}
     groups = {factor: own for factor, own in groups.items() if own}
     figure = new_figure(9.6, 5.0)
     axes = figure.subplots(2, len(groups), sharey="row", width_ratios=[1 + len(own) for own in groups.values()])
@@ -186,7 +185,7 @@ def sweep_figure(found: Sequence[Reading], *, of_paper: bool = True) -> Figure:
             )  # fmt: skip
     for panel, factor in zip(axes[0], groups, strict=True):
         panel.set_title(_TITLES[factor.name])
-    lines = [Line2D([], [], color=GREY, linewidth=0.6, label="the paper's")] if of_paper else []
+    lines = [Line2D([], [], color=GREY, linewidth=0.6, label="the paper's")] if found.of_paper else []
     _legend(figure, axes[0][0], lines)
     return figure
 
@@ -216,7 +215,7 @@ def _legend(figure: Figure, panel: Axes, more: Sequence[Line2D] = ()) -> None:
 
 def _look(model: str) -> dict:
     colour, dashes = LOOKS.get(model, (GREY, "solid"))
-    return {"color": colour, "linestyle": dashes, "label": NAMES.get(model, model)}
+    return {"color": colour, "linestyle": dashes, "label": NAMES[model]}
 
 
 def _means(losses: Sequence[float], steps_per_epoch: int) -> np.ndarray:

@@ -1,23 +1,15 @@
-"""Report: a study as a page of Markdown."""
+"""Report of a study: as text, as a document, as a page of Markdown."""
 
 import dataclasses
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
-from raytrace.studies.codesign.claims import claims, penalty
-from raytrace.studies.codesign.experiment import Outcome, Settings
+from raytrace.maths.result import Result, plain
+from raytrace.pages import grid, picture, shown
+from raytrace.studies.codesign.claims import Claim, claims, penalty, percent
+from raytrace.studies.codesign.experiment import Outcome
 from raytrace.studies.codesign.optima import Optimum
-from raytrace.studies.codesign.step_time import StepTime
-from raytrace.studies.codesign.study import NAMES, PAPER, Summary, summaries
-
-#: What stands below this line is written by hand: a report that is made again keeps it.
-KEPT = "<!-- kept when this page is made again -->"
-
-#: What leads to the page of the sweep.
-#: Said of the columns that hold published numbers.
-_OF_PAPER = "; “paper”: the published study of this lens and these models, which does not say which focus is its own"
-
-SWEEP = "At other apertures, ρ, noise, normalisations and starts: [codesign_sweep.md](codesign_sweep.md)."
+from raytrace.studies.codesign.settings import NAMES, Settings
+from raytrace.studies.codesign.study import PAPER, StepTime, Summary, rows, summaries
 
 #: Figures of the page, by file name: what each shows.
 CAPTIONS = {
@@ -30,9 +22,12 @@ CAPTIONS = {
     "drawn noise.",
 }
 
+_OF_PAPER = "; “paper”: the published study of this lens and these models, which does not say which focus is its own"
+_SWEEP = "At other apertures, ρ, noise, normalisations and starts: [codesign_sweep.md](codesign_sweep.md)."
+
 
 @dataclasses.dataclass(frozen=True)
-class Report:
+class Report(Result):
     """All that a page says.
 
     missing: (row, seed) of runs that are not finished; figures: file names that exist; sweep: whether there is a page
@@ -51,50 +46,66 @@ class Report:
     sweep: bool = False
     of_paper: bool = True
 
+    @property
+    def claims(self) -> list[Claim]:
+        """Those of the paper, if the lens is its."""
+        return claims(self.found, self.times) if self.of_paper else []
 
-def markdown(report: Report, *, folder: str = "codesign", kept: str = "") -> str:
-    """The page. folder: where its figures lie, as the page calls it; kept: text to end with, below `KEPT`."""
-    parts = [
-        "# Co-design: which PSF model chooses the better lens?",
-        _command(report),
-        _experiment(report),
-        _progress(report),
-        "## Loss and focus",
-        _table(report.found, of_paper=report.of_paper),
-        *(["## The paper's claims", _claims(report)] if report.of_paper else []),
-        *(f"![{CAPTIONS[name]}]({folder}/{name})\n\n*{CAPTIONS[name]}*" for name in report.figures),
-        "## The best linear filter beside training",
-        _closed_form(report),
-        "## Time of a step",
-        _times(report),
-        f"{KEPT}\n{kept.strip()}".strip(),
-    ]
-    return "\n\n".join(part for part in parts if part) + "\n"
+    def document(self) -> dict:
+        return plain(
+            {
+                "settings": dataclasses.asdict(self.settings),
+                "rows": rows(self.found),
+                "missing": [{"model": row, "seed": seed} for row, seed in self.missing],
+                "models": [dataclasses.asdict(one) for one in summaries(self.found)],
+                "claims": [{**dataclasses.asdict(one), "answer": one.answer} for one in self.claims],
+                "closed_form": [one.document() for one in self.optima],
+                "times": [dataclasses.asdict(one) for one in self.times],
+            }
+        )
 
+    def __str__(self) -> str:
+        return "\n".join(self._lines())
 
-def below_the_mark(page: str) -> str:
-    """What a page made before keeps."""
-    return page.partition(KEPT)[2].strip()
+    def _lines(self) -> Iterator[str]:
+        columns = ("L1 step 1", "L1 step 2", "paraxial m", "RMS m", "sensor mm")
+        yield f"{'model':>26} {'seeds':>5} " + " ".join(f"{column:>10}" for column in columns)
+        for one in summaries(self.found):
+            mean = one.mean
+            yield (
+                f"{NAMES[one.model]:>26} {one.seeds:>5} {mean['l1_joint']:>10.5f} {mean['l1_drt']:>10.5f} "
+                f"{mean['focus_paraxial_m']:>10.2f} {mean['focus_rms_m']:>10.2f} {mean['sensor_mm']:>10.4f}"
+            )
+        for claim in self.claims:
+            yield f"{claim.answer:>11}: {claim.text}; {claim.figures}"
+        if self.missing:
+            yield f"not finished: {', '.join(f'{row} {seed}' for row, seed in self.missing)}"
+
+    def parts(self) -> list[str]:
+        """The page."""
+        asked = ("claim", "here", "figures", "yes if")
+        answers = [(one.text, f"**{one.answer}**", one.figures, one.criterion) for one in self.claims]
+        return [
+            "# Co-design: which PSF model chooses the better lens?",
+            _command(self),
+            _experiment(self),
+            _progress(self),
+            "## Loss and focus",
+            _table(self.found, of_paper=self.of_paper),
+            *(["## The paper's claims", grid(asked, answers)] if self.of_paper else []),
+            *(picture(f"codesign/{name}", CAPTIONS[name]) for name in self.figures),
+            "## The best linear filter beside training",
+            _closed_form(self),
+            "## Time of a step",
+            _times(self),
+        ]
 
 
 def _command(report: Report) -> str:
-    rows = list(dict.fromkeys([one.model for one in report.found] + [row for row, _ in report.missing]))
+    models = list(dict.fromkeys([one.model for one in report.found] + [row for row, _ in report.missing]))
     seeds = sorted({one.seed for one in report.found} | {seed for _, seed in report.missing})
-    words = [f"--models {' '.join(rows)}", f"--seeds {' '.join(map(str, seeds))}", *options(report.settings)]
+    words = [f"--models {' '.join(models)}", f"--seeds {' '.join(map(str, seeds))}", *report.settings.words()]
     return f"    raytrace codesign compare {report.lens} --data DIR -o FOLDER --docs docs {' '.join(words)}"
-
-
-def options(settings: Settings) -> list[str]:
-    """The settings that are not the default ones, as options of the command."""
-    usual, found = Settings(), []
-    for field in dataclasses.fields(Settings):
-        value = getattr(settings, field.name)
-        if field.name in ("model", "seed") or value == getattr(usual, field.name):
-            continue
-        option = {"fields": "field", "wavelengths": "wavelength"}.get(field.name, field.name).replace("_", "-")
-        shown = " ".join(f"{one:g}" for one in value) if isinstance(value, tuple) else value
-        found.append(f"--{option} {shown}")
-    return found
 
 
 def _experiment(report: Report) -> str:
@@ -105,11 +116,12 @@ def _experiment(report: Report) -> str:
         "rms": f"the least RMS spot of an object at {s.focus_distance / 1e3:g} m",
         "spectral": "the optimum of the closed form",
     }.get(s.start, f"{s.start} mm")
-    where = "the axis" if s.fields == (0.0,) else "the fields " + ", ".join(f"{y:g}" for y in s.fields)
+    where = "the axis" if s.fields == (0.0,) else f"the fields {_listed(s.fields)}"
+    weights = f" weighted {_listed(s.wavelength_weights)}" if len(s.wavelengths) > 1 else ""
     light = {"window": "the window", "energy": "the light through the pupil"}[s.normalise]
     return (
-        f"{report.lens} at {aperture}, {_colours(s)}, on {where}; objects at {s.near / 1e3:g} to "
-        f"{s.far / 1e3:g} m, drawn evenly; windows of {s.size} × {s.size} pixels of {1e3 * s.pixel:g} µm, PSFs "
+        f"{report.lens} at {aperture}, {_listed(s.wavelengths)} µm{weights}, on {where}; objects at {s.near / 1e3:g} "
+        f"to {s.far / 1e3:g} m, drawn evenly; windows of {s.size} × {s.size} pixels of {1e3 * s.pixel:g} µm, PSFs "
         f"normalised to {light}; noise of standard deviation {s.noise:g} on pictures in [0, 1]. Learned: {s.vary}, "
         f"from {start}. RED-Net of {s.depth} layers of {s.width} maps in {s.precision}, L¹ loss, Adam at "
         f"{s.rate_network:g} (network) and {s.rate_optics:g} (lens), {s.epochs} epochs of each step, batches of "
@@ -117,21 +129,16 @@ def _experiment(report: Report) -> str:
     )
 
 
-def _colours(s: Settings) -> str:
-    listed = ", ".join(f"{one:g}" for one in s.wavelengths)
-    if len(s.wavelengths) == 1:
-        return f"{listed} µm"
-    return f"{listed} µm weighted {', '.join(f'{one:g}' for one in s.wavelength_weights)}"
+def _listed(numbers: Sequence[float]) -> str:
+    return ", ".join(f"{one:g}" for one in numbers)
 
 
 def _progress(report: Report) -> str:
     if not report.missing:
         return ""
     missing = ", ".join(f"{row} {seed}" for row, seed in report.missing)
-    return (
-        f"**Unfinished: {len(report.found)} of {len(report.found) + len(report.missing)} runs.** Missing, by model and "
-        f"seed: {missing}."
-    )
+    done = len(report.found)
+    return f"**Unfinished: {done} of {done + len(report.missing)} runs.** Missing, by model and seed: {missing}."
 
 
 def _table(found: Sequence[Outcome], *, of_paper: bool) -> str:
@@ -141,26 +148,24 @@ def _table(found: Sequence[Outcome], *, of_paper: bool) -> str:
         "model", "seeds", "L¹, step 1", "L¹, step 2 (DRT)", "change", "focus, paraxial (m)", "focus, RMS (m)",
         "sensor (mm)", *(("paper: L¹, step 1", "paper: step 2", "paper: focus (m)") if of_paper else ()),
     )  # fmt: skip
-    rows = []
-    for one in summaries(found):
-        rows.append(
-            (
-                NAMES.get(one.model, one.model),
-                one.seeds,
-                _spread(one, "l1_joint", 4),
-                _spread(one, "l1_drt", 4),
-                f"{100 * penalty(one):+.1f} %",
-                _spread(one, "focus_paraxial_m", 1),
-                _spread(one, "focus_rms_m", 1),
-                _spread(one, "sensor_mm", 4),
-                *(_paper(one.model) if of_paper else ()),
-            )
+    lines = [
+        (
+            NAMES[one.model],
+            one.seeds,
+            _spread(one, "l1_joint", 4),
+            _spread(one, "l1_drt", 4),
+            percent(penalty(one)),
+            _spread(one, "focus_paraxial_m", 1),
+            _spread(one, "focus_rms_m", 1),
+            _spread(one, "sensor_mm", 4),
+            *(_paper(one.model) if of_paper else ()),
         )
+        for one in summaries(found)
+    ]
     return (
-        f"{table(header, rows)}\n\nMean ± standard deviation over seeds, of test pictures; every model of a seed sees "
+        f"{grid(header, lines)}\n\nMean ± standard deviation over seeds, of test pictures; every model of a seed sees "
         "the same crops, distances and noise. Focus is the object distance from vertex 1 whose image is on the sensor: "
-        "the paraxial one, or that of least RMS spot"
-        f"{_OF_PAPER if of_paper else ''}."
+        f"the paraxial one, or that of least RMS spot{_OF_PAPER if of_paper else ''}."
         " Rows one by one: [table2.csv](codesign/table2.csv)."
     )
 
@@ -172,20 +177,15 @@ def _paper(model: str) -> tuple[str, ...]:
     return f"{first:.4f}", f"{second:.4f}", f"{focus:.1f}"
 
 
-def _claims(report: Report) -> str:
-    rows = [(one.text, f"**{one.answer}**", one.figures, one.criterion) for one in claims(report.found, report.times)]
-    return table(("claim", "here", "figures", "yes if"), rows)
-
-
 def _closed_form(report: Report) -> str:
     trained = {one.model: one for one in summaries(report.found)}
     header = (
         "model", "sensor (mm)", "trained (mm)", "focus, paraxial (m)", "focus, RMS (m)", "error, own PSFs",
         "error, DRT PSFs",
     )  # fmt: skip
-    rows = [
+    lines = [
         (
-            NAMES.get(one.model, one.model),
+            NAMES[one.model],
             f"{one.sensor_mm:.4f}" + (" (no optimum)" if one.no_optimum else ""),
             _spread(trained[one.model], "sensor_mm", 4) if one.model in trained else "–",
             shown(one.focus_paraxial_m, 1),
@@ -195,34 +195,20 @@ def _closed_form(report: Report) -> str:
         )
         for one in report.optima
     ]
-    text = (
-        f"{table(header, rows)}\n\nMean square error of a pixel behind the best linear filter that does not know the "
+    return (
+        f"{grid(header, lines)}\n\nMean square error of a pixel behind the best linear filter that does not know the "
         "object distance, for pictures of this power spectrum: [spectral.csv](codesign/spectral.csv)."
+        f"{f' {_SWEEP}' if report.sweep else ''}"
     )
-    return f"{text} {SWEEP}" if report.sweep else text
 
 
 def _times(report: Report) -> str:
-    rows = [
-        (NAMES.get(one.model, one.model), f"{one.psf:.1f}", f"{one.image:.1f}", f"{one.network:.1f}")
-        for one in report.times
-    ]
+    lines = [(NAMES[one.model], *(f"{ms:.1f}" for ms in (one.psf, one.image, one.network))) for one in report.times]
     about = ", ".join(f"{key} {value}" for key, value in report.machine.items())
-    parts = table(("model", "PSFs (ms)", "image (ms)", "network (ms)"), rows)
-    return f"{parts}\n\nA batch, forward and backward, median of several: {about}."
+    table = grid(("model", "PSFs (ms)", "image (ms)", "network (ms)"), lines)
+    return f"{table}\n\nA batch, forward and backward, median of several: {about}."
 
 
 def _spread(one: Summary, column: str, digits: int) -> str:
     mean, deviation = shown(one.mean[column], digits), shown(one.deviation[column], digits)
     return f"{mean} ± {deviation}" if one.seeds > 1 else mean
-
-
-def shown(value: float, digits: int) -> str:
-    """A number with so many digits behind the point; ∞, and – for none."""
-    return f"{value:.{digits}f}" if math.isfinite(value) else "∞" if math.isinf(value) else "–"
-
-
-def table(header: Sequence, rows: Iterable[Sequence]) -> str:
-    """A table of Markdown."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)

@@ -10,19 +10,23 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import distributed
+from torch import Tensor, distributed
 from tqdm import tqdm
 
+from raytrace.camera.limits import Limits
 from raytrace.camera.network import PRESETS, RedNetShape, faster_precision
 from raytrace.camera.training import NotFinite, Record, read_json
 from raytrace.cli.door import CommandError, catalogs, field_points, find_lens, open_lens, refuse_untraceable, say
+from raytrace.cli.progress import progress
 from raytrace.formats import FORMATS
-from raytrace.formats.pictures import Pictures, dead_leaves, files, read, split
-from raytrace.maths.result import number
+from raytrace.formats.pictures import Pictures, dead_leaves, split
 from raytrace.optics.focus import NoImage
 from raytrace.optics.paraxial import paraxial_image_distance
 from raytrace.shards import share
-from raytrace.studies.codesign.experiment import STEPS, Outcome, Settings, camera, lens_at_start, outcome, run_model
+from raytrace.studies.codesign.closed_form import power_spectrum
+from raytrace.studies.codesign.experiment import STEPS, Outcome, camera, lens_at_start, outcome, run_model, variables
+from raytrace.studies.codesign.settings import Settings
+from raytrace.studies.pictures import pictures
 from raytrace.system.lens import Lens
 
 _LEAVES = 100  # pictures, where none are given
@@ -52,14 +56,23 @@ class Experiment:
         """Object distances in mm at which runs are tested."""
         return tuple(np.linspace(self.settings.near, self.settings.far, _DISTANCES).tolist())
 
+    @property
+    def limits(self) -> Limits:
+        """What thicknesses are held to."""
+        return variables(self.lens, self.settings).limits
+
+    def spectrum(self) -> Tensor:
+        """Power spectrum of the training pictures, at the size of a patch with its margin."""
+        own = self.settings
+        return power_spectrum(self.train, own.patch + own.size - 1, crops=own.crops, seed=own.seed)
+
 
 def experiment(arguments: argparse.Namespace, settings: Settings) -> Experiment:
     """Open the lens, refuse what cannot be simulated, then read the pictures."""
-    path = find_lens(arguments.lens)
-    lens = open_lens(argparse.Namespace(lens=arguments.lens, catalog=arguments.catalog))
+    path, lens = find_lens(arguments.lens), _lens(arguments)
     if settings.near >= settings.far:
         raise CommandError(f"--near {settings.near:g} is not nearer than --far {settings.far:g}")
-    field_points(lens, argparse.Namespace(field=[(0.0, y) for y in settings.fields]))
+    field_points(lens, argparse.Namespace(fields=[(0.0, y) for y in settings.fields]))
     try:
         camera(lens, settings)  # refuses bad variables, starts and networks
     except NoImage as error:
@@ -68,14 +81,12 @@ def experiment(arguments: argparse.Namespace, settings: Settings) -> Experiment:
     begun = lens_at_start(lens, settings)
     refuse_untraceable(begun, str(path))
     FORMATS[".zmx"].write(begun, str(path), catalogs=catalogs(arguments))  # refuses what a learned lens could not keep
-    pictures = _pictures(arguments, settings)
-    train, test = split(pictures)
+    given, kind = pictures(arguments, settings.patch + settings.size - 1, lambda: _leaves(arguments, settings))
     about = {
         "lens": f"{path.stem}, sha256 {hashlib.sha256(path.read_bytes()).hexdigest()[:16]}",
-        "pictures": f"{len(pictures)}, blake2 {_digest(pictures)}",
+        "pictures": f"{len(given)}, blake2 {_digest(given)}",
     }
-    kind = "pictures" if arguments.data else "dead leaves"
-    return Experiment(lens, path.stem, settings, train, test, about, kind, catalogs(arguments))
+    return Experiment(lens, path.stem, settings, *split(given), about, kind, catalogs(arguments))
 
 
 def refuse_too_few(given: Experiment) -> None:
@@ -87,47 +98,42 @@ def refuse_too_few(given: Experiment) -> None:
         )
 
 
-def settings_of(arguments: argparse.Namespace, begun: Path) -> Settings:
-    """Settings by the options; begun: `settings.json` of what may have been begun, whose precision "auto" keeps."""
+def settings_of(arguments: argparse.Namespace, begun: Path | None = None) -> Settings:
+    """Settings by the options. begun: `settings.json` of what may have been begun, whose precision "auto" keeps; None
+    for work that trains no network."""
     preset = PRESETS[arguments.preset]
-    given: dict = {"depth": preset.depth, "width": preset.width}
-    for field in dataclasses.fields(Settings):
-        value = getattr(arguments, field.name, None)
-        if value is not None:
-            given[field.name] = value
-    for words in ("vary", "bounds"):
-        if getattr(arguments, words):
-            given[words] = " ".join(getattr(arguments, words))
-    if arguments.fields:
-        if any(x for x, _ in arguments.fields):
+    given = {name: value for name, value in vars(arguments).items() if value is not None}
+    given = {"depth": preset.depth, "width": preset.width} | given | _light(arguments)
+    given |= {name: " ".join(given[name]) for name in ("vary", "bounds") if name in given}
+    if "fields" in given:
+        if any(x for x, _ in given["fields"]):
             raise CommandError("--field X,Y: co-design takes field points along y, --field Y")
-        given["fields"] = tuple(y for _, y in arguments.fields)
-    given |= _light(arguments)
-    if arguments.precision == "auto":
+        given["fields"] = [y for _, y in given["fields"]]
+    if begun is None:
+        given["precision"] = "float32"
+    elif given.get("precision", "auto") == "auto":
         shape = RedNetShape(given["depth"], given["width"])
         given["precision"] = _agreed(lambda: recorded(begun).get("precision") or faster_precision(shape))
-    return Settings(**given)
+    return Settings.of(given)
 
 
-def _light(arguments: argparse.Namespace) -> dict[str, tuple[float, ...]]:
+def _light(arguments: argparse.Namespace) -> dict[str, Sequence[float]]:
     """Wavelengths and weights by the options: those given, or the file's own, its primary one first."""
+    wavelengths, weights = arguments.wavelengths, arguments.wavelength_weights
     if not arguments.file_wavelengths:
-        wavelengths = tuple(arguments.wavelengths or Settings.wavelengths)
-        weights = tuple(arguments.wavelength_weights or [1.0] * len(wavelengths))
-        return {"wavelengths": wavelengths, "wavelength_weights": weights}
-    if arguments.wavelengths or arguments.wavelength_weights:
+        wavelengths = wavelengths or Settings.wavelengths
+        return {"wavelengths": wavelengths, "wavelength_weights": weights or [1.0] * len(wavelengths)}
+    if wavelengths or weights:
         raise CommandError("--file-wavelengths takes the file's own: leave out --wavelength and --wavelength-weights")
-    lens = open_lens(argparse.Namespace(lens=arguments.lens, catalog=arguments.catalog))
+    lens = _lens(arguments)
     order = sorted(range(len(lens.wavelengths)), key=lambda k: k != lens.primary_wavelength)
-    return {
-        "wavelengths": tuple(lens.wavelengths[order].tolist()),
-        "wavelength_weights": tuple(lens.wavelength_weights[order].tolist()),
-    }
+    names = ("wavelengths", "wavelength_weights")
+    return {name: getattr(lens, name)[order].tolist() for name in names}
 
 
-def settings_without_network(arguments: argparse.Namespace) -> Settings:
-    """Settings by the options, for work that trains no network: nothing is tried out."""
-    return settings_of(argparse.Namespace(**{**vars(arguments), "precision": "float32"}), Path())
+def _lens(arguments: argparse.Namespace) -> Lens:
+    """The lens as its file has it: what options change of it is part of the settings."""
+    return open_lens(argparse.Namespace(lens=arguments.lens, catalog=arguments.catalog))
 
 
 def _agreed(choose: Callable[[], str]) -> str:
@@ -143,27 +149,16 @@ def recorded(path: Path) -> dict:
     return read_json(path) if path.exists() else {}
 
 
-def _pictures(arguments: argparse.Namespace, settings: Settings) -> Pictures:
-    if not arguments.data:
-        count = arguments.limit or _LEAVES
-        say(f"no --data: training on {count} pictures of dead leaves, discs that hide one another")
-        size = max(256, settings.patch + settings.size - 1)
-        leaves = [dead_leaves(1, size=size, seed=seed).samples[0] for seed in bar(range(count), "dead leaves")]
-        return Pictures(tuple(leaves), tuple(f"dead leaves {seed}" for seed in range(count)))
-    paths = files(arguments.data)
-    if arguments.limit and arguments.limit < len(paths):
-        paths = [paths[i * len(paths) // arguments.limit] for i in range(arguments.limit)]
-    return read(paths, least=settings.patch + settings.size - 1, progress=lambda given: bar(given, "pictures"))
+def _leaves(arguments: argparse.Namespace, settings: Settings) -> Pictures:
+    count, size = arguments.limit or _LEAVES, max(256, settings.patch + settings.size - 1)
+    say(f"no --data: training on {count} pictures of dead leaves, discs that hide one another")
+    leaves = [dead_leaves(1, size=size, seed=seed).samples[0] for seed in progress(range(count), "dead leaf")]
+    return Pictures(tuple(leaves), tuple(f"dead leaves {seed}" for seed in range(count)))
 
 
-def bar(given, what: str):
-    """The given things behind a bar, on a terminal."""
-    return tqdm(given, desc=what, unit="", leave=False, disable=None)
-
-
-def _digest(pictures: Pictures) -> str:
+def _digest(given: Pictures) -> str:
     found = hashlib.blake2b(digest_size=8)
-    for sample in pictures.samples:
+    for sample in given.samples:
         found.update(repr(sample.shape).encode())
         found.update(np.ascontiguousarray(sample))
     return found.hexdigest()
@@ -172,7 +167,7 @@ def _digest(pictures: Pictures) -> str:
 def train_run(given: Experiment, settings: Settings, folder: Path, label: str) -> Outcome:
     """Both steps of one run, or what is left of them, with a bar; a run that is finished is read again."""
     length = settings.epochs * given.steps_per_epoch
-    progress = Progress(label, length, given.steps_per_epoch, focus_of(given.lens, settings))
+    shown = Progress(label, length, given.steps_per_epoch, focus_of(given.lens, settings))
     steps = run_model(
         given.lens,
         given.train,
@@ -182,16 +177,16 @@ def train_run(given: Experiment, settings: Settings, folder: Path, label: str) -
         about=given.about,
         distances=given.distances,
         catalogs=given.catalogs,
-        progress=progress.testing,
+        progress=shown.testing,
     )
     try:
         for name, step, record in steps:
-            progress(name, step, record)
+            shown(name, step, record)
     except NotFinite as error:
         raise CommandError(str(error)) from error
     finally:
-        progress.close()
-    if progress.bar is None:
+        shown.close()
+    if shown.bar is None:
         say(f"{label}: finished before, nothing to train")
     return outcome(folder)
 
@@ -214,13 +209,11 @@ class Progress:
             self.bar = tqdm(total=2 * self.length, initial=self.first, unit="step", disable=None, dynamic_ncols=True)
         self.is_testing = False
         self.losses.append(record["loss"])
-        if self.bar.disable:
-            if (step + 1) % self.steps_per_epoch == 0:
-                self._line(name, step, record, place)
-        else:
-            self.bar.set_description(f"{self.label}, {name}", refresh=False)
-            self.bar.set_postfix_str(f"loss {record['loss']:.4f}{self._lens(record)}", refresh=False)
+        if not self.bar.disable:
+            self._describe(name, f"loss {record['loss']:.4f}{self._lens(record)}")
             self.bar.update()
+        elif (step + 1) % self.steps_per_epoch == 0:
+            self._line(name, step, record, place)
 
     def testing(self, batches: Sequence[int]) -> Iterator[int]:
         """The batches of a test one by one, counted on the bar; elsewhere one line for all tests behind a step."""
@@ -231,13 +224,16 @@ class Progress:
         self.is_testing = True
         for place, first in enumerate(batches, 1):
             if is_drawn:
-                self.bar.set_description(f"{self.label}, testing", refresh=False)
-                self.bar.set_postfix_str(f"batch {place} of {len(batches)}")
+                self._describe("testing", f"batch {place} of {len(batches)}", refresh=True)
             yield first
 
     def close(self) -> None:
         if self.bar is not None:
             self.bar.close()
+
+    def _describe(self, name: str, words: str, refresh: bool = False) -> None:
+        self.bar.set_description(f"{self.label}, {name}", refresh=refresh)
+        self.bar.set_postfix_str(words, refresh=refresh)
 
     def _line(self, name: str, step: int, record: Record, place: int) -> None:
         left = (2 * self.length - place) * (time.monotonic() - self.since) / (place - self.first)
@@ -275,12 +271,3 @@ def focus_of(lens: Lens, settings: Settings) -> Callable[[float], float] | None:
         return None
     sensors, distances = conjugates(lens, settings)
     return lambda sensor: float(np.interp(sensor, sensors, distances))
-
-
-def plain(value):
-    """A document for JSON: null for what is no finite number."""
-    if isinstance(value, dict):
-        return {key: plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(entry) for entry in value]
-    return number(value) if isinstance(value, float) else value

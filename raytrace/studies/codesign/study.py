@@ -4,45 +4,35 @@ A study is a folder of runs, `<row>-<seed>/`; finished ones are read again, neve
 `AFTER_PARAXIAL`: Gaussian DRT with the sensor where the paraxial run of the same seed ended.
 """
 
-import csv
+import copy
 import dataclasses
-import io
 import statistics
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from raytrace.camera.camera import Camera
+from raytrace.camera.image import blur
 from raytrace.camera.training import load_state, read_log, read_state
-from raytrace.files import write_atomically
 from raytrace.formats.pictures import Pictures
 from raytrace.maths.pupil import gauss_rings
 from raytrace.optics.launch import launch
 from raytrace.optics.spot import spot_of
 from raytrace.optics.trace import trace_lens
-from raytrace.studies.codesign.experiment import STEPS, Outcome, Settings, batch, outcome
+from raytrace.studies.codesign.experiment import STEPS, Batch, Outcome, batch, outcome
 from raytrace.studies.codesign.experiment import camera as camera_at_start
+from raytrace.studies.codesign.settings import AFTER_PARAXIAL, Settings
 from raytrace.system.lens import Lens, with_object_distance
 
 #: The paper's table: L1 after step 1, L1 with DRT PSFs after step 2, focus distance in m.
 PAPER = {"paraxial": (0.0415, 0.0504, 33.9), "fourier": (0.0408, 0.0509, 35.7), "gaussian": (0.0429, 0.0430, 27.3)}
 
-AFTER_PARAXIAL = "gaussian-after-paraxial"
-#: What the rows are called in tables and figures.
-NAMES = {
-    "paraxial": "paraxial",
-    "fourier": "Fourier",
-    "gaussian": "Gaussian DRT",
-    "drt": "DRT",
-    AFTER_PARAXIAL: "Gaussian DRT from paraxial",
-}
-
-ROWS = tuple(NAMES)
-
 _CHOICE = 16  # patches of which the one with most contrast is shown
 
+#: Columns of `table2.csv`.
 COLUMNS = ("model", "seed", "l1_joint", "l1_drt", "focus_paraxial_m", "focus_rms_m", "sensor_mm")
 
 
@@ -79,14 +69,6 @@ def rows(found: Sequence[Outcome]) -> list[dict[str, str | float]]:
     return [{column: getattr(one, column) for column in COLUMNS} for one in found]
 
 
-def write_table(found: Sequence[Outcome], path: Path) -> None:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows(found))
-    write_atomically(path, lambda file: file.write(text.getvalue().encode()))
-
-
 def summaries(found: Sequence[Outcome]) -> list[Summary]:
     """Mean and deviation over seeds, in the order in which the models come first."""
     result = []
@@ -99,20 +81,12 @@ def summaries(found: Sequence[Outcome]) -> list[Summary]:
     return result
 
 
-def course(study: Path, model: str, seed: int, step: str = STEPS[0]) -> dict[str, list[float]]:
-    """The log of one step of one run, a list for each of its columns; empty if it has not begun."""
-    path = run_folder(study, model, seed) / step / "log.csv"
-    if not path.exists():
-        return {}
-    rows = read_log(path)
-    return {key: [row[key] for row in rows] for key in (rows[0] if rows else ())}
-
-
 def courses(study: Path, found: Sequence[Outcome], column: str, step: str = STEPS[0]) -> dict[str, list[list[float]]]:
     """One column of the logs of finished runs, by model, a list for each seed; models without it are left out."""
     result: dict[str, list[list[float]]] = {}
     for one in found:
-        values = course(study, one.model, one.seed, step).get(column)
+        path = run_folder(study, one.model, one.seed) / step / "log.csv"
+        values = [row[column] for row in (read_log(path) if path.exists() else ()) if column in row]
         if values:
             result.setdefault(one.model, []).append(values)
     return result
@@ -165,3 +139,54 @@ def examples(camera: Camera, pictures: Pictures, settings: Settings, distances: 
     picture = own.picture[chosen].expand(len(many), -1, -1)
     image = camera.image(picture, many) + camera.noise * own.noise[chosen]
     return {"picture": camera.target(picture), "image": image, "restored": camera.restore(image)}
+
+
+# ---------------------------------------------------------------- time of a step
+
+
+@dataclasses.dataclass(frozen=True)
+class StepTime:
+    """Median times in ms of a batch, forward and backward."""
+
+    model: str
+    psf: float
+    image: float
+    network: float
+
+
+def step_time(camera: Camera, batch: Batch, *, repeats: int = 5) -> StepTime:
+    """What the parts of one step cost with this camera and batch; the camera is left as it was, without gradients."""
+    kernels = camera.kernels(batch.distance).detach().to(batch.picture.dtype).requires_grad_()
+    image = camera.image(batch.picture, batch.distance).detach().requires_grad_()
+    before = copy.deepcopy(camera.variables.state_dict())
+
+    def psf() -> None:
+        _nudge(camera)
+        camera.kernels(batch.distance).square().sum().backward()
+
+    found = StepTime(
+        model=camera.model,
+        psf=_median(psf, 4 * repeats),  # the shortest, and what models are compared by
+        image=_median(lambda: blur(batch.picture, kernels).square().sum().backward(), repeats),
+        network=_median(lambda: camera.restore(image).square().sum().backward(), repeats),
+    )
+    camera.variables.load_state_dict(before)
+    camera.zero_grad(set_to_none=True)
+    return found
+
+
+@torch.no_grad()
+def _nudge(camera: Camera) -> None:
+    """Move the lens by next to nothing: what a step of training computes anew is then computed anew."""
+    for parameter in camera.variables.parameters():
+        parameter.add_(1e-9)
+
+
+def _median(work: Callable[[], None], repeats: int) -> float:
+    work()  # the first call plans and fills caches
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        work()
+        times.append(1e3 * (time.perf_counter() - start))
+    return statistics.median(times)

@@ -3,21 +3,16 @@
 Every factor is varied alone, then aperture, noise and normalisation together.
 """
 
-import csv
 import dataclasses
-import io
 import itertools
 from collections.abc import Callable, Iterable, Sequence
-from pathlib import Path
 
 from torch import Tensor
 
-from raytrace.files import write_atomically
-from raytrace.studies.codesign.experiment import Settings
-from raytrace.studies.codesign.optima import Optimum, closed_form
+from raytrace.studies.codesign import optima
+from raytrace.studies.codesign.optima import Optimum, Place, closed_form
+from raytrace.studies.codesign.settings import MODELS, Settings
 from raytrace.system.lens import Lens
-
-MODELS = ("paraxial", "fourier", "gaussian", "drt")
 
 DEFAULT, COMBINED = "default", "combination"
 
@@ -52,22 +47,14 @@ class Case:
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
-    """One optimum; errors, penalty, focus distances and why it is none as for `Optimum`."""
+class Row(Place):
+    """One optimum, and what it is the optimum for."""
 
-    factor: str
-    value: str
-    model: str
-    sensor_mm: float
-    focus_paraxial_m: float
-    focus_rms_m: float
-    error: float
-    error_drt: float
-    penalty: float = 0.0
-    no_optimum: str = ""
+    factor: str = ""
+    value: str = ""
 
 
-COLUMNS = tuple(field.name for field in dataclasses.fields(Row))
+COLUMNS = ("factor", "value", *optima.COLUMNS)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,17 +113,9 @@ def sweep(
     for case in progress(cases(settings, factors)):
         if case.settings not in known:
             known[case.settings] = closed_form(lens, case.settings, spectrum)
-        optimum = known[case.settings]
-        found.append(Row(case.factor, case.value, **{column: getattr(optimum, column) for column in COLUMNS[2:]}))
+        optimum = {name: getattr(known[case.settings], name) for name in optima.COLUMNS}
+        found.append(Row(**optimum, factor=case.factor, value=case.value))
     return found
-
-
-def write_sweep(rows: Sequence[Row], path: Path) -> None:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(map(dataclasses.asdict, rows))
-    write_atomically(path, lambda file: file.write(text.getvalue().encode()))
 
 
 def readings(rows: Sequence[Row]) -> list[Reading]:

@@ -1,18 +1,29 @@
-"""What a sweep answers, as a page of Markdown.
+"""What a sweep answers: as text, as a document, as a page of Markdown.
 
 The question: in which reading of the experiment, and by which definition of focus, is the lens of Gaussian DRT focused
 nearer than that of paraxial optics, as the paper found?
 """
 
+import argparse
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import cached_property
+from pathlib import Path
 
-from raytrace.studies.codesign.claims import SIMPLE
-from raytrace.studies.codesign.experiment import Settings
-from raytrace.studies.codesign.page import KEPT, options, shown, table
-from raytrace.studies.codesign.study import NAMES, PAPER
-from raytrace.studies.codesign.sweep import COMBINED, MODELS, TOGETHER, Reading, Row, distinct, readings
+from raytrace.camera.training import share
+from raytrace.cli.door import CommandError, say
+from raytrace.cli.progress import progress
+from raytrace.cli.run import present
+from raytrace.files import write_table
+from raytrace.maths.result import Result, plain
+from raytrace.pages import grid, picture, shown, write_page
+from raytrace.studies.codesign.claims import SIMPLE, is_of_paper, percent
+from raytrace.studies.codesign.settings import MODELS, NAMES
+from raytrace.studies.codesign.setup import Experiment, experiment, settings_of
+from raytrace.studies.codesign.study import PAPER
+from raytrace.studies.codesign.sweep import COLUMNS, COMBINED, TOGETHER, Reading, Row, distinct, readings
+from raytrace.studies.codesign.sweep import sweep as sweep_all
 
 _NEAR = 2.0  # m: so close to the paper's number is its number
 
@@ -66,56 +77,110 @@ def _answer(definition: str, focus: Callable[[Row], float], found: Sequence[Read
     )
 
 
-def page(
-    rows: Sequence[Row],
-    settings: Settings,
-    *,
-    lens: str,
-    pictures: str,
-    folder: str = "codesign",
-    kept: str = "",
-    of_paper: bool = True,
-) -> str:
-    """The sweep as a page of Markdown. folder: of table and figure, as the page calls it; kept: text below `KEPT`.
+@dataclasses.dataclass(frozen=True)
+class Sweep(Result):
+    """The optima of all cases.
 
     of_paper: whether the lens is the paper's, so that the found numbers stand beside its and answer its claims.
     """
-    found = readings(rows)
-    alone = [one for one in found if one.factor != COMBINED]
-    together = [one for one in found if one.factor == COMBINED]
-    command = " ".join([f"raytrace codesign sweep {lens} --data DIR --docs docs", *options(settings)])
-    verdict = ["## Is the lens of Gaussian DRT focused nearer, at 27.3 m beside 33.9 m?", _verdict(found)]
-    lines = "; thin lines: the numbers of the paper" if of_paper else ""
-    consequences = [
-        "## What follows for the paper's claims",
-        _claims(distinct(found)),
-        "A loss here is of the mean square error with DRT PSFs, beside the least of the four lenses, behind linear "
-        "filters; the paper's are of the mean absolute error behind networks.",
-    ]
-    parts = [
-        "# Co-design: the optimum of the best linear filter, by aperture, noise, normalisation and start",
-        f"    {command}",
-        f"The optimum of the closed form for {lens} and {pictures}: the sensor at which the best linear filter that "
-        "does not know the object distance errs least. Each factor is varied alone (ρ, the σ of the "
-        "paraxial model over the radius of its blur, is of that model only), "
-        f"then {_words(TOGETHER)} together. All rows: [sweep.csv]({folder}/sweep.csv). The experiment is that of "
-        "[codesign.md](codesign.md).",
-        *(verdict if of_paper else []),
-        f"![Focus distance by factor, model and definition.]({folder}/sweep.png)",
-        f"*Focus distance of the optimum by factor, model and definition{lines}.*",
-        *(consequences if of_paper else []),
-        "## Focus of the optimum",
-        _focus_table(alone),
-        "Object distances in m: paraxial conjugate / least RMS spot of the sensor. Shift: of Gaussian DRT's sensor "
-        "from that of paraxial optics; negative is nearer to the lens, for objects further away.",
-        "## What each lens costs with DRT PSFs",
-        _penalty_table(alone),
-        "## Aperture, noise and normalisation together",
-        _focus_table(together),
-        _penalty_table(together),
-        f"{KEPT}\n{kept.strip()}".strip(),
-    ]
-    return "\n\n".join(parts) + "\n"
+
+    rows: list[Row]
+    given: Experiment
+    of_paper: bool
+
+    FIGURE = "studies.codesign.figures.sweep_figure"
+
+    @cached_property
+    def readings(self) -> list[Reading]:
+        return readings(self.rows)
+
+    def document(self) -> dict:
+        return plain(
+            {
+                "settings": dataclasses.asdict(self.given.settings),
+                **self.given.about,
+                "rows": [dataclasses.asdict(row) for row in self.rows],
+                "answers": [dataclasses.asdict(one) for one in answers(self.readings)],
+            }
+        )
+
+    def __str__(self) -> str:
+        return "\n".join(self._lines())
+
+    def _lines(self) -> Iterator[str]:
+        sizes = ("sensor mm", "paraxial m", "RMS m", "error DRT")
+        yield "{:>12} {:<42} {:<9} {:>10} {:>11} {:>8} {:>11}".format("factor", "value", "model", *sizes)
+        for row in self.rows:
+            yield (
+                f"{row.factor:>12} {row.value:<42} {row.model:<9} {row.sensor_mm:>10.4f} {row.focus_paraxial_m:>11.2f} "
+                f"{row.focus_rms_m:>8.2f} {row.error_drt:>11.8f}"
+            )
+        for one in answers(self.readings):
+            nearer = f"{one.definition}: Gaussian DRT focused nearer than paraxial in {one.nearer} of {one.readings}"
+            closest = f"; closest to the paper {one.pair[0]:.1f} and {one.pair[1]:.1f} m ({one.closest})"
+            yield f"{nearer} readings{closest if self.of_paper else ''}"
+
+    def parts(self) -> list[str]:
+        """The page."""
+        found, lens = self.readings, self.given.name
+        alone = [one for one in found if one.factor != COMBINED]
+        together = [one for one in found if one.factor == COMBINED]
+        verdict = ["## Is the lens of Gaussian DRT focused nearer, at 27.3 m beside 33.9 m?", _verdict(found)]
+        lines = "; thin lines: the numbers of the paper" if self.of_paper else ""
+        consequences = [
+            "## What follows for the paper's claims",
+            _claims(distinct(found)),
+            "A loss here is of the mean square error with DRT PSFs, beside the least of the four lenses, behind linear "
+            "filters; the paper's are of the mean absolute error behind networks.",
+        ]
+        return [
+            "# Co-design: the optimum of the best linear filter, by aperture, noise, normalisation and start",
+            " ".join([f"    raytrace codesign sweep {lens} --data DIR --docs docs", *self.given.settings.words()]),
+            f"The optimum of the closed form for {lens} and the spectrum of {len(self.given.train)} {self.given.kind}: "
+            "the sensor at which the best linear filter that does not know the object distance errs least. Each factor "
+            "is varied alone (ρ, the σ of the paraxial model over the radius of its blur, is of that model only), "
+            f"then {_words(TOGETHER)} together. All rows: [sweep.csv](codesign/sweep.csv). The experiment is that of "
+            "[codesign.md](codesign.md).",
+            *(verdict if self.of_paper else []),
+            picture("codesign/sweep.png", f"Focus distance of the optimum by factor, model and definition{lines}."),
+            *(consequences if self.of_paper else []),
+            "## Focus of the optimum",
+            _focus_table(alone),
+            "Object distances in m: paraxial conjugate / least RMS spot of the sensor. Shift: of Gaussian DRT's sensor "
+            "from that of paraxial optics; negative is nearer to the lens, for objects further away.",
+            "## What each lens costs with DRT PSFs",
+            _penalty_table(alone),
+            "## Aperture, noise and normalisation together",
+            _focus_table(together),
+            _penalty_table(together),
+        ]
+
+
+def sweep(arguments: argparse.Namespace) -> None:
+    """Find all optima, then write table, figure and page."""
+    if not (arguments.docs or arguments.folder):
+        raise CommandError("no folder to write to: give --docs DOCS or -o FOLDER")
+    given = experiment(arguments, settings_of(arguments))
+    spectrum = given.spectrum()
+    rows = sweep_all(given.lens, given.settings, spectrum, progress=lambda cases: progress(cases, "case"))
+    if share().rank:
+        return  # the first process writes
+    found, docs = Sweep(rows, given, is_of_paper(given.lens)), Path(arguments.docs or arguments.folder)
+    folder = docs / "codesign"
+    folder.mkdir(parents=True, exist_ok=True)
+    write_table(folder / "sweep.csv", rows, COLUMNS)
+    found.plot(folder / "sweep.png")
+    write_page(docs / "codesign_sweep.md", found.parts())
+    present(found, arguments)
+    say(f"written: {docs / 'codesign_sweep.md'}")
+    for row in rows:
+        if row.no_optimum:
+            say(f"warning: {row.factor} {row.value}, {row.model}: {row.no_optimum}")
+    if all(row.no_optimum for row in rows):
+        raise CommandError("no case has an optimum; see the warnings, and choose other --near, --far, --bounds")
+
+
+# ---------------------------------------------------------------- parts of the page
 
 
 def _verdict(found: Sequence[Reading]) -> str:
@@ -147,69 +212,84 @@ def _verdict(found: Sequence[Reading]) -> str:
     else:
         summary += " Gaussian DRT is the nearer one in none."
     return (
-        f"{summary}\n\n{table(header, lines)}\n\nEach model's own: the paraxial conjugate for paraxial and Fourier "
+        f"{summary}\n\n{grid(header, lines)}\n\nEach model's own: the paraxial conjugate for paraxial and Fourier "
         "optics, which know no other, and the least RMS spot for traced rays."
     )
 
 
+#: Claims of the paper: (text, whether it holds in a reading, figures over all of them).
+_CLAIMS: tuple[tuple[str, Callable[[Reading], bool], Callable[[Sequence[Reading]], str]], ...] = (
+    (
+        "paraxial and Fourier optics agree to 2 m",
+        lambda one: _apart(one) <= 2,
+        lambda found: f"apart by {_range(map(_apart, found), lambda metres: f'{shown(metres, 1)} m')}",
+    ),
+    (
+        "Gaussian DRT puts the sensor nearer to the lens than paraxial optics",
+        lambda one: _shift(one) < 0,
+        lambda found: f"shift {_range(map(_shift, found), '{:+.0f}'.format)} µm",
+    ),
+    (
+        "the simple models lose 10 % or more to DRT",
+        lambda one: _simple(one) >= 0.1,
+        lambda found: f"the better one {_range(map(_simple, found), percent)}",
+    ),
+    (
+        "Gaussian DRT loses 2 % or less",
+        lambda one: one.penalty("gaussian") <= 0.02,
+        lambda found: _range((one.penalty("gaussian") for one in found), percent),
+    ),
+    (
+        "Gaussian DRT loses less than both simple models",
+        lambda one: one.penalty("gaussian") < _simple(one),
+        lambda found: _least_ahead(min(found, key=lambda one: _simple(one) - one.penalty("gaussian"))),
+    ),
+)
+
+
 def _claims(found: Sequence[Reading]) -> str:
     """What of the paper's claims holds in how many readings."""
-    apart = [abs(one.of["fourier"].focus_paraxial_m - one.of["paraxial"].focus_paraxial_m) for one in found]
-    shifts = [1e3 * (one.of["gaussian"].sensor_mm - one.of["paraxial"].sensor_mm) for one in found]
-    simple = [min(one.penalty(model) for model in SIMPLE) for one in found]
-    ours = [one.penalty("gaussian") for one in found]
-    least = min(range(len(found)), key=lambda i: simple[i] - ours[i])
-    lines = [
-        ("paraxial and Fourier optics agree to 2 m", [one <= 2 for one in apart], f"apart by {_range(apart, _metres)}"),
-        (
-            "Gaussian DRT puts the sensor nearer to the lens than paraxial optics",
-            [one < 0 for one in shifts],
-            f"shift {_range(shifts, '{:+.0f}'.format)} µm",
-        ),
-        (
-            "the simple models lose 10 % or more to DRT",
-            [one >= 0.1 for one in simple],
-            f"the better one {_range(simple, _percent)}",
-        ),
-        ("Gaussian DRT loses 2 % or less", [one <= 0.02 for one in ours], _range(ours, _percent)),
-        (
-            "Gaussian DRT loses less than both simple models",
-            [own < other for own, other in zip(ours, simple, strict=True)],
-            f"least ahead: {_percent(ours[least])} beside {_percent(simple[least])} ({found[least].text})",
-        ),
-    ]
-    rows = [(text, f"{sum(holds)} of {len(found)}", figures) for text, holds, figures in lines]
-    return table(("claim", "holds in", "figures"), rows)
+    rows = [(text, f"{sum(map(holds, found))} of {len(found)}", figures(found)) for text, holds, figures in _CLAIMS]
+    return grid(("claim", "holds in", "figures"), rows)
 
 
-def _range(values: Sequence[float], written: Callable[[float], str]) -> str:
+def _apart(one: Reading) -> float:
+    """Focus of the simple models, m."""
+    return abs(one.of["fourier"].focus_paraxial_m - one.of["paraxial"].focus_paraxial_m)
+
+
+def _shift(one: Reading) -> float:
+    """The sensor of Gaussian DRT from that of paraxial optics, µm."""
+    return 1e3 * (one.of["gaussian"].sensor_mm - one.of["paraxial"].sensor_mm)
+
+
+def _simple(one: Reading) -> float:
+    return min(map(one.penalty, SIMPLE))
+
+
+def _least_ahead(one: Reading) -> str:
+    return f"least ahead: {percent(one.penalty('gaussian'))} beside {percent(_simple(one))} ({one.text})"
+
+
+def _range(values: Iterable[float], written: Callable[[float], str]) -> str:
+    values = list(values)
     return f"{written(min(values))} to {written(max(values))}"
-
-
-def _metres(value: float) -> str:
-    return f"{shown(value, 1)} m"
-
-
-def _percent(part: float) -> str:
-    return f"{100 * part:+.1f} %"
 
 
 def _focus_table(found: Sequence[Reading]) -> str:
     header = ("reading", *(NAMES[model] for model in MODELS), "shift (µm)")
-    return table(header, [(one.text, *(_pair(one.of[model]) for model in MODELS), _shift(one)) for one in found])
+    return grid(
+        header, [(one.text, *(_pair(one.of[model]) for model in MODELS), f"{_shift(one):+.0f}") for one in found]
+    )
 
 
 def _penalty_table(found: Sequence[Reading]) -> str:
     header = ("reading", *(NAMES[model] for model in MODELS))
-    return table(header, [(one.text, *(_percent(one.penalty(model)) for model in MODELS)) for one in found])
+    return grid(header, [(one.text, *(percent(one.penalty(model)) for model in MODELS)) for one in found])
 
 
 def _pair(row: Row) -> str:
     return f"{shown(row.focus_paraxial_m, 1)} / {shown(row.focus_rms_m, 1)}"
-
-
-def _shift(one: Reading) -> str:
-    return f"{1e3 * (one.of['gaussian'].sensor_mm - one.of['paraxial'].sensor_mm):+.0f}"
 
 
 def _signed(value: float) -> str:

@@ -9,8 +9,9 @@ from matplotlib.figure import Figure
 
 from raytrace.plot.style import FIELD_COLOURS, GREY, INK, array, new_figure, styled, wavelength_colours
 from raytrace.studies.edof.scene import Deep
-from raytrace.studies.edof.table import NAMES, PUBLISHED
-from raytrace.studies.edof.world import Quality, World
+from raytrace.studies.edof.table import ROWS
+from raytrace.studies.edof.world import Judged, Quality, World, depth_text
+from raytrace.studies.figures import picture as show
 from raytrace.wave.element import Element, height
 from raytrace.wave.psf import ElementPsf
 
@@ -26,7 +27,7 @@ def depth_figure(found: Mapping[str, Mapping[str, Quality]], world: World) -> Fi
     dioptres = [1e3 / depth for depth in world.depths]
     for panel, (content, rows) in zip(axes, found.items(), strict=True):
         for name, own in rows.items():
-            panel.plot(dioptres, own.by_depth["blind"], label=NAMES[name], **_look(name, list(rows)))
+            panel.plot(dioptres, own.by_depth["blind"], label=ROWS[name].title, **_look(name, list(rows)))
         panel.set(title=content, xlabel="object distance")
         _mark_depths(panel, world)
     axes[0].set_ylabel("PSNR, depth-invariant filter (dB)")
@@ -50,10 +51,12 @@ def gain_figure(found: Mapping[str, Mapping[str, Quality]]) -> Figure:
             face = FIELD_COLOURS[number] if filter == "blind" else "white"
             axes.plot(gain, place, mark, ms=5.5, mfc=face, mec=FIELD_COLOURS[number], label=label)
     published = [
-        (PUBLISHED[name] - PUBLISHED["fresnel"], y) for name, y in zip(rows, place, strict=True) if name in PUBLISHED
+        (ROWS[name].published - ROWS["fresnel"].published, y)
+        for name, y in zip(rows, place, strict=True)
+        if ROWS[name].published
     ]
     axes.plot(*zip(*published, strict=True), "|", ms=15, mew=2, color=INK, label="Sitzmann 2018")
-    axes.set_yticks(place, [NAMES[name] for name in rows])
+    axes.set_yticks(place, [ROWS[name].title for name in rows])
     axes.set_ylim(-0.6, len(rows) - 0.4)
     axes.axvline(0, color=GREY, lw=0.8)
     axes.set(xlabel="mean PSNR over that of the Fresnel lens (dB)")
@@ -62,12 +65,13 @@ def gain_figure(found: Mapping[str, Mapping[str, Quality]]) -> Figure:
 
 
 @styled
-def element_figure(elements: Sequence[Element], found: ElementPsf, own: Quality, world: World) -> Figure:
+def element_figure(judged: Judged) -> Figure:
     """Height over the radius, kernels over depth × colour, PSNR over depth, of one element."""
+    own, world = judged.quality, judged.world
     figure = new_figure(9.2, 7.0)
     top, bottom = figure.subfigures(2, 1, height_ratios=(1, 1.75))
     profile, quality = top.subplots(1, 2)
-    _draw_profile(profile, elements)
+    _draw_profile(profile, judged.elements)
     dioptres = [1e3 / depth for depth in world.depths]
     for filter, mark in (("wiener", "o--"), ("blind", "s-")):
         label = "Wiener, 1 m kernel" if filter == "wiener" else "best depth-invariant filter"
@@ -75,7 +79,7 @@ def element_figure(elements: Sequence[Element], found: ElementPsf, own: Quality,
     _mark_depths(quality, world)
     quality.set(xlabel="object distance", ylabel="PSNR (dB)")
     quality.legend(fontsize=8)
-    _draw_kernels(bottom, found)
+    _draw_kernels(bottom, judged.kernels)
     return figure
 
 
@@ -93,7 +97,7 @@ def scene_figure(columns: Mapping[str, Mapping[str, tuple[np.ndarray, float]]], 
         axes[line, 0].set_ylabel(name, fontsize=8)
         for column, (row, cells) in enumerate(columns.items(), 1):
             image, ratio = cells[name]
-            _show(axes[line, column], image, NAMES.get(row, row) if line == 0 else "")
+            _show(axes[line, column], image, _title(row) if line == 0 else "")
             axes[line, column].set_xlabel(f"{ratio:.1f} dB", fontsize=7.5, labelpad=2)
     return figure
 
@@ -111,7 +115,7 @@ def deep_figure(found: Deep) -> Figure:
     marks = [mark for mark in (0, 0.5, 1, 1.5, 2) if found.dioptres.min() <= mark <= found.dioptres.max()]
     bar.set_ticks(marks, labels=["∞" if mark == 0 else f"{1 / mark:.2g} m" for mark in marks], fontsize=6.5)
     for column, name in enumerate(found.seen, 1):
-        _show(axes[0, column], found.seen[name], NAMES.get(name, name))
+        _show(axes[0, column], found.seen[name], _title(name))
         image, ratio = found.restored[name]
         _show(axes[1, column], image, "")
         axes[1, column].set_xlabel(f"{ratio:.1f} dB", fontsize=7.5, labelpad=2)
@@ -144,7 +148,7 @@ def _draw_kernels(figure, found: ElementPsf) -> None:
             panel.imshow(logarithm, cmap="inferno", vmin=np.log10(_MARGIN), vmax=0, extent=(-half, half, -half, half))
             panel.set(xticks=[], yticks=[])
             if w == 0:
-                panel.set_title(_depth(float(found.depths[d])), fontsize=9)
+                panel.set_title(depth_text(float(found.depths[d]), "∞"), fontsize=9)
             if d == 0:
                 panel.set_ylabel(f"{1e3 * float(found.wavelengths[w]):.0f} nm", color=colours[w], fontsize=9)
     figure.supxlabel(
@@ -153,9 +157,11 @@ def _draw_kernels(figure, found: ElementPsf) -> None:
 
 
 def _show(axes: Axes, picture: np.ndarray, title: str) -> None:
-    axes.imshow(np.clip(picture, 0, 1), cmap="gray", vmin=0, vmax=1)
-    axes.set(xticks=[], yticks=[])
-    axes.set_title(title.replace(", ", ",\n"), fontsize=7.5)
+    show(axes, np.clip(picture, 0, 1), title)
+
+
+def _title(name: str) -> str:
+    return ROWS[name].title.replace(", ", ",\n")
 
 
 def _look(name: str, rows: Sequence[str]) -> dict:
@@ -170,9 +176,5 @@ def _look(name: str, rows: Sequence[str]) -> dict:
 
 def _mark_depths(axes: Axes, world: World) -> None:
     """Near objects on the left, even in dioptres."""
-    axes.set_xticks([1e3 / depth for depth in world.depths], [_depth(depth) for depth in world.depths])
+    axes.set_xticks([1e3 / depth for depth in world.depths], [depth_text(depth, "∞") for depth in world.depths])
     axes.invert_xaxis()
-
-
-def _depth(depth: float) -> str:
-    return "∞" if depth == float("inf") else f"{1e-3 * depth:.3g} m"

@@ -15,7 +15,7 @@ from torch import Tensor
 from raytrace.camera.deconvolve import blind_filter, psnr, restore
 from raytrace.camera.image import blur_layers, depth_masks
 from raytrace.formats.pictures import dead_leaves, draws
-from raytrace.studies.edof.world import World, kernels, mirrored, spectrum, transfer
+from raytrace.studies.edof.world import World, depth_text, kernels, mirrored, spectrum, transfer
 from raytrace.wave.element import Element
 
 _KEY = 99  # of what is drawn
@@ -60,9 +60,7 @@ def flat(
         for d in (0, len(H) // 2, len(H) - 1):
             estimate = torch.fft.ifft2(torch.fft.fft2(torch.fft.ifft2(torch.fft.fft2(picture) * H[d]).real + noise) * G)
             ratio = float(psnr((estimate.real - picture).square().mean()))
-            depth = world.depths[d]
-            title = "infinity" if math.isinf(depth) else f"{depth / 1e3:.3g} m"
-            found[name][title] = _shown(estimate.real[:, part, part]), ratio
+            found[name][depth_text(world.depths[d])] = _shown(estimate.real[:, part, part]), ratio
     return found, _shown(picture[:, part, part])
 
 

@@ -25,55 +25,16 @@ from raytrace.formats.pictures import Pictures, crop, draws
 from raytrace.media.catalog import find_glass
 from raytrace.media.glass import index
 from raytrace.optics.reuse import Memo
+from raytrace.studies.edof.settings import Settings
 from raytrace.studies.edof.world import World, best_of_starts, expected_error, mirrored, restored, scene, transfer
 from raytrace.wave.designs import aim, converging
-from raytrace.wave.element import ETCHED, Element, EvenPowers, Zernike, as_rings, wrapped
+from raytrace.wave.element import Element, EvenPowers, Zernike, as_rings, wrapped
 from raytrace.wave.plan import plan
 from raytrace.wave.psf import psf
 
-KINDS = ("smooth", "rings", "zernike")
-LOSSES = ("spectral", "images")
-RESTORATIONS = ("blind", "towards", "network")
 _NETWORK = RedNetShape(6, 16)  # behind the blind filter, the same for every colour
-OPTIMIZERS = ("adam", "sgd", "adadelta")
-SCHEDULES = ("cosine", "linear", "constant")
 _NETWORK_RATE = 1e-3
 _SAMPLE, _START = 20, 21  # last numbers of the keys of what is drawn
-
-
-@dataclasses.dataclass(frozen=True)
-class Settings:
-    """All that decides the result of a run.
-
-    kind: "smooth" (even powers of r), "rings" (free heights, from the smooth optimum), "zernike" (Noll's, no symmetry);
-    glass, terms: of the smooth start (Zernike terms without angle), or how far Noll's go; pitch: of rings, mm; levels:
-    steps of a period they are etched in while learned, 0 for any height; wrap: modulo one wave at 0.55 µm.
-    loss: of LOSSES; restoration: of RESTORATIONS, for loss "images"; optimizer, schedule, rate (µm or a share of it).
-    steps; starts: random starts of the smooth optimum, the best is kept; spread: of them, µm; size: of the periodic
-    pictures; batch; noise: least and largest deviation drawn for "images"; tolerance: rings err by up to so many mm,
-    evenly, drawn anew at every step by the seed and its number.
-    """
-
-    kind: str = "rings"
-    glass: str = "F_SILICA"
-    terms: int = 7
-    pitch: float = ETCHED
-    levels: int = 0
-    wrap: bool = False
-    loss: str = "spectral"
-    restoration: str = "blind"
-    optimizer: str = "adam"
-    schedule: str = "cosine"
-    rate: float = 0.02
-    steps: int = 120
-    starts: int = 4
-    spread: float = 0.5
-    start_steps: int = 60
-    size: int = 256
-    batch: int = 4
-    noise: tuple[float, float] = (0.01, 0.01)
-    tolerance: float = 0.0
-    seed: int = 0
 
 
 class EdofCamera(nn.Module):
@@ -156,7 +117,7 @@ def start(
         return best
     (element,) = best()
     element = Element(element.profile, element.radius.detach(), element.glass)
-    if settings.wrap or settings.levels:
+    if settings.levels:
         element = wrapped(element, made_for.wavelength, levels=settings.levels)
     rings = as_rings(element, settings.pitch)
     profile = dataclasses.replace(rings.profile, heights=rings.profile.heights.detach())

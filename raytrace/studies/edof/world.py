@@ -19,6 +19,7 @@ from raytrace.camera.deconvolve import blind_error, blind_filter, errors, power_
 from raytrace.camera.image import transfer_functions
 from raytrace.formats.pictures import Pictures, draws
 from raytrace.maths.grid import grid
+from raytrace.maths.result import Result
 from raytrace.optics.reuse import Memo
 from raytrace.studies.descent import NoOptimum, minimise
 from raytrace.wave.element import Element, Rings
@@ -26,7 +27,6 @@ from raytrace.wave.plan import plan
 from raytrace.wave.psf import ElementPsf, psf
 from raytrace.wave.scene import WaveScene, is_round
 
-FILTERS = ("wiener", "blind")
 _START = 21  # last number of the key of a random start
 
 
@@ -47,6 +47,11 @@ class World:
     size: int = 255
     noise: float = 0.01
     exact: bool = False
+
+
+def depth_text(depth: float, infinity: str = "infinity") -> str:
+    """A depth in mm as a reader would say it."""
+    return infinity if math.isinf(depth) else f"{1e-3 * depth:.3g} m"
 
 
 def scene(elements: Sequence[Element], world: World, *, depths: Sequence[float] | None = None) -> WaveScene:
@@ -165,6 +170,18 @@ def quality(
         gamma,
         tuple(map(tuple, found.energy.tolist())),
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class Judged(Result):
+    """Elements in a world: their kernels and what they are worth."""
+
+    elements: Sequence[Element]
+    world: World
+    kernels: ElementPsf
+    quality: Quality
+
+    FIGURE = "studies.edof.figures.element_figure"
 
 
 def restored(H: Tensor, G: Tensor, pictures: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,6 +8,7 @@ surface. Flat pixels would lose what a lens bends across each of them; the recor
 
 import dataclasses
 import math
+import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -19,11 +20,14 @@ from raytrace.camera.phase import PhaseVariables
 from raytrace.formats.pictures import Pictures, crop, dead_leaves
 from raytrace.kernels.dft import phasor
 from raytrace.maths.grid import grid
+from raytrace.maths.result import Result
 from raytrace.media.catalog import find_glass
 from raytrace.media.glass import index
 from raytrace.optics.reuse import Memo
+from raytrace.studies.options import Settings
 from raytrace.wave.designs import Aim, aim, ideal
 from raytrace.wave.element import Element, Pixels, height
+from raytrace.wave.element_file import write_element
 from raytrace.wave.plan import Plan
 from raytrace.wave.plan import plan as plan_of
 from raytrace.wave.psf import psf
@@ -36,7 +40,7 @@ _ACROSS = 8  # samples along a flat pixel, where that is asked for
 
 
 @dataclasses.dataclass(frozen=True)
-class Setting:
+class Setting(Settings):
     """What is learned. Lengths mm, wavelength µm.
 
     diameter: of the aperture; distance: to the sensor, or of a collimator from the point source; samples: heights
@@ -54,7 +58,6 @@ class Setting:
     batch: int = 4
     method: str = "sgd"
     rate: float | None = None
-    seed: int = 0
     collimator: bool = False
 
 
@@ -71,13 +74,15 @@ class Frame:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Learned:
+class Learned(Result):
     """What became of the plate. peak_ratios: before the first step, then after each; losses: of each step.
 
     flat_ratio: the peak ratio if pixels are flat, and flat_bound that of the best flat pixels, those of the ideal lens;
     residual: RMS phase that is left in the aperture, waves; frames: of the steps asked for, then the ideal lens as one
-    of step -1.
+    of step -1; seconds, processor_seconds: what learning took.
     """
+
+    FIGURE = "studies.focusing.figures.focus_figure"
 
     setting: Setting
     peak_ratios: tuple[float, ...]
@@ -87,6 +92,41 @@ class Learned:
     residual: float
     element: Element
     frames: tuple[Frame, ...]
+    seconds: float
+    processor_seconds: float
+
+    def document(self) -> dict:
+        return {
+            "peak_ratio": self.peak_ratios[-1],
+            "initial_peak_ratio": self.peak_ratios[0],
+            "steps": self.steps,
+            "residual_waves": self.residual,
+            "flat_pixels_peak_ratio": self.flat_ratio,
+            "flat_pixels_best": self.flat_bound,
+            "method": self.setting.method,
+            "collimator": self.setting.collimator,
+            "loss": self.losses[-1] if self.losses else None,
+            "seconds": self.seconds,
+            "processor_seconds": self.processor_seconds,
+        }
+
+    def __str__(self) -> str:
+        return (
+            f"{self.title}\nfrom {self.peak_ratios[0]:.4f} in {self.steps} steps, {self.seconds:.1f} s\n"
+            f"residual phase: {self.residual:.4f} waves RMS\n"
+            f"peak with the height constant over each pixel: {self.flat_ratio:.3f}; the most that such pixels can "
+            f"reach: {self.flat_bound:.3f}"
+        )
+
+    def save(self, path: str) -> None:
+        """The height map, in the format of the suffix."""
+        write_element(self.element, path, design_wavelength=self.setting.wavelength)
+
+    @property
+    def title(self) -> str:
+        goal = "collimate" if self.setting.collimator else "focus"
+        heights, peak = f"{self.setting.samples}² heights", f"{self.peak_ratios[-1]:.3f}"
+        return f"A flat plate learns to {goal}: {heights}, peak {peak} of the ideal lens's"
 
     @property
     def steps(self) -> int:
@@ -113,6 +153,8 @@ def learn_to_focus(
     """
     if setting.size % 2 == 0:
         raise ValueError(f"a window of {setting.size} pixels has no pixel at its middle: expected an odd size")
+    torch.optim.SGD([torch.zeros(1)], 1.0)  # torch loads its compiler with the first optimiser: no part of learning
+    began, busy = time.perf_counter(), time.process_time()
     variables = PhaseVariables(plate(setting), unit=radian(setting), others=_behind(setting))
     plan, memo = sampled(setting, variables()), Memo()
     best = best_kernel(setting)
@@ -145,6 +187,8 @@ def learn_to_focus(
             residual=residual_phase(setting, variables()),
             element=variables()[0],
             frames=tuple(kept),
+            seconds=time.perf_counter() - began,
+            processor_seconds=time.process_time() - busy,
         )
 
 

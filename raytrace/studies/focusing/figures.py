@@ -12,7 +12,7 @@ from raytrace.studies.focusing.experiment import Learned
 
 
 @styled
-def focus_figure(found: Learned, *, title: str = "") -> Figure:
+def focus_figure(found: Learned) -> Figure:
     """How a plate became a lens: height, PSF and image after some steps, the ideal lens beside them; and the curve."""
     frames, setting = found.frames, found.setting
     figure = new_figure(1.45 * len(frames) + 0.9, 6.6)
@@ -41,7 +41,7 @@ def focus_figure(found: Learned, *, title: str = "") -> Figure:
     for row, label in enumerate((f"height, 0 … {wave:.0f} nm", "PSF, logarithmic", "image")):
         axes[row][0].set_ylabel(label)
     _course(figure.add_subplot(grid[3, :]), found)
-    figure.suptitle(title, fontweight="bold", fontsize=10)
+    figure.suptitle(found.title, fontweight="bold", fontsize=10)
     return figure
 
 

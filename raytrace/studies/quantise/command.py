@@ -1,193 +1,69 @@
-"""`raytrace wave quantise`."""
+"""`raytrace wave quantise`: its words and options. Imports no torch."""
 
 import argparse
 import dataclasses
-import tempfile
-from collections.abc import Sequence
-from pathlib import Path
 
-from torch import Tensor
+from raytrace.cli.options import file_name, json, output_folder, positive_finite
+from raytrace.studies import options as rows
+from raytrace.studies.options import add_options, documents, option, pictures, whole
 
-from raytrace.cli.door import CommandError, print_json
-from raytrace.cli.options import did_you_mean
-from raytrace.cli.progress import progress
-from raytrace.formats.pictures import Pictures
-from raytrace.studies.codesign.page import table
-from raytrace.studies.edof.training import Settings
-from raytrace.studies.edof.world import World, periodic, spectrum
-from raytrace.studies.quantise.experiment import (
-    WAYS,
-    Judge,
-    Steps,
-    Tolerance,
-    efficiency,
-    law,
-    learned,
-    made,
-    read,
-    steps_of,
-    tolerances_of,
-)
-from raytrace.studies.superres.command import folders, page, pictures, write_csv
-from raytrace.wave.designs import aim, baseline, singlet
-from raytrace.wave.element import Element
-from raytrace.wave.element_file import read_element
-from raytrace.wave.exchange import FORMATS
+SUMMARY = "what levels, wrapping and errors of height cost"
+DESCRIPTION = """\
+What fabrication costs: quantised heights (levels), wrapping to one wave of 0.55 µm, and errors of height. Light at
+the focus of a kinoform against sinc²(1/L), and the expected PSNR over 0.5 m to infinity, in three colours, behind
+the best filter that knows no depth: of the Fresnel lens, and of a learned element of fused silica rings, wrapped and
+quantised after learning, or learned further as a wrapped and quantised element.
+
+An element is fresnel, learned (learned first, in FOLDER, or a temporary one), the folder of a run of
+`raytrace wave edof --element rings`, or a file of heights, of rings or pixels, as `raytrace wave psf` reads it."""
+EXAMPLES = """examples:
+  raytrace wave quantise --element fresnel --json
+  raytrace wave quantise --levels 2 4 16 --tolerance 20 --no-wrap
+  raytrace wave quantise --element rings --steps 0
+  raytrace wave quantise --element rings/heights.npy --glass F_SILICA --levels 16 --steps 0
+  raytrace wave quantise --docs docs -o learned"""
 
 
-def quantise(arguments: argparse.Namespace) -> None:
-    """Efficiency, expected PSNR over levels and tolerances; draw, write the page."""
-    train, test, kind = pictures(arguments, 128)
-    own, others = periodic(train, 256), periodic(test, 256)
-    S = spectrum(own)
-    steps: list[Steps] = []
-    tolerances: list[Tolerance] = []
-    for given in arguments.element:
-        name, element, world = _element(arguments, given, train, S)
-        judge, ways = Judge(world, S), _ways(arguments, given)
-        rows, elements = steps_of(
-            name,
-            element,
-            judge,
-            others,
-            levels=arguments.levels,
-            ways=ways,
-            steps=arguments.steps,
-            progress=lambda cases: progress(cases, "element"),
-        )
-        steps += rows
-        for way in ways:
-            if way == "looped" and "trained" in ways:
-                continue
-            count = 0 if way == "whole" else 16 if 16 in arguments.levels else max(arguments.levels)
-            made_so = elements[way, count]
-            nm = (0.0, *arguments.tolerance)
-            tolerances += tolerances_of(name, way, made_so, judge, nm=nm, seed=arguments.seed)
-    etched = _etched(arguments.levels)
-    document = {
-        "efficiency": [{"levels": n, "law": law(n), "any_width": one, "rings": two} for n, one, two in etched],
-        "levels": [dataclasses.asdict(row) for row in steps],
-        "tolerance": [dataclasses.asdict(row) for row in tolerances],
-    }
-    if arguments.json:
-        print_json({"pictures": kind, **document})
-    else:
-        print("\n\n".join(_text(rows) for rows in document.values()))
-    if arguments.docs:
-        _quantise_docs(arguments, kind, etched, steps, tolerances, document)
+@dataclasses.dataclass(frozen=True)
+class Settings(rows.Settings):
+    """levels, tolerance: of every element; glass to span: of those that are files of heights; learn, starts: of the
+    element "learned", and steps: of learning on."""
+
+    element: tuple[str, ...] = option(
+        ("fresnel", "learned"),
+        "fresnel, learned (default both), folders of `raytrace wave edof`, or height maps: .npy, .csv, .png, .tif, "
+        ".dat, .grd; fine maps of pixels take minutes, rings seconds",
+        "NAME|FOLDER|FILE",
+        type=file_name,
+    )
+    glass: str | None = option(None, "material (default: that of its FILE.json)", "NAME")
+    aperture: float = option(5.0, "diameter, sensor at 35.5 mm", "MM")
+    pitch: float | None = option(None, "of a file that does not say it", "MM", type=positive_finite)
+    span: tuple[float, float] | None = option(
+        None, "heights of black and white of a picture that does not say", "MM", type=float, nargs=2
+    )
+    levels: tuple[int, ...] = option((2, 4, 8, 16, 32, 64), "steps of a wave (default 2 4 … 64)", "L", type=whole(2))
+    tolerance: tuple[float, ...] = option((10.0, 20.0, 40.0, 80.0), "errors of height, nm (default 10 20 40 80)", "NM")
+    wrap: bool | None = option(
+        None, "of learned elements wrapped ones, or whole ones (default both)", action=argparse.BooleanOptionalAction
+    )
+    steps: int = option(
+        20, "of learning on as made, 4 times as many for the wraps (default 20; 0: none)", type=whole(0)
+    )
+    learn: int = option(60, "steps of the learned element")
+    starts: int = option(2, "random starts of it")
 
 
-def _element(arguments, given: str, train: Pictures, S: Tensor) -> tuple[str, Element, World]:
-    world = World()
-    if given == "fresnel":
-        (element,) = baseline("fresnel", aim(radius=world.radius, sensor=world.sensor_distance, focus=world.design))
-        return given, element, world
-    if given != "learned" and Path(given).suffix.lower() in FORMATS and not Path(given).is_dir():
-        made_of = read_element(
-            given, aperture=arguments.aperture, glass=arguments.glass, pitch=arguments.pitch, span=arguments.span
-        )
-        return Path(given).name, made_of, dataclasses.replace(world, radius=0.5 * arguments.aperture)
-    if given != "learned" and not Path(given).is_dir():
-        raise CommandError(
-            f"--element {given}: expected fresnel, learned, the folder of a run, or a height map "
-            f"({', '.join(FORMATS)}){did_you_mean(given, ('fresnel', 'learned'))}"
-        )
-    try:
-        return (Path(given).name, *read(given, S)) if given != "learned" else _learned(arguments, world, train, S)
-    except ValueError as error:
-        raise CommandError(str(error)) from error
+def options(parser: argparse.ArgumentParser) -> None:
+    of_files = ("glass", "aperture", "pitch", "span")
+    add_options(parser, Settings, "element")
+    add_options(parser.add_argument_group("height maps"), Settings, *of_files)
+    add_options(parser, Settings, "levels", "tolerance", "wrap", "steps", "learn", "starts")
+    what = "folder of pictures of 128 × 128 pixels or more; four fifths make the filters, the others are restored"
+    pictures(parser, what, "seed", limit=16)
+    documents(parser, "wave_quantise.md and wave/")
+    output_folder(parser, "folder of the learned element")
+    json(parser)
 
 
-def _learned(arguments, world: World, train: Pictures, S: Tensor) -> tuple[str, Element, World]:
-    settings = Settings(steps=arguments.learn, starts=arguments.starts, seed=arguments.seed)
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = arguments.output or temporary
-        for _ in progress(learned(settings, world, S, train, folder), what="learning"):
-            pass
-        return "learned", *read(folder, S)
-
-
-def _ways(arguments, given: str) -> list[str]:
-    """Of WAYS, those asked for; a kinoform lives by its wraps."""
-    if given == "fresnel":
-        return ["wrapped"]
-    whole = [] if arguments.wrap else ["whole"]
-    if arguments.wrap is False:
-        return whole
-    return [*whole, "wrapped", *(("looped", "trained") if arguments.steps else ())]
-
-
-def _etched(levels: Sequence[int]) -> list[tuple[int, float, float]]:
-    """Efficiency of the Fresnel lens as it is and in rings of 2 µm, by levels; 0: any height."""
-    world, made_for = World(), aim()
-    (smooth,) = singlet(made_for)
-    (rings,) = baseline("fresnel", made_for)
-    found = []
-    for count in (*levels, 0):
-        found.append((count, *(efficiency(made(one, count, wrap=True), world) for one in (smooth, rings))))
-    return found
-
-
-def _text(rows: Sequence[dict]) -> str:
-    """The table, and below it what the words in the column `made` mean."""
-    known = [f"{way}: {WAYS[way]}" for way in dict.fromkeys(row["made"] for row in rows)]
-    lines = [list(rows[0])] + [[_cell(value) for value in row.values()] for row in rows] if rows else []
-    return "\n".join("  ".join(f"{cell:>12}" for cell in line) for line in lines) + "\n" + "; ".join(known)
-
-
-def _cell(value) -> str:
-    return f"{value:.4f}" if isinstance(value, float) else str(value)
-
-
-def _quantise_docs(arguments, kind: str, etched, steps, tolerances, document: dict) -> None:
-    from raytrace.plot.style import save
-    from raytrace.studies.superres.figures import quantise_figure
-
-    docs, folder = folders(arguments.docs)
-    save(quantise_figure(etched, steps, tolerances), folder / "quantise.png")
-    write_csv(document["levels"], folder / "quantise.csv")
-    write_csv(document["tolerance"], folder / "quantise_tolerance.csv")
-    page(docs / "wave_quantise.md", _quantise_page(arguments, kind, etched, steps, tolerances))
-
-
-def _quantise_page(arguments, kind: str, etched, steps: Sequence[Steps], tolerances: Sequence[Tolerance]) -> list[str]:
-    words = [f"--element {' '.join(arguments.element)} --levels {' '.join(map(str, arguments.levels))}"]
-    words += [f"--tolerance {' '.join(f'{nm:g}' for nm in arguments.tolerance)} --steps {arguments.steps}"]
-    words += ["--data DIR"] if arguments.data else []
-    levels = [0, *arguments.levels]
-    by = {(row.element, row.made, row.levels): row for row in steps}
-    header = ("element", "how made", *(f"{n} levels" if n else "any height" for n in levels))
-    kinds = list(dict.fromkeys((row.element, row.made) for row in steps))
-
-    def of(column: str) -> str:
-        return table(
-            header,
-            [(name, WAYS[way], *(f"{getattr(by[name, way, n], column):.2f}" for n in levels)) for name, way in kinds],
-        )
-
-    errors = [
-        (row.element, WAYS[row.made], row.levels or "any", f"{row.nm:g}", f"{row.mean:.3f}",
-         f"{row.least:.3f} … {row.greatest:.3f}")
-        for row in tolerances
-    ]  # fmt: skip
-    return [
-        "# What fabrication costs: levels, wrapping, errors of height",
-        f"    raytrace wave quantise {' '.join(words)} --docs docs",
-        "![Efficiency, levels and tolerance](wave/quantise.png)",
-        "## A kinoform at its focus",
-        table(
-            ("levels", "sinc²(1/L)", "efficiency, steps of any width", "efficiency, rings of 2 µm"),
-            [(n or "any", f"{law(n):.4f}", f"{one:.4f}", f"{two:.4f}") for n, one, two in etched],
-        ),
-        "Light at the focus over that of an ideal lens: 5 mm, f/7.1, 0.55 µm. The law is met where steps may be as "
-        "narrow as they come; rings of 2 µm are too wide for the outermost zones of 4 µm.",
-        "## Levels",
-        "Expected PSNR in dB, in closed form, over 0.5 m to infinity at 460, 550 and 640 nm, behind the best filter "
-        f"that knows no depth; {kind}, noise 0.01:",
-        of("closed"),
-        "The same of test pictures that the filter was not made for, mean over depths:",
-        of("restored"),
-        "## Errors of height",
-        "The height of every ring in error by a uniform random number within ±, five draws each:",
-        table(("element", "how made", "levels", "± nm", "mean PSNR (dB)", "draws"), errors),
-    ]
+run = "studies.quantise.report.quantise"

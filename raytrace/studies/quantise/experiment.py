@@ -21,7 +21,8 @@ from raytrace.camera.phase import PhaseVariables
 from raytrace.camera.training import DamagedRun, Record, load_state, read_json
 from raytrace.formats.pictures import Pictures, draws
 from raytrace.optics.reuse import Memo
-from raytrace.studies.edof.training import EdofCamera, Settings, begin, learn_element, scheduled
+from raytrace.studies.edof.settings import Settings
+from raytrace.studies.edof.training import EdofCamera, begin, learn_element, scheduled
 from raytrace.studies.edof.world import World, expected_error, scene, spectrum, transfer
 from raytrace.studies.edof.world import kernels as kernels_of
 from raytrace.wave.element import Element, Pixels, Rings, period, with_tolerance, wrapped
@@ -168,7 +169,7 @@ def read(folder: str | Path, S: Tensor) -> tuple[Element, World]:
         raise ValueError(f"{folder}: no settings.json; expected the folder of a run of `raytrace wave edof`")
     given = read_json(written)
     try:
-        world, settings = World(**_tuples(given.pop("world"))), Settings(**_tuples(given))
+        world, settings = World(**_tuples(given.pop("world"))), Settings.read(given)
     except (KeyError, TypeError, AttributeError) as error:
         raise DamagedRun(f"{written}: no settings of `raytrace wave edof` ({error})") from error
     camera, run = begin(settings, world, S, folder)

@@ -1,0 +1,90 @@
+"""Settings of studies as rows: a field is the option of a command, and part of what a run is known by. No torch."""
+
+import argparse
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Self
+
+from raytrace.cli.options import count, file_name, positive_finite, seed_number
+
+_READ = {int: {"type": count, "metavar": "N"}, float: {"type": positive_finite}}
+
+
+def option(default, help: str, metavar: str | None = None, *, name: str = "", **spelling):
+    """A field of settings that is an option of the command, by default --FIELD; spelling: what else argparse takes.
+
+    Whole numbers are above 0, others finite too, and a tuple takes one or more, where `type` does not say otherwise.
+    The parser leaves None where the option is not given: the help ends with the default, unless it says it itself.
+    """
+    is_tuple = isinstance(default, tuple)
+    read = {} if "choices" in spelling and not is_tuple else _READ.get(type(default[0] if is_tuple else default), {})
+    usual = f"{default:g}" if isinstance(default, float) else default
+    if usual not in (None, "") and "default" not in help:
+        help = f"{help} (default {usual})"
+    given = {"metavar": metavar} if metavar else {}
+    several = {"nargs": "+"} if is_tuple else {}
+    return dataclasses.field(default=default, metadata={"name": name, "help": help} | read | several | given | spelling)
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """All that decides the result of a run: other settings are another run."""
+
+    seed: int = option(0, "of random numbers", type=seed_number)
+
+    @classmethod
+    def of(cls, given: Mapping, **more) -> Self:
+        """Settings by options, where they were given; `more` goes before them."""
+        found = {field.name: given.get(field.name) for field in dataclasses.fields(cls)}
+        return cls.read({name: value for name, value in found.items() if value is not None} | more)
+
+    @classmethod
+    def read(cls, document: Mapping) -> Self:
+        """Settings as JSON has them. Raises TypeError where they are not of this kind."""
+        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in document.items()})
+
+    def words(self) -> list[str]:
+        """What is not as by default, as options of the command."""
+        found = []
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if field.metadata and value != field.default:
+                name = (field.metadata["name"] or field.name).replace("_", "-")
+                found.append(f"--{name} {' '.join(f'{one:g}' for one in value) if isinstance(value, tuple) else value}")
+        return found
+
+
+def add_options(group, settings: type[Settings], *names: str) -> None:
+    """The options of the fields of these names, of all that this kind of settings adds if none are given."""
+    fields = {field.name: dict(field.metadata) for field in dataclasses.fields(settings) if field.metadata}
+    for name in names or [name for name in settings.__annotations__ if name in fields]:
+        spelled = (fields[name].pop("name") or name).replace("_", "-")
+        group.add_argument(f"--{spelled}", dest=name, **fields[name])
+
+
+def whole(least: int) -> Callable[[str], int]:
+    """What reads whole numbers from `least` on."""
+
+    def read(text: str) -> int:
+        found = 0 if text == "0" else count(text)
+        if found < least:
+            raise argparse.ArgumentTypeError(f"{text!r}: expected {least} at least")
+        return found
+
+    return read
+
+
+def pictures(parser, what: str, *names: str, settings: type[Settings] = Settings, limit: int | None = None):
+    """A group of --data, --limit and the options of these names."""
+    group = parser.add_argument_group("pictures")
+    group.add_argument(
+        "--data", metavar="DIR", type=file_name, help=f"{what} (default: dead leaves, discs that hide one another)"
+    )
+    usual = f" (default {limit})" if limit else ""
+    group.add_argument("--limit", metavar="N", type=count, default=limit, help=f"take N of them, evenly{usual}")
+    add_options(group, settings, *names)
+
+
+def documents(group, what: str) -> None:
+    """--docs."""
+    group.add_argument("--docs", metavar="DOCS", type=file_name, help=f"folder of {what}")

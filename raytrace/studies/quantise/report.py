@@ -1,0 +1,212 @@
+"""What `raytrace wave quantise` finds: as text, as a document, as a page."""
+
+import argparse
+import dataclasses
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from torch import Tensor
+
+from raytrace.cli.door import CommandError, say
+from raytrace.cli.options import did_you_mean
+from raytrace.cli.progress import progress
+from raytrace.files import write_table
+from raytrace.formats.pictures import Pictures, dead_leaves, split
+from raytrace.maths.result import Result
+from raytrace.pages import grid, write_page
+from raytrace.studies.edof.settings import Settings as Learning
+from raytrace.studies.edof.world import World, periodic, spectrum
+from raytrace.studies.pictures import pictures
+from raytrace.studies.quantise.command import Settings
+from raytrace.studies.quantise.experiment import (
+    WAYS,
+    Judge,
+    Steps,
+    Tolerance,
+    efficiency,
+    law,
+    learned,
+    made,
+    read,
+    steps_of,
+    tolerances_of,
+)
+from raytrace.wave.designs import aim, baseline, singlet
+from raytrace.wave.element import Element
+from raytrace.wave.element_file import read_element
+from raytrace.wave.exchange import FORMATS
+
+
+@dataclasses.dataclass(frozen=True)
+class Etched:
+    """Light at the focus of the Fresnel lens, the ideal lens's being 1: its law sinc²(1/L), its profile as it is, and
+    that in rings of 2 µm; levels 0: any height."""
+
+    levels: int
+    law: float
+    any_width: float
+    rings: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Fabrication(Result):
+    """What levels and errors of height cost; kind: of the pictures."""
+
+    kind: str
+    etched: list[Etched]
+    steps: list[Steps]
+    tolerances: list[Tolerance]
+
+    FIGURE = "studies.quantise.figures.quantise_figure"
+
+    def tables(self) -> dict[str, list[dict]]:
+        named = {"efficiency": self.etched, "levels": self.steps, "tolerance": self.tolerances}
+        return {name: [dataclasses.asdict(row) for row in rows] for name, rows in named.items()}
+
+    def document(self) -> dict:
+        return {"pictures": self.kind, **self.tables()}
+
+    def __str__(self) -> str:
+        return "\n\n".join(map(_text, self.tables().values()))
+
+
+def quantise(arguments: argparse.Namespace) -> Fabrication:
+    """Efficiency, expected PSNR over levels and tolerances; write the page where --docs asks for it."""
+    settings = Settings.of(vars(arguments))
+    given, kind = pictures(arguments, 128, lambda: dead_leaves(arguments.limit, size=128, seed=settings.seed))
+    train, test = split(given)
+    own, others = periodic(train, 256), periodic(test, 256)
+    S = spectrum(own)
+    found = Fabrication(kind, _etched(settings.levels), [], [])
+    for name in settings.element:
+        title, element, world = _element(settings, name, train, S, arguments.folder)
+        judge, ways = Judge(world, S), _ways(settings, name)
+        rows, elements = steps_of(
+            title,
+            element,
+            judge,
+            others,
+            levels=settings.levels,
+            ways=ways,
+            steps=settings.steps,
+            progress=lambda cases: progress(cases, "element"),
+        )
+        found.steps.extend(rows)
+        for way in ways:
+            if way == "looped" and "trained" in ways:
+                continue
+            count = 0 if way == "whole" else 16 if 16 in settings.levels else max(settings.levels)
+            nm = (0.0, *settings.tolerance)
+            found.tolerances.extend(tolerances_of(title, way, elements[way, count], judge, nm=nm, seed=settings.seed))
+    if arguments.docs:
+        _document(found, Path(arguments.docs), settings, ["--data DIR"] if arguments.data else [])
+    return found
+
+
+def _element(
+    settings: Settings, name: str, train: Pictures, S: Tensor, folder: str | None
+) -> tuple[str, Element, World]:
+    """What an element is called, itself, and its world."""
+    world, path = World(), Path(name)
+    if name == "fresnel":
+        (element,) = baseline("fresnel", aim(radius=world.radius, sensor=world.sensor_distance, focus=world.design))
+        return name, element, world
+    if name == "learned":
+        return name, *_learned(settings, world, train, S, folder)
+    if path.is_dir():
+        return path.name, *read(path, S)
+    if path.suffix.lower() not in FORMATS:
+        raise CommandError(
+            f"--element {name}: expected fresnel, learned, the folder of a run, or a height map "
+            f"({', '.join(FORMATS)}){did_you_mean(name, ('fresnel', 'learned'))}"
+        )
+    own = {option: getattr(settings, option) for option in ("aperture", "glass", "pitch", "span")}
+    element = read_element(name, **own)
+    return path.name, element, dataclasses.replace(world, radius=0.5 * settings.aperture)
+
+
+def _learned(settings: Settings, world: World, train: Pictures, S: Tensor, folder: str | None) -> tuple[Element, World]:
+    how = Learning(steps=settings.learn, starts=settings.starts, seed=settings.seed)
+    with tempfile.TemporaryDirectory() as temporary:
+        for _ in progress(learned(how, world, S, train, folder or temporary), what="learning"):
+            pass
+        return read(folder or temporary, S)
+
+
+def _ways(settings: Settings, name: str) -> list[str]:
+    """Of WAYS, those asked for; a kinoform lives by its wraps."""
+    if name == "fresnel":
+        return ["wrapped"]
+    whole = [] if settings.wrap else ["whole"]
+    if settings.wrap is False:
+        return whole
+    return [*whole, "wrapped", *(("looped", "trained") if settings.steps else ())]
+
+
+def _etched(levels: Sequence[int]) -> list[Etched]:
+    world, made_for = World(), aim()
+    shapes = (*singlet(made_for), *baseline("fresnel", made_for))
+    return [Etched(n, law(n), *(efficiency(made(one, n, wrap=True), world) for one in shapes)) for n in (*levels, 0)]
+
+
+def _text(rows: Sequence[dict]) -> str:
+    """The table, and below it what the words in the column `made` mean."""
+    lines = [list(rows[0])] + [[_cell(value) for value in row.values()] for row in rows] if rows else []
+    text = "\n".join("  ".join(f"{cell:>12}" for cell in line) for line in lines)
+    ways = dict.fromkeys(row["made"] for row in rows if "made" in row)
+    return "\n".join([text, "; ".join(f"{way}: {WAYS[way]}" for way in ways)]).rstrip()
+
+
+def _cell(value) -> str:
+    return f"{value:.4f}" if isinstance(value, float) else str(value)
+
+
+def _document(found: Fabrication, docs: Path, settings: Settings, words: Sequence[str]) -> None:
+    """The page, its figure and its tables."""
+    page, folder, tables = docs / "wave_quantise.md", docs / "wave", found.tables()
+    folder.mkdir(parents=True, exist_ok=True)
+    found.plot(folder / "quantise.png")
+    for name, rows in (("quantise", tables["levels"]), ("quantise_tolerance", tables["tolerance"])):
+        write_table(folder / f"{name}.csv", rows, floats=lambda number: round(number, 4))
+    write_page(page, _parts(found, settings, words))
+    say(f"written: {page}")
+
+
+def _parts(found: Fabrication, settings: Settings, more: Sequence[str]) -> list[str]:
+    words = [f"--element {' '.join(settings.element)} --levels {' '.join(map(str, settings.levels))}"]
+    words += [f"--tolerance {' '.join(f'{nm:g}' for nm in settings.tolerance)} --steps {settings.steps}", *more]
+    levels = [0, *settings.levels]
+    header = ("element", "how made", *(f"{n} levels" if n else "any height" for n in levels))
+    by = {(row.element, row.made, row.levels): row for row in found.steps}
+    kinds = list(dict.fromkeys((row.element, row.made) for row in found.steps))
+
+    def of(column: str) -> str:
+        cells = {kind: [f"{getattr(by[*kind, n], column):.2f}" for n in levels] for kind in kinds}
+        return grid(header, [(name, WAYS[way], *cells[name, way]) for name, way in kinds])
+
+    light = [
+        (row.levels or "any", f"{row.law:.4f}", f"{row.any_width:.4f}", f"{row.rings:.4f}") for row in found.etched
+    ]
+    errors = [
+        (row.element, WAYS[row.made], row.levels or "any", f"{row.nm:g}", f"{row.mean:.3f}",
+         f"{row.least:.3f} … {row.greatest:.3f}")
+        for row in found.tolerances
+    ]  # fmt: skip
+    return [
+        "# What fabrication costs: levels, wrapping, errors of height",
+        f"    raytrace wave quantise {' '.join(words)} --docs docs",
+        "![Efficiency, levels and tolerance](wave/quantise.png)",
+        "## A kinoform at its focus",
+        grid(("levels", "sinc²(1/L)", "efficiency, steps of any width", "efficiency, rings of 2 µm"), light),
+        "Light at the focus over that of an ideal lens: 5 mm, f/7.1, 0.55 µm.",
+        "## Levels",
+        "Expected PSNR in dB, in closed form, over 0.5 m to infinity at 460, 550 and 640 nm, behind the best filter "
+        f"that knows no depth; {found.kind}, noise 0.01:",
+        of("closed"),
+        "The same of test pictures that the filter was not made for, mean over depths:",
+        of("restored"),
+        "## Errors of height",
+        "The height of every ring in error by a uniform random number within ±, five draws each:",
+        grid(("element", "how made", "levels", "± nm", "mean PSNR (dB)", "draws"), errors),
+    ]
