@@ -266,8 +266,8 @@ def test_a_lens_shows_itself():
 
 # -- one verb, one door ------------------------------------------------------------------------------------------------
 
-#: Commands that are a verb, each in a file of its own.
-VERBS = [command for command in COMMANDS if not isinstance(command.run, str)]
+#: Commands that are a verb, each in a file of its own; those of studies are none.
+VERBS = [one for one in COMMANDS if not isinstance(one.run, str) and ".studies." not in one.run.__name__]
 OF_A_LENS = [command for command in VERBS if not hasattr(command.run, "run")]
 
 
