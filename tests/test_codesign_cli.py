@@ -239,7 +239,7 @@ WRONG = {
     "folder": (["--data", "nowhere"], "nowhere: no such folder"),
     "empty": (["--data", "."], r"\.: no pictures found"),
     "small": (["--patch", "64"], "none of 10 pictures has 70 × 70 pixels"),
-    "variables": (["--vary", "radius:3"], "'radius:3': expected sensor, or one of thickness, curvature, conic"),
+    "variables": (["--vary", "radius:3"], "'radius:3': surface 3 has no radius; it has thickness, curvature, conic"),
     "surface": (["--vary", "thickness:99"], "surface 99; this lens has surfaces 1 to 11 to vary"),
     "range": (["--near", "60000"], "--near 60000 is not nearer than --far 50000"),
     "start": (
