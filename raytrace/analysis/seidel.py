@@ -22,7 +22,7 @@ from raytrace.optics.launch import paraxial_field
 from raytrace.optics.paraxial import FirstOrder, first_order, marginal_ray, signed
 from raytrace.optics.trace import media
 from raytrace.system.lens import Lens, largest_field
-from raytrace.system.surface import Surface, vertex_curvature
+from raytrace.system.surface import Surface, is_even, vertex_curvature
 
 
 @value
@@ -73,13 +73,15 @@ def seidel(lens: Lens, *, fields: Tensor | None = None, kind: str = "coefficient
     upper one where there is a choice, in the order of `_transverse`. "longitudinal": mm along z from the paraxial
     focus to theirs. The last two are nan where image space is afocal.
     fields: (2, F), of which the distance from the axis counts; the largest of the lens by default. Image heights are
-    those of the paraxial image. Raises ValueError for a kind not named here, and for a surface with a departure.
+    those of the paraxial image. Raises ValueError for a kind not named here, and for a surface of
+    other terms than even powers of r.
     """
     if kind not in KINDS:
         raise ValueError(f"Seidel aberrations as {kind!r}: expected one of {', '.join(KINDS)}")
     for number, surface in enumerate(lens.surfaces):
-        if surface.departure is not None:
-            raise ValueError(f"surface {number} has a departure: Seidel's theory is of surfaces that are round")
+        if not is_even(surface):
+            what = "has a departure" if surface.departure is not None else f"is an {surface.kind}"
+            raise ValueError(f"surface {number} {what}: Seidel's theory is of even powers of r")
     paraxial = first_order(lens)
     fields = largest_field(lens) if fields is None else fields
     marginal, chief = marginal_ray(lens), _chief_ray(lens, fields, paraxial)

@@ -17,7 +17,7 @@ from raytrace.maths.value import to
 from raytrace.optics.trace import media
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
-from raytrace.system.surface import Surface
+from raytrace.system.surface import Surface, is_even
 
 #: Beside -O3 -march=native: roots and comparisons as vector instructions, which errno and traps would forbid; no
 #: arithmetic changes by that. The others are tried first, and left out where a compiler does not know them.
@@ -151,7 +151,7 @@ def _gaps(lens: Lens) -> Sequence[float]:
 
 def _surface(surface: Surface, number: int, gap: float, n1: Tensor, n2: Tensor) -> _Surface:
     conic_alone = surface.conic is not None and surface.coefficients is None
-    if surface.is_mirror or surface.apertures or surface.departure is not None or conic_alone:
+    if surface.is_mirror or surface.apertures or not is_even(surface) or conic_alone:
         raise ValueError(f"surface {number}: the limits know planes, spheres and even aspheres that refract")
     a = [] if surface.coefficients is None else surface.coefficients.tolist()
     if len(a) > _TERMS:

@@ -20,6 +20,7 @@ from raytrace.optics.launch import rays_of_field
 from raytrace.optics.trace import media
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
+from raytrace.system.surface import is_even
 
 SAMPLE = 24  # rays of the check against the reference
 _PIECES = (2**15, 2**16)  # numbers of rays traced at a time that are tried, beside all at once
@@ -91,8 +92,8 @@ def surfaces_of(lens: Lens) -> int:
 
 def reference_of(lens: Lens) -> tuple[list[ReferenceSurface], float]:
     """The lens in front of surface 1 and behind, for `trace_reference`: its surfaces and the first index."""
-    if any(surface.departure is not None for surface in lens.surfaces):
-        raise ValueError("the reference traces conics and even aspheres: this lens has a departure from them")
+    if not all(map(is_even, lens.surfaces)):
+        raise ValueError("the reference traces conics and even aspheres: this lens has others")
     indices = [float(index) for index in media(lens, lens.wavelengths[lens.primary_wavelength])]
     surfaces = [
         reference_surface(

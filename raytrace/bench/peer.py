@@ -23,6 +23,7 @@ from raytrace.maths.value import to
 from raytrace.optics.trace import media
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
+from raytrace.system.surface import is_even
 
 VERSION = version("optiland")
 NUMBA_VERSION = version("numba")
@@ -104,7 +105,7 @@ class Optiland:
             if surface.curvature is not None and float(surface.curvature) != 0:
                 numbers["radius"] = 1 / float(surface.curvature)
                 numbers["conic"] = 0.0 if surface.conic is None else float(surface.conic)
-            if surface.departure is not None:
+            if not is_even(surface):
                 raise ValueError(f"surface {number} departs from a conic and even terms; this peer is not given it")
             kind = "standard"
             if surface.coefficients is not None:

@@ -129,6 +129,11 @@ def is_round(surface: Surface) -> bool:
     return surface.departure is None or DEPARTURES[type(surface.departure).__name__].is_round
 
 
+def is_even(surface: Surface) -> bool:
+    """Whether the sag is a conic with the terms of an even asphere at most, which is what other programs know."""
+    return surface.departure is None and (surface.coefficients is None or surface.kind == EVEN)
+
+
 def is_searched(surface: Surface) -> bool:
     """Whether rays look for the surface step by step: there is no formula for where they meet it."""
     return surface.coefficients is not None or surface.departure is not None
