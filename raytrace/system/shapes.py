@@ -66,13 +66,13 @@ class Kind:
         first = {1: "r", 2: "r²"}.get(self.step, f"r^{self.step}")
         return f" ({first} to r^{self.step * self.parameters})"
 
-    def term(self, coefficients: Tensor | None, power: int) -> Tensor | float:
-        """The coefficient (...) of r^power, 0 where there is none."""
-        j, rest = divmod(power, self.step)
-        return 0.0 if coefficients is None or rest or j > len(coefficients) else coefficients[j - 1]
 
-
-KINDS = {kind.name: kind for kind in (Kind(EVEN, zemax="EVENASPH", words=("even", "evenasph"), code=3),)}
+KINDS = {
+    kind.name: kind
+    for kind in (
+        Kind(EVEN, even_terms, zemax="EVENASPH", words=("even", "evenasph"), code=3),
+    )
+}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -140,16 +140,17 @@ def is_searched(surface: Surface) -> bool:
 
 
 def vertex_curvature(surface: Surface) -> Tensor:
-    """c + 2 a + (D_xx + D_yy)/2 in 1/mm: a term a r² bends the vertex like a curvature.
+    """c + 2 P'(0) + (D_xx + D_yy)/2 in 1/mm: a term a r² bends the vertex like a curvature.
 
     A departure D may bend it differently along x and y: this is the mean. Its tilt at the vertex, and that of an odd
     asphere, are left out.
     """
     total = torch.zeros_like(surface.thickness) if surface.curvature is None else surface.curvature
-    total = total if surface.coefficients is None else total + 2 * KINDS[surface.kind].term(surface.coefficients, 2)
+    centre = torch.zeros_like(surface.thickness)
+    if surface.coefficients is not None:
+        total = total + 2 * KINDS[surface.kind].terms(centre, surface.coefficients, 1, 1.0)[1]
     if surface.departure is None:
         return total
-    centre = torch.zeros_like(surface.thickness)
     bend = relief(surface.departure).sag(centre, centre)
     return total + 0.5 * (bend.xx + bend.yy)
 
