@@ -50,6 +50,7 @@ EVERYTHING = lens(
         surface(-0.08, 3.0, 1.7, apertures=(Aperture("circular", (0.0, 0.3), obscures=True),)),
         surface(None, 4.0, 1.5),
         surface(0.01, 3.0, coefficients=[0.0, 1e-5, 1e-8, 1e-11, 1e-14], conic=-1.0, semi_diameter=14.0),
+        surface(0.02, 2.0, 1.4, kind="odd asphere", coefficients=[0.02, 1e-3, -2e-4, 1e-5, -4e-7], semi_diameter=14.0),
         surface(-0.02, -10.0, MIRROR, conic=0.4, apertures=(Aperture("elliptic", (9.0, 8.0)),)),
         surface(-0.01, -5.0),
     ],

@@ -246,7 +246,7 @@ def test_a_mirror_and_a_dummy_surface_stay():
     assert len(found.surfaces) == 4
 
 
-@pytest.mark.parametrize("kind", ["COORDBRK", "PARAXIAL", "TOROIDAL", "DGRATING", "TILTSURF", "ODDASPHE", "NONSEQCO"])
+@pytest.mark.parametrize("kind", ["COORDBRK", "PARAXIAL", "TOROIDAL", "DGRATING", "TILTSURF", "XOSPHERE", "NONSEQCO"])
 def test_types_that_are_not_modelled_are_refused_by_name_surface_and_line(kind):
     text = file(stop=f"TYPE {kind}", surface="GLAS NOSUCH")
     line = text.split("\n").index(f"  TYPE {kind}") + 1

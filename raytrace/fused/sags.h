@@ -7,7 +7,7 @@
 
 namespace raytrace {
 
-enum Kind { kPlane, kSphere, kConic, kEven };
+enum Kind { kPlane, kSphere, kConic, kEven, kOdd };
 
 constexpr bool has_terms(int kind) { return kind >= kEven; }
 
@@ -27,14 +27,34 @@ inline void series(const T* a, int count, T u, T& S, T& dS, T& d2S) {
   if (second) d2S = d2S + 2 * dp + 2 * u * d2p;
 }
 
+// r and its slope by u: that of a cone at its tip is the mean of all directions.
+template <typename T>
+struct Radius {
+  T r, dr;
+  explicit Radius(T u) {
+    bool apart = u > T(1e-24);
+    T at = root(apart ? u : T(1));
+    r = apart ? at : T(0), dr = apart ? T(0.5) / at : T(0);
+  }
+};
+
 // Adds Σ a_j b_j(u) to a sag, and its derivatives.
 template <int kind, bool second, typename T>
 inline void add_terms(const T* a, int count, T u, T& S, T& dS, T& d2S) {
-  series<second>(a, count, u, S, dS, d2S);
+  if constexpr (kind == kOdd) {  // those of even j, and r q with q = a_1 + a_3 u + …
+    const Radius<T> at(u);
+    T q = a[0], dq = 0, d2q = 0;
+    series<second, 2>(a + 1, count / 2, u, S, dS, d2S);
+    series<second, 2>(a + 2, (count - 1) / 2, u, q, dq, d2q);
+    S += at.r * q, dS += at.dr * q + at.r * dq;
+    if (second) d2S += at.r * d2q + 2 * at.dr * (dq - at.dr * at.dr * q);
+  } else {
+    series<second>(a, count, u, S, dS, d2S);
+  }
 }
 
-// What a_j of Σ a_j v u^m, v = u, gets from each ray, s b_j + S̄' b_j', summed; s and S̄' stand in notes.px and py.
-template <int stride = 1, typename T>
+// What a_j of Σ a_j v u^j, v = u or r, gets from each ray, s b_j + S̄' b_j', summed; s and S̄' stand in notes.px and py.
+template <int stride = 1, bool by_radius = false, typename T>
 void sum_series(const Rays<T>& to, Notes<T>& notes, int n, int count, T* sums) {
 #pragma omp simd
   for (int i = 0; i < n; i++) notes.pz[i] = 1;
@@ -43,7 +63,12 @@ void sum_series(const Rays<T>& to, Notes<T>& notes, int n, int count, T* sums) {
 #pragma omp simd reduction(+ : sum)
     for (int i = 0; i < n; i++) {
       T u = to.x[i] * to.x[i] + to.y[i] * to.y[i];
-      sum += notes.pz[i] * (notes.px[i] * u + T(j + 1) * notes.py[i]);
+      if constexpr (by_radius) {
+        const Radius<T> at(u);
+        sum += notes.pz[i] * (notes.px[i] * at.r + T(2 * j + 1) * at.dr * notes.py[i]);
+      } else {
+        sum += notes.pz[i] * (notes.px[i] * u + T(j + 1) * notes.py[i]);
+      }
       notes.pz[i] *= u;
     }
     sums[stride * j] += sum;
@@ -53,13 +78,19 @@ void sum_series(const Rays<T>& to, Notes<T>& notes, int n, int count, T* sums) {
 // The same of all coefficients of a kind.
 template <int kind, typename T>
 void sum_terms(const Rays<T>& to, Notes<T>& notes, int n, int count, T* sums) {
-  sum_series(to, notes, n, count, sums);
+  if constexpr (kind == kOdd) {
+    sum_series<2, true>(to, notes, n, (count + 1) / 2, sums);
+    sum_series<2>(to, notes, n, count / 2, sums + 1);
+  } else {
+    sum_series(to, notes, n, count, sums);
+  }
 }
 
 // Calls work(kind, terms) for a surface with terms: loops are compiled for these kinds, and up to so many terms.
 template <typename Work>
 void by_kind_of_terms(const Layout& at, Work work) {
-  if (at.terms <= 4) work(Constant<kEven>{}, Constant<4>{});
+  if (at.kind == kOdd) work(Constant<kOdd>{}, Constant<kTerms>{});
+  else if (at.terms <= 4) work(Constant<kEven>{}, Constant<4>{});
   else if (at.terms <= 8) work(Constant<kEven>{}, Constant<8>{});
   else work(Constant<kEven>{}, Constant<kTerms>{});
 }

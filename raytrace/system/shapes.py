@@ -20,6 +20,8 @@ from raytrace.system.departure import Departure, Sag
 
 EVEN = "even asphere"
 
+_TIP = 1e-24  # mm²: r² up to which a ray goes through the vertex
+
 
 #: What terms add to a sag: u (...), coefficients (m, ...), highest derivative, a factor f -> Σ_j a_j b_j(u), its slope
 #: and f² times its second derivative; None for those above the highest. The b_j are at least 0.
@@ -38,6 +40,27 @@ def even_terms(u: Tensor, coefficients: Tensor, highest: int, along: Tensor | fl
         return P, dP, None
     second = (order - 1).reshape(-1, *(1,) * (coefficients.dim() - 1)) * first
     return P, dP, polynomial(second[1:], u) * along * along
+
+
+def odd_terms(u: Tensor, coefficients: Tensor, highest: int, along: Tensor | float):
+    """b_j = r^j, as `Terms`: those of even j, and r q(u) with q = a_1 + a_3 u + …
+
+    The cone a_1 r has no slope at its tip: a ray through the vertex sees the mean of all directions, 0.
+    """
+    S, dS, d2S = even_terms(u, coefficients[1::2], highest, along)
+    q, dq, d2q = even_terms(u, coefficients[2::2], highest, along)
+    q = coefficients[0] + q
+    apart = u > _TIP
+    r = torch.sqrt(torch.where(apart, u, 1.0))
+    dr, r = torch.where(apart, 0.5 / r, 0.0), torch.where(apart, r, 0.0)
+    S = S + r * q
+    if highest == 0:
+        return S, None, None
+    dS = dS + dr * q + r * dq
+    if highest == 1:
+        return S, dS, None
+    turn = dr * along
+    return S, dS, d2S + r * d2q + 2 * turn * (dq * along) - 2 * dr * turn * turn * q
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,6 +94,7 @@ KINDS = {
     kind.name: kind
     for kind in (
         Kind(EVEN, even_terms, zemax="EVENASPH", words=("even", "evenasph"), code=3),
+        Kind("odd asphere", odd_terms, step=1, zemax="ODDASPHE", words=("odd", "oddasphe"), code=4),
     )
 }
 

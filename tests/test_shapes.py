@@ -1,0 +1,372 @@
+"""Kinds of sag: the odd asphere against its formula in 50 digits, in files and everywhere else; and kinds made up here,
+added at run time, which everything has to find in their rows."""
+
+import dataclasses
+import json
+import math
+from decimal import Decimal, localcontext
+from pathlib import Path
+
+import pytest
+import torch
+from problems import both_engines, field, lens, scalar, scene_of, surface, vector
+from torch.autograd import gradcheck, gradgradcheck
+from torch.testing import assert_close
+
+from raytrace.camera.variables import Variables
+from raytrace.formats import read_lens, write_lens
+from raytrace.formats.source import LensFileError
+from raytrace.fused import tracing
+from raytrace.fused.structure import is_expressible
+from raytrace.kernels import psf
+from raytrace.maths.grid import grid
+from raytrace.maths.pupil import gauss_rings, sobol
+from raytrace.maths.value import value
+from raytrace.optics.launch import launch
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.reuse import Memo, trace_bundle
+from raytrace.optics.scene import symmetry
+from raytrace.optics.spot import spot_of
+from raytrace.optics.streaming import stream_spot
+from raytrace.optics.trace import trace_lens, trace_surfaces
+from raytrace.plot.layout import layout
+from raytrace.plot.outline import depth
+from raytrace.plot.style import save
+from raytrace.system import shapes
+from raytrace.system.build import lens as lens_of_rows
+from raytrace.system.departure import Sag
+from raytrace.system.rays import start
+from raytrace.system.surface import intersect, normal, number_at, places, sag, sag_at, with_number
+
+TIER2 = Path(__file__).parents[2] / "shared" / "tier2"
+ODD = "odd asphere"
+CURVATURE, CONIC = 0.02, -0.6
+PUPIL = gauss_rings(3)[0]
+BETA = [0.02, 1e-3, -2e-4, 1e-5, -4e-7, 3e-9, 1e-10, -2e-12]
+
+
+def odd(coefficients=BETA, curvature=CURVATURE, conic=CONIC, **others):
+    return surface(curvature, 5.0, 1.5, conic=conic, coefficients=coefficients, kind=ODD, semi_diameter=9.0, **others)
+
+
+def bundle(count: int = 40, seed: int = 3, reach: float = 5.0):
+    """Positions and unit directions of rays before the vertex plane; the first along the axis, through the vertex."""
+    generator = torch.Generator().manual_seed(seed)
+    spread = 2 * torch.rand(4, count, generator=generator, dtype=torch.float64) - 1
+    spread[:, 0] = 0
+    direction = torch.stack([0.3 * spread[0], 0.3 * spread[1], torch.ones(count, dtype=torch.float64)])
+    direction = direction / torch.linalg.vector_norm(direction, dim=0)
+    position = torch.stack([reach * spread[2], reach * spread[3], torch.zeros(count, dtype=torch.float64)])
+    return position - 20 * direction, direction
+
+
+def textbook(position, direction, n1: float, n2: float):
+    """Hit and direction behind an odd asphere by its formula: bisection and Snell's law in 50 digits."""
+    with localcontext() as context:
+        context.prec = 50
+        c, shape = Decimal(CURVATURE), 1 + Decimal(CONIC)
+        beta = [Decimal(b) for b in BETA]
+        p, d = ([Decimal(x) for x in v.tolist()] for v in (position, direction))
+
+        def sag_of(r):
+            w = (1 - shape * c * c * r * r).sqrt()
+            return c * r * r / (1 + w) + sum(b * r**i for i, b in enumerate(beta, 1))
+
+        def at(t):
+            return [a + t * b for a, b in zip(p, d, strict=True)]
+
+        low, high = Decimal(15), Decimal(27)
+        for _ in range(160):
+            middle = (low + high) / 2
+            x, y, z = at(middle)
+            low, high = (middle, high) if z < sag_of((x * x + y * y).sqrt()) else (low, middle)
+        x, y, z = at(low)
+        r = (x * x + y * y).sqrt()
+        slope = c * r / (1 - shape * c * c * r * r).sqrt() + sum(i * b * r ** (i - 1) for i, b in enumerate(beta, 1))
+        size = (1 + slope * slope).sqrt()
+        normal = [-slope * x / r / size, -slope * y / r / size, 1 / size]
+        length = sum(v * v for v in d).sqrt()
+        unit = [v / length for v in d]
+        mu, cosine = Decimal(n1) / Decimal(n2), sum(a * b for a, b in zip(normal, unit, strict=True))
+        behind = (1 - mu * mu * (1 - cosine * cosine)).sqrt()
+        bent = [mu * a + (behind - mu * cosine) * b for a, b in zip(unit, normal, strict=True)]
+        return [float(v) for v in (x, y, z)], [float(v) for v in bent]
+
+
+@both_engines
+def test_odd_asphere_is_its_formula_in_fifty_digits(engine):
+    position, direction = bundle(12)
+    rays = start(position, direction)
+    end = trace_surfaces([odd()], rays, indices=vector(1.0, 1.5).unbind(), gap=None)
+    assert end.valid.all()
+    for i in range(1, 12):
+        hit, bent = textbook(position[:, i], direction[:, i], 1.0, 1.5)
+        assert_close(end.position[:, i], vector(*hit), rtol=0, atol=1e-14 * 30)
+        assert_close(end.direction[:, i], vector(*bent), rtol=0, atol=2e-15)
+
+
+def test_slopes_are_the_derivatives_of_the_sag():
+    u = vector(0.01, 0.5, 20.0).requires_grad_()
+    S, dS, d2S = shapes.sag_and_derivatives(u, scalar(0.05), scalar(1.2), vector(*BETA), kind=ODD)
+    (slope,) = torch.autograd.grad(S.sum(), u, create_graph=True)
+    (bend,) = torch.autograd.grad(slope.sum(), u)
+    assert_close(slope, dS, rtol=1e-13, atol=0)
+    assert_close(bend, d2S, rtol=1e-12, atol=0)
+
+
+def numbers_of(given):
+    return {"curvature": scalar(0.02), "conic": scalar(-0.6), "coefficients": vector(*BETA), **given}
+
+
+@pytest.mark.parametrize("name", ["curvature", "conic", "coefficients", "position"])
+def test_first_and_second_derivatives_of_the_hit(name):
+    position, direction = bundle(5, reach=1.0)
+    position, direction = position[:, 1:], direction[:, 1:]
+
+    def hits(x):
+        given = numbers_of({name: x} if name != "position" else {})
+        face = surface(given["curvature"], 5.0, 1.5, conic=given["conic"], coefficients=given["coefficients"], kind=ODD)
+        return intersect(face, x if name == "position" else position, direction)[0]
+
+    x = (position if name == "position" else numbers_of({})[name]).clone().requires_grad_()
+    assert gradcheck(hits, x, eps=1e-7, atol=1e-5, rtol=1e-4)
+    assert gradgradcheck(hits, x, eps=1e-7, atol=2e-3, rtol=2e-3)
+
+
+@both_engines
+def test_even_powers_alone_are_the_even_asphere_at_the_vertex_too(engine):
+    """Hits, directions and their derivatives, also of the ray through the vertex: the tip of a cone that is flat."""
+    position, direction = bundle(64)
+    found = []
+    for kind, terms in ((ODD, [0.0, 1e-3, 0.0, 1e-5, 0.0, 3e-9]), (shapes.EVEN, [1e-3, 1e-5, 3e-9])):
+        c, a, p = scalar(0.02).requires_grad_(), vector(*terms).requires_grad_(), position.clone().requires_grad_()
+        face = surface(c, 5.0, 1.5, conic=-0.6, coefficients=a, kind=kind, semi_diameter=9.0)
+        end = trace_surfaces([face], start(p, direction), indices=vector(1.0, 1.5).unbind())
+        merit = (end.direction[:2] * torch.linspace(1, 2, 64, dtype=torch.float64)).sum() + (end.position**2).sum()
+        by_c, by_a, by_p = torch.autograd.grad(merit, (c, a, p))
+        found.append((end.position, end.direction, by_c, by_a[1::2] if kind == ODD else by_a, by_p))
+    for one, other in zip(*found, strict=True):
+        assert_close(one, other, rtol=1e-11, atol=1e-13)
+
+
+@both_engines
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_the_tip_of_a_cone_makes_no_nan(engine, dtype):
+    """A ray through the tip meets the mean of all directions, the vertex plane; its neighbours meet the cone."""
+    position = torch.zeros(3, 4, dtype=dtype)
+    position[1] = torch.tensor([0.0, 1e-13, 1e-9, 1e-3], dtype=dtype)
+    position[2] = -1
+    beta, p = torch.tensor([0.1, 0.01, 0.0], dtype=dtype).requires_grad_(), position.requires_grad_()
+    face = dataclasses.replace(odd(), curvature=None, conic=None, coefficients=beta)
+    axis = torch.tensor([[0.0], [0.0], [1.0]], dtype=dtype).expand(3, 4)
+    rays = dataclasses.replace(start(p, axis), direction=axis)
+    end = trace_surfaces([face], rays, indices=torch.tensor([1.0, 1.5], dtype=dtype).unbind())
+    assert end.valid.all()
+    by_p, by_beta = torch.autograd.grad(end.direction[1].sum() + end.position[2].sum(), (p, beta))
+    assert by_p.isfinite().all()
+    assert by_beta.isfinite().all()
+    assert end.direction[1, :2].abs().max() < 1e-12
+    slope = 0.1 + 0.02 * 1e-3
+    bent = math.asin(math.sin(math.atan(slope)) / 1.5) - math.atan(slope)
+    assert float(end.direction[1, 3]) == pytest.approx(math.sin(bent), rel=1e-6)
+
+
+@pytest.mark.skipif(not TIER2.exists(), reason="needs ../shared/tier2")
+def test_a_file_of_another_hand_is_traced_as_its_oracle_says():
+    found = read_lens(TIER2 / "dev" / "oddasphe.zmx")
+    oracle = json.loads((TIER2 / "oracle_dev.json").read_text())["files"]["oddasphe.zmx"]
+    front = found.surfaces[2]
+    assert front.kind == ODD
+    assert front.coefficients.tolist() == [0.002, 0.0001, -1e-05, 2e-06, 1e-08]
+    for ray in oracle["rays"]:
+        rays = start(vector(*ray["P"])[:, None], vector(*ray["D"])[:, None])
+        end = trace_lens(found, rays, scalar(ray["wavelength"]))
+        expected = vector(*ray["out"][-1])
+        assert_close(torch.cat([end.position, end.direction])[:, 0], expected, rtol=0, atol=1e-10)
+    efl = oracle["first_order"]["efl"]
+    assert float(first_order(found).effective_focal_length) == pytest.approx(efl, rel=1e-9)
+
+
+@pytest.mark.parametrize("suffix", [".zmx", ".csv", ".tsv"])
+def test_files_bring_every_number_back(tmp_path, suffix):
+    system = lens([odd(), surface(0.01, 40.0, coefficients=[0.0, 1e-6]), surface(None, 2.0)])
+    write_lens(system, tmp_path / f"odd{suffix}")
+    back = read_lens(tmp_path / f"odd{suffix}").surfaces
+    assert [s.kind for s in back[1:3]] == [ODD, shapes.EVEN]
+    for one, other in zip(system.surfaces[1:3], back[1:3], strict=True):
+        assert torch.equal(one.coefficients, other.coefficients)
+        assert torch.equal(sag(one, vector(0.0, 7.0)), sag(other, vector(0.0, 7.0)))
+
+
+def test_units_and_too_many_terms(tmp_path):
+    path, rows = tmp_path / "odd.csv", "0,inf,inf,,,\n1,2,1,1.5,0.1,0.2\n2,inf,9,,,\n3,inf,0,,,\n"
+    path.write_text(f"# units: in\n# stop: 1\nsurface,radius,thickness,glass,a1,a3\n{rows}")
+    face = read_lens(path).surfaces[1]
+    assert face.kind == ODD
+    assert_close(face.coefficients, vector(0.1, 0.0, 0.2 / 25.4**2), rtol=1e-15, atol=0)
+    with pytest.raises(LensFileError, match=r"9 terms \(to r\^9\), an ODDASPHE has 8 \(r to r\^8\)"):
+        write_lens(lens([odd([1e-9] * 9), surface(None, 2.0)]), tmp_path / "odd.zmx")
+
+
+# ---------------------------------------------------------------- everything that has to know of a kind
+
+
+@value
+class Ripple:
+    """A departure made up here: depth (R,) mm of ripples exp(-(x² + 2 y²)/width²), one number and several."""
+
+    depth: torch.Tensor
+    width: torch.Tensor
+
+
+def ripple_sag(numbers, x, y, highest):
+    depth, width = (number.to(x.dtype) for number in numbers)
+    s = width**-2
+    z = depth.sum() * torch.exp(-(x * x + 2 * y * y) * s)
+    z_x, z_y = -2 * x * s * z, -4 * y * s * z
+    return Sag(z, z_x, z_y, -2 * s * (z + x * z_x), -2 * x * s * z_y, -4 * s * (z + y * z_y))
+
+
+def dome(u, coefficients, highest, along):
+    """Terms made up here: a_j (1 + u)^(j/2) - a_j, r² j/2 near the vertex."""
+    total = [torch.zeros_like(u) for _ in range(3)]
+    for j, a in enumerate(coefficients.unbind(0), 1):
+        power = (1 + u) ** (j / 2)
+        terms = a * (power - 1), a * j / 2 * power / (1 + u), a * j / 2 * (j / 2 - 1) * power / (1 + u) ** 2 * along**2
+        total = [t + term for t, term in zip(total, terms, strict=True)]
+    return total[0], total[1] if highest > 0 else None, total[2] if highest > 1 else None
+
+
+@pytest.fixture
+def made_up(monkeypatch):
+    kind = shapes.Kind("dome", dome, zemax="USERDOME", words=("dome",))
+    monkeypatch.setitem(shapes.KINDS, "dome", kind)
+    ripple = shapes.DepartureKind(ripple_sag, lambda numbers: numbers[0].abs().sum())
+    monkeypatch.setitem(shapes.DEPARTURES, "Ripple", ripple)
+
+
+FACES = {
+    "odd": lambda **others: odd([0.0, *BETA[1:]], **others),
+    "dome": lambda **others: dataclasses.replace(odd([0.01, -2e-3], curvature=0.03, **others), kind="dome"),
+    "ripple": lambda **others: odd(None, departure=Ripple(vector(0.02, 0.01), scalar(6.0)), **others),
+}
+SYMMETRY = {"odd": "round", "dome": "round", "ripple": "none"}
+VARIABLES = {"odd": "a2:1 a3:1 a8:1", "dome": "a2:1 a4:1", "ripple": "depth1:1 depth2:1 width:1"}
+
+
+def system_of(name: str, **others):
+    return lens([FACES[name](**others), surface(-0.02, 60.0)])
+
+
+@pytest.mark.parametrize("name", FACES)
+@pytest.mark.usefixtures("made_up")
+class TestWhatHasToKnow:
+    def test_hits_lie_on_the_sag_and_normals_are_its_slopes(self, name):
+        position, direction = bundle()
+        hit, met = intersect(FACES[name](), position, direction)
+        assert met.all()
+        assert (hit[2] - sag_at(FACES[name](), hit[0], hit[1])).abs().max() < 1e-13
+        x, y = (part[1:].clone().requires_grad_() for part in hit[:2])
+        slope = torch.autograd.grad(sag_at(FACES[name](), x, y).sum(), (x, y))
+        n, _ = normal(FACES[name](), hit[:, 1:])
+        assert_close(-n[0] / n[2], slope[0], rtol=1e-11, atol=1e-13)
+        assert_close(-n[1] / n[2], slope[1], rtol=1e-11, atol=1e-13)
+
+    def test_paraxial_power_is_the_limit_of_real_rays(self, name):
+        """The mean over two meridians, at a height of 1 µm."""
+        system, height = system_of(name), 0.001
+        bent = []
+        for x, y in ((height, 0.0), (0.0, height)):
+            rays = start(vector(x, y, 0.0)[:, None], vector(0.0, 0.0, 1.0)[:, None])
+            end = trace_lens(system, rays, system.wavelengths[0])
+            bent.append(-float(end.direction[:2].sum()) / height)
+        power = float(first_order(system).power)
+        assert sum(bent) / 2 == pytest.approx(power, rel=1e-4)
+
+    def test_every_number_is_a_variable_with_the_derivative_of_a_difference(self, name):
+        """By its name, through Variables and the trace; and the memory of traced rays forgets what it moves."""
+        system, memo = system_of(name), Memo()
+        variables = Variables(system, VARIABLES[name])
+
+        def merit(memo=None):
+            changed = variables()
+            rays = trace_bundle((changed, field(3.0), changed.wavelengths[:1], PUPIL), memo)
+            return (rays.position[:2] ** 2).sum()
+
+        merit(memo)
+        for parameter in variables.parameters():
+            (slope,) = torch.autograd.grad(merit(memo), parameter)
+            ends = []
+            with torch.no_grad():
+                for step in (1e-5, -2e-5):
+                    parameter += step
+                    ends.append(float(merit(memo)))
+                parameter += 1e-5
+            assert float(slope) == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-4)
+            assert float(slope) != 0
+
+    def test_every_tensor_of_a_shape_ends_the_memory(self, name):
+        """Also one that a kind has for itself: each is a leaf of the shape."""
+        system, memo = lens([surface(0.01, 3.0, 1.6), FACES[name](), surface(-0.02, 60.0)]), Memo()
+        trace_bundle((system, field(0.0), system.wavelengths[:1], PUPIL), memo)
+        for place in places(system.surfaces[2]).values():
+            number = number_at(system.surfaces[2], place)
+            moved = with_number(system.surfaces[2], place, number.clone().requires_grad_())
+            changed = dataclasses.replace(system, surfaces=(*system.surfaces[:2], moved, *system.surfaces[3:]))
+            given = changed, field(0.0), changed.wavelengths[:1], PUPIL
+            trace_bundle(given, memo)
+            before = memo.crossed
+            assert trace_bundle(given, memo).position.requires_grad
+            assert memo.crossed - before == 3
+
+    def test_symmetry_streams_kernels_and_figures(self, name, tmp_path):
+        system = system_of(name)
+        assert symmetry(scene_of(system)) == SYMMETRY[name]
+        streamed = stream_spot(system, 4096, sampling="sobol", seed=1)
+        assert float(streamed.rays.sum()) == 4096
+        points = sobol(4096, seed=1)[0]
+        end = trace_lens(system, launch(system, points), system.wavelengths[:, None])
+        assert float(streamed.rms_radius) == pytest.approx(float(spot_of(end).rms_radius), rel=1e-9)
+        found = psf(system, "gaussian", fields=field(0.0), grid=grid(0.5, 9), tol=1e-2)
+        assert found.kernel.isfinite().all()
+        save(layout(system), tmp_path / "layout.png")
+        y = torch.linspace(-5, 5, 11, dtype=torch.float64)
+        drawn = torch.as_tensor(depth(system.surfaces[1], y.numpy()))
+        assert_close(drawn, sag_at(system.surfaces[1], 0 * y, y), rtol=0, atol=1e-14)
+
+    def test_lens_rows_and_replace(self, name):
+        face = FACES[name]()
+        row = {key: getattr(face, key) for key in ("curvature", "conic", "coefficients", "kind", "departure")}
+        made = lens_of_rows([row | {"thickness": 5.0, "glass": 1.5}], stop=1, f_number=8).surfaces[1]
+        plain = lens_of_rows([dict(radius=50, thickness=5.0, glass=1.5)], stop=1, f_number=8)
+        for found in (made, plain.replace(1, **row).surfaces[1]):
+            x = vector(0.0, 3.0, 4.0)
+            assert torch.equal(sag_at(found, x, x), sag_at(face, x, x))
+        with pytest.raises(ValueError, match="surface 1: kind 'cone'; expected one of even asphere, odd asphere, dome"):
+            plain.replace(1, kind="cone")
+
+    def test_files_hold_it_or_say_that_they_do_not(self, name, tmp_path):
+        system = system_of(name)
+        for suffix in (".zmx", ".csv"):
+            path = tmp_path / f"{name}{suffix}"
+            if name == "ripple":
+                with pytest.raises(LensFileError, match="Ripple"):
+                    write_lens(system, path)
+                continue
+            write_lens(system, path)
+            back = read_lens(path).surfaces[1]
+            assert back.kind == system.surfaces[1].kind
+            assert torch.equal(
+                back.coefficients[: len(system.surfaces[1].coefficients)], system.surfaces[1].coefficients
+            )
+
+    @both_engines
+    def test_both_engines_trace_it(self, name, engine):
+        """The compiled trace leaves to torch what it has no code for."""
+        system = system_of(name)
+        rays = start(*bundle(300))
+        found = trace_lens(system, rays, system.wavelengths[0])
+        with tracing("eager"):
+            expected = trace_lens(system, rays, system.wavelengths[0])
+        assert is_expressible(system.surfaces[1]) == (name == "odd")
+        assert_close(found.position, expected.position, rtol=0, atol=1e-12)
