@@ -35,8 +35,9 @@ from raytrace.plot.style import save
 from raytrace.system import shapes
 from raytrace.system.build import lens as lens_of_rows
 from raytrace.system.departure import Sag
+from raytrace.system.places import number_at, places, with_number
 from raytrace.system.rays import start
-from raytrace.system.surface import intersect, normal, number_at, places, sag, sag_at, with_number
+from raytrace.system.surface import intersect, normal, sag, sag_at
 
 TIER2 = Path(__file__).parents[2] / "shared" / "tier2"
 ODD = "odd asphere"

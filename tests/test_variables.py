@@ -14,7 +14,8 @@ from raytrace.formats import read_lens
 from raytrace.media.glass import AIR, MIRROR, constant, is_air, model_glass, nd
 from raytrace.system.departure import ZernikeSag
 from raytrace.system.lens import with_sensor_distance
-from raytrace.system.surface import Surface, places, sag
+from raytrace.system.places import places
+from raytrace.system.surface import Surface, sag
 
 LENSES = Path(__file__).parents[1] / "lenses"
 NANOMETRE = 1e-6

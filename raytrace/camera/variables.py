@@ -14,7 +14,8 @@ from torch import Tensor, nn
 
 from raytrace.camera.limits import limits_of, violation
 from raytrace.system.lens import Lens
-from raytrace.system.surface import Place, Surface, number_at, places, sag_at, with_number
+from raytrace.system.places import Place, number_at, places, with_number
+from raytrace.system.surface import Surface, sag_at
 
 _KINDS = "thickness, curvature, conic, or a number of its kind of shape as a4"
 
@@ -47,7 +48,7 @@ class Variables(nn.Module):
     """The variables of a lens as parameters: 0 at the start, in units of `Variable.unit`.
 
     vary: "sensor", and lists like "thickness:5,6,10 curvature:1-4 a4:3", of the file's surface numbers; beside
-        thickness, curvature and conic every number that the surface has by its kind (`surface.places`).
+        thickness, curvature and conic every number that the surface has by its kind (`places.places`).
     bounds: by name ("sensor", "curvature_3"), smallest and largest number of the lens; `project` keeps them.
     glass_thickness, air_thickness: least and greatest in mm at the axis; edge: least of glass at its edge; by default
     they go with the size of the lens (`limits_of`). `violation` says how far the lens is from them.

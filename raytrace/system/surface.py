@@ -72,58 +72,6 @@ SHAPE = tuple(
 )
 
 
-class Place(NamedTuple):
-    """Where a surface holds a number: the fields from it down, and which entry of a tensor of several."""
-
-    path: tuple[str, ...]
-    entry: int | None = None
-
-
-def places(surface: Surface) -> dict[str, Place]:
-    """Every number of the shape by its name: curvature, conic, a4 (of r⁴) …, and the fields of a departure.
-
-    Entries of a tensor are counted from 1, coefficients by the power of r that they belong to.
-    """
-    found: dict[str, Place] = {}
-    for field in dataclasses.fields(Surface):
-        part = getattr(surface, field.name)
-        if field.name == "coefficients":
-            found |= _entries(("coefficients",), part, "a", KINDS[surface.kind].step)
-        elif field.name in SHAPE and field.type == Tensor | None:
-            found[field.name] = Place((field.name,))
-        elif field.name in SHAPE and dataclasses.is_dataclass(part):
-            for own in dataclasses.fields(part):
-                found |= _entries((field.name, own.name), getattr(part, own.name), own.name)
-    return found
-
-
-def _entries(path: tuple[str, ...], part: Tensor | None, name: str, step: int = 1) -> dict[str, Place]:
-    if not isinstance(part, Tensor):
-        return {}
-    if part.dim() == 0:
-        return {name: Place(path)}
-    return {f"{name}{step * (entry + 1)}": Place(path, entry) for entry in range(part.numel())}
-
-
-def number_at(part, place: Place) -> Tensor | None:
-    """The number in its place; None where it is not modelled."""
-    for name in place.path:
-        part = getattr(part, name)
-    return part if place.entry is None else part.reshape(-1)[place.entry]
-
-
-def with_number(part, place: Place, number: Tensor):
-    """The surface with another number in that place."""
-    name, *rest = place.path
-    old = getattr(part, name)
-    if rest:
-        number = with_number(old, Place(tuple(rest), place.entry), number)
-    elif place.entry is not None:
-        flat = old.reshape(-1)
-        number = torch.cat([flat[: place.entry], number[None], flat[place.entry + 1 :]]).reshape(old.shape)
-    return dataclasses.replace(part, **{name: number})
-
-
 def is_round(surface: Surface) -> bool:
     """Whether the sag is symmetric about the axis, by its kind and whatever its numbers are."""
     return surface.departure is None or DEPARTURES[type(surface.departure).__name__].is_round
