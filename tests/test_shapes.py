@@ -13,6 +13,7 @@ from problems import both_engines, field, lens, scalar, scene_of, surface, vecto
 from torch.autograd import gradcheck, gradgradcheck
 from torch.testing import assert_close
 
+import raytrace as rt
 from raytrace.camera.variables import Variables
 from raytrace.formats import read_lens, write_lens
 from raytrace.formats.source import LensFileError
@@ -29,9 +30,7 @@ from raytrace.optics.scene import symmetry
 from raytrace.optics.spot import spot_of
 from raytrace.optics.streaming import stream_spot
 from raytrace.optics.trace import trace_lens, trace_surfaces
-from raytrace.plot.layout import layout
 from raytrace.plot.outline import depth
-from raytrace.plot.style import save
 from raytrace.system import shapes
 from raytrace.system.build import lens as lens_of_rows
 from raytrace.system.departure import Sag
@@ -330,7 +329,7 @@ class TestWhatHasToKnow:
         assert float(streamed.rms_radius) == pytest.approx(float(spot_of(end).rms_radius), rel=1e-9)
         found = psf(system, "gaussian", fields=field(0.0), grid=grid(0.5, 9), tol=1e-2)
         assert found.kernel.isfinite().all()
-        save(layout(system), tmp_path / "layout.png")
+        rt.layout(system).plot(tmp_path / "layout.png")
         y = torch.linspace(-5, 5, 11, dtype=torch.float64)
         drawn = torch.as_tensor(depth(system.surfaces[1], y.numpy()))
         assert_close(drawn, sag_at(system.surfaces[1], 0 * y, y), rtol=0, atol=1e-14)
