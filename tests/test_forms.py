@@ -17,11 +17,12 @@ from raytrace import plot
 from raytrace.analysis import distortion, opd_fan, ray_fan
 from raytrace.cli import build_parser
 from raytrace.cli.door import find_lens
-from raytrace.cli.options import PICTURES, data_file, did_you_mean, picture_file
+from raytrace.cli.options import PICTURES, data_file, picture_file
 from raytrace.formats import read_lens
 from raytrace.maths.pupil import hexapolar
 from raytrace.optics.arrivals import arrivals
 from raytrace.optics.losses import LOST, STATUS, losses
+from raytrace.words import did_you_mean
 
 #: Options whose form differs between commands, and why.
 DIFFERENT = {

@@ -16,6 +16,7 @@ FLOORS = {
     "files": 0,
     "budget": 0,
     "shards": 0,
+    "words": 0,
     "maths": 1,
     "pages": 1,
     # nouns

@@ -257,7 +257,8 @@ def test_panels_share_one_scale_and_are_centred_on_the_centroid():
 def test_a_field_that_no_ray_survives_says_so(double_gauss):
     blind = double_gauss.replace(6, apertures=(Aperture("circular", (0.0, 20.0), obscures=True),))
     assert "no ray reaches" in words(rt.spot(blind, rings=4).plot())
-    plot.through_focus_curve(blind, pupil=PUPIL)
+    with pytest.raises(rt.NoFocus, match="no ray reaches the image"):
+        rt.focus(blind)
     rt.layout(blind).plot()
 
 
@@ -268,7 +269,7 @@ def test_curve_passes_through_the_spot_of_the_moved_sensor_and_its_minimum_is_th
     points, weights = gauss_rings(6)
     lens = with_object_distance(double_gauss, 25000.0)
     axis = torch.zeros(2, 1, dtype=torch.float64)
-    figure = plot.through_focus_curve(lens, fields=axis, pupil=(points, weights))
+    figure = rt.focus(lens, rings=6).plot(by="field")
     curve = max(figure.axes[0].lines, key=lambda line: len(line.get_xdata()))
     best = float(focus_of_rms(lens, points, weights, fields=axis))
     lowest = curve.get_xdata()[np.argmin(curve.get_ydata())]
@@ -289,9 +290,9 @@ def test_curves_by_wavelength_find_the_axial_colour():
     bundle = focus_rays(lens, fields=fields, wavelengths=None, wavelength_weights=None, pupil=PUPIL, by="wavelength")
     paraxial = [float(first_order(lens, wavelength).back_focal_distance) for wavelength in lens.wavelengths]
     assert list(np.argsort(bundle.best)) == list(np.argsort(paraxial)) == [0, 1, 2]
-    assert "0.4861 µm" in words(plot.through_focus_curve(lens, by="wavelength", pupil=PUPIL))
+    assert "0.4861 µm" in words(rt.focus(lens, wavelengths=lens.wavelengths, rings=4).plot(by="wavelength"))
     with pytest.raises(ValueError, match="expected 'field' or 'wavelength'"):
-        plot.through_focus_curve(lens, by="colour")
+        rt.focus(lens).plot(by="colour")
 
 
 # focus report
@@ -381,7 +382,7 @@ def test_the_lens_keeps_its_gradients(double_gauss):
     for figure in (
         rt.layout(lens, rays=3).plot(),
         rt.spot(lens, rings=4).plot(),
-        plot.through_focus_curve(lens, pupil=PUPIL),
+        rt.focus(lens, rings=4).plot(by="field"),
     ):
         assert figure.axes
     assert thickness.grad is None

@@ -70,7 +70,7 @@ def test_titles_longer_than_the_page_are_broken():
         plot.wavefront_maps(lens, analysis.wavefront_map(lens, wavelengths=number([0.55]), size=16)),
         rt.spot(lens).plot(),
         rt.layout(lens).plot(),
-        plot.through_focus_curve(lens),
+        rt.focus(lens).plot(by="field"),
     ):
         assert outside(figure) == []
 

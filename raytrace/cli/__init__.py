@@ -12,8 +12,9 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 
-from raytrace.cli.options import did_you_mean, max_bytes
+from raytrace.cli.options import max_bytes
 from raytrace.cli.several import each_distance
+from raytrace.words import did_you_mean
 
 DESCRIPTION = "A sequential, differentiable ray tracer: read a lens file, trace it, focus it, plot it."
 

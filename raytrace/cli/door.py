@@ -9,7 +9,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from raytrace.cli.options import did_you_mean
 from raytrace.files import shipped
 from raytrace.formats import FORMATS, read_lens, shipped_lens
 from raytrace.system.lens import (
@@ -21,6 +20,7 @@ from raytrace.system.lens import (
     with_sensor_distance,
     with_wavelengths,
 )
+from raytrace.words import did_you_mean
 
 
 class CommandError(ValueError):

@@ -27,6 +27,12 @@ def options(parser):
         parser.add_argument(option, metavar="W", type=words.positive_finite, nargs="+", help=f"one a {name}")
     words.sampling(parser, rings=12)
     words.plot(parser, "the through-focus curve, the spots before and after, and the layout")
+    parser.add_argument(
+        "--by",
+        dest="plot_by",
+        choices=("field", "wavelength"),
+        help="draw the through-focus curves alone, one a field, or one a wavelength of the first field",
+    )
     words.output(parser, "lens file to write with the new sensor distance")
 
 

@@ -1,9 +1,8 @@
 """Arguments that commands share: one name means the same everywhere. No torch: the help must not wait for it."""
 
 import argparse
-import difflib
 import importlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import PurePath
 
 SAMPLINGS = ("gauss", "hexapolar", "square", "sobol", "random")
@@ -22,13 +21,6 @@ class Names:
 
     def __contains__(self, name: str) -> bool:
         return name in tuple(self)
-
-
-def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """What may have been meant by a word, of the known ones, as the end of a message; empty if nothing is near."""
-    spelled = {name.lower(): name for name in known}
-    near = difflib.get_close_matches(word.lower(), spelled, n=1, cutoff=0.7)
-    return f"; did you mean {spelled[near[0]]}?" if near else ""
 
 
 def positive(text: str) -> float:

@@ -62,3 +62,13 @@ def to(instance, *, dtype: torch.dtype | None = None, device: torch.device | str
         return converted[id(leaf)]
 
     return pytree.tree_map(convert, instance)
+
+
+def detached(instance):
+    """The same value as plain numbers, without gradients: to be shown or drawn. Tensors that were one stay one."""
+    seen: dict[int, torch.Tensor] = {}
+
+    def plain(leaf):
+        return seen.setdefault(id(leaf), leaf.detach()) if isinstance(leaf, torch.Tensor) else leaf
+
+    return pytree.tree_map(plain, instance)

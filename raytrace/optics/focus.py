@@ -85,38 +85,16 @@ def through_focus(rays: Rays, shifts: Tensor, weights: Tensor | None = None, *, 
     return spot_of_points(moved, rays.valid.expand(moved.shape[1:]), weights, empty=empty)
 
 
-def focus_of_rms(
-    lens: Lens,
-    pupil: Tensor,
-    weights: Tensor,
-    *,
-    object_distances: Sequence[Tensor | float] | None = None,
-    distance_weights: Sequence[float] | None = None,
-    fields: Tensor | None = None,
-    wavelengths: Tensor | None = None,
-    field_weights: Tensor | None = None,
-    wavelength_weights: Tensor | None = None,
-    empty: str = "nan",
-) -> Tensor:
+def focus_of_rms(lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = "nan", **scene) -> Tensor:
     """Sensor distance (scalar, mm) of least RMS spot over object distances × fields × wavelengths.
 
-    pupil, weights: (2, P), (P,) of a rule in `pupil`; object_distances: mm, that of the lens by default; the other
-    weights are 1 by default. Differentiable in every number of the lens.
+    pupil, weights: (2, P), (P,) of a rule in `pupil`; scene: as for `bundles`. Differentiable in every number of the
+    lens.
     empty: "nan" leaves spots without rays out, for they are nowhere in focus; where none is left, or all rays are
     parallel, the distance is nan with gradient 0. "error" raises EmptySpot for either.
     """
     covariance = variance = torch.zeros_like(lens.surfaces[-2].thickness)
-    bundles = _bundles(
-        lens,
-        pupil,
-        object_distances=object_distances,
-        distance_weights=distance_weights,
-        fields=fields,
-        wavelengths=wavelengths,
-        field_weights=field_weights,
-        wavelength_weights=wavelength_weights,
-    )
-    for rays, share in bundles:
+    for rays, share in bundles(lens, pupil, **scene):
         moments = focus_moments(rays, weights, empty=empty)
         covariance, variance = (
             total + torch.where(_lit(rays, weights), share * moment, 0.0).sum()
@@ -136,13 +114,13 @@ def focus_of_mean_radius(lens: Lens, pupil: Tensor, weights: Tensor, **scene) ->
     """
     with torch.no_grad():
         start = focus_of_rms(lens, pupil, weights, **scene)
-        bundles = list(_bundles(lens, pupil, **scene))
+        traced = list(bundles(lens, pupil, **scene))
     if not bool(torch.isfinite(start)):
         raise EmptySpot("no ray reaches the image, or all are parallel: there is no focus")
 
     def merit(sensor: Tensor) -> Tensor:
         total = torch.zeros_like(sensor)
-        for rays, share in bundles:
+        for rays, share in traced:
             found = through_focus(rays, (sensor - lens.surfaces[-2].thickness).reshape(1), weights)
             x, y = torch.where(found.valid, found.points - found.centroid[..., None], 0.0)
             light = torch.where(rays.valid, weights, 0.0)
@@ -160,7 +138,7 @@ def mean_rms_radius(lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = 
     or, with empty = "error", raises EmptySpot.
     """
     total = sum_of_shares = torch.zeros_like(lens.surfaces[-2].thickness)
-    for rays, share in _bundles(lens, pupil, **scene):
+    for rays, share in bundles(lens, pupil, **scene):
         lit = _lit(rays, weights)
         square = spot_of(rays, weights, empty=empty).mean_square_radius
         total = total + torch.where(lit, share * square, 0.0).sum()
@@ -173,7 +151,7 @@ def _lit(rays: Rays, weights: Tensor) -> Tensor:
     return (rays.valid & (weights != 0)).any(-1)
 
 
-def _bundles(
+def bundles(
     lens: Lens,
     pupil: Tensor,
     *,
@@ -184,7 +162,10 @@ def _bundles(
     field_weights: Tensor | None = None,
     wavelength_weights: Tensor | None = None,
 ) -> Iterator[tuple[Rays, Tensor]]:
-    """The rays (3, F, W, P) of every object distance and what their spots (F, W) count."""
+    """The rays (3, F, W, P) of every object distance (mm, the lens's by default) and what their spots (F, W) count.
+
+    fields, wavelengths: as for `launch`; weights: one for each, 1 by default.
+    """
     distances = [lens.surfaces[0].thickness] if object_distances is None else object_distances
     distance_weights = [1.0] * len(distances) if distance_weights is None else distance_weights
     for distance, distance_weight in zip(distances, distance_weights, strict=True):

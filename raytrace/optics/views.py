@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.result import Result, number, numbers
-from raytrace.maths.value import value
+from raytrace.maths.value import detached, value
 from raytrace.optics.f_number import real_working_f_number
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.trace import media
@@ -45,7 +45,8 @@ class Info(Result):
     lens: Lens
 
     def columns(self) -> dict[str, Tensor]:
-        surfaces, like = self.lens.surfaces, self.lens.wavelengths
+        lens = detached(self.lens)
+        surfaces, like = lens.surfaces, lens.wavelengths
         number_of = torch.arange(len(surfaces))
         rows = [
             (_radius(s), float(s.thickness), math.nan if s.semi_diameter is None else s.semi_diameter) for s in surfaces
@@ -53,18 +54,20 @@ class Info(Result):
         radius, thickness, size = like.new_tensor(rows).T
         return {
             "surface": number_of, "radius": radius, "thickness": thickness, "glass": number_of,
-            "index": like.new_tensor(_indices(self.lens)), "semi_diameter": size, "note": number_of,
+            "index": like.new_tensor(_indices(lens)), "semi_diameter": size, "note": number_of,
         }  # fmt: skip
 
     def words(self) -> dict[str, Sequence[str]]:
-        surfaces = self.lens.surfaces
+        lens = detached(self.lens)
+        surfaces = lens.surfaces
         return {
             "glass": [s.glass.name for s in surfaces],
-            "note": [_remarks(self.lens, k) for k in range(len(surfaces))],
+            "note": [_remarks(lens, k) for k in range(len(surfaces))],
         }
 
     def document(self) -> dict:
-        lens, indices = self.lens, media(self.lens, self.lens.wavelengths)
+        lens = detached(self.lens)
+        indices = media(lens, lens.wavelengths)
         return {
             "name": lens.name,
             **{name: number(figure) for (_, name, _), figure in zip(FIRST_ORDER_LINES, _figures(lens), strict=True)},
@@ -97,7 +100,7 @@ class Info(Result):
         }
 
     def __str__(self) -> str:
-        lens = self.lens
+        lens = detached(self.lens)
         lines = [lens.name or "Lens", ""]
         for (words, _, unit), figure in zip(FIRST_ORDER_LINES, _figures(lens), strict=True):
             lines.append(f"  {words:<24} {_quantity(figure):>16}  {unit}".rstrip())
@@ -183,7 +186,7 @@ def _quantity(value: float) -> str:
 def _figures(lens: Lens) -> list[float]:
     """The numbers of FIRST_ORDER_LINES; nan or infinite where a quantity does not exist."""
     data, real = first_order(lens), real_working_f_number(lens)
-    return [float(getattr(data, name, real).detach()) for _, name, _ in FIRST_ORDER_LINES]
+    return [float(getattr(data, name, real)) for _, name, _ in FIRST_ORDER_LINES]
 
 
 def _remarks(lens: Lens, k: int) -> str:

@@ -18,7 +18,6 @@ from raytrace.plot.analysis import lateral_curves as lateral_curves
 from raytrace.plot.analysis import mtf_curves as mtf_curves
 from raytrace.plot.analysis import mtf_through_focus_curves as mtf_through_focus_curves
 from raytrace.plot.analysis import wavefront_maps as wavefront_maps
-from raytrace.plot.curve import through_focus_curve as through_focus_curve
 from raytrace.plot.layout import layout as layout
 from raytrace.plot.psf import model_grid as model_grid
 from raytrace.plot.psf import psf_grid as psf_grid

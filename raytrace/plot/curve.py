@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from raytrace.maths.numerics import safe_divide
-from raytrace.maths.pupil import gauss_rings
 from raytrace.optics.focus import focus_moments, image_rays, through_focus
-from raytrace.optics.paraxial import first_order, paraxial_image_distance
+from raytrace.optics.focusing import Focus
+from raytrace.optics.paraxial import first_order
 from raytrace.plot import style
 from raytrace.plot.spots import shares_of
 from raytrace.system.lens import Lens, with_object_distance
@@ -40,46 +40,31 @@ class FocusRays(NamedTuple):
 
 
 @style.styled
-def through_focus_curve(
-    lens: Lens,
-    *,
-    fields: Tensor | None = None,
-    wavelengths: Tensor | None = None,
-    wavelength_weights: Tensor | None = None,
-    pupil: tuple[Tensor, Tensor] | None = None,
-    by: str = "field",
-    span: tuple[float, float] | None = None,
-    object_distance: Tensor | float | None = None,
-) -> Figure:
-    """RMS spot radius against the sensor distance; minima, the paraxial focus and the present sensor are marked.
+def through_focus_curve(found: Focus, by: str = "field") -> Figure:
+    """RMS spot radius against the sensor distance; minima, the paraxial focus and the sensor before are marked.
 
     by: "field", a line for each field over all wavelengths, or "wavelength", a line for each wavelength of the first
-    field. fields: (2, F), wavelengths: (W,) µm, by default those of the lens; wavelength_weights: (W,), by default the
-    lens's, equal for wavelengths that are given; pupil: points (2, P), weights (P,); span: first and last sensor
-    distance in mm, by default around all that is marked; object_distance: mm from surface 1, inf allowed.
+    field; of the first object distance. Raises ValueError for another word.
     """
     if by not in ("field", "wavelength"):
         raise ValueError(f"by = {by!r}: expected 'field' or 'wavelength'")
-    lens = style.detached(lens)
-    if object_distance is not None:
-        lens = with_object_distance(lens, object_distance)
-    fields = style.lens_fields(lens, fields)
-    fields = fields[:, :1] if by == "wavelength" else fields
-    rule = {"wavelengths": wavelengths, "wavelength_weights": wavelength_weights, "pupil": pupil}
-    bundle = focus_rays(lens, fields=fields, by=by, **rule)
+    lens = with_object_distance(style.detached(found.before), found.object_distances[0].detach())
+    fields, values = found.fields.detach(), style.array(found.wavelengths)
     if by == "field":
         labels = [style.field_label(lens, field) for field in style.array(fields).T]
         colours, title = style.field_colours(len(labels)), style.field_title(lens)
     else:
-        values = style.array(lens.wavelengths if wavelengths is None else wavelengths)
-        labels = [f"{wavelength:.4g} µm" for wavelength in values]
+        fields, labels = fields[:, :1], [f"{wavelength:.4g} µm" for wavelength in values]
         colours, title = style.wavelength_colours(values), f"Field {style.field_label(lens, style.array(fields)[:, 0])}"
+    bundle = focus_rays(
+        lens, fields=fields, wavelengths=found.wavelengths.detach(), wavelength_weights=found.wavelength_weights,
+        pupil=(found.points, found.weights), by=by,
+    )  # fmt: skip
     sensor = float(lens.surfaces[-2].thickness)
-    marks = {"paraxial focus": float(paraxial_image_distance(lens, lens.surfaces[0].thickness)), "sensor": sensor}
+    marks = {"paraxial focus": float(found.paraxial[0]), "sensor": sensor}
     figure = style.new_figure(7.0, 4.4)
     axes = figure.add_subplot()
-    span = focus_span(lens, bundle, sensor, marks.values()) if span is None else span
-    draw_curves(axes, bundle, sensor, span, labels=labels, colours=colours)
+    draw_curves(axes, bundle, sensor, focus_span(lens, bundle, sensor, marks.values()), labels=labels, colours=colours)
     draw_marks(axes, marks)
     axes.set_title(
         style.fill(lens.name, 6.3, 11, bold=True) or "Lens", fontsize=11, fontweight="bold", pad=20, loc="left"
@@ -89,11 +74,7 @@ def through_focus_curve(
         (0, 1), (0, 8), xycoords="axes fraction", textcoords="offset points", color=style.GREY,
     )  # fmt: skip
     columns = 3 if max(map(len, labels)) < 6 else 2
-    if bool(bundle.rays.valid.any()):
-        heading = f"{title}: least RMS radius at"
-        figure.legend(title=heading, title_fontsize=8, loc="outside lower center", ncols=columns)
-    else:
-        axes.text(0.5, 0.5, "no ray reaches the image", transform=axes.transAxes, ha="center", color=style.GREY)
+    figure.legend(title=f"{title}: least RMS radius at", title_fontsize=8, loc="outside lower center", ncols=columns)
     return figure
 
 
@@ -103,12 +84,11 @@ def focus_rays(
     fields: Tensor,
     wavelengths: Tensor | None,
     wavelength_weights: Tensor | None,
-    pupil: tuple[Tensor, Tensor] | None,
+    pupil: tuple[Tensor, Tensor],
     by: str = "field",
 ) -> FocusRays:
     """The rays of every curve: by "field" all wavelengths in one with their weights, by "wavelength" each by itself."""
-    dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
-    points, weights = gauss_rings(dtype=dtype, device=device) if pupil is None else pupil
+    points, weights = pupil
     shares = shares_of(lens, wavelengths, wavelength_weights)
     with torch.no_grad():
         rays = image_rays(lens, points, fields=fields, wavelengths=wavelengths)

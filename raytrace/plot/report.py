@@ -10,7 +10,7 @@ from raytrace.maths.result import object_text
 from raytrace.optics.focusing import Focus
 from raytrace.optics.paraxial import first_order, paraxial_image_distance
 from raytrace.plot import style
-from raytrace.plot.curve import FocusRays, draw_curves, focus_rays, focus_span
+from raytrace.plot.curve import FocusRays, draw_curves, focus_rays, focus_span, through_focus_curve
 from raytrace.plot.layout import draw_layout
 from raytrace.plot.spots import airy_radius, draw_dots, draw_spot, field_spots, panel_size, wavelength_handles
 from raytrace.system.lens import Lens, with_object_distance
@@ -23,11 +23,14 @@ _MAGNIFY = 4.0  # where the spot after is smaller than its panel by more than th
 
 
 @style.styled
-def focus_report(found: Focus) -> Figure:
+def focus_report(found: Focus, by: str | None = None) -> Figure:
     """One page: the lens, the RMS spot radius through focus, and the spots before and after on one scale.
 
-    Every object distance and field is a curve and a pair of spots.
+    Every object distance and field is a curve and a pair of spots. by: instead the curves alone, as for
+    `through_focus_curve`.
     """
+    if by is not None:
+        return through_focus_curve(found, by)
     lens_before, lens_after = style.detached(found.before), style.detached(found.lens)
     lens, fields, wavelengths = lens_before, found.fields.detach(), found.wavelengths.detach()
     distances = found.object_distances.tolist()

@@ -17,10 +17,10 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.patheffects import withStroke
 from matplotlib.textpath import TextPath
 from torch import Tensor
-from torch.utils import _pytree as pytree
 
 from raytrace.files import write_atomically
 from raytrace.maths.result import object_text
+from raytrace.maths.value import detached as detached
 from raytrace.optics.paraxial import FirstOrder
 from raytrace.system.lens import FIELD_UNITS, Lens
 
@@ -106,16 +106,6 @@ def save(figure: Figure, path: str | os.PathLike, *, dpi: float = 200) -> None:
         found = f"the suffix {Path(path).suffix!r}" if suffix else "no suffix"
         raise ValueError(f"{path}: {found} names no format of figures; expected one of {', '.join(SUFFIXES)}")
     write_atomically(path, lambda file: figure.savefig(file, format=suffix[1:], dpi=dpi, metadata=SUFFIXES[suffix]))
-
-
-def detached(lens: Lens) -> Lens:
-    """The lens as plain numbers: a figure needs no gradients. Tensors that were one (a medium's) stay one."""
-    seen: dict[int, Tensor] = {}
-
-    def plain(leaf):
-        return seen.setdefault(id(leaf), leaf.detach()) if isinstance(leaf, Tensor) else leaf
-
-    return pytree.tree_map(plain, lens)
 
 
 def array(tensor: Tensor) -> np.ndarray:

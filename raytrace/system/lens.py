@@ -1,7 +1,6 @@
 """Lens: surfaces, stop, aperture, fields and wavelengths, as one value."""
 
 import dataclasses
-import difflib
 from collections.abc import Iterable, Mapping, Sequence
 
 import torch
@@ -12,6 +11,7 @@ from raytrace.maths.value import value
 from raytrace.media.glass import check_unit, check_wavelengths, refractive_index
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface
+from raytrace.words import did_you_mean
 
 #: Units of a field point by the kind of field.
 FIELD_UNITS = {
@@ -152,9 +152,8 @@ def changed(surface: Surface, numbers: Mapping[str, object], where: str, *, like
     given = dict(numbers)
     for name in given:
         if name not in (*known, "radius"):
-            near = difflib.get_close_matches(name, [*known, "radius"], 1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise ValueError(f"{where} has no {name!r}{hint} (it has {', '.join(known)}, radius)")
+            meant = did_you_mean(name, [*known, "radius"])
+            raise ValueError(f"{where} has no {name!r}{meant} (it has {', '.join(known)}, radius)")
     if given.get("kind", EVEN) not in KINDS:
         raise ValueError(f"{where}: kind {given['kind']!r}; expected one of {', '.join(KINDS)}")
     if "radius" in given:

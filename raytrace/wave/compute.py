@@ -1,7 +1,6 @@
 """The wave camera as one call: an element, a sensor behind it, and its PSFs over depth and colour."""
 
 import dataclasses
-import difflib
 import math
 import os
 from collections.abc import Callable, Iterable, Sequence
@@ -20,6 +19,7 @@ from raytrace.wave.exchange import FORMATS
 from raytrace.wave.plan import Plan, plan
 from raytrace.wave.psf import ElementPsf, psf
 from raytrace.wave.scene import WaveScene, aperture
+from raytrace.words import did_you_mean
 
 COLOURS = (0.46, 0.55, 0.64)
 _DESIGN = 0.55  # µm
@@ -132,11 +132,9 @@ def elements(
         )
         return baseline(name, made_for, **({"levels": levels} if levels else {}))
     if Path(name).suffix.lower() not in FORMATS:
-        near = difflib.get_close_matches(name.lower(), BASELINES, 1, 0.7)
-        meant = f"; did you mean {near[0]}?" if near else ""
         raise ValueError(
             f"--element {name}: neither a named element ({', '.join(BASELINES)}) nor a height map "
-            f"({', '.join(FORMATS)}){meant}"
+            f"({', '.join(FORMATS)}){did_you_mean(name, BASELINES)}"
         )
     if index is not None:
         if glass:

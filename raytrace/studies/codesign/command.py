@@ -3,9 +3,10 @@
 import argparse
 import importlib
 
-from raytrace.cli.options import catalog, did_you_mean, file_name, json, output_folder, seed_number
+from raytrace.cli.options import catalog, file_name, json, output_folder, seed_number
 from raytrace.studies.codesign.settings import AFTER_PARAXIAL, MODELS, Settings
 from raytrace.studies.options import add_options, documents, pictures
+from raytrace.words import did_you_mean
 
 SUMMARY = "learn a lens and a network together"
 DESCRIPTION = """\

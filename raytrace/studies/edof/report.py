@@ -10,7 +10,6 @@ import torch
 
 from raytrace.camera.training import NotFinite, OtherSettings
 from raytrace.cli.door import CommandError, say
-from raytrace.cli.options import did_you_mean
 from raytrace.cli.progress import progress
 from raytrace.files import write_json, write_table
 from raytrace.formats.pictures import Pictures, dead_leaves, split
@@ -25,6 +24,7 @@ from raytrace.studies.edof.world import Judged, Quality, World, depth_text, kern
 from raytrace.studies.pictures import pictures
 from raytrace.wave.element import Element, as_made, as_pixels
 from raytrace.wave.element_file import write_element
+from raytrace.words import did_you_mean
 
 _WIDE = 512  # pixels of a period that is restored
 _LEAVES = 40  # pictures of dead leaves

@@ -9,7 +9,6 @@ from pathlib import Path
 from torch import Tensor
 
 from raytrace.cli.door import CommandError, say
-from raytrace.cli.options import did_you_mean
 from raytrace.cli.progress import progress
 from raytrace.files import write_table
 from raytrace.formats.pictures import Pictures, dead_leaves, split
@@ -36,6 +35,7 @@ from raytrace.wave.designs import aim, baseline, singlet
 from raytrace.wave.element import Element
 from raytrace.wave.element_file import read_element
 from raytrace.wave.exchange import FORMATS
+from raytrace.words import did_you_mean
 
 
 @dataclasses.dataclass(frozen=True)
