@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from raytrace.camera.limits import limits_of, violation
+from raytrace.optics.paraxial import first_order
 from raytrace.system.lens import Lens
 from raytrace.system.places import Place, number_at, places, with_number
 from raytrace.system.surface import Surface, sag_at
@@ -156,18 +157,19 @@ def _variable(lens: Lens, kind: str, number: int, word: str) -> Variable:
         raise BadVariables(f"{word!r}: surface {number} has no {kind}; it has {', '.join(list(known)[1:])}")
     start = number_at(surface, known[kind])
     start = torch.zeros_like(surface.thickness) if start is None else start.detach()
-    unit = 1.0 if known[kind].path == ("thickness",) else 1 / _sag_moved(surface, kind, known[kind], start, word)
+    unit = 1.0 if known[kind].path == ("thickness",) else 1 / _sag_moved(lens, surface, kind, known[kind], start, word)
     return Variable(kind, number, float(start), unit, known[kind])
 
 
-def _sag_moved(surface: Surface, kind: str, place: Place, start: Tensor, word: str) -> float:
+def _sag_moved(lens: Lens, surface: Surface, kind: str, place: Place, start: Tensor, word: str) -> float:
     """How far the surface moves at its semi-diameter with one unit of a number, by the first term of the series
 
     z ≈ c r²/2 + (1 + k) c³ r⁴/8 + …
+
+    A surface without a semi-diameter is taken to be as large as the entrance pupil.
     """
-    edge, curvature = surface.semi_diameter, 0.0 if surface.curvature is None else float(surface.curvature)
-    if not edge:
-        raise BadVariables(f"{word!r}: a surface without semi-diameter, by which its {kind} is scaled; give one")
+    edge = surface.semi_diameter or float(first_order(lens).entrance_pupil_diameter) / 2
+    curvature = 0.0 if surface.curvature is None else float(surface.curvature)
     if kind == "curvature":
         return edge**2 / 2
     if kind == "conic":

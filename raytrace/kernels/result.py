@@ -11,7 +11,7 @@ from torch import Tensor
 from raytrace.files import write_atomically
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide
-from raytrace.maths.result import Result, cell, number, numbers
+from raytrace.maths.result import Result, axis, cell, number, numbers
 from raytrace.maths.value import value
 from raytrace.optics.spot import where_lit
 from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
@@ -127,12 +127,12 @@ class Psf(Result):
 
     def columns(self) -> dict[str, Tensor]:
         """A row for every kernel: mm, widths of the light before pixels."""
-        axes = [self.object_distances, torch.arange(self.fields.shape[1])]
-        places = torch.meshgrid(*axes, *([] if self.wavelengths_summed else [self.wavelengths]), indexing="ij")
+        axes = self.energy.dim()
+        colours = {} if self.wavelengths_summed else {"wavelength": axis(self.wavelengths, 2, axes)}
         return {
-            "object_distance": places[0],
-            **{f"field_{a}": field[places[1]] for a, field in zip("xy", self.fields, strict=True)},
-            **dict(zip(["wavelength"], places[2:], strict=False)),
+            "object_distance": axis(self.object_distances, 0, axes),
+            **{f"field_{a}": axis(field, 1, axes) for a, field in zip("xy", self.fields, strict=True)},
+            **colours,
             **{f"centroid_{a}": t for a, t in zip("xy", self.centroid, strict=True)},
             **{f"sigma_{a}": t for a, t in zip("xy", _sigmas(self.covariance), strict=True)},
             "energy": self.energy,
