@@ -198,5 +198,6 @@ def _constants(scene: WaveScene) -> tuple[list[Tensor], Any]:
         held = [free.detach()] if jumps else []
         parts = [element.radius, getattr(profile, "pitch", None), element.period]
         leaves += [t for t in (*parts, *held) if t is not None]
-        structure = (structure, type(profile), free.shape, free.dtype, free.device, element.levels)
+        own = (type(profile), free.shape, free.dtype, free.device, element.levels, element.period is None)
+        structure = (structure, *own)
     return leaves, structure
