@@ -76,7 +76,9 @@ PUBLIC = {
     "ray_fan": "analysis",
     "relative_illumination": "analysis",
     "seidel": "analysis",
+    "element_lens": "wave.bridge",
     "elements": "wave.compute",
+    "hybrid_psf": "wave.bridge",
     "wave_psf": "wave.compute",
     "wavefront_map": "analysis",
     # pictures and learning

@@ -1,7 +1,7 @@
 """Bridge: phase elements and traced lenses meet, both ways.
 
     element_lens   a height map as a plano lens whose rays are traced: plane, glass, surface z = h(x, y)
-    kernels        a lens whose stop carries elements: the traced wavefront plus their path
+    hybrid_psf     a lens whose stop carries elements: the traced wavefront plus their path
 
         U(x, y) = (n/λ) Σ_j √(E_j Ω_j) exp(2πi [W_j + Σ_e (n_e(λ) - 1) h_e(x_j, y_j) + n (L_j x + M_j y)]/λ)
 
@@ -13,6 +13,7 @@ elsewhere, which is of second order in its slopes.
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -30,21 +31,22 @@ from raytrace.kernels.diffraction import (
 from raytrace.kernels.radial import is_centred, radii_of_waves, unfold
 from raytrace.kernels.result import Kernels
 from raytrace.maths.grid import Grid
+from raytrace.maths.grid import grid as make_grid
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to
 from raytrace.maths.zernike import noll
 from raytrace.media.glass import index
 from raytrace.optics.launch import rays_of_field
-from raytrace.optics.scene import Scene, symmetry
+from raytrace.optics.scene import Scene, scene, symmetry, trace_scene
 from raytrace.optics.trace import media, trace_surfaces
 from raytrace.optics.vignetting import vignette
 from raytrace.optics.wavefront import Wavefront, wavefront_of
 from raytrace.system.departure import GridSag, ZernikeSag, spline
-from raytrace.system.lens import Fields, Lens, SystemAperture, with_object_distance
+from raytrace.system.lens import Fields, Lens, SystemAperture, field_points, with_object_distance
 from raytrace.system.shapes import relief
 from raytrace.system.surface import Surface, sag_at
-from raytrace.wave.element import Element, EvenPowers, Rings, Zernike, designed_height, is_flat, is_radial, path
+from raytrace.wave.element import Element, EvenPowers, Rings, Zernike, is_flat, is_radial, path, slopes_of
 
 _MOST_RAYS = 400_000  # of one kernel
 _PROBE = 8, 32  # rings and arms of the rays that find how far directions spread and beams reach
@@ -65,8 +67,8 @@ def element_lens(
     element: Element,
     *,
     sensor_distance: Tensor | float,
-    object_distance: Tensor | float,
-    wavelengths: Tensor,
+    object_distance: Tensor | float = math.inf,
+    wavelengths: Tensor | Sequence[float] = (0.55,),
     substrate: Tensor | float = 0.0,
 ) -> Lens:
     """A plano lens of one element: the stop, its round rim, is on the height's side, which faces the sensor.
@@ -80,6 +82,7 @@ def element_lens(
     back = dataclasses.replace(back, thickness=torch.as_tensor(sensor_distance, dtype=front.thickness.dtype))
     zero = torch.zeros_like(front.thickness)
     before, image = (Surface(torch.as_tensor(t, dtype=zero.dtype)) for t in (object_distance, zero))
+    wavelengths = torch.as_tensor(wavelengths, dtype=zero.dtype)
     nothing = wavelengths.new_zeros(1)
     return Lens(
         surfaces=(before, front, back, image),
@@ -128,6 +131,36 @@ def surfaces_of(element: Element, *, substrate: Tensor | float = 0.0) -> tuple[S
 
 
 # -- elements at the stop of a lens ------------------------------------------------------------------------------------
+
+
+def hybrid_psf(
+    lens: Lens,
+    elements: Element | Sequence[Element],
+    *,
+    fields: Tensor | Sequence | None = None,
+    object_distances: Tensor | Sequence[float] | None = None,
+    wavelengths: Tensor | Sequence[float] | None = None,
+    pixel: float = 0.005,
+    size: int | tuple[int, int] = 21,
+    order: int = 0,
+) -> Kernels:
+    """PSFs (D, F, W, rows, columns) of a lens that carries phase elements in contact at its stop, by waves.
+
+    fields: y, pairs (x, y) or (2, F) in the lens's kind of field; object_distances: (D,) mm; wavelengths: (W,) µm; all
+    the lens's own by default. pixel, size: pitch in mm and number of pixels around the chief ray of each kernel. order,
+    derivatives and errors: of `kernels`.
+    """
+    like = lens.wavelengths
+    fields = field_points(fields, like=lens)
+    distances = lens.surfaces[0].thickness.reshape(1) if object_distances is None else object_distances
+    distances, colours = (
+        torch.as_tensor(t).to(like) for t in (distances, like if wavelengths is None else wavelengths)
+    )
+    view = scene(lens, fields, distances, colours)
+    with torch.no_grad():
+        chief = trace_scene(view, fields.new_zeros(2, 1)).position[:2, ..., 0].expand(2, *view.shape)
+    parts = (elements,) if isinstance(elements, Element) else tuple(elements)
+    return kernels(view, parts, make_grid(like.new_tensor(pixel), size, chief), order=order)
 
 
 def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: int = 0) -> Kernels:
@@ -257,16 +290,8 @@ def _slopes(elements: tuple[Element, ...], stop: Tensor, wavelengths: Tensor) ->
     for element in elements:
         if not is_flat(element):
             excess = (index(element.glass, wavelengths) - 1).to(wavelengths)
-            total = total + excess[:, None] * _gradient(element, *stop)
+            total = total + excess[:, None] * slopes_of(element, *stop)
     return total
-
-
-def _gradient(element: Element, x: Tensor, y: Tensor) -> Tensor:
-    """Of the height before it is wrapped, (2, ...) at points (...) mm."""
-    with torch.enable_grad():
-        x, y = (p.detach().clone().requires_grad_() for p in (x, y))
-        height = designed_height(element, x, y).sum()
-        return torch.stack(torch.autograd.grad(height, (x, y)))
 
 
 def _shift(front: Wavefront, stop: Tensor, slopes: Tensor) -> Tensor:
@@ -290,7 +315,7 @@ def _phase_of_steps(element: Element, beam: Tensor, wavelengths: Tensor) -> Tens
         return torch.maximum(excess * slope * beam, least + none)
     if element.period is None:
         return none
-    return _PER_ZONE * excess * beam * torch.linalg.vector_norm(_gradient(element, *_disc(beam)), dim=0).max()
+    return _PER_ZONE * excess * beam * torch.linalg.vector_norm(slopes_of(element, *_disc(beam)), dim=0).max()
 
 
 def _phase_of_turns(element: Element, beam: Tensor, wavelengths: Tensor) -> Tensor:
@@ -299,7 +324,7 @@ def _phase_of_turns(element: Element, beam: Tensor, wavelengths: Tensor) -> Tens
     if not isinstance(element.profile, Zernike) or not bool((coefficients != 0).any()):
         return none
     turns = max(abs(noll(int(j) + 1)[1]) for j in torch.nonzero(coefficients))
-    slope = torch.linalg.vector_norm(_gradient(element, *_disc(beam)), dim=0).max()
+    slope = torch.linalg.vector_norm(slopes_of(element, *_disc(beam)), dim=0).max()
     phase = 2e3 * math.pi * (index(element.glass, wavelengths) - 1).abs().to(wavelengths) / wavelengths * slope * beam
     return max(turns - 1, 0) * (6 + 1.5 * phase ** (1 / 3))
 

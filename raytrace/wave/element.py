@@ -161,6 +161,13 @@ def designed_height(element: Element, x: Tensor, y: Tensor) -> Tensor:
     return element.kind.height(element.profile, x, y, element.radius)
 
 
+def slopes_of(element: Element, x: Tensor, y: Tensor) -> Tensor:
+    """∂h/∂x and ∂h/∂y (2, ...) of the designed height at points (...) mm, as numbers."""
+    with torch.enable_grad():
+        x, y = (p.detach().clone().requires_grad_() for p in (x, y))
+        return torch.stack(torch.autograd.grad(designed_height(element, x, y).sum(), (x, y)))
+
+
 def fabricated(height: Tensor, period: Tensor | None, levels: int = 0) -> Tensor:
     """Heights modulo a period, and lowered to the step below: floor(h/H·L)·H/L. The gradient is that of the height."""
     if period is None:

@@ -14,7 +14,17 @@ from torch import Tensor
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to, value
 from raytrace.wave import radial
-from raytrace.wave.element import Element, Pixels, Rings, designed_height, excess_index, fabricated, height, is_flat
+from raytrace.wave.element import (
+    Element,
+    Pixels,
+    Rings,
+    designed_height,
+    excess_index,
+    fabricated,
+    height,
+    is_flat,
+    slopes_of,
+)
 from raytrace.wave.scene import WaveScene, aperture, millimetres, residual, spheres
 
 _RAYS = 4096
@@ -87,11 +97,7 @@ def slopes(scene: WaveScene, x: Tensor, y: Tensor, diffracted: bool = False) -> 
         power = excess_index(element, scene.wavelengths.detach(), x)
         if diffracted and element.period is not None:
             power = wavelength / element.period.detach()
-        with torch.enable_grad():
-            a, b = x.clone().requires_grad_(), y.clone().requires_grad_()
-            h = designed_height(element, a, b)
-            gradient = torch.stack(torch.autograd.grad(h.sum(), (a, b)))
-        total = total + power[:, None] * gradient[:, None, None]
+        total = total + power[:, None] * slopes_of(element, x, y)[:, None, None]
     return total
 
 
