@@ -6,7 +6,7 @@ The oracle is the focal length that each source itself states.
 import pytest
 import torch
 
-from raytrace.formats import LensFileError, table
+from raytrace.formats import LensFileError, table_read
 from raytrace.formats.source import Place, decode
 from raytrace.formats.table_columns import meaning
 from raytrace.media.glass import LINES, abbe_number, nd, refractive_index
@@ -66,7 +66,7 @@ stop       8.300     1      0      21.3
 
 
 def read(text: str, system: str = SYSTEM, **options):
-    return table.read(system + text, "lens.csv", **options)
+    return table_read.read(system + text, "lens.csv", **options)
 
 
 def focal_length(lens) -> float:

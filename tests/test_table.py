@@ -7,7 +7,7 @@ import sys
 import pandas as pd
 import pytest
 
-from raytrace.formats import LensFileError, UnsupportedSurface, table
+from raytrace.formats import LensFileError, UnsupportedSurface, table_read
 from raytrace.formats.frame import lens_from_frame, to_frame
 from raytrace.media.catalog import UnknownGlass
 from raytrace.media.glass import MIRROR, mil_glass
@@ -36,7 +36,7 @@ SINGLET = "surface,type,radius,thickness,glass\n1,stop,50,4,N-BK7\n2,,-50,47.5,\
 
 
 def read(text: str, **options):
-    return table.read(text, "lens.csv", **options)
+    return table_read.read(text, "lens.csv", **options)
 
 
 def lens(rows: str = SINGLET, system: str = SYSTEM):

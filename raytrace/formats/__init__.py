@@ -4,11 +4,12 @@ import dataclasses
 import os
 import warnings
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from raytrace.files import shipped, write_atomically
-from raytrace.formats import table, table_write, zemax_read, zemax_write
+from raytrace.formats import table_read, table_write, zemax_read, zemax_write
 from raytrace.formats.report import ImportReport as ImportReport
 from raytrace.formats.source import LensFileError as LensFileError
 from raytrace.formats.source import LensFileWarning as LensFileWarning
@@ -32,9 +33,9 @@ class Format(NamedTuple):
 #: The formats by suffix, in lower case.
 FORMATS = {
     ".zmx": Format(zemax_read.read, zemax_write.write),
-    ".csv": Format(table.read, table_write.write_comma),
-    ".tsv": Format(table.read, table_write.write_tab),
-    ".txt": Format(table.read, table_write.write_tab),
+    ".csv": Format(table_read.read, table_write.write),
+    ".tsv": Format(table_read.read, partial(table_write.write, separator="\t")),
+    ".txt": Format(table_read.read, partial(table_write.write, separator="\t")),
 }
 
 

@@ -9,9 +9,9 @@ import pandas as pd
 from raytrace.files import write_atomically
 from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, Place
-from raytrace.formats.table import build
+from raytrace.formats.table_read import build
+from raytrace.formats.table_system import written
 from raytrace.formats.table_text import Table, add_metadata, add_row, header
-from raytrace.formats.table_write import header as header_lines
 from raytrace.formats.table_write import rows
 from raytrace.maths.result import Result, flat
 from raytrace.system.lens import Lens
@@ -40,33 +40,33 @@ def to_frame(lens: Lens, *, catalogs: Sequence[Path] = ()) -> pd.DataFrame:
     columns = rows(lens, _PLACE.file)
     frame = pd.DataFrame({name: _column(name, cells) for name, cells in columns.items() if name != "surface"})
     frame.index = pd.RangeIndex(len(frame), name="surface")
-    frame.attrs["system"] = header_lines(lens, _PLACE, catalogs)
+    frame.attrs["system"] = written(lens, _PLACE, catalogs)
     return frame
 
 
 def lens_from_frame(
     frame: pd.DataFrame, *, catalogs: Sequence[Path] = (), strict: bool = False, **metadata: object
 ) -> Lens:
-    """The lens of a table of pandas: columns as in `raytrace.formats.table`, the system by keyword or in attrs.
+    """The lens of a table of pandas: columns as in `raytrace.formats.table_read`, the system by keyword or in attrs.
 
     metadata: header keys with `_` for blanks, as text or numbers: aperture="EPD 33.33", fields="angle 0 10 14",
     wavelengths=[0.4861, 0.5876], primary_wavelength=2, object_distance=25000, stop=6, title, note. They go before
     `frame.attrs["system"]`. Raises LensFileError with the row where it applies, UnsupportedSurface and UnknownGlass.
     """
     report = Draft(_PLACE.file, "DataFrame")
-    table = Table(_PLACE)
+    table = Table(_PLACE, report)
     stored = dict.fromkeys(metadata)
     for key, value in frame.attrs.get("system", ()):
         if key.replace(" ", "_") not in stored:
-            add_metadata(table, key, value, _PLACE, report)
+            add_metadata(table, key, value, _PLACE)
     for key, value in metadata.items():
-        add_metadata(table, key, _text(value), _PLACE, report)
+        add_metadata(table, key, _text(value), _PLACE)
     if not isinstance(frame.index, pd.RangeIndex) or frame.index.name is not None:
         frame = frame.reset_index(names=frame.index.name or "surface")
-    header(table, [str(column) for column in frame.columns], _PLACE, report)
+    header(table, [str(column) for column in frame.columns], _PLACE)
     for cells in frame.itertuples(index=False, name=None):
         add_row(table, [_text(cell) for cell in cells], _PLACE)
-    lens = build(table, report, catalogs=catalogs)
+    lens = build(table, catalogs=catalogs)
     report.finished(strict=strict)
     return lens
 

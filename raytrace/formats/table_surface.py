@@ -4,18 +4,17 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
-from raytrace.formats.media import listed_glass
+from raytrace.formats.media import by_figures, is_code, listed_glass
 from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, Place, UnsupportedSurface, shown
-from raytrace.formats.spelling import is_infinite, is_number, number
+from raytrace.formats.spelling import double, is_infinite, is_number, number
 from raytrace.formats.table_columns import order
 from raytrace.formats.table_media import figures as figures_of
 from raytrace.formats.table_media import medium
 from raytrace.formats.table_text import Row
-from raytrace.media.glass import AIR, LINES, MIRROR, Glass, constant, mil_glass, model_glass, refractive_index
+from raytrace.media.glass import AIR, LINES, MIRROR, Glass, mil_glass, refractive_index
 from raytrace.system.aperture import SHAPES, Aperture
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface
@@ -59,9 +58,9 @@ def build(row: Row, unit: float, catalogs: tuple[str, ...], user: Sequence[Path]
     conic = _cell(row, "conic")
     kind, coefficients = _terms(row, unit)
     return Surface(
-        thickness=_scalar(_thickness(row) * unit),
+        thickness=double(_thickness(row) * unit),
         curvature=_curvature(row, unit),
-        conic=_scalar(conic) if conic else None,
+        conic=double(conic) if conic else None,
         coefficients=coefficients,
         kind=kind,
         glass=_glass(row, catalogs, user, report),
@@ -95,7 +94,7 @@ def _curvature(row: Row, unit: float) -> Tensor | None:
     if radius and curvature and abs(radius * curvature - 1) > 1e-3:
         raise LensFileError(f"curvature {curvature:g} and radius {radius:g} contradict each other", row.place)
     found = curvature if curvature is not None else 1 / radius if radius else 0.0
-    return _scalar(found / unit) if found else None
+    return double(found / unit) if found else None
 
 
 def _terms(row: Row, unit: float) -> tuple[str, Tensor | None]:
@@ -110,7 +109,7 @@ def _terms(row: Row, unit: float) -> tuple[str, Tensor | None]:
             numbers = [
                 terms.get(n, 0.0) / unit ** (n - 1) for n in range(kind.step, max(filled, default=0) + 1, kind.step)
             ]
-            return kind.name, torch.tensor(numbers, dtype=torch.float64) if numbers else None
+            return kind.name, double(numbers) if numbers else None
     raise UnsupportedSurface(f"the term r^{odd} is odd; modelled are conics and {', '.join(KINDS)}s", row.place)
 
 
@@ -135,7 +134,7 @@ def _glass(row: Row, catalogs: tuple[str, ...], user: Sequence[Path], report: Dr
     name, equals, figures = text.partition("=")
     figures = figures if equals else text
     name = name.strip() if equals else ""
-    if not equals and len(text) == 6 and text.isascii() and text.isdigit():
+    if not equals and is_code(text):
         report.glass(place.surface, text, "six-digit code: nd and Vd by its digits")
         return mil_glass(text)
     if equals or all(is_number(part.strip()) for part in figures.split("/")):
@@ -143,7 +142,7 @@ def _glass(row: Row, catalogs: tuple[str, ...], user: Sequence[Path], report: Dr
     glass = listed_glass(text, catalogs=catalogs, user=user, place=place, report=report)
     for name, cell in given.items():
         kind, _, line = name.partition(" ")
-        listed = float(refractive_index(glass, _scalar(LINES[line]))) if kind == "index" else 0.0
+        listed = float(refractive_index(glass, double(LINES[line]))) if kind == "index" else 0.0
         if kind == "index" and abs(listed - number(cell, name, place)) > 2e-3:
             report.warn(f"index {cell} stated for {text}, whose n{line} is {listed:.5f}; the catalog is used", place)
     return glass
@@ -158,7 +157,7 @@ def _by_figures(name: str, figures: str, place: Place, report: Draft) -> Glass:
     if nd == 1 and vd == 0 and not name:
         return AIR
     report.glass(place.surface, name, f"constant index {nd!r}" if vd == dpgf == 0 else f"model glass {figures}")
-    return constant(nd, name) if vd == dpgf == 0 else model_glass(nd, vd, dpgf, name=name)
+    return by_figures(nd, vd, dpgf, name)
 
 
 def _several(text: str) -> list[str]:
@@ -181,7 +180,3 @@ def _aperture(text: str, unit: float, place: Place) -> Aperture:
     if min(sizes) < 0:
         raise LensFileError(f"aperture {shown(text)} has a negative size", place)
     return Aperture(words[0], sizes, obscures, (x, y))
-
-
-def _scalar(number: float) -> Tensor:
-    return torch.tensor(number, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""The header lines of a prescription table: aperture, fields, wavelengths and the rest of the system.
+"""The header lines of a prescription table, read and written: aperture, fields, wavelengths, the rest of the system.
 
 # title: Double Gauss            # note: free text; so is a '#' line that is not one of these
 # units: mm                      mm, cm, in, m; of every length in the table and the header
@@ -18,56 +18,19 @@
 # ray aiming: paraxial
 """
 
-import difflib
 import re
+from collections.abc import Sequence
 from decimal import Decimal
+from pathlib import Path
 
-import torch
 from torch import Tensor
 
-from raytrace.formats.report import Draft
+from raytrace.formats.media import catalogs_needed
 from raytrace.formats.source import LensFileError, Place, shown
-from raytrace.formats.spelling import integer, is_number, number
+from raytrace.formats.spelling import double, exact, exact_list, integer, is_number, number, quoted, word
+from raytrace.formats.table_text import Table
 from raytrace.media.glass import LINES
-from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, RAY_AIMING, Fields, SystemAperture
-
-#: Header keys: "once" or "repeated" (notes).
-KEYS = {
-    "title": "once",
-    "note": "repeated",
-    "units": "once",
-    "ignore": "once",
-    "object distance": "once",
-    "stop": "once",
-    "aperture": "once",
-    "fields": "once",
-    "field weights": "once",
-    "vdx": "once",
-    "vdy": "once",
-    "vcx": "once",
-    "vcy": "once",
-    "van": "once",
-    "telecentric": "once",
-    "wavelengths": "once",
-    "wavelength weights": "once",
-    "primary wavelength": "once",
-    "catalogs": "once",
-    "ray aiming": "once",
-}
-
-_OTHER_SPELLINGS = {
-    "name": "title",
-    "notes": "note",
-    "unit": "units",
-    "system aperture": "aperture",
-    "stop surface": "stop",
-    "field": "fields",
-    "weights": "wavelength weights",
-    "wavelength": "wavelengths",
-    "primary": "primary wavelength",
-    "catalog": "catalogs",
-    "glass catalogs": "catalogs",
-}
+from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, RAY_AIMING, Fields, Lens, SystemAperture
 
 #: Short names of the system aperture, longest first, as patterns.
 _APERTURES = (
@@ -83,67 +46,49 @@ _APERTURES = (
 DEFAULT_F_NUMBER = 10.0
 
 _NUMBERS = re.compile(r"[\s,;]+")
-
-Metadata = dict[str, tuple[str, Place]]
-
-
-def key_of(name: str) -> tuple[str | None, str | None]:
-    """(key, None) of a header name; (None, the key it looks like or None) if it is none."""
-    bare = " ".join(re.sub(r"[_\s]+", " ", name).lower().split())
-    bare = _OTHER_SPELLINGS.get(bare, bare)
-    if bare in KEYS:
-        return bare, None
-    near = difflib.get_close_matches(bare, [*KEYS, *_OTHER_SPELLINGS], n=1, cutoff=0.8) if len(bare) < 40 else []
-    return None, near[0] if near else None
+_NO, _YES = ("no", "off", "false", "0", ""), ("yes", "on", "true", "1")
+_VIGNETTING = ("vdx", "vdy", "vcx", "vcy", "van")
 
 
-def numbers(metadata: Metadata, key: str) -> list[float] | None:
+def _numbers(table: Table, key: str) -> list[float] | None:
     """The numbers of a header line, None if it is absent."""
-    if key not in metadata:
+    if key not in table.metadata:
         return None
-    value, place = metadata[key]
-    return [number(word, key, place) for word in _NUMBERS.split(value) if word]
+    value, place = table.metadata[key]
+    return [number(part, key, place) for part in _NUMBERS.split(value) if part]
 
 
-def truth(metadata: Metadata, key: str) -> bool:
-    """yes or no."""
-    if key not in metadata:
-        return False
-    value, place = metadata[key]
-    word = value.strip().lower()
-    if word not in ("yes", "on", "true", "1", "no", "off", "false", "0", ""):
-        raise LensFileError(f"{key} is {shown(value)}, expected yes or no", place)
-    return word in ("yes", "on", "true", "1")
-
-
-def ray_aiming(metadata: Metadata) -> str:
-    """off, paraxial or real."""
-    if "ray aiming" not in metadata:
-        return "off"
-    value, place = metadata["ray aiming"]
-    if value.strip().lower() not in RAY_AIMING:
-        raise LensFileError(f"ray aiming is {shown(value)}, expected one of {', '.join(RAY_AIMING)}", place)
+def _choice(table: Table, key: str, choices: Sequence[str], expected: str) -> str:
+    """The value of a header line that is one of several, the first if it is absent."""
+    value, place = table.metadata.get(key, (choices[0], table.place))
+    if value.strip().lower() not in choices:
+        raise LensFileError(f"{key} is {shown(value)}, expected {expected}", place)
     return value.strip().lower()
 
 
-def aperture(metadata: Metadata, stop_semi_diameter: float | None, unit: float, table: Place, report: Draft):
+def ray_aiming(table: Table) -> str:
+    """off, paraxial or real."""
+    return _choice(table, "ray aiming", [*RAY_AIMING], f"one of {', '.join(RAY_AIMING)}")
+
+
+def aperture(table: Table, stop_semi_diameter: float | None, unit: float) -> SystemAperture:
     """The system aperture: of the header, else the stop's semi-diameter, else F/10 with a warning."""
-    if "aperture" not in metadata:
+    if "aperture" not in table.metadata:
         if stop_semi_diameter:
-            report.note("no aperture in the header: the beam fills the stop's semi-diameter")
-            return SystemAperture("float_by_stop", _tensor(stop_semi_diameter))
+            table.report.note("no aperture in the header: the beam fills the stop's semi-diameter")
+            return SystemAperture("float_by_stop", double(stop_semi_diameter))
         message = f"no aperture: F/{DEFAULT_F_NUMBER:g} is assumed; write it, as '# aperture: EPD 33.33'"
-        report.warn(message, table)
-        return SystemAperture("image_f_number", _tensor(DEFAULT_F_NUMBER))
-    value, place = metadata["aperture"]
+        table.report.warn(message, table.place)
+        return SystemAperture("image_f_number", double(DEFAULT_F_NUMBER))
+    value, place = table.metadata["aperture"]
     kind, size = _aperture_words(value, place)
     if not size and kind == "float_by_stop" and stop_semi_diameter:
-        return SystemAperture(kind, _tensor(stop_semi_diameter))
+        return SystemAperture(kind, double(stop_semi_diameter))
     found = number(size.removesuffix("mm").removesuffix("deg").strip() or "?", "aperture", place)
     if found <= 0:
         raise LensFileError(f"the aperture is {found:g}, expected a positive number", place)
     scaled = kind in ("entrance_pupil_diameter", "float_by_stop")
-    return SystemAperture(kind, _tensor(found * unit if scaled else found))
+    return SystemAperture(kind, double(found * unit if scaled else found))
 
 
 def _aperture_words(value: str, place: Place) -> tuple[str, str]:
@@ -159,23 +104,22 @@ def _aperture_words(value: str, place: Place) -> tuple[str, str]:
     raise LensFileError(f"aperture is {shown(value)}, expected for example 'EPD 33.33', 'F/3', 'NA 0.1'", place)
 
 
-def fields(metadata: Metadata, unit: float, table: Place, report: Draft) -> Fields:
+def fields(table: Table, unit: float) -> Fields:
     """The field points of the header; on axis, with a warning, if there are none."""
     kind, points = "angle", [(0.0, 0.0)]
-    if "fields" in metadata:
-        kind, points = _field_points(*metadata["fields"])
+    if "fields" in table.metadata:
+        kind, points = _field_points(*table.metadata["fields"])
     else:
-        report.warn("no fields: on axis only; write them, as '# fields: angle 0 10 14'", table)
+        table.report.warn("no fields: on axis only; write them, as '# fields: angle 0 10 14'", table.place)
     length = 1.0 if kind == "angle" else unit
-    columns = [_per_field(metadata, key, len(points), 0.0) for key in ("vdx", "vdy", "vcx", "vcy", "van")]
-    vignetting = torch.tensor(columns, dtype=torch.float64)
+    vignetting = double([_per_field(table, key, len(points), 0.0) for key in _VIGNETTING])
     return Fields(
         kind=kind,
-        x=_tensor([length * x for x, _ in points]),
-        y=_tensor([length * y for _, y in points]),
-        weight=_tensor(_per_field(metadata, "field weights", len(points), 1.0)),
+        x=double([length * x for x, _ in points]),
+        y=double([length * y for _, y in points]),
+        weight=double(_per_field(table, "field weights", len(points), 1.0)),
         vignetting=vignetting if bool(vignetting.any()) else None,
-        telecentric=truth(metadata, "telecentric"),
+        telecentric=_choice(table, "telecentric", [*_NO, *_YES], "yes or no") in _YES,
     )
 
 
@@ -187,13 +131,14 @@ def _field_points(value: str, place: Place) -> tuple[str, list[tuple[float, floa
     rest = text[len(kind) :].strip() if kind else text
     kind = kind or "angle"
     pairs = re.fullmatch(r"(?:\([^()]*\)[\s,;]*)+", rest)
+    listed = [
+        point for point in (re.findall(r"\(([^()]*)\)", rest) if pairs else _NUMBERS.split(rest)) if point.strip()
+    ]
     points = []
-    for word in re.findall(r"\(([^()]*)\)", rest) if pairs else _NUMBERS.split(rest):
-        if not word.strip():
-            continue
-        found = [number(part, "field", place) for part in _NUMBERS.split(word.strip())]
+    for point in listed:
+        found = [number(part, "field", place) for part in _NUMBERS.split(point.strip())]
         if pairs and len(found) != 2:
-            raise LensFileError(f"field ({shown(word)}), expected (x, y)", place)
+            raise LensFileError(f"field ({shown(point)}), expected (x, y)", place)
         points.append((found[0], found[1]) if pairs else (0.0, found[0]))
     if not points or len(points) > 1000:
         expected = f"a kind ({', '.join(kind.replace('_', ' ') for kind in FIELD_UNITS)}) and numbers"
@@ -201,35 +146,33 @@ def _field_points(value: str, place: Place) -> tuple[str, list[tuple[float, floa
     return kind, points
 
 
-def _per_field(metadata: Metadata, key: str, count: int, default: float) -> list[float]:
-    found = numbers(metadata, key)
+def _per_field(table: Table, key: str, count: int, default: float) -> list[float]:
+    found = _numbers(table, key)
     if found is None:
         return [default] * count
     if len(found) != count:
-        raise LensFileError(f"{key} has {len(found)} values for {count} fields", metadata[key][1])
+        raise LensFileError(f"{key} has {len(found)} values for {count} fields", table.metadata[key][1])
     return found
 
 
-def wavelengths(metadata: Metadata, table: Place, report: Draft) -> tuple[Tensor, Tensor, int]:
+def wavelengths(table: Table) -> tuple[Tensor, Tensor, int]:
     """Wavelengths in µm, weights, 0-based primary; the d line, with a warning, if there are none."""
-    found = [LINES["d"]]
-    if "wavelengths" in metadata:
-        found = _wavelengths(*metadata["wavelengths"])
+    found, report = [LINES["d"]], table.report
+    if "wavelengths" in table.metadata:
+        found = _wavelengths(*table.metadata["wavelengths"])
     else:
-        report.warn(f"no wavelengths: {LINES['d']} µm (d) is taken; write '# wavelengths: 0.5876'", table)
-    weights = numbers(metadata, "wavelength weights") or [1.0] * len(found)
+        report.warn(f"no wavelengths: {LINES['d']} µm (d) is taken; write '# wavelengths: 0.5876'", table.place)
+    weights = _numbers(table, "wavelength weights") or [1.0] * len(found)
     if len(weights) != len(found) or min(weights) < 0:
         message = f"{len(weights)} wavelength weights for {len(found)} wavelengths, expected as many, 0 or more"
-        raise LensFileError(message, metadata["wavelength weights"][1])
-    primary = 0
-    if "primary wavelength" in metadata:
-        value, place = metadata["primary wavelength"]
-        primary = integer(value, "primary wavelength", place) - 1
-        if not 0 <= primary < len(found):
-            raise LensFileError(f"primary wavelength is {value}, expected a number from 1 to {len(found)}", place)
-    elif len(found) > 1:
+        raise LensFileError(message, table.metadata["wavelength weights"][1])
+    value, place = table.metadata.get("primary wavelength", ("1", table.place))
+    primary = integer(value, "primary wavelength", place)
+    if not 1 <= primary <= len(found):
+        raise LensFileError(f"primary wavelength is {value}, expected a number from 1 to {len(found)}", place)
+    if "primary wavelength" not in table.metadata and len(found) > 1:
         report.note("no primary wavelength in the header: the first is taken")
-    return _tensor(found), _tensor(weights), primary
+    return double(found), double(weights), primary - 1
 
 
 def _wavelengths(value: str, place: Place) -> list[float]:
@@ -253,5 +196,29 @@ def _decimal(word: str, power: int, place: Place) -> float:
     return float(Decimal(repr(found)).scaleb(power))
 
 
-def _tensor(values: float | list[float]) -> Tensor:
-    return torch.tensor(values, dtype=torch.float64)
+def written(lens: Lens, place: Place, catalogs: Sequence[Path] = ()) -> list[tuple[str, str]]:
+    """The system of a lens as keys and values of header lines."""
+
+    def listed(numbers: Tensor, what: str) -> str:
+        return " ".join(exact_list(numbers, what, place))
+
+    fields, aperture = lens.fields, lens.aperture
+    size = exact(aperture.value, "system aperture", place)
+    x, y = exact_list(fields.x, "field", place), exact_list(fields.y, "field", place)
+    points = [f"({a}, {b})" for a, b in zip(x, y, strict=True)] if any(fields.x) else y
+    vignetting = [] if fields.vignetting is None else zip(_VIGNETTING, fields.vignetting, strict=True)
+    lines = [
+        ("title", quoted(lens.name) if lens.name else ""),
+        *(("note", quoted(note)) for note in lens.notes),
+        ("aperture", f"{aperture.kind.replace('_', ' ')} {size}"),
+        ("fields", f"{fields.kind.replace('_', ' ')} {' '.join(points)}"),
+        ("field weights", listed(fields.weight, "weight of a field")),
+        *((key, listed(row, "vignetting factor")) for key, row in vignetting),
+        ("telecentric", "yes" if fields.telecentric else ""),
+        ("wavelengths", listed(lens.wavelengths, "wavelength")),
+        ("wavelength weights", listed(lens.wavelength_weights, "weight")),
+        ("primary wavelength", str(lens.primary_wavelength + 1)),
+        ("catalogs", " ".join(map(word, catalogs_needed(lens, catalogs, place.file)))),
+        ("ray aiming", "" if lens.ray_aiming == "off" else lens.ray_aiming),
+    ]
+    return [(key, value) for key, value in lines if value]

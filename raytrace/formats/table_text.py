@@ -1,20 +1,29 @@
-"""The text of a prescription table as header lines, headings and rows of cells."""
+"""The text of a prescription table as header lines, headings and rows of cells, numbers made plain."""
 
 import csv
+import difflib
 import re
-from collections.abc import Sequence
+import unicodedata
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
-from raytrace.formats import spelling
 from raytrace.formats.report import READ, Draft
 from raytrace.formats.source import MAX_SURFACES, LensFileError, Place, shown
-from raytrace.formats.spelling import is_number
-from raytrace.formats.table_columns import UNREAD, columns, is_header, squeezed
-from raytrace.formats.table_system import KEYS, key_of
+from raytrace.formats.spelling import is_infinite, is_number, plain_text
+from raytrace.formats.table_columns import UNREAD, columns, is_header, order, squeezed
+
+#: Header keys, each with its further spellings; a note may stand more than once.
+_KEYS = (
+    "title, name; note, notes; units, unit; ignore; object distance; stop, stop surface; aperture, system aperture"
+    "; fields, field; field weights; vdx; vdy; vcx; vcy; van; telecentric; wavelengths, wavelength"
+    "; wavelength weights, weights; primary wavelength, primary; catalogs, catalog, glass catalogs; ray aiming"
+)
+KEYS = {spelling: row.split(", ")[0] for row in _KEYS.split("; ") for spelling in row.split(", ")}
 
 #: Lines before the headings beyond which the file is no table.
 _PREAMBLE = 500
+_WANTED = "expected one naming thickness and curvature or radius"
 
 
 @dataclass
@@ -27,19 +36,24 @@ class Row:
 
 @dataclass
 class Table:
-    """A table taken apart: header lines (key, value, place), notes, rows."""
+    """A table taken apart: header lines (key, value, place), notes, rows; and the report on it."""
 
     place: Place
+    report: Draft
     metadata: dict[str, tuple[str, Place]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     rows: list[Row] = field(default_factory=list)
     headings: tuple[str, ...] = ()
     columns: tuple[str | None, ...] = ()
 
+    def value(self, key: str, default: str = "") -> str:
+        """The value of a header key."""
+        return self.metadata.get(key, (default, self.place))[0]
+
 
 def parse(text: str, file: str, report: Draft) -> Table:
     """Take a text apart. Separators are tabs, semicolons, commas, bars or aligned blanks, as the headings show."""
-    table = Table(Place(file))
+    table = Table(Place(file), report)
     lines = text.split("\n")
     split, skipped = None, 0
     for line_number, line in enumerate(lines, 1):
@@ -50,26 +64,23 @@ def parse(text: str, file: str, report: Draft) -> Table:
         following = lines[line_number : line_number + 1]
         if split is None and not _is_metadata(line) and (found := _headings(line, following, place)):
             split, headings, skipped = found
-            header(table, headings, place, report)
-        elif not metadata_line(table, line, place, report):
+            header(table, headings, place)
+        elif not _metadata_line(table, line, place):
             if split is None:
-                _preamble(table, line, place, report)
+                _preamble(table, line, place)
             else:
                 add_row(table, split(line, place), place)
     if split is None:
         hint = "; in Shift-JIS or GBK? Save it as UTF-8" if re.search("[\x80-\x9f]", text) else ""
-        raise LensFileError(
-            f"no line of headings; expected one naming thickness and curvature or radius{hint}", table.place
-        )
+        raise LensFileError(f"no line of headings; {_WANTED}{hint}", table.place)
     return table
 
 
-def header(table: Table, cells: Sequence[str], place: Place, report: Draft) -> None:
+def header(table: Table, cells: Sequence[str], place: Place) -> None:
     """Take a line of headings; every column is reported."""
-    units, ignored = (table.metadata.get(key, ("", place))[0] for key in ("units", "ignore"))
-    ignored = [squeezed(part).casefold() for part in re.split(r"[,;]", ignored)]
+    ignored = [squeezed(part).casefold() for part in re.split(r"[,;]", table.value("ignore"))]
     table.headings = tuple(cells)
-    table.columns = tuple(columns(cells, units, ignored, place, report))
+    table.columns = tuple(columns(cells, table.value("units"), ignored, place, table.report))
 
 
 def add_row(table: Table, cells: Sequence[str], place: Place) -> None:
@@ -82,7 +93,7 @@ def add_row(table: Table, cells: Sequence[str], place: Place) -> None:
         raise LensFileError(f"{len(cells)} cells under {count} headings; {shown(extra[0])} has no column", place)
     named: dict[str, str] = {}
     for heading, column, cell in zip(table.headings, table.columns, cells, strict=False):
-        cell = spelling.plain_text(cell) if column == "comment" else " ".join(cell.split())
+        cell = plain_text(cell) if column == "comment" else " ".join(cell.split())
         if column == UNREAD and is_number(cell.replace(",", ".").strip("*")):
             message = f"column {shown(heading)} holds numbers ({cell}), but what they are is not known"
             fix = f"name it, as radius, thickness, nd, Vd, conic, A4, or write the header line '# ignore: {heading}'"
@@ -94,10 +105,10 @@ def add_row(table: Table, cells: Sequence[str], place: Place) -> None:
 
 def _is_metadata(line: str) -> bool:
     """True for a line '# key: value' of a key that is known; other lines with '#' may be headings."""
-    return line.strip().startswith(("#", '"#')) and key_of(line.strip('"# \t').partition(":")[0])[0] is not None
+    return line.strip().startswith(("#", '"#')) and _bare(line.strip('"# \t').partition(":")[0]) in KEYS
 
 
-def metadata_line(table: Table, line: str, place: Place, report: Draft) -> bool:
+def _metadata_line(table: Table, line: str, place: Place) -> bool:
     """Take a line '# key: value', or a comment '# text', which becomes a note."""
     content = line.strip()
     bare = content.rstrip(",;\t ")
@@ -108,40 +119,41 @@ def metadata_line(table: Table, line: str, place: Place, report: Draft) -> bool:
         return False
     content = content.lstrip("#").strip()
     name, colon, value = content.partition(":")
-    add_metadata(table, name if colon else "", value.strip() if colon else content, place, report)
+    add_metadata(table, name if colon else "", value.strip() if colon else content, place)
     return True
 
 
-def add_metadata(table: Table, name: str, value: str, place: Place, report: Draft) -> None:
+def _bare(name: str) -> str:
+    return " ".join(re.sub(r"[_\s]+", " ", name).lower().split())
+
+
+def add_metadata(table: Table, name: str, value: str, place: Place) -> None:
     """Store one header value under its key; a name that is no key makes a note of "name: value"."""
-    key, near = key_of(name)
-    if key is None:
-        text = f"{name.strip()}: {value}" if name.strip() else value
+    key = KEYS.get(_bare(name), "note")
+    if _bare(name) not in KEYS:
+        near = difflib.get_close_matches(_bare(name), KEYS, n=1, cutoff=0.8) if len(_bare(name)) < 40 else []
         if near:
-            report.warn(f"unknown header {shown(name.strip())}, taken as a note; is '{near}' meant?", place)
-        if text:
-            table.notes.append(text)
-        report.met("note", READ, place)
-    elif KEYS[key] == "repeated":
-        if value:
-            table.notes.append(spelling.plain_text(value))
-        report.met(key, READ, place)
+            message = f"unknown header {shown(name.strip())}, taken as a note; is '{near[0]}' meant?"
+            table.report.warn(message, place)
+        value = f"{name.strip()}: {value}" if name.strip() else value
+        table.notes += [value] if value else []
+    elif key == "note":
+        table.notes += [plain_text(value)] if value else []
     else:
         if key in table.metadata:
-            report.warn(f"'{key}' stands again; the last is used", place)
+            table.report.warn(f"'{key}' stands again; the last is used", place)
         table.metadata[key] = (value, place)
-        report.met(key, READ, place)
+    table.report.met(key, READ, place)
 
 
-def _preamble(table: Table, line: str, place: Place, report: Draft) -> None:
+def _preamble(table: Table, line: str, place: Place) -> None:
     if place.line > _PREAMBLE:
-        message = f"no line of headings in {_PREAMBLE} lines; expected one naming thickness and curvature or radius"
-        raise LensFileError(message, place)
+        raise LensFileError(f"no line of headings in {_PREAMBLE} lines; {_WANTED}", place)
     table.notes.append(line.strip())
-    report.met("text before the table", READ, place)
+    table.report.met("text before the table", READ, place)
 
 
-def _headings(line: str, following: list[str], place: Place):
+def _headings(line: str, following: list[str], place: Place) -> tuple[Callable, list[str], int] | None:
     """(what splits lines like these into cells, the headings, lines they take beyond the first), or None.
 
     A second line of words or units, as "curvature" and "(mm)" under "Radius of", belongs to the headings.
@@ -210,3 +222,86 @@ def _aligned(gap: str, spans: list[tuple[int, int]], line: str, place: Place) ->
             raise LensFileError(f"{message}; align the columns, or separate them by tabs or commas", place)
         cells[column] = word
     return cells
+
+
+# -- cells as people write numbers: minus signs, commas, planes, and marks of the stop -------------------------------
+
+_MINUS = str.maketrans("−–—―‐‑‒﹣－", "-" * 9)
+_PLANE = re.compile(r"plan[eo]?|flat|平面|plan[- ]?o?|無限大?|无限大?|\(?plane\)?", re.IGNORECASE)
+_STOP = re.compile(
+    r"\(?(?:aperture stop|stop|sto|aperture|diaphragm|iris|(?-i:AST?|ST|S)|開口絞り|絞り|孔径光阑|光阑|光圈"
+    r"|aperturblende|blende|diaphragme)\)?",
+    re.IGNORECASE,
+)
+_VARIABLE = re.compile(r"\(?(?:variable|var\.?|可変|可变|variabel)\)?|[dD]\s*\d+.*|b\.?f\.?l?\.?", re.IGNORECASE)
+_COEFFICIENT = re.compile(r"(?:k|κ|ε|[A-Z]\d{0,2}|a\d{1,2})\s*=.*", re.DOTALL)
+
+_DECIMAL = re.compile(r"[+-]?(?:0?,\d+|\d+,(?:\d{1,2}|\d{4,}))(?:[eE][+-]?\d+)?|[+-]?\d{4,},\d+")
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+\.\d*|[+-]?[1-9]\d{0,2}(?:,\d{3}){2,}")
+#: Columns whose numbers may reach thousands.
+_SIZES = ("radius", "thickness", "curvature", "diameter", "conic")
+_EITHER = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}(?:[eE][+-]?\d+)?")
+
+
+def is_figure(column: str) -> bool:
+    """True for a column of numbers."""
+    named = ("radius", "thickness", "curvature", "conic", "semi_diameter", "diameter", "pgf", "dpgf")
+    return column in named or column.startswith(("index ", "abbe ")) or order(column) is not None
+
+
+def plain(text: str) -> str:
+    """A number in ASCII: full-width digits, other minus signs and marks such as * taken away."""
+    text = unicodedata.normalize("NFKC", text).translate(_MINUS).strip(" *†‡")
+    text = re.sub(r"^([+-])\s+(?=[\d.])", r"\1", text)
+    return "-" if text and not text.strip("-") else text
+
+
+def cleaned(rows: list[Row]) -> list[Row]:
+    """The rows with their numbers plain, a stop marked in a radius or label moved to its column.
+
+    Raises LensFileError for a comma that may be a decimal or a thousands separator, for a distance that is variable,
+    and for lines of aspheric coefficients.
+    """
+    rows = [Row(row.place, {name: plain(c) if is_figure(name) else c for name, c in row.cells.items()}) for row in rows]
+    cells = [cell for row in rows for name, cell in row.cells.items() if is_figure(name)]
+    decimal = any(_DECIMAL.fullmatch(cell) for cell in cells)
+    point = any("." in cell and is_number(cell.replace(",", "")) for cell in cells)
+    return [_marked(Row(row.place, _without_commas(row, decimal, point))) for row in rows]
+
+
+def _without_commas(row: Row, decimal: bool, point: bool) -> dict[str, str]:
+    cells = dict(row.cells)
+    for name, cell in row.cells.items():
+        if _COEFFICIENT.fullmatch(cell) and name not in ("comment", "glass"):
+            message = f"{shown(cell)} is a coefficient in a line of its own"
+            raise LensFileError(f"{message}; write it in a column of its surface: conic, A4, A6, …", row.place)
+        if not is_figure(name) or "," not in cell:
+            continue
+        if not name.endswith(_SIZES) and (_DECIMAL.fullmatch(cell) or _EITHER.fullmatch(cell)):
+            cells[name] = cell.replace(",", ".")  # an index of 1,516 is no index of 1516
+        elif _THOUSANDS.fullmatch(cell) or (_EITHER.fullmatch(cell) and point and not decimal):
+            cells[name] = cell.replace(",", "")
+        elif _DECIMAL.fullmatch(cell) or (_EITHER.fullmatch(cell) and decimal and not point):
+            cells[name] = cell.replace(",", ".")
+        elif _EITHER.fullmatch(cell):
+            message = f"{name} is {shown(cell)}: a decimal comma or thousands? Write {cell.replace(',', '.')}"
+            raise LensFileError(f"{message} or {cell.replace(',', '')}", row.place)
+    return cells
+
+
+def _marked(row: Row) -> Row:
+    cells = dict(row.cells)
+    radius = cells.get("radius", "")
+    rest = _STOP.sub("", radius, count=1).strip() if not is_number(radius) and not is_infinite(radius) else radius
+    if rest != radius and (not rest or rest == "-" or is_number(rest) or is_infinite(rest) or _PLANE.fullmatch(rest)):
+        cells |= {"radius": rest or "-", "stop": cells.get("stop", "stop")}
+    if _PLANE.fullmatch(cells.get("radius", "")):
+        cells["radius"] = "inf"
+    label = unicodedata.normalize("NFKC", cells.get("label", ""))
+    if re.fullmatch(r"\d+\s*\(?(?:AST?|STO?|S)\)?\*?|AST?|STO?|S", label):
+        cells.setdefault("stop", "stop")
+    thickness = cells.get("thickness", "")
+    if _VARIABLE.fullmatch(thickness) and not is_number(thickness):
+        message = f"thickness is {shown(thickness)}, a distance given elsewhere"
+        raise LensFileError(f"{message}; write its number, at one position of a zoom or focus", row.place)
+    return Row(row.place, cells)

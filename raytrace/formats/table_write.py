@@ -5,71 +5,33 @@ import io
 from collections.abc import Sequence
 from pathlib import Path
 
-from raytrace.formats import spelling
-from raytrace.formats.media import catalogs_needed, is_left_out, is_listed, listed_name
+from raytrace.formats.media import is_code, is_left_out, is_listed, listed_name
 from raytrace.formats.source import LensFileError, Place
-from raytrace.formats.spelling import exact, exact_list, refuse_departure, thickness
+from raytrace.formats.spelling import exact, exact_list, quoted, refuse_departure, thickness
 from raytrace.formats.table_columns import order
+from raytrace.formats.table_system import written
 from raytrace.media.glass import Glass, mil_glass
 from raytrace.system.aperture import Aperture
 from raytrace.system.lens import Lens
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface
 
-Metadata = list[tuple[str, str]]
 
-
-def write_comma(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
-    """The content of a .csv file: header lines '# key: value', headings, one row per surface; UTF-8.
+def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = (), separator: str = ",") -> bytes:
+    """The content of a table: header lines '# key: value', headings, one row per surface; UTF-8.
 
     file: its name, for messages. catalogs: the user's glass catalogs that the lens was read with.
     Raises LensFileError for what a table cannot hold: a batch of lenses, nan, a glass whose figures are not those
-    of its catalog. Texts come back whatever they hold (`texts`).
+    of its catalog. Texts come back whatever they hold (`spelling.quoted`).
     """
-    return _write(lens, ",", file, catalogs)
-
-
-def write_tab(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
-    """As `write_comma`, separated by tabs."""
-    return _write(lens, "\t", file, catalogs)
-
-
-def _write(lens: Lens, separator: str, file: str, catalogs: Sequence[Path]) -> bytes:
     text = io.StringIO()
-    for key, value in header(lens, Place(file), catalogs):
+    for key, value in written(lens, Place(file), catalogs):
         text.write(f"# {key}: {value}\n")
     writer = csv.writer(text, delimiter=separator, lineterminator="\n")
     columns = rows(lens, file)
     writer.writerow(columns)
     writer.writerows(zip(*columns.values(), strict=True))
     return text.getvalue().encode("utf-8")
-
-
-def header(lens: Lens, place: Place, catalogs: Sequence[Path] = ()) -> Metadata:
-    """The system of a lens as keys and values of header lines."""
-    fields = lens.fields
-    lines = [("title", spelling.quoted(lens.name))] if lens.name else []
-    lines += [("note", spelling.quoted(note)) for note in lens.notes]
-    size = exact(lens.aperture.value, "system aperture", place)
-    lines.append(("aperture", f"{lens.aperture.kind.replace('_', ' ')} {size}"))
-    x, y = exact_list(fields.x, "field", place), exact_list(fields.y, "field", place)
-    points = y if not any(fields.x) else [f"({a}, {b})" for a, b in zip(x, y, strict=True)]
-    lines.append(("fields", f"{fields.kind.replace('_', ' ')} {' '.join(points)}"))
-    lines.append(("field weights", " ".join(exact_list(fields.weight, "weight of a field", place))))
-    if fields.vignetting is not None:
-        for key, row in zip(("vdx", "vdy", "vcx", "vcy", "van"), fields.vignetting, strict=True):
-            lines.append((key, " ".join(exact_list(row, "vignetting factor", place))))
-    if fields.telecentric:
-        lines.append(("telecentric", "yes"))
-    lines.append(("wavelengths", " ".join(exact_list(lens.wavelengths, "wavelength", place))))
-    lines.append(("wavelength weights", " ".join(exact_list(lens.wavelength_weights, "weight", place))))
-    lines.append(("primary wavelength", str(lens.primary_wavelength + 1)))
-    names = catalogs_needed(lens, catalogs, place.file)
-    if names:
-        lines.append(("catalogs", " ".join(map(spelling.word, names))))
-    if lens.ray_aiming != "off":
-        lines.append(("ray aiming", lens.ray_aiming))
-    return lines
 
 
 def rows(lens: Lens, file: str) -> dict[str, list[str]]:
@@ -103,7 +65,7 @@ def _row(lens: Lens, number: int, surface: Surface, place: Place) -> dict[str, s
         row |= {f"a{kind.step * j}": term for j, term in enumerate(found, 1)}
     if surface.apertures:
         row["apertures"] = " + ".join(_aperture(aperture, place) for aperture in surface.apertures)
-    return row | {"comment": spelling.quoted(surface.comment)} if surface.comment else row
+    return row | {"comment": quoted(surface.comment)} if surface.comment else row
 
 
 def _glass(glass: Glass, place: Place) -> str:
@@ -115,7 +77,7 @@ def _glass(glass: Glass, place: Place) -> str:
     if is_listed(glass):
         return name
     figures = exact_list(glass.coefficients, "glass", place)
-    if len(name) == 6 and name.isdigit() and figures == exact_list(mil_glass(name).coefficients, "glass", place):
+    if is_code(name) and figures == exact_list(mil_glass(name).coefficients, "glass", place):
         return name
     if "=" in name:
         raise LensFileError(f"the name {name!r} of a glass holds '=', which a table cannot hold", place)

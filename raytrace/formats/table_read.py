@@ -26,15 +26,23 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
-from raytrace.formats import spelling, table_surface, table_system
+from raytrace.formats import table_surface, table_system
 from raytrace.formats.media import report_missing_catalogs
 from raytrace.formats.report import Draft, ImportReport
-from raytrace.formats.source import LensFileError, Place, shown
-from raytrace.formats.spelling import MILLIMETRES, integer, is_infinite, is_number, number, refuse_overflow
-from raytrace.formats.table_rows import cleaned
-from raytrace.formats.table_text import Row, Table, parse
+from raytrace.formats.source import LensFileError, shown
+from raytrace.formats.spelling import (
+    MILLIMETRES,
+    double,
+    integer,
+    is_infinite,
+    is_number,
+    number,
+    plain_text,
+    refuse_overflow,
+    words,
+)
+from raytrace.formats.table_text import Row, Table, cleaned, parse
 from raytrace.media.glass import AIR
 from raytrace.system.lens import Lens
 from raytrace.system.surface import Surface
@@ -44,6 +52,15 @@ _IMAGE = re.compile(r"\b(image|ima|img|sensor|detector|bild|bildebene)\b|像面|
 _OBJECT = re.compile(r"\b(object|obj|objekt|objet)\b|物体|物面", re.IGNORECASE)
 
 
+#: Where a row may be called the stop, and by what; the first column that has one counts.
+_STOP_MARKS = (
+    ("stop", re.compile(r"x|yes|true|1|stop|sto|\*|y", re.IGNORECASE).fullmatch),
+    ("type", _STOP.search),
+    ("label", _STOP.search),
+    ("comment", re.compile(r"\bstop\b", re.IGNORECASE).search),
+)
+
+
 def read(text: str, file: str, *, catalogs: Sequence[Path] = (), strict: bool = False) -> tuple[Lens, ImportReport]:
     """The lens of a table's text and the report of its import.
 
@@ -51,44 +68,40 @@ def read(text: str, file: str, *, catalogs: Sequence[Path] = (), strict: bool = 
     Raises LensFileError, UnsupportedSurface and UnknownGlass.
     """
     report = Draft(file, "table")
-    return build(parse(text, file, report), report, catalogs=catalogs), report.finished(strict=strict)
+    return build(parse(text, file, report), catalogs=catalogs), report.finished(strict=strict)
 
 
-def build(table: Table, report: Draft, *, catalogs: Sequence[Path] = ()) -> Lens:
+def build(table: Table, *, catalogs: Sequence[Path] = ()) -> Lens:
     """The lens of a table taken apart."""
-    metadata, place = table.metadata, table.place
-    unit = _unit(metadata)
-    rows = _numbered(table)
-    names = tuple(spelling.words(metadata.get("catalogs", ("", place))[0]))
-    report_missing_catalogs(names, catalogs, report)
-    surfaces = [table_surface.build(row, unit, names, catalogs, report) for row in rows]
+    unit, rows = _unit(table), _numbered(table)
+    names = tuple(words(table.value("catalogs")))
+    report_missing_catalogs(names, catalogs, table.report)
+    surfaces = [table_surface.build(row, unit, names, catalogs, table.report) for row in rows]
     _refuse_all_air(table, surfaces)
-    surfaces = _with_object(surfaces, rows, metadata, unit)
-    surfaces += _missing_image(rows, surfaces, report)
-    _warn_of_zero_radii(rows, surfaces, report)
-    stop = _stop(rows, metadata, len(surfaces), place)
-    wavelengths, weights, primary = table_system.wavelengths(metadata, place, report)
+    surfaces = _with_object(surfaces, rows, table, unit)
+    surfaces += _missing_image(rows, surfaces, table.report)
+    _warn_of_zero_radii(rows, surfaces, table.report)
+    stop = _stop(rows, table, len(surfaces))
+    wavelengths, weights, primary = table_system.wavelengths(table)
     lens = Lens(
         surfaces=tuple(surfaces),
         stop=stop,
-        aperture=table_system.aperture(metadata, surfaces[stop].semi_diameter, unit, place, report),
-        fields=table_system.fields(metadata, unit, place, report),
+        aperture=table_system.aperture(table, surfaces[stop].semi_diameter, unit),
+        fields=table_system.fields(table, unit),
         wavelengths=wavelengths,
         wavelength_weights=weights,
         primary_wavelength=primary,
-        name=spelling.plain_text(metadata.get("title", ("", place))[0]),
+        name=plain_text(table.value("title")),
         notes=tuple(table.notes),
         catalogs=names,
-        ray_aiming=table_system.ray_aiming(metadata),
+        ray_aiming=table_system.ray_aiming(table),
     )
-    refuse_overflow(lens, place.file)
+    refuse_overflow(lens, table.place.file)
     return lens
 
 
-def _unit(metadata: table_system.Metadata) -> float:
-    if "units" not in metadata:
-        return 1.0
-    value, place = metadata["units"]
+def _unit(table: Table) -> float:
+    value, place = table.metadata.get("units", ("mm", table.place))
     if value.upper() not in MILLIMETRES:
         raise LensFileError(f"units is {shown(value)}, expected mm, cm, in or m", place)
     return MILLIMETRES[value.upper()]
@@ -114,25 +127,19 @@ def _numbered(table: Table) -> list[Row]:
     return rows
 
 
-def _with_object(
-    surfaces: list[Surface], rows: list[Row], metadata: table_system.Metadata, unit: float
-) -> list[Surface]:
+def _with_object(surfaces: list[Surface], rows: list[Row], table: Table, unit: float) -> list[Surface]:
     """The surfaces with the object before them, at the distance of its row or of the header."""
     has_row = rows[0].place.surface == 0
-    empty = has_row and rows[0].cells.get("thickness", "-").lower() in ("-", "nan", "none")
-    if "object distance" not in metadata:
-        infinite = _scalar(float("inf"))
-        if has_row:
-            return [dataclasses.replace(surfaces[0], thickness=infinite), *surfaces[1:]] if empty else surfaces
-        return [Surface(thickness=infinite), *surfaces]
-    value, place = metadata["object distance"]
+    told = has_row and rows[0].cells.get("thickness", "-").lower() not in ("-", "nan", "none")
+    value, place = table.metadata.get("object distance", ("inf", None))
     infinite = is_infinite(value) and not value.startswith("-")
-    distance = float("inf") if infinite else number(value.removesuffix("mm").strip(), "object distance", place) * unit
-    if not has_row:
-        return [Surface(thickness=_scalar(distance)), *surfaces]
-    if not empty and float(surfaces[0].thickness) != distance:
+    distance = torch.inf if infinite else number(value.removesuffix("mm").strip(), "object distance", place) * unit
+    if told and place and float(surfaces[0].thickness) != distance:
         raise LensFileError(f"object distance {value}, but the row of the object says otherwise", place)
-    return [dataclasses.replace(surfaces[0], thickness=_scalar(distance)), *surfaces[1:]]
+    if told:
+        return surfaces
+    own, others = (surfaces[0], surfaces[1:]) if has_row else (Surface(thickness=double(distance)), surfaces)
+    return [dataclasses.replace(own, thickness=double(distance)), *others]
 
 
 def _refuse_all_air(table: Table, surfaces: list[Surface]) -> None:
@@ -159,7 +166,7 @@ def _missing_image(rows: list[Row], surfaces: list[Surface], report: Draft) -> l
     if surfaces[-1].thickness != 0:
         message = f"no row of the image: added {float(surfaces[-1].thickness):g} mm behind the last surface"
         report.warn(message, last.place)
-        return [Surface(thickness=_scalar(0.0))]
+        return [Surface(thickness=double(0.0))]
     label = last.cells.get("label", "")
     ends_glass = len(surfaces) > 1 and surfaces[-2].glass.formula not in ("mirror",) and surfaces[-2].glass is not AIR
     if surfaces[-1].curvature is not None or ends_glass or surfaces[-1].glass is not AIR:
@@ -185,30 +192,25 @@ def _warn_of_zero_radii(rows: list[Row], surfaces: list[Surface], report: Draft)
         report.warn(message, found[0].place._replace(surface=None))
 
 
-def _stop(rows: list[Row], metadata: table_system.Metadata, count: int, table: Place) -> int:
+def _stop(rows: list[Row], table: Table, count: int) -> int:
     """The stop by the header, by the column of stops, by the type, or by the name of the row."""
-    if "stop" in metadata:
-        value, place = metadata["stop"]
+    if "stop" in table.metadata:
+        value, place = table.metadata["stop"]
         stop = integer(value, "stop", place)
     else:
-        stop, place = _stop_row(rows, table)
+        place = _stop_row(rows, table).place
+        stop = place.surface
     if not 0 < stop < count - 1:
         raise LensFileError(f"the stop is surface {stop}, expected 1 to {count - 2}", place)
     return stop
 
 
-def _stop_row(rows: list[Row], table: Place) -> tuple[int, Place]:
-    marks = ("x", "yes", "true", "1", "stop", "sto", "*", "y")
-    found = [row for row in rows if row.cells.get("stop", "").lower() in marks]
-    found = found or [row for row in rows if _STOP.search(row.cells.get("type", ""))]
-    found = found or [row for row in rows if _STOP.search(row.cells.get("label", ""))]
-    found = found or [row for row in rows if re.search(r"\bstop\b", row.cells.get("comment", ""), re.IGNORECASE)]
-    if not found:
-        raise LensFileError("no row is the stop; call one 'Stop', or write the header line '# stop: 6'", table)
-    if len(found) > 1:
-        raise LensFileError(f"a second stop; surface {found[0].place.surface} is the stop already", found[1].place)
-    return found[0].place.surface, found[0].place
-
-
-def _scalar(number: float) -> Tensor:
-    return torch.tensor(number, dtype=torch.float64)
+def _stop_row(rows: list[Row], table: Table) -> Row:
+    for column, mark in _STOP_MARKS:
+        found = [row for row in rows if mark(row.cells.get(column, ""))]
+        if len(found) > 1:
+            message = f"a second stop; surface {found[0].place.surface} is the stop already"
+            raise LensFileError(message, found[1].place)
+        if found:
+            return found[0]
+    raise LensFileError("no row is the stop; call one 'Stop', or write the header line '# stop: 6'", table.place)
