@@ -65,8 +65,8 @@ def optic_of(case: Case) -> Optic | None:
         optic.fields.add(y=case.field)
     for number, surface in enumerate(lens.surfaces):
         for aperture in surface.apertures:
-            inner, outer = aperture.extent
             central = aperture.shape == "circular" and aperture.centre == (0.0, 0.0)
+            inner, outer = aperture.extent if central else (math.nan, math.nan)
             if not central or (aperture.obscures and inner > 0):
                 return None
             inner, outer = (outer, math.inf) if aperture.obscures else (inner, outer)

@@ -170,13 +170,13 @@ def _aperture(text: str, unit: float, place: Place) -> Aperture:
     obscures = words[0] == "obscuration"
     words = words[1:] if obscures else words
     at = words.index("at") if "at" in words else len(words)
-    count = SHAPES[words[0]].sizes if words[:1] and words[0] in SHAPES else None
-    if at - 1 != count or len(words[at + 1 :]) not in ((2,) if words[at:] else (0,)):
+    shape = SHAPES.get(words[0]) if words else None
+    if shape is None or at - 1 != (shape.sizes or at - 1) or len(words[at + 1 :]) != (2 if words[at:] else 0):
         raise LensFileError(
             f"aperture is {shown(text)}, expected for example 'circular 0 12.5' or 'rectangular 3 4'", place
         )
     sizes = tuple(number(word, "size of the aperture", place) * unit for word in words[1:at])
     x, y = [number(word, "centre of the aperture", place) * unit for word in words[at + 1 :]] or [0.0, 0.0]
-    if min(sizes) < 0:
-        raise LensFileError(f"aperture {shown(text)} has a negative size", place)
+    if shape.objection(sizes):
+        raise LensFileError(f"aperture {shown(text)} {shape.objection(sizes)}", place)
     return Aperture(words[0], sizes, obscures, (x, y))

@@ -11,7 +11,7 @@ from raytrace.formats.source import LensFileError, UnsupportedSurface, shown
 from raytrace.formats.spelling import double, is_infinite
 from raytrace.formats.zemax_keywords import TYPE_NAMES, Block, Record, aperture_keywords, modelled_types
 from raytrace.media.glass import AIR, MIRROR, Glass, mil_glass
-from raytrace.system.aperture import Aperture
+from raytrace.system.aperture import SHAPES, Aperture
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface
 
@@ -180,12 +180,11 @@ def _apertures(block: Block, millimetres: float, report: Draft) -> tuple[Apertur
         report.warn(message, record.place)
         return ()
     shape, obscures = keywords[record.keyword]
-    first = record.number(0, "first size of the aperture") * millimetres
-    second = record.number(1, "second size of the aperture") * millimetres
+    sizes = tuple(record.number(k, "size of the aperture") * millimetres for k in range(SHAPES[shape].sizes))
     if record.keyword == "FLAP":
-        first, second = 0.0, semi_diameter(block, millimetres) or second
-    if first < 0 or second < 0:
-        raise LensFileError(f"{record.keyword} has a negative size", record.place)
+        sizes = 0.0, semi_diameter(block, millimetres) or sizes[1]
+    if SHAPES[shape].objection(sizes):
+        raise LensFileError(f"{record.keyword} {SHAPES[shape].objection(sizes)}", record.place)
     centre = block.last("OBDC")
     x, y = (centre.number(axis, "decentre") * millimetres for axis in (0, 1)) if centre else (0.0, 0.0)
-    return (Aperture(shape, (first, second), obscures, (x, y)),)
+    return (Aperture(shape, sizes, obscures, (x, y)),)

@@ -32,11 +32,15 @@ class Aperture:
 
 
 class Edge(NamedTuple):
-    """An edge of a shape: points whose measure (...) is at most the limit lie within it, of an inner one at least."""
+    """An edge of a shape: points whose measure (...) is at most the limit lie within it, of an inner one at least.
+
+    size: what distances from it are counted in; by default the limit.
+    """
 
     measure: Tensor
     limit: float
     is_inner: bool = False
+    size: float | None = None
 
     def within(self) -> Tensor:
         """Which points (...) lie within, the edge itself included."""
@@ -48,6 +52,8 @@ class Edge(NamedTuple):
 
     def distance(self) -> Tensor:
         """How far within points (...) lie, smooth at the edge, in its own size; an edge at infinity is none."""
+        if self.size is not None:
+            return (self.limit - self.measure) / self.size
         return self.measure / self.limit - 1 if self.is_inner else 1 - self.measure / self.limit
 
 
@@ -60,6 +66,8 @@ class Shape:
     symmetry: "round", "mirror" (in x and y) or "none".
     zemax: keywords of a .zmx file for it as an aperture and as an obscuration.
     code: of fused/apertures.h.
+    sizes: how many numbers it has, of 0 or more; None: points x, y, as many as there are, from 3 on.
+    is_hollow: sizes -> whether light may be stopped within it.
     """
 
     edges: Callable[[Tensor, Tensor, Sequence[float]], list[Edge]]
@@ -67,7 +75,16 @@ class Shape:
     symmetry: str
     zemax: tuple[str, str]
     code: int
-    sizes: int = 2
+    sizes: int | None = 2
+    is_hollow: Callable[[Sequence[float]], bool] = lambda sizes: False
+
+    def objection(self, sizes: Sequence[float]) -> str:
+        """Why these are no sizes of the shape; "" if they are."""
+        if self.sizes is None:
+            return "" if len(sizes) >= 6 and len(sizes) % 2 == 0 else "has no points x, y, three or more"
+        if len(sizes) != self.sizes:
+            return f"has not {self.sizes} sizes"
+        return "" if min(sizes) >= 0 else "has a negative size"
 
 
 def _rings(x: Tensor, y: Tensor, sizes: Sequence[float]) -> list[Edge]:
@@ -76,7 +93,7 @@ def _rings(x: Tensor, y: Tensor, sizes: Sequence[float]) -> list[Edge]:
 
 
 SHAPES = {
-    "circular": Shape(_rings, tuple, "round", ("CLAP", "OBSC"), 0),
+    "circular": Shape(_rings, tuple, "round", ("CLAP", "OBSC"), 0, is_hollow=lambda sizes: sizes[0] > 0),
     "rectangular": Shape(
         lambda x, y, sizes: [Edge(x.abs(), sizes[0]), Edge(y.abs(), sizes[1])],
         lambda sizes: (0.0, sizes[1]),
@@ -125,4 +142,4 @@ def reach(aperture: Aperture) -> tuple[float, float]:
 
 def stands_inside(aperture: Aperture) -> bool:
     """Whether an aperture can stop light in the midst of a beam whose rim it lets through."""
-    return aperture.obscures or reach(aperture)[0] > 0
+    return aperture.obscures or SHAPES[aperture.shape].is_hollow(aperture.extent)
