@@ -1,5 +1,5 @@
 """Kinds of sag: the odd asphere against its formula in 50 digits, in files and everywhere else; and kinds made up here,
-added at run time, which everything has to find in their rows."""
+added at run time, which everything has to find in their rows. Polygons as apertures."""
 
 import dataclasses
 import json
@@ -32,13 +32,15 @@ from raytrace.optics.streaming import stream_spot
 from raytrace.optics.trace import trace_lens, trace_surfaces
 from raytrace.plot.outline import depth
 from raytrace.system import shapes
+from raytrace.system.aperture import Aperture, clearance, inside, reach, stands_inside
 from raytrace.system.build import lens as lens_of_rows
 from raytrace.system.departure import Sag
 from raytrace.system.places import number_at, places, with_number
 from raytrace.system.rays import start
 from raytrace.system.surface import intersect, normal, sag, sag_at
 
-TIER2 = Path(__file__).parents[2] / "shared" / "tier2"
+SHARED = Path(__file__).parents[2] / "shared"
+TIER2, CORPUS = SHARED / "tier2", SHARED / "corpus"
 ODD = "odd asphere"
 CURVATURE, CONIC = 0.02, -0.6
 PUPIL = gauss_rings(3)[0]
@@ -370,3 +372,89 @@ class TestWhatHasToKnow:
             expected = trace_lens(system, rays, system.wavelengths[0])
         assert is_expressible(system.surfaces[1]) == (name == "odd")
         assert_close(found.position, expected.position, rtol=0, atol=1e-12)
+
+
+# ---------------------------------------------------------------- polygons
+
+SLIT = CORPUS / "zmx" / "Project_X__sc_slit.ZMX"
+#: A square ring of ±4 mm with a hole of ±2 mm and a triangle beside it, each closed.
+CORNERS = (-4, -4, 4, -4, 4, 4, -4, 4, -4, -4, -2, -2, -2, 2, 2, 2, 2, -2, -2, -2, 6, 1, 8, 1, 7, 3, 6, 1)
+
+
+STEPS = (-1e-9, 0.0, 1e-9)
+
+
+def polygon(*corners: float, **others) -> Aperture:
+    return Aperture("polygon", tuple(float(c) for c in corners), **others)
+
+
+def through(x, y):
+    """The same by its words."""
+    ring = max(abs(x), abs(y)) <= 4 and max(abs(x), abs(y)) >= 2
+    return ring or (1 <= y <= 3 and 2 * (x - 6) >= y - 1 and 2 * (8 - x) >= y - 1)
+
+
+@both_engines
+@pytest.mark.parametrize("obscures", [False, True])
+def test_polygons_pass_what_lies_within_an_odd_number_of_them(engine, obscures):
+    grid_of = torch.linspace(-9, 9, 73, dtype=torch.float64)  # corners and sides among them
+    x, y = (part.reshape(-1) for part in torch.meshgrid(grid_of, grid_of, indexing="xy"))
+    position = torch.stack([x, y, torch.zeros_like(x)])
+    axis = torch.zeros_like(position)
+    axis[2] = 1
+    stop = surface(None, 1.0, apertures=(polygon(*CORNERS, obscures=obscures),))
+    valid = trace_surfaces([stop], start(position, axis), indices=[scalar(1.0)] * 2).valid
+    for px, py, passes in zip(x.tolist(), y.tolist(), valid.tolist(), strict=True):
+        near = min(through(px + dx, py + dy) for dx in STEPS for dy in STEPS)
+        far = max(through(px + dx, py + dy) for dx in STEPS for dy in STEPS)
+        assert passes == (not near if obscures else far), (px, py)
+
+
+def test_the_clearance_of_a_polygon_is_its_distance_in_its_size():
+    square = polygon(-3, -3, 3, -3, 3, 3, -3, 3)
+    hit = vector(0.0, 0.0, 2.5, 1.0, 5.0, 0.0).reshape(3, 2).T
+    assert_close(clearance(square, hit), vector(3.0, 0.5, -2.0) / 3, rtol=1e-15, atol=0)
+    assert_close(clearance(dataclasses.replace(square, obscures=True), hit), vector(-3.0, -0.5, 2.0) / 3)
+    x = vector(2.9, 3.1).requires_grad_()
+    (slope,) = torch.autograd.grad(clearance(square, torch.stack([x, 0 * x])).sum(), x)
+    assert_close(slope, vector(-1.0, -1.0) / 3)
+    assert reach(square) == (0.0, 3.0)
+    assert stands_inside(square)
+
+
+@pytest.mark.parametrize("suffix", [".zmx", ".csv"])
+def test_polygons_in_files(tmp_path, suffix):
+    face = surface(0.02, 5.0, 1.5, semi_diameter=9.0, apertures=(polygon(*CORNERS, centre=(0.5, -0.25)),))
+    path = tmp_path / f"polygon{suffix}"
+    write_lens(lens([face, surface(-0.02, 60.0)]), path)
+    found = read_lens(path).surfaces[1].apertures[0]
+    assert (found.shape, found.extent, found.centre) == ("polygon", polygon(*CORNERS).extent, (0.5, -0.25))
+
+
+def test_polygons_that_files_cannot_hold(tmp_path):
+    def write(path, *corners):
+        write_lens(lens([surface(None, 5.0, apertures=(polygon(*corners),)), surface(-0.02, 60.0)]), path)
+
+    with pytest.raises(LensFileError, match="corner at 0, 0"):
+        write(tmp_path / "polygon.zmx", 0, 0, 1, 0, 1, 1)
+    with pytest.raises(LensFileError, match="has no points x, y, three or more"):
+        write(tmp_path / "line.csv", 1, 0, 1, 1)
+
+
+def test_a_scene_with_a_polygon_has_no_symmetry_and_a_figure(tmp_path):
+    system = lens([surface(0.02, 5.0, 1.5, apertures=(polygon(-3, -3, 3, -3, 0, 4),)), surface(-0.02, 60.0)])
+    assert symmetry(scene_of(system)) == "none"
+    rt.layout(system).plot(tmp_path / "layout.png")
+    found = psf(system, "drt", fields=field(0.0), grid=grid(0.5, 9), tol=3e-2)
+    share = 0.5 * 6 * 7 / (math.pi * 25)
+    assert float(found.energy) == pytest.approx(share, rel=3e-2)
+
+
+@pytest.mark.skipif(not SLIT.exists(), reason="needs ../shared/corpus")
+def test_slits_of_a_real_file():
+    """Six bars of 1 × 12 mm, one every 2 mm, as user-defined aperture that is shifted by half a bar."""
+    (aperture,) = read_lens(SLIT).surfaces[1].apertures
+    assert len(aperture.extent) == 6 * 10
+    assert aperture.centre == (-0.5, 0.0)
+    x = vector(-4.5, -3.5, -2.5, 0.5, 1.5, 5.5, 6.5) - 0.5
+    assert inside((aperture,), torch.stack([x, 0 * x])).tolist() == [True, False, True, False, True, True, False]

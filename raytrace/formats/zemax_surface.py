@@ -167,20 +167,23 @@ def _apertures(block: Block, millimetres: float, report: Draft) -> tuple[Apertur
     A floating aperture (FLAP) follows the semi-diameter of its surface: it clips at DIAM as it now is.
     """
     keywords = aperture_keywords()
-    found = block.all(*keywords, "USAP", "USOB")
+    found = block.all(*keywords)
     if not found:
         return ()
     record = found[-1]
     if len({other.keyword for other in found}) > 1:
         names = ", ".join(other.keyword for other in found)
         report.warn(f"several apertures on one surface ({names}); the last is used", record.place)
-    if record.keyword in ("USAP", "USOB"):
-        points = len(block.all("UDAD"))
-        message = f"user-defined aperture ({record.keyword}, {points} UDAD lines) is not modelled: it blocks no ray"
-        report.warn(message, record.place)
-        return ()
     shape, obscures = keywords[record.keyword]
-    sizes = tuple(record.number(k, "size of the aperture") * millimetres for k in range(SHAPES[shape].sizes))
+    count = SHAPES[shape].sizes
+    if count is None:
+        sizes = _corners(block.all("UDAD"), millimetres)
+        if not sizes:
+            message = f"user-defined aperture ({record.keyword}) is not of polygons (UDAD): it blocks no ray"
+            report.warn(message, record.place)
+            return ()
+    else:
+        sizes = tuple(record.number(k, "size of the aperture") * millimetres for k in range(count))
     if record.keyword == "FLAP":
         sizes = 0.0, semi_diameter(block, millimetres) or sizes[1]
     if SHAPES[shape].objection(sizes):
@@ -188,3 +191,22 @@ def _apertures(block: Block, millimetres: float, report: Draft) -> tuple[Apertur
     centre = block.last("OBDC")
     x, y = (centre.number(axis, "decentre") * millimetres for axis in (0, 1)) if centre else (0.0, 0.0)
     return (Aperture(shape, sizes, obscures, (x, y)),)
+
+
+def _corners(records: Sequence[Record], millimetres: float) -> tuple[float, ...]:
+    """x and y of the corners of polygons, each closed by its first one; none if anything else is told, as arcs.
+
+    UDAD k x y 0: line 0 names a file, and 0 0 0 ends a polygon.
+    """
+    corners: list[float] = []
+    polygon: list[float] = []
+    for record in (*(one for one in records if one.integer(0, "number of the point") > 0), None):
+        x, y, other = (record.number(k, "point of the aperture", 0.0) for k in (1, 2, 3)) if record else (0, 0, 0)
+        if other:
+            return ()
+        if (x, y) != (0, 0):
+            polygon += [x * millimetres, y * millimetres]
+        elif polygon:
+            corners += [*polygon, *polygon[:2]]
+            polygon = []
+    return tuple(corners)

@@ -151,9 +151,23 @@ def _apertures(apertures: tuple[Aperture, ...], place: Place) -> list[str]:
         message = f"{len(apertures)} apertures, a surface of a .zmx file has one"
         raise LensFileError(f"{message}; put the others on dummy surfaces, or write a table (.csv)", place)
     aperture = apertures[0]
-    sizes = " ".join(exact(number, "size of the aperture", place) for number in aperture.extent)
-    lines = [f"  {SHAPES[aperture.shape].zemax[aperture.obscures]} {sizes} 0"]
+    sizes, shape = [exact(number, "size of the aperture", place) for number in aperture.extent], SHAPES[aperture.shape]
+    keyword = shape.zemax[aperture.obscures]
+    lines = [f"  {keyword} {' '.join(sizes)} 0"] if shape.sizes else [f"  {keyword} 0 0 0", *_corners(sizes, place)]
     if any(aperture.centre):
         x, y = (exact(number, "decentre of the aperture", place) for number in aperture.centre)
         lines.append(f"  OBDC {x} {y}")
     return lines
+
+
+def _corners(sizes: Sequence[str], place: Place) -> list[str]:
+    """UDAD lines of the corners of polygons; 0 0 0 in place of the corner that comes again."""
+    points = list(zip(sizes[::2], sizes[1::2], strict=True))
+    if any(float(x) == float(y) == 0 for x, y in points):
+        raise LensFileError("a polygon has a corner at 0, 0, by which a .zmx file ends it; write a table (.csv)", place)
+    first, lines = 0, []
+    for k, point in enumerate(points):
+        closes = k > first and point == points[first]
+        lines.append("0 0 0" if closes else f"{point[0]} {point[1]} 0")
+        first = k + 1 if closes else first
+    return [f"  UDAD {k} {line}" for k, line in enumerate(lines if lines[-1] == "0 0 0" else [*lines, "0 0 0"], 1)]

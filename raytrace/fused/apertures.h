@@ -5,7 +5,7 @@
 
 namespace raytrace {
 
-enum Shape { kCircular, kRectangular, kElliptic };
+enum Shape { kCircular, kRectangular, kElliptic, kPolygon };
 
 // An aperture as structure.py writes it into the constants; its sizes follow.
 struct Aperture {
@@ -17,8 +17,28 @@ struct Aperture {
 // Where a point lies: within the shape, its edge included, and strictly inside it.
 struct Place { bool within, blocked; };
 
+// Polygons by their corners, each closed by its first one, the last anyhow: within an odd number of them, or on a side.
+template <typename T>
+inline Place in_polygons(T x, T y, const double* corners, int count) {
+  bool odd = false, on_side = false;
+  for (int first = 0, k = 1; 2 * first < count; k++) {
+    const bool last = 2 * k >= count;
+    const int from = 2 * (k - 1), to = 2 * (last ? first : k);
+    const T x1 = T(corners[from]), y1 = T(corners[from + 1]), x2 = T(corners[to]), y2 = T(corners[to + 1]);
+    const T dx = x2 - x1, dy = y2 - y1, length = dx * dx + dy * dy;
+    T share = ((x - x1) * dx + (y - y1) * dy) / (length > 0 ? length : T(1));
+    share = share < 0 ? T(0) : share > 1 ? T(1) : share;
+    on_side |= x - x1 - share * dx == 0 && y - y1 - share * dy == 0;
+    if (y1 != y2) odd ^= ((y1 > y) != (y2 > y)) && x < x1 + (y - y1) * (dx / dy);
+    if (last) break;
+    if (x2 == T(corners[2 * first]) && y2 == T(corners[2 * first + 1])) first = k + 1, k = first;
+  }
+  return {odd || on_side, odd && !on_side};
+}
+
 template <int shape, typename T>
-inline Place inside(T x, T y, const double* sizes, int) {
+inline Place inside(T x, T y, const double* sizes, int count) {
+  if (shape == kPolygon) return in_polygons(x, y, sizes, count);
   const T a = T(sizes[0]), b = T(sizes[1]);
   if (shape == kCircular) {
     T r = x * x + y * y;
@@ -46,6 +66,7 @@ void clip(const Rays<T>& rays, uint8_t* valid, int n, const double* constants, i
     const int shape = int(aperture->shape);
     if (shape == kCircular) clip_by<kCircular>(*aperture, rays, valid, n);
     else if (shape == kRectangular) clip_by<kRectangular>(*aperture, rays, valid, n);
+    else if (shape == kPolygon) clip_by<kPolygon>(*aperture, rays, valid, n);
     else clip_by<kElliptic>(*aperture, rays, valid, n);
   }
 }

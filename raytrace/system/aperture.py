@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from raytrace.maths.numerics import safe_sqrt
 from raytrace.maths.value import value
 
 
@@ -19,7 +20,7 @@ class Aperture:
     """The part of a surface that passes light; one surface may carry several, and a ray must pass all of them.
 
     shape: a key of SHAPES, "circular" (extent: inner and outer radius), "rectangular" or "elliptic" (half-widths in x
-        and y).
+        and y), "polygon" (x, y of its corners; several, each closed by its first corner, are one shape).
     extent: the numbers of the shape, mm.
     obscures: True if the shape blocks what lies inside it (an obscuration) instead of passing it.
     centre: (x, y) mm of the shape in the surface's frame.
@@ -92,6 +93,33 @@ def _rings(x: Tensor, y: Tensor, sizes: Sequence[float]) -> list[Edge]:
     return [Edge(square, outer * outer), *([Edge(square, inner * inner, True)] if inner > 0 else [])]
 
 
+def _outlines(sizes: Sequence[float]) -> list[tuple[float, float, float, float]]:
+    """The sides (x1, y1, x2, y2) of polygons, each of which ends where its first point comes again, the last anyhow."""
+    points = list(zip(sizes[::2], sizes[1::2], strict=True))
+    sides, first = [], 0
+    for k in range(1, len(points)):
+        if first == k:
+            continue
+        sides.append((*points[k - 1], *points[k]))
+        first = k + 1 if points[k] == points[first] else first
+    return sides if first >= len(points) else [*sides, (*points[-1], *points[first])]
+
+
+def _polygons(x: Tensor, y: Tensor, sizes: Sequence[float]) -> list[Edge]:
+    """The signed distance from the nearest side; what lies within an odd number of polygons is inside."""
+    nearest, odd = torch.full_like(x, float("inf")), torch.zeros_like(x, dtype=torch.bool)
+    for x1, y1, x2, y2 in _outlines(sizes):
+        along_x, along_y = x2 - x1, y2 - y1
+        length = along_x * along_x + along_y * along_y
+        share = (((x - x1) * along_x + (y - y1) * along_y) / (length or 1.0)).clamp(0, 1)
+        off_x, off_y = x - x1 - share * along_x, y - y1 - share * along_y
+        nearest = torch.minimum(nearest, off_x * off_x + off_y * off_y)
+        if y1 != y2:
+            odd = odd ^ (((y1 > y) != (y2 > y)) & (x < x1 + (y - y1) * (along_x / along_y)))
+    distance = safe_sqrt(nearest)
+    return [Edge(torch.where(odd, -distance, distance), 0.0, size=max(map(abs, sizes)))]
+
+
 SHAPES = {
     "circular": Shape(_rings, tuple, "round", ("CLAP", "OBSC"), 0, is_hollow=lambda sizes: sizes[0] > 0),
     "rectangular": Shape(
@@ -107,6 +135,15 @@ SHAPES = {
         "mirror",
         ("ELAP", "ELOB"),
         2,
+    ),
+    "polygon": Shape(
+        _polygons,
+        lambda sizes: (0.0, max(map(abs, sizes[1::2]))),
+        "none",
+        ("USAP", "USOB"),
+        3,
+        sizes=None,
+        is_hollow=lambda sizes: True,
     ),
 }
 
