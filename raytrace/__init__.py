@@ -51,6 +51,7 @@ PUBLIC = {
     "hit_jacobian": "optics.jacobian",
     "info": "optics.views",
     "layout": "optics.views",
+    "mean_square_gradient": "optics.stream_gradient",
     "paraxial_image_distance": "optics.paraxial",
     "prepare": "fused",
     "rays": "optics.launch",

@@ -21,7 +21,6 @@ from raytrace.formats import read_lens
 from raytrace.formats.pictures import dead_leaves, split
 from raytrace.kernels import psf
 from raytrace.maths.grid import grid
-from raytrace.optics.conjugates import distance_in_focus, sensor_range
 from raytrace.optics.focus import NoImage, best_focus
 from raytrace.optics.paraxial import first_order, paraxial_image_distance
 from raytrace.studies.codesign.closed_form import (
@@ -31,6 +30,7 @@ from raytrace.studies.codesign.closed_form import (
     out_of_focus,
     power_spectrum,
 )
+from raytrace.studies.codesign.conjugates import distance_in_focus, sensor_range
 from raytrace.studies.codesign.experiment import (
     Batches,
     Outcome,

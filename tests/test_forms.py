@@ -191,6 +191,7 @@ def test_rays_of_a_table_keep_their_form(command):
         ("spot DOUBLE_GAUS", 1, "did you mean double_gauss?"),
         ("spot mien.zmx", 1, "did you mean mine.zmx?"),
         ("spot double_gauss --sampling gaus", 2, "did you mean gauss?"),
+        ("layout double_gauss -o layout.png", 2, "unknown option -o; figures are saved by --plot"),
         ("spot double_gauss --plto spot.png", 2, "unknown option --plto; did you mean --plot?"),
         ("wave psf --elment=cubic", 2, "unknown option --elment; did you mean --element?"),
         ("wave psf --element cubc", 1, "did you mean cubic?"),

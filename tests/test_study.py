@@ -12,13 +12,13 @@ import torch
 from raytrace.files import shipped, write_table
 from raytrace.formats import read_lens
 from raytrace.formats.pictures import dead_leaves
-from raytrace.optics.conjugates import paraxial_image
 from raytrace.optics.focus import best_focus
 from raytrace.optics.paraxial import first_order
 from raytrace.pages import kept_of, markdown
 from raytrace.studies.codesign import optima
 from raytrace.studies.codesign.claims import claims, is_of_paper
 from raytrace.studies.codesign.closed_form import even_distances, optimise_closed_form, power_spectrum
+from raytrace.studies.codesign.conjugates import paraxial_image
 from raytrace.studies.codesign.experiment import Outcome, batch, camera, lens_at_start
 from raytrace.studies.codesign.figures import _marks
 from raytrace.studies.codesign.optima import Optimum, closed_form, closed_forms, scan

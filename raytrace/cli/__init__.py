@@ -57,7 +57,10 @@ class _Parser(argparse.ArgumentParser):
         option = next((word for word in unknown if word.startswith("-")), None)
         if option is not None:
             name = option.partition("=")[0]
-            self.error(f"unknown option {name}{did_you_mean(name, self._option_string_actions)}")
+            known = self._option_string_actions
+            drawn = name in ("-o", "--output") and "--plot" in known
+            meant = "; figures are saved by --plot" if drawn else did_you_mean(name, known)
+            self.error(f"unknown option {name}{meant}")
         return found, unknown
 
     def _check_value(self, action, value):

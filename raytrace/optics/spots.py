@@ -21,9 +21,13 @@ _RIM = 72  # rays on the rim of the pupil, for the largest radius, as the spot o
 _REFERENCES, _WEIGHTS = ("centroid", "chief"), ("area", "equal")
 
 
+def _of_each(name: str) -> property:
+    return property(lambda spots: getattr(spots.each, name), doc=f"(F, W): `{name}` of every spot.")
+
+
 @value
 class Spots(Result):
-    """Spots (F, W) of every field and wavelength on the sensor, mm; attributes of `each` are those of the result.
+    """Spots (F, W) of every field and wavelength on the sensor, mm: what Spot says of them, this says, too.
 
     each: (F, W) Spot, or StreamedSpot of rays that were not kept; whole: (F,) those of all wavelengths together, by
     their weights. arrivals: the rays, None where none were kept. reference, weights: as for `spot`.
@@ -40,30 +44,11 @@ class Spots(Result):
 
     FIGURE = "plot.spots.spot_diagram"
 
-    @property
-    def centroid(self) -> Tensor:
-        """(2, F, W) mm."""
-        return self.each.centroid
-
-    @property
-    def mean_square_radius(self) -> Tensor:
-        """(F, W) mm², smooth where the RMS is 0: minimise this one."""
-        return self.each.mean_square_radius
-
-    @property
-    def rms_radius(self) -> Tensor:
-        """(F, W) mm; nan with gradient 0 where no ray arrives."""
-        return self.each.rms_radius
-
-    @property
-    def geometric_radius(self) -> Tensor:
-        """(F, W) mm, the largest distance."""
-        return self.each.geometric_radius
-
-    @property
-    def rays(self) -> Tensor:
-        """How many arrived, (F, W)."""
-        return self.each.rays
+    centroid = _of_each("centroid")
+    mean_square_radius = _of_each("mean_square_radius")
+    rms_radius = _of_each("rms_radius")
+    geometric_radius = _of_each("geometric_radius")
+    rays = _of_each("rays")
 
     @property
     def launched(self) -> int:

@@ -32,26 +32,21 @@ class ChangesNothing(UserWarning):
     """Something is asked for that makes no difference to what is done."""
 
 
-@value
-class Origin:
-    """What rays (...) were launched for: object distance (...) mm, field (2, ...) and pupil point (2, ...)."""
-
-    object_distance: Tensor
-    field: Tensor
-    pupil: Tensor
+#: What chief and marginal rays were launched for: mm, degrees or mm, µm, and fractions of the pupil.
+LABELS = ("object_distance", "field_x", "field_y", "wavelength", "pupil_x", "pupil_y")
 
 
 @value
 class Traced(Rays, Result):
     """Rays (3, ...) on the image, and as a table: a row for every ray and surface that it reaches, or is lost at.
 
-    lens, begun: the lens, and the rays in front of surface 1, with their wavelength; origin: what they were launched
-    for, if the trace itself did it. Rays that never set out are not in the table.
+    lens, begun: the lens, and the rays in front of surface 1, with their wavelength; labels: (6, ...) LABELS, where the
+    trace itself launched them. Rays that never set out are not in the table.
     """
 
     lens: Lens | None = None
     begun: Rays | None = None
-    origin: Origin | None = None
+    labels: Tensor | None = None
 
     @property
     def count(self) -> int:
@@ -118,13 +113,14 @@ class Traced(Rays, Result):
 
     def _parts(self) -> Iterator[dict[str, Tensor]]:
         """The columns of the table, of so many rays at a time."""
-        origin = {} if self.origin is None else _named(self.origin, self.begun)
+        kept = self.begun.valid.flatten()
+        labels = () if self.labels is None else self.labels.reshape(len(LABELS), -1)[:, kept]
         for place, way in enumerate(self._ways()):
             some = slice(place * _BATCH, (place + 1) * _BATCH)
             rays, surfaces = (torch.arange(n, device=way.shown.device) for n in way.shown.shape)
             table = {"ray": rays[:, None] + some.start, "surface": surfaces + 1}
             table |= dict(zip((*COLUMNS, "opl"), way.values, strict=True)) | {"status": way.status}
-            table |= {name: column[some, None] for name, column in origin.items()}
+            table |= {name: column[some, None] for name, column in zip(LABELS, labels, strict=False)}
             yield {name: column.expand(way.shown.shape)[way.shown] for name, column in table.items()}
 
     def _ways(self) -> Iterator["_Way"]:
@@ -152,9 +148,9 @@ def trace(
     (F, W, 4) for the lens's own distance: fields as for `rt.rays`, wavelengths the primary one unless given. Their path
     counts from the wavefront of the object point that passes the vertex of surface 1.
     """
-    origin = None
+    labels = None
     if rays is None:
-        begun, origin = _chief_and_marginal(lens, object_distances, fields, wavelengths, ray_aiming)
+        begun, labels = _chief_and_marginal(lens, object_distances, fields, wavelengths, ray_aiming)
     else:
         if object_distances is not None or fields is not None:
             told = "--object-distance and --field change nothing: the rays of a table begin where it says"
@@ -163,7 +159,7 @@ def trace(
     if begun.wavelength is None:
         begun = dataclasses.replace(begun, wavelength=_chosen(lens, wavelengths).squeeze())
     end = trace_surfaces(lens.surfaces[1:], begun, indices=media(lens, begun.wavelength))
-    return Traced(end.position, end.direction, end.valid, end.opl, begun.wavelength, lens, begun, origin)
+    return Traced(end.position, end.direction, end.valid, end.opl, begun.wavelength, lens, begun, labels)
 
 
 def _chosen(lens: Lens, wavelengths: Tensor | Sequence[float] | None) -> Tensor:
@@ -171,7 +167,7 @@ def _chosen(lens: Lens, wavelengths: Tensor | Sequence[float] | None) -> Tensor:
     return primary if wavelengths is None else wavelengths_of(lens, wavelengths)
 
 
-def _chief_and_marginal(lens: Lens, object_distances, fields, wavelengths, ray_aiming) -> tuple[Rays, Origin]:
+def _chief_and_marginal(lens: Lens, object_distances, fields, wavelengths, ray_aiming) -> tuple[Rays, Tensor]:
     pupil = lens.wavelengths.new_tensor([[0.0, 0.0, 0.0, 1.0], [0.0, 1.0, -1.0, 0.0]])
     fields, wavelengths = field_points(fields, like=lens), _chosen(lens, wavelengths)
     distance = lens.surfaces[0].thickness
@@ -186,7 +182,8 @@ def _chief_and_marginal(lens: Lens, object_distances, fields, wavelengths, ray_a
     if unaimed := int((~found.valid).sum()):
         told = f"{unaimed} rays found no way to their point of the stop and are left out"
         warnings.warn(told, LostRays, stacklevel=3)
-    return found, Origin(distance, fields[:, :, None, None], pupil)
+    labels = (distance, *fields[:, :, None, None], wavelengths[:, None], *pupil)
+    return found, torch.stack([label.detach().expand(found.shape) for label in labels])
 
 
 _AXES = {"position": 1, "direction": 1, "valid": 0, "opl": 0}  # of Rays, where distances go
@@ -226,20 +223,6 @@ def _flat(rays: Rays) -> Rays:
     opl, wavelength = (t.detach().expand(rays.shape).flatten()[kept] for t in (opl, rays.wavelength))
     position, direction = (t.detach().reshape(3, -1)[:, kept] for t in (rays.position, rays.direction))
     return Rays(position, direction, kept[kept], opl, wavelength)
-
-
-def _named(origin: Origin, rays: Rays) -> dict[str, Tensor]:
-    """Columns (P,) of the rays that set out."""
-    columns = {
-        "object_distance": origin.object_distance,
-        "field_x": origin.field[0],
-        "field_y": origin.field[1],
-        "wavelength": rays.wavelength,
-        "pupil_x": origin.pupil[0],
-        "pupil_y": origin.pupil[1],
-    }
-    kept = rays.valid.flatten()
-    return {name: column.detach().expand(rays.shape).flatten()[kept] for name, column in columns.items()}
 
 
 def _cells(part: dict[str, Tensor]) -> list[list]:

@@ -51,19 +51,9 @@ def layout(found: Layout) -> Figure:
     return figure
 
 
-def draw_layout(
-    axes: Axes,
-    lens: Lens,
-    *,
-    fields: Tensor | None = None,
-    wavelength: Tensor | float | None = None,
-    rays: int = 7,
-    colours: list | None = None,
-) -> None:
-    """Draw the cross section into axes, equal in both directions and without ticks; colours: one for each field."""
+def draw_layout(axes: Axes, lens: Lens, *, fields: Tensor, wavelength: Tensor | None = None, rays: int = 7) -> None:
+    """Draw the cross section into axes, equal in both directions and without ticks; wavelength: () µm, or primary."""
     wavelength = lens.wavelengths[lens.primary_wavelength] if wavelength is None else wavelength
-    wavelength = torch.as_tensor(wavelength, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
-    fields = style.lens_fields(lens, fields)
     with torch.no_grad():
         z, radii = outline.vertices(lens), outline.drawn_radii(lens, wavelength, fields)
         indices = [float(index) for index in media(lens, wavelength)]
@@ -79,7 +69,7 @@ def draw_layout(
         _draw_mirrors(axes, lens, z, radii, paths)
         _draw_apertures(axes, lens, z, radii)
         _draw_stop(axes, lens, z, radii)
-        _draw_rays(axes, paths, colours or style.field_colours(len(paths)))
+        _draw_rays(axes, paths, style.field_colours(len(paths)))
         half = _draw_sensor(axes, lens, z, radii, paths)
         if near:
             _draw_object(axes, lens, z, paths)

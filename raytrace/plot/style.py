@@ -113,11 +113,6 @@ def array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().to(device="cpu", dtype=torch.float64 if tensor.is_floating_point() else None).numpy()
 
 
-def lens_fields(lens: Lens, fields: Tensor | None) -> Tensor:
-    """Field points (2, F): those given, or the lens's own."""
-    return torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields
-
-
 def field_colour(number: int) -> str:
     return FIELD_COLOURS[number % len(FIELD_COLOURS)]
 

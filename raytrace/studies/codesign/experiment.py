@@ -27,9 +27,9 @@ from raytrace.formats import write_lens
 from raytrace.formats.pictures import Pictures, crop, draws
 from raytrace.maths.grid import grid
 from raytrace.maths.result import plain
-from raytrace.optics.conjugates import distance_in_focus, paraxial_image
 from raytrace.optics.focus import best_focus, focused, real_image_distance
 from raytrace.studies.codesign.closed_form import optimise_closed_form, out_of_focus, power_spectrum
+from raytrace.studies.codesign.conjugates import distance_in_focus, paraxial_image
 from raytrace.studies.codesign.settings import Settings
 from raytrace.studies.descent import NoOptimum
 from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance, with_wavelengths

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from raytrace.camera.camera import Camera
-from raytrace.optics.conjugates import distance_in_focus, paraxial_image
 from raytrace.optics.focus import best_focus
 from raytrace.studies.codesign.closed_form import camera_error, even_distances, optimise_closed_form
+from raytrace.studies.codesign.conjugates import distance_in_focus, paraxial_image
 from raytrace.studies.codesign.experiment import camera
 from raytrace.studies.codesign.settings import AFTER_PARAXIAL, Settings
 from raytrace.system.lens import Lens
