@@ -13,14 +13,15 @@ from pathlib import Path
 
 import torch
 
-from raytrace import analysis
-from raytrace.analysis.setting import scene_of
+import raytrace as rt
+from raytrace.analysis.mtf import mtf_through_focus as mtf_through_focus_of
 from raytrace.kernels import diffraction
 from raytrace.maths import pupil, zernike
 from raytrace.media import glass
 from raytrace.media.catalog import find_glass
 from raytrace.optics.launch import launch, stop_radius
 from raytrace.optics.paraxial import first_order
+from raytrace.optics.scene import Scene, scene
 from raytrace.optics.trace import media, steps, trace_lens
 from raytrace.optics.wavefront import peak_to_valley, rms, wavefront_of
 from raytrace.system.lens import FIELD_UNITS, RAY_AIMING, Fields, Lens, SystemAperture
@@ -147,6 +148,12 @@ def waves_of(case: dict) -> torch.Tensor:
     return tensor(case["wavelength"]).reshape(-1)
 
 
+def of_waves(case: dict, values: torch.Tensor) -> torch.Tensor:
+    """Values (F, W, ...) at the wavelengths of a lens: those of the case, whatever is primary."""
+    known = lens_of(case).wavelengths.tolist()
+    return values[:, [known.index(wavelength) for wavelength in waves_of(case).tolist()]]
+
+
 def points_of(case: dict) -> tuple[torch.Tensor, torch.Tensor]:
     """Pupil points (2, P) and weights of `sampling`: ["grid", N], ["points", list] or ["gq", rings, arms]."""
     kind, *told = case.get("sampling", ["gq", 14, 56])
@@ -168,8 +175,13 @@ def points_of(case: dict) -> tuple[torch.Tensor, torch.Tensor]:
     return points, torch.full_like(points[0], 1 / points.shape[1])
 
 
+def scene_at(case: dict, wavelengths: torch.Tensor) -> Scene:
+    lens = lens_of(case)
+    return scene(lens, fields_of(case), lens.surfaces[0].thickness[None], wavelengths)
+
+
 def front_of(case: dict):
-    return wavefront_of(scene_of(lens_of(case), fields_of(case), waves_of(case)), *points_of(case))
+    return wavefront_of(scene_at(case, waves_of(case)), *points_of(case))
 
 
 def flat(*parts: torch.Tensor) -> list[float]:
@@ -242,16 +254,17 @@ def semi_diameter(case):
 
 def _fan(found, case, scale):
     every = case.get("every", 1)
-    return flat(scale * found.tangential[..., ::every], scale * found.sagittal[..., ::every])
+    curves = (of_waves(case, scale * curve[..., ::every]) for curve in (found.tangential, found.sagittal))
+    return flat(*curves)
 
 
 def ray_fan(case):
-    found = analysis.ray_fan(lens_of(case), fields=fields_of(case), wavelengths=waves_of(case), size=case["size"])
+    found = rt.ray_fan(lens_of(case), fields=fields_of(case), points=case["size"])
     return _fan(found, case, 1000.0)
 
 
 def opd_fan(case):
-    found = analysis.opd_fan(lens_of(case), fields=fields_of(case), wavelengths=waves_of(case), size=case["size"])
+    found = rt.opd_fan(lens_of(case), fields=fields_of(case), points=case["size"])
     return _fan(found, case, -1.0)
 
 
@@ -292,13 +305,11 @@ def wavefront_map(case):
 
 
 def wavefront_rms_cli(case):
-    return flat(analysis.wavefront_map(lens_of(case), fields=fields_of(case), wavelengths=waves_of(case)).rms)
+    return flat(of_waves(case, rt.wavefront(lens_of(case), fields=fields_of(case)).rms))
 
 
 def wavefront_pv_cli(case):
-    return flat(
-        analysis.wavefront_map(lens_of(case), fields=fields_of(case), wavelengths=waves_of(case)).peak_to_valley
-    )
+    return flat(of_waves(case, rt.wavefront(lens_of(case), fields=fields_of(case)).peak_to_valley))
 
 
 def _zernike(case, orders, scales):
@@ -318,41 +329,40 @@ def zernike_fringe(case):
 
 
 def distortion(case):
-    found = analysis.distortion(lens_of(case), fields=fields_of(case), wavelengths=waves_of(case))
-    return flat(100 * found.f_tan)
+    return flat(100 * of_waves(case, rt.distortion(lens_of(case), fields=fields_of(case)).f_tan))
 
 
 def chief_height(case):
-    return flat(analysis.distortion(lens_of(case), fields=fields_of(case), wavelengths=waves_of(case)).height)
+    return flat(of_waves(case, rt.distortion(lens_of(case), fields=fields_of(case)).height))
 
 
 def field_curvature(case):
-    found = analysis.field_curvature(lens_of(case), fields=fields_of(case), wavelengths=waves_of(case))
-    return flat(found.tangential, found.sagittal)
+    found = rt.field_curvature(lens_of(case), fields=fields_of(case))
+    return flat(of_waves(case, found.tangential), of_waves(case, found.sagittal))
 
 
 def lateral(case):
     """The longest wavelength against the shortest, µm."""
     lens = lens_of(case)
-    shift = 1000 * analysis.lateral_colour(lens, fields=fields_of(case)).shift
+    shift = 1000 * rt.lateral_colour(lens, fields=fields_of(case)).shift
     short, long = lens.wavelengths.argmin(), lens.wavelengths.argmax()
     return flat(tensor(case["sign"]) * (shift[:, long] - shift[:, short]))
 
 
 def illumination(case):
-    found = analysis.relative_illumination(lens_of(case), fields=fields_of(case), wavelengths=waves_of(case))
+    found = rt.relative_illumination(lens_of(case), fields=fields_of(case), wavelengths=waves_of(case))
     return flat(found.illumination)
 
 
 def mtf_fft(case):
-    found = analysis.mtf(lens_of(case), tensor(case["frequency"]), fields=fields_of(case))
+    found = rt.mtf(lens_of(case), tensor(case["frequency"]), fields=fields_of(case))
     return flat(found.tangential, found.sagittal)
 
 
 def mtf_geometric(case):
     """OpticStudio multiplies by the MTF of the perfect lens."""
     lens, frequencies = lens_of(case), tensor(case["frequency"])
-    found = analysis.mtf(lens, frequencies, kind="geometric", fields=fields_of(case))
+    found = rt.mtf(lens, frequencies, geometric=True, fields=fields_of(case))
     share = lens.wavelength_weights / lens.wavelength_weights.sum()
     s = (1e-3 * lens.wavelengths[:, None] * case["working_f_number"] * frequencies).clamp_max(1.0)
     limit = (share[:, None] * 2 / math.pi * (torch.acos(s) - s * torch.sqrt(1 - s * s))).sum(0)
@@ -362,13 +372,13 @@ def mtf_geometric(case):
 def mtf_through_focus(case):
     lens = lens_of(case)
     distances = lens.surfaces[-2].thickness + tensor(case["shift"])
-    found = analysis.mtf_through_focus(lens, case["frequency"], distances, fields=fields_of(case))
+    found = mtf_through_focus_of(lens, case["frequency"], distances, fields=fields_of(case))
     return flat(found.tangential, found.sagittal)
 
 
 def encircled(case):
-    found = analysis.encircled_energy(
-        lens_of(case), 1e-3 * tensor(case["radius"]), kind=case["kind"], fields=fields_of(case)
+    found = rt.encircled_energy(
+        lens_of(case), 1e-3 * tensor(case["radius"]), geometric=case["kind"] == "geometric", fields=fields_of(case)
     )
     return flat(found.share * tensor(case.get("scale", 1.0)))
 
@@ -379,8 +389,8 @@ def intensities(case, x, y):
     x, y: mm; at best: without aberrations.
     """
     lens = lens_of(case)
-    scene = scene_of(lens, fields_of(case), lens.wavelengths)
-    light = diffraction.waves(scene, torch.hypot(x.abs().max(), y.abs().max()), order=2)
+    view = scene_at(case, lens.wavelengths)
+    light = diffraction.waves(view, torch.hypot(x.abs().max(), y.abs().max()), order=2)
     U = diffraction.amplitude(light, x, y)[0, 0]
     best = light.amplitude.sum(-1)[0, 0] / (1e-3 * lens.wavelengths / light.wavefront.index)
     return U.real**2 + U.imag**2, best**2
@@ -410,7 +420,7 @@ def mtf_huygens(case):
 def strehl(case):
     """The peak of all wavelengths together, by weight."""
     if len(lens_of(case).wavelengths) == 1:
-        return flat(diffraction.strehl(scene_of(lens_of(case), fields_of(case), waves_of(case))))
+        return flat(diffraction.strehl(scene_at(case, waves_of(case))))
     found, best = intensities(case, tensor([0.0]), tensor([0.0]))
     return flat((share_of(case) * found / best[:, None, None]).sum(0))
 

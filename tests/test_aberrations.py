@@ -7,7 +7,7 @@ import pytest
 import torch
 from problems import MICROMETRE, NANOMETRE, double_gauss, fields, lens, scalar, surface, vector
 
-from raytrace.analysis import distortion, grid_distortion, incidence, longitudinal_aberration
+from raytrace import distortion, distortion_grid, incidence, longitudinal_aberration
 from raytrace.cli import main
 from raytrace.media.glass import MIRROR
 from raytrace.optics.paraxial import first_order, paraxial_image_distance
@@ -20,7 +20,7 @@ SPHERE = lens([surface(None, 300.0), surface(-0.01, -50.0, MIRROR)], aperture=("
 
 def test_rays_of_a_spherical_mirror_cross_the_axis_at_half_the_secant():
     """A ray at height h of a mirror of radius R crosses R - R/(2 cos i) behind its vertex, sin i = h/R."""
-    found = longitudinal_aberration(SPHERE, size=9)
+    found = longitudinal_aberration(SPHERE, points=9)
     height = 40.0 * found.pupil
     exact = -(100.0 - 50.0 / torch.sqrt(1 - (height / 100.0) ** 2)) + 50.0
     torch.testing.assert_close(found.crossing[0], exact, rtol=0, atol=2 * NANOMETRE)
@@ -30,7 +30,7 @@ def test_rays_of_a_spherical_mirror_cross_the_axis_at_half_the_secant():
 @pytest.mark.parametrize("distance", [INF, 1000.0])
 def test_the_first_crossing_is_the_paraxial_focus_of_each_wavelength(distance):
     system = with_object_distance(double_gauss(wavelengths=(0.53, 0.48)), distance)
-    found = longitudinal_aberration(system, size=3)
+    found = longitudinal_aberration(system, points=3)
     focus = paraxial_image_distance(system, scalar(distance), system.wavelengths) - system.surfaces[-2].thickness
     torch.testing.assert_close(found.crossing[:, 0], focus, rtol=0, atol=2 * NANOMETRE)
 
@@ -38,15 +38,15 @@ def test_the_first_crossing_is_the_paraxial_focus_of_each_wavelength(distance):
 def test_rays_that_do_not_cross_the_axis_are_said_to():
     """Lost on the way, or parallel to the axis."""
     stopped = SPHERE.replace(2, apertures=(Aperture("circular", (0.0, 20.0)),))
-    assert longitudinal_aberration(stopped, size=5).valid[0].tolist() == [True, True, True, False, False]
-    assert math.isnan(longitudinal_aberration(stopped, size=5).to_frame()["crossing"].iloc[-1])
-    assert not bool(longitudinal_aberration(lens([surface(None, 10.0)]), size=3).valid.any())
+    assert longitudinal_aberration(stopped, points=5).valid[0].tolist() == [True, True, True, False, False]
+    assert math.isnan(longitudinal_aberration(stopped, points=5).to_frame()["crossing"].iloc[-1])
+    assert not bool(longitudinal_aberration(lens([surface(None, 10.0)]), points=3).valid.any())
 
 
 def test_a_pinhole_distorts_nothing_and_a_sphere_about_it_does_as_the_sine():
     """Without a lens the image is the object's; the chief rays of a concentric sphere image h = R sin θ on its rim."""
     pinhole = lens([surface(None, 50.0)], field=fields("angle", (30.0,)))
-    found = grid_distortion(pinhole, size=5)
+    found = distortion_grid(pinhole, points=5)
     assert found.distortion.abs().max().item() < 1e-12
     corner = 50.0 * math.tan(math.radians(30.0)) / math.sqrt(2)
     torch.testing.assert_close(found.ideal[:, 0, -1, -1], vector(corner, corner), rtol=1e-12, atol=0)
@@ -58,8 +58,8 @@ def test_the_corner_of_the_grid_is_the_end_of_the_distortion_curve(distance):
     """Of a round lens, distortion depends on the distance from the axis alone."""
     field = fields("angle", (0.0, 14.0)) if distance == INF else fields("object_height", (0.0, 60.0))
     system = with_object_distance(double_gauss(field=field), distance)
-    end = distortion(system, size=2).f_tan[-1, 0]
-    found = grid_distortion(system, size=7)
+    end = distortion(system, samples=2).f_tan[-1, 0]
+    found = distortion_grid(system, points=7)
     for corner in (found.distortion[0, 0, 0], found.distortion[0, -1, 0], found.distortion[0, -1, -1]):
         assert corner.item() == pytest.approx(end.item(), abs=2e-8)
     assert found.distortion[0, 3, 3].item() == 0.0
@@ -97,8 +97,8 @@ def test_curvatures_carry_derivatives():
         system = lens(
             [surface(None, 4.0), surface(curvature, 5.0, 1.5), surface(-0.01, 90.0)], field=fields("angle", (9.0,))
         )
-        crossing = longitudinal_aberration(system, size=3).crossing
-        return crossing, incidence(system, size=2).angle[1], grid_distortion(system, size=3).distortion
+        crossing = longitudinal_aberration(system, points=3).crossing
+        return crossing, incidence(system, samples=2).angle[1], distortion_grid(system, points=3).distortion
 
     assert torch.autograd.gradcheck(angles, (scalar(0.02).requires_grad_(),), atol=1e-6)
 
@@ -106,14 +106,14 @@ def test_curvatures_carry_derivatives():
 def test_a_micrometre_of_the_sensor_moves_every_crossing_by_one():
     system = double_gauss()
     moved = system.at(sensor_distance=system.surfaces[-2].thickness + MICROMETRE)
-    here, there = (longitudinal_aberration(s, size=5).crossing for s in (system, moved))
+    here, there = (longitudinal_aberration(s, points=5).crossing for s in (system, moved))
     torch.testing.assert_close(there, here - MICROMETRE, rtol=0, atol=NANOMETRE * 1e-3)
 
 
 COMMANDS = {
-    "seidel": (["--as", "waves", "--field", "10", "14"], "W040"),
-    "longitudinal": (["--points", "5"], "crossing"),
-    "grid": (["--points", "3", "--exaggerate", "5"], "largest"),
+    "seidel": (["--kind", "waves", "--field", "10", "14"], "W040"),
+    "longitudinal-aberration": (["--points", "5"], "crossing"),
+    "distortion-grid": (["--points", "3", "--exaggerate", "5"], "largest"),
     "incidence": (["--samples", "3", "--surfaces"], "chief"),
 }
 

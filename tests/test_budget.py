@@ -12,7 +12,8 @@ import pytest
 import torch
 
 import raytrace
-from raytrace import analysis, budget
+import raytrace as rt
+from raytrace import budget
 from raytrace.budget import OverBudget, TakesLong, afford, free_bytes, in_words, piece, within
 from raytrace.cli import build_parser, main
 from raytrace.cli.commands import COMMANDS
@@ -92,11 +93,11 @@ def test_analyses_in_pieces_are_those_of_all_at_once(lens, monkeypatch):
             for module in ("aperture", "mtf", "wavefronts", "encircled"):
                 each = sys.modules[f"raytrace.analysis.{module}"]
                 monkeypatch.setattr(each, "piece", lambda each: 1 if each > 1e4 else 5000)
-        found_map = analysis.wavefront_map(lens, size=9, fields=fields)
+        found_map = rt.wavefront(lens, size=9, fields=fields)
         found[pieces] = (
-            analysis.mtf(lens, frequencies, kind="geometric", fields=fields).tangential,
-            analysis.mtf(lens, frequencies, fields=fields).sagittal,
-            analysis.encircled_energy(lens, frequencies / 1e4, kind="geometric", fields=fields).share,
+            rt.mtf(lens, frequencies, geometric=True, fields=fields).tangential,
+            rt.mtf(lens, frequencies, fields=fields).sagittal,
+            rt.encircled_energy(lens, frequencies / 1e4, geometric=True, fields=fields).share,
             *(getattr(found_map, name) for name in ("opd", "rms", "coefficients")),
         )
     for one, whole in zip(found[True], found[False], strict=True):
@@ -116,8 +117,8 @@ NASTY = {
     "wave of x-rays": lambda lens: psf(
         lens, "wave", fields=torch.zeros(2, 1, dtype=torch.float64), wavelengths=lens.wavelengths.new_tensor([1e-6])
     ),
-    "wavefront": lambda lens: analysis.wavefront_map(lens, size=10**5),
-    "encircled": lambda lens: analysis.encircled_energy(lens, fields=torch.zeros(2, 10**6, dtype=torch.float64)),
+    "wavefront": lambda lens: rt.wavefront(lens, size=10**5),
+    "encircled": lambda lens: rt.encircled_energy(lens, fields=torch.zeros(2, 10**6, dtype=torch.float64)),
     "rays": lambda lens: image_rays(lens, torch.zeros(2, 1, dtype=torch.float64).expand(2, 10**9)),
 }
 
@@ -143,7 +144,8 @@ def test_what_takes_long_is_said_before_it_begins(lens):
 def test_commands_refuse_in_one_line(capsys):
     assert main(["wavefront", "double_gauss", "--size", "20000", "--max-bytes", "1GB"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("raytrace: error: the wavefronts of 3 fields × 1 wavelengths at 20000 × 20000 points (")
+    points = "the wavefronts of 3 fields × 1 wavelengths at 20000 × 20000 points ("
+    assert line.startswith(f"raytrace: error: double_gauss: {points}")
     assert "1 GB may be taken" in line
 
 
@@ -159,7 +161,7 @@ def test_every_command_has_the_option(name, capsys):
 
 #: Commands that take memory, and what they are allowed.
 HEAVY = (
-    (["encircled", "double_gauss", "--field", *map(str, range(0, 14))], 1.0e9),
+    (["encircled-energy", "double_gauss", "--field", *map(str, range(0, 14))], 1.0e9),
     (["wavefront", "double_gauss", "--size", "1500"], 2.0e9),
     (["psf", "double_gauss", "--model", "wave", "--field", "14", "--size", "41"], 1.0e9),
 )

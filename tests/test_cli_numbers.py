@@ -107,12 +107,12 @@ LOST = "no ray of field 0 degrees reaches the sensor: all 217 rays lost: vignett
     ("command", "change", "message"),
     [
         ("mtf --frequency 5", ("VCYN 0 0 0", "VCYN 0 1 1"), NARROW),
-        ("encircled", ("VCXN 0 0 0", "VCXN 0 1 1"), NARROW),
+        ("encircled-energy", ("VCXN 0 0 0", "VCXN 0 1 1"), NARROW),
         ("psf --model fourier", ("DISZ 100.0", "DISZ 0"), AFOCAL),
         ("psf --model fourier", PLATE, AFOCAL),
         ("mtf --frequency 5", BLOCKED, LOST),
         ("mtf --frequency 5 --geometric", BLOCKED, LOST),
-        ("encircled --geometric", BLOCKED, LOST),
+        ("encircled-energy --geometric", BLOCKED, LOST),
         ("wavefront", BLOCKED, LOST),
         ("spot", ("ENPD 12.5", "OBNA 1.5 0"), "aperture object_na needs an object at a finite distance"),
         ("focus --criterion mean", BLOCKED, "no ray reaches the image"),
@@ -160,7 +160,7 @@ def test_a_cone_that_hardly_anything_passes_gives_no_absurd_numbers(run):
     assert "field 0 degrees: the light fills too little of the entrance pupil for Zernike coefficients" in found.err
     assert {row["coefficient"] for row in found.document["results"]} == {None}
     assert found.document["summary"][0]["rms"] > 1
-    lost = run("illumination", "double_gauss", "--f-number", 0.1, "--samples", 3)
+    lost = run("relative-illumination", "double_gauss", "--f-number", 0.1, "--samples", 3)
     assert "nothing to show" in lost.err  # nor a solid angle of 1e13 sr
 
 
@@ -182,6 +182,6 @@ def test_a_blur_of_very_many_pixels_is_refused_before_it_is_cut_into_cells(run, 
 
 
 def test_an_object_in_the_first_surface_has_no_invariant_and_no_aberrations(run):
-    text = run("seidel", singlet("touching", ("DISZ INFINITY", "DISZ 0")), "--as", "waves").out
+    text = run("seidel", singlet("touching", ("DISZ INFINITY", "DISZ 0")), "--kind", "waves").out
     assert "optical invariant - mm" in text
     assert "nan" not in text

@@ -13,8 +13,7 @@ import pandas
 import pytest
 import torch
 
-from raytrace import plot
-from raytrace.analysis import distortion, opd_fan, ray_fan
+from raytrace import distortion, opd_fan, ray_fan
 from raytrace.cli import build_parser
 from raytrace.cli.door import find_lens
 from raytrace.cli.options import PICTURES, data_file, picture_file
@@ -22,6 +21,7 @@ from raytrace.formats import read_lens
 from raytrace.maths.pupil import hexapolar
 from raytrace.optics.arrivals import arrivals
 from raytrace.optics.losses import LOST, STATUS, losses
+from raytrace.plot.analysis import distortion_curves
 from raytrace.words import did_you_mean
 
 #: Options whose form differs between commands, and why.
@@ -106,7 +106,7 @@ def test_several_object_distances_are_one_result_each(command):
     both = json.loads(command(*words, 25000, "inf")[1])["results_by_object_distance"]
     alone = [json.loads(command(*words, distance)[1]) for distance in (25000, "inf")]
     assert both == [{"object_distance": 25000, **alone[0]}, {"object_distance": None, **alone[1]}]
-    code, out, err = command("fan", "tessar", "--object-distance", 1000.5, "inf", "--plot", "fan.png")
+    code, out, err = command("ray-fan", "tessar", "--object-distance", 1000.5, "inf", "--plot", "fan.png")
     assert code == 0, err
     assert re.findall("^object at .*", out, re.M) == ["object at 1000.5 mm", "object at infinity"]
     names = sorted(path.name for path in Path().glob("*.png"))
@@ -223,7 +223,9 @@ def test_nothing_near_is_nothing_said():
 
 
 @pytest.mark.parametrize("lens", ["phone", "hubble", "telephoto"])
-@pytest.mark.parametrize("analysis", ["mtf", "fan", "opd", "wavefront", "distortion", "encircled", "incidence"])
+@pytest.mark.parametrize(
+    "analysis", ["mtf", "ray-fan", "opd-fan", "wavefront", "distortion", "encircled-energy", "incidence"]
+)
 def test_a_field_out_of_reach_is_told_with_cause_and_help(command, analysis, lens):
     field = 5 if lens == "hubble" else 60
     code, out, err = command(analysis, lens, "--field", field, "--plot", "figure.png")
@@ -236,7 +238,7 @@ def test_a_field_out_of_reach_is_told_with_cause_and_help(command, analysis, len
 
 
 def test_curves_show_the_fields_that_are_in_reach_and_tell_of_the_others(command):
-    code, out, err = command("fan", "tessar", "--field", 0, 80, "--points", 3, "--json")
+    code, out, err = command("ray-fan", "tessar", "--field", 0, 80, "--points", 3, "--json")
     assert code == 0
     assert "warning: no ray of field 80 degrees reaches the sensor" in err
     rows = json.loads(out)["results"]
@@ -252,13 +254,13 @@ FLAT += "0,inf,inf,,,\n1,inf,5,N-BK7,10,1\n2,inf,50,,10,\n3,inf,0,,,\n"
     ("words", "message"),
     [
         (
-            "lateral hubble",
+            "lateral-colour hubble",
             "lateral colour is a difference of wavelengths, and there is one, 0.6328 µm; give",
         ),
         ("distortion hubble --field 0", "all fields are on the axis; give others by --field"),
-        ("lateral tessar --field 0", "all fields are on the axis; give others by --field"),
-        ("curvature tessar --field 0 --plot curvature.png", "all fields are on the axis; give others by --field"),
-        ("curvature flat.csv", "no number of curvature exists for this lens"),
+        ("lateral-colour tessar --field 0", "all fields are on the axis; give others by --field"),
+        ("field-curvature tessar --field 0 --plot curvature.png", "all fields are on the axis; give others by --field"),
+        ("field-curvature flat.csv", "no number of field curvature exists for this lens"),
         (
             "compare hubble",
             "within the focal length, or the lens diverges (paraxial image at -1068.25 mm); its focal len",
@@ -276,7 +278,7 @@ def test_an_analysis_that_shows_nothing_says_so(command, words, message):
 
 def test_close_rays_of_a_field_in_any_meridian_have_the_foci_of_its_own(command):
     """A lens of revolution: the sections of a field turn with it."""
-    code, out, err = command("curvature", "tessar", "--field", 9, "9,0", "-9,0", "--json")
+    code, out, err = command("field-curvature", "tessar", "--field", 9, "9,0", "-9,0", "--json")
     assert code == 0, err
     upright, *turned = [[row for row in json.loads(out)["results"] if row["field_x"] == x] for x in (0, 9, -9)]
     for rows in turned:
@@ -286,11 +288,11 @@ def test_close_rays_of_a_field_in_any_meridian_have_the_foci_of_its_own(command)
 
 
 def test_a_thinned_table_says_how_many_points_it_lists(command):
-    for name, points, listed in (("fan", 41, 9), ("opd", 21, 5)):
+    for name, points, listed in (("ray-fan", 41, 9), ("opd-fan", 21, 5)):
         out = command(name, "tessar", "--field", 0, "--wavelength", 0.55, "--points", points)[1]
         assert out.splitlines()[-1] == f"{listed} of {points} points of each curve; --json lists all"
         assert len(out.splitlines()) == 2 + listed + 1
-    assert "points of each curve" not in command("fan", "tessar", "--points", 9)[1]
+    assert "points of each curve" not in command("ray-fan", "tessar", "--points", 9)[1]
 
 
 PARABOLA = "# wavelengths: 0.5\n# fields: angle 0 1\nsurface,radius,thickness,glass,conic,diameter,stop\n"
@@ -304,10 +306,10 @@ def test_axes_do_not_magnify_rounding(tmp_path):
     axis = torch.zeros(2, 1, dtype=torch.float64)
     for found in (ray_fan(lens, fields=axis), opd_fan(lens, fields=axis)):
         assert float(found.tangential.abs().max()) < 1e-9
-        panels = plot.fan_plot(lens, found).axes
+        panels = found.plot().axes
         assert panels[0].get_ylim()[1] >= 1e-4
         assert "everywhere" in panels[0].texts[0].get_text()
     off_axis = ray_fan(lens, fields=axis + 1)
-    assert not plot.fan_plot(lens, off_axis).axes[0].texts
+    assert not off_axis.plot().axes[0].texts
     alone = distortion(lens, fields=axis + 1)
-    assert plot.distortion_curves(lens, alone).axes[0].lines[0].get_marker() == "o"  # one field: a line is not seen
+    assert distortion_curves(alone).axes[0].lines[0].get_marker() == "o"  # one field: a line is not seen

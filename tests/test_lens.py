@@ -8,7 +8,7 @@ import pytest
 import torch
 from problems import lens, surface, vector
 
-from raytrace.analysis import distortion
+from raytrace import distortion
 from raytrace.formats import LensFileError, read_lens, write_lens
 from raytrace.media.glass import MIRROR, ImplausibleWavelength, InvalidIndex, OutOfRange, check_unit
 from raytrace.media.glass import constant as medium

@@ -11,7 +11,7 @@ import pytest
 import torch
 from problems import fields, lens, scalar, surface, vector
 
-from raytrace.analysis import grid_distortion, incidence, longitudinal_aberration, rms_over_field, seidel
+from raytrace import distortion_grid, incidence, longitudinal_aberration, rms_over_field, seidel
 from raytrace.media.glass import Glass
 from raytrace.optics.f_number import real_working_f_number
 from raytrace.optics.paraxial import first_order
@@ -94,7 +94,7 @@ def test_first_order(system):
 
 def test_seidel_sum_and_yni(system):
     found = seidel(system)
-    assert found.sums()["S1"].item() == pytest.approx(0.000625, abs=5e-7)
+    assert found.summary()["S1"].item() == pytest.approx(0.000625, abs=5e-7)
     assert found.marginal_yni[0, 0].item() == pytest.approx(0.1011, abs=5e-5)
 
 
@@ -108,7 +108,7 @@ CROSSINGS = {
 
 def test_longitudinal_aberration(system):
     """To 2.5 nm, which the indices, printed to 5e-11, leave; at the axis OpticStudio takes a ray at 0.005."""
-    found = longitudinal_aberration(system, size=101)
+    found = longitudinal_aberration(system, points=101)
     for pupil, expected in CROSSINGS.items():
         torch.testing.assert_close(found.crossing[:, round(100 * pupil)], vector(*expected), rtol=0, atol=2.5e-6)
     assert found.crossing[0, 0].item() == pytest.approx(0.003305, abs=5e-7)
@@ -117,12 +117,12 @@ def test_longitudinal_aberration(system):
 def test_angle_of_incidence_on_the_sensor(system):
     """Of the upper ray at 0.7 of the field."""
     found = incidence(system, fields=vector(0.0, 3.15)[:, None])
-    assert found.on_sensor()["upper"].item() == pytest.approx(-6.784391, abs=6e-7)
+    assert found.summary()["upper"].item() == pytest.approx(-6.784391, abs=6e-7)
 
 
-def test_grid_distortion():
+def test_distortion_grid():
     """Its grid reaches to the field angle 23.70386965° that it takes for the largest image height."""
-    found = grid_distortion(objective(fields("angle", (23.70386965,))), size=5)
+    found = distortion_grid(objective(fields("angle", (23.70386965,))), points=5)
     assert 100 * found.largest().item() == pytest.approx(-4.558131, abs=6e-7)
 
 

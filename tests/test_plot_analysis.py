@@ -12,9 +12,12 @@ from page import outside
 from problems import number
 
 import raytrace as rt
-from raytrace import analysis, plot, read_lens
+from raytrace import plot, read_lens
+from raytrace.analysis.setting import NothingToShow
 from raytrace.cli import main
 from raytrace.optics.focus import image_rays
+from raytrace.plot import style
+from raytrace.plot.analysis import curvature_curves, illumination_curve
 from raytrace.plot.spots import even_hexapolar, field_spots
 from raytrace.plot.style import field_colours
 
@@ -28,7 +31,7 @@ def drawn(monkeypatch):
 
     def run(*words: str):
         figures = []
-        for place in (plot, plot.style):
+        for place in (plot, style):
             monkeypatch.setattr(place, "save", lambda figure, path: figures.append(figure))
         assert main([*words, "--plot", "figure.png"]) == 0
         return figures[-1]
@@ -41,20 +44,23 @@ def curves(panel) -> list:
     return [line for line in panel.lines if len(line.get_xdata()) > 2 and line.get_marker() in ("None", "")]
 
 
-COMMANDS = ("layout", "spot", "mtf", "fan", "opd", "wavefront", "distortion", "curvature", "lateral", "illumination")
+COMMANDS = (
+    *("layout", "spot", "mtf", "ray-fan", "opd-fan", "wavefront", "distortion", "field-curvature", "lateral-colour"),
+    *("relative-illumination", "encircled-energy", "psf"),
+)
 
 
 TWELVE = ("double_gauss", "--field", *map(str, range(12)))
-DEAR = ("mtf", "encircled", "wavefront", "opd", "curvature")  # seconds of twelve fields
+DEAR = ("mtf", "encircled-energy", "wavefront", "opd-fan", "field-curvature")  # seconds of twelve fields
 
 
 @pytest.mark.parametrize(
     ("command", "lens"),
     [
         pytest.param(command, lens, marks=[pytest.mark.slow] if lens is TWELVE and command in DEAR else [])
-        for command in (*COMMANDS, "encircled", "psf")
+        for command in COMMANDS
         for lens in (("hubble",), ("telephoto",), TWELVE, ("singlet", "--field", "5"))
-        if command != "lateral" or lens[0] in ("telephoto", "singlet")  # the others have one wavelength
+        if command != "lateral-colour" or lens[0] in ("telephoto", "singlet")  # the others have one wavelength
     ],
 )
 def test_every_word_is_on_the_page_and_none_over_another(drawn, command, lens):
@@ -66,8 +72,8 @@ def test_every_word_is_on_the_page_and_none_over_another(drawn, command, lens):
 def test_titles_longer_than_the_page_are_broken():
     lens = dataclasses.replace(read_lens(LENSES / "singlet.zmx"), name=LONG)
     for figure in (
-        plot.curvature_curves(lens, analysis.field_curvature(lens)),
-        plot.wavefront_maps(lens, analysis.wavefront_map(lens, wavelengths=number([0.55]), size=16)),
+        rt.field_curvature(lens).plot(),
+        rt.wavefront(lens, wavelengths=[0.55], size=16).plot(),
         rt.spot(lens).plot(),
         rt.layout(lens).plot(),
         rt.focus(lens).plot(by="field"),
@@ -75,7 +81,7 @@ def test_titles_longer_than_the_page_are_broken():
         assert outside(figure) == []
 
 
-@pytest.mark.parametrize("command", ["mtf", "encircled"])
+@pytest.mark.parametrize("command", ["mtf", "encircled-energy"])
 def test_curves_are_drawn_finer_than_they_are_printed_and_what_was_asked_is_marked(drawn, command):
     option, asked = ("--frequency", ["5", "20"]) if command == "mtf" else ("--radius", ["0.01", "0.05"])
     for words in ([], [option, *asked]):
@@ -98,12 +104,12 @@ def test_curves_are_drawn_finer_than_they_are_printed_and_what_was_asked_is_mark
 
 @pytest.mark.parametrize("lens", ["phone", "cooke_triplet", "singlet"])
 def test_illumination_is_a_line(drawn, lens):
-    (panel,) = drawn("illumination", lens).axes
+    (panel,) = drawn("relative-illumination", lens).axes
     line = max(panel.lines, key=lambda line: line.get_linewidth())
     assert len(line.get_xdata()) > 50
     assert line.get_linestyle() == "-"
     assert not [c for c in panel.collections if isinstance(c, PathCollection)]
-    (panel,) = drawn("illumination", lens, "--field", "3", "9").axes
+    (panel,) = drawn("relative-illumination", lens, "--field", "3", "9").axes
     (marks,) = [line for line in panel.lines if line.get_marker() == "o"]
     line = max((line for line in panel.lines if line is not marks), key=lambda line: line.get_linewidth())
     assert marks.get_xdata().tolist() == [3, 9]
@@ -112,34 +118,35 @@ def test_illumination_is_a_line(drawn, lens):
 
 
 def test_a_lens_of_one_wavelength_has_no_lateral_colour_to_draw():
-    lens = read_lens(LENSES / "double_gauss.zmx")
-    (panel,) = plot.lateral_curves(lens, analysis.lateral_colour(lens)).axes
-    assert "one wavelength" in panel.texts[0].get_text()
-    assert not len(panel.get_xticks()) + len(panel.get_yticks())
+    with pytest.raises(NothingToShow, match=r"there is one, 0\.53 µm"):
+        rt.lateral_colour(read_lens(LENSES / "double_gauss.zmx"))
 
 
 @pytest.mark.parametrize(
     ("draw", "analyse"),
     [
-        (plot.curvature_curves, analysis.field_curvature),
-        (plot.illumination_curve, analysis.relative_illumination),
+        (curvature_curves, rt.field_curvature),
+        (illumination_curve, rt.relative_illumination),
     ],
 )
 def test_a_single_field_is_a_dot_on_axes_that_measure_something(draw, analyse):
     lens = read_lens(LENSES / "cooke_triplet.zmx")
-    (panel,) = draw(lens, analyse(lens, fields=torch.zeros(2, 1, dtype=torch.float64))).axes
+    found = analyse(lens, fields=[0])
+    (panel,) = draw(found).axes
     assert max(panel.get_xlim()[1] - panel.get_xlim()[0], panel.get_ylim()[1] - panel.get_ylim()[0]) >= 1
     assert [line for line in panel.lines if line.get_marker() == "o" and len(line.get_xdata()) == 1]
+    with pytest.raises(NothingToShow, match="all fields are on the axis"):
+        found.plot()
 
 
 @pytest.mark.parametrize(("fields", "wavelengths"), [(1, 1), (3, 1), (12, 1), (3, 3)])
 def test_maps_fill_their_page_and_their_scale(fields, wavelengths):
     lens = read_lens(LENSES / "singlet.zmx")
     y = torch.linspace(0, 5, fields, dtype=torch.float64)
-    found = analysis.wavefront_map(
+    found = rt.wavefront(
         lens, fields=torch.stack([0 * y, y]), wavelengths=number([0.5, 0.55, 0.6])[:wavelengths], size=24
     )
-    figure = plot.wavefront_maps(lens, found)
+    figure = found.plot()
     assert outside(figure) == []
     panels = [panel for panel in figure.axes if panel.images]
     assert len(panels) == fields * wavelengths

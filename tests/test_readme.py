@@ -84,7 +84,7 @@ def test_every_command_is_shown():
     """As an example, or by its name in the text about the analyses, which all work alike."""
     from raytrace.cli.commands import COMMANDS
 
-    shown = {line.split()[0] for line in examples()} | set(re.findall(r"`(\w+)`", README))
+    shown = {line.split()[0] for line in examples()} | set(re.findall(r"`([\w-]+)`", README))
     assert {command.name for command in COMMANDS} <= shown
 
 

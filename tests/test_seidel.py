@@ -7,7 +7,7 @@ import pytest
 import torch
 from problems import aspheric_singlet, double_gauss, fields, lens, scalar, surface, vector
 
-from raytrace.analysis import seidel
+from raytrace import seidel
 from raytrace.formats import read_lens
 from raytrace.media.glass import MIRROR, model_glass
 from raytrace.optics.focus import image_rays
@@ -102,7 +102,7 @@ def test_the_sum_of_s4_is_petzvals(name):
     data, found = first_order(system), seidel(system)
     n_image = signed(system.surfaces[1:-1], media(system, system.wavelengths[0])[:-1])[-1]
     expected = -(found.invariant**2) / (n_image * data.petzval_radius)
-    torch.testing.assert_close(found.sums()["S4"], expected, rtol=1e-12, atol=1e-18)
+    torch.testing.assert_close(found.summary()["S4"], expected, rtol=1e-12, atol=1e-18)
     assert found.invariant.abs().item() == pytest.approx(data.optical_invariant.item(), rel=1e-12)
 
 
@@ -120,7 +120,7 @@ def test_colours_are_the_first_order_of_close_wavelengths(distance):
     system = in_paraxial_focus(system, distance)
     rays = image_rays(system, vector(0.0, 0.0, 0.0, 1.0).reshape(2, 2), fields=vector(0.0, 1e-3)[:, None])
     chief, upper = rays.position[1, 0].unbind(-1)
-    found = seidel(system, kind="transverse").sums()
+    found = seidel(system, kind="transverse").summary()
     assert (chief[1] - chief[2]).item() == pytest.approx(found["TLAC"].item(), rel=1e-5)
     assert ((upper - chief)[1] - (upper - chief)[2]).item() == pytest.approx(found["TAXC"].item(), rel=1e-5)
 
@@ -128,7 +128,7 @@ def test_colours_are_the_first_order_of_close_wavelengths(distance):
 def test_a_paraboloid_with_the_stop_in_its_focal_plane_has_neither_spherical_aberration_nor_astigmatism():
     """Schroeder, Astronomical Optics, §6.2."""
     system = lens([surface(None, 100.0), surface(-1 / 200, -100.0, MIRROR, conic=-1.0)], field=FIELD)
-    sums = seidel(system).sums()
+    sums = seidel(system).summary()
     assert sums["S1"].abs().item() < 1e-18
     assert sums["S3"].abs().item() < 1e-15
     assert sums["S2"].abs().item() > 1e-4

@@ -50,7 +50,7 @@ def exit_pupil(scene: Scene, *, size: int | None = None) -> ExitPupil:
     points, weights = gauss_rings(*_PROBE, **like)
     probe = wavefront_of(scene, points, weights)
     enough = (probe.usable.sum(-1) >= 2 * _TERMS) & probe.valid.any(-1)
-    refuse_dark(scene.lens, scene.fields, scene.wavelengths, enough[0], "wave on the sensor")
+    refuse_dark(scene.lens, scene.fields, enough[0], "wave on the sensor")
     waves_per = 1e3 * probe.index / probe.wavelength  # n/λ, 1/mm
     middle, half = _box(probe.direction[:2].detach(), probe.usable)
     narrow = (beam_share(scene)[0, :, 0] == 0) | (half == 0).any(0).any(-1)[0]
@@ -70,23 +70,27 @@ def exit_pupil(scene: Scene, *, size: int | None = None) -> ExitPupil:
     basis = zernike.polynomials(orders, *normal).movedim(0, -1)
     root = safe_sqrt(torch.where(probe.usable, probe.weights, 0.0))[..., None]
     map_to_pupil = torch.linalg.lstsq(root * basis, root * points.T).solution  # (1, F, W, J, 2)
+    nodes, values, slopes = _interpolation(size, like)
+    y, x = torch.meshgrid(nodes, nodes, indexing="ij")
+    at_nodes = torch.einsum("jyx,...jc->c...yx", zernike.polynomials(orders, x, y), map_to_pupil)
+    pupil, by_l, by_m = (
+        rows @ at_nodes @ columns.T for rows, columns in ((values, values), (values, slopes), (slopes, values))
+    )
     line = (2 * torch.arange(size, **like) + 1 - size) / size
-    m, ell = (c.reshape(-1) for c in torch.meshgrid(line, line, indexing="ij"))
-    inside = ell * ell + m * m <= 1
-    # In pieces: the polynomials of all points at once would take gigabytes.
-    together = piece(8 * (6 * _TERMS + 60 * probe.opd[..., 0].numel()))
+    inside = line * line + (line * line)[:, None] <= 1
+    together = piece(480 * probe.opd[..., 0].numel())
     cells = [
-        _cells(scene, map_to_pupil, *some, size=size)
-        for some in zip(ell[inside].split(together), m[inside].split(together), strict=True)
+        _cells(scene, *some, size=size)
+        for some in zip(*(part[..., inside].split(together, -1) for part in (pupil, by_l, by_m)), strict=True)
     ]
     field, light = (torch.cat(parts, -1) for parts in zip(*cells, strict=True))
-    amplitude = field.new_zeros(*field.shape[1:3], size * size)
+    amplitude = field.new_zeros(*field.shape[1:3], size, size)
     amplitude[..., inside] = field[0]
     energy = torch.where(probe.valid, probe.energy, 0.0)
     total = energy.sum(-1)
     offset = safe_divide((energy * probe.landing).sum(-1), total.expand_as(probe.landing[..., 0]))
     return ExitPupil(
-        amplitude=amplitude.unflatten(-1, (size, size)),
+        amplitude=amplitude,
         energy=light.sum(-1)[0],
         step=(2 / size * half * waves_per)[:, 0],
         centre=probe.centre[:2, 0],
@@ -95,11 +99,25 @@ def exit_pupil(scene: Scene, *, size: int | None = None) -> ExitPupil:
     )
 
 
-def _cells(scene: Scene, map_to_pupil: Tensor, ell: Tensor, m: Tensor, *, size: int) -> tuple[Tensor, Tensor]:
-    """The wave (1, F, W, P) in cells of `size` across about directions (P,), scaled to the disc, and its |A|²."""
-    orders = [zernike.noll(j) for j in range(1, _TERMS + 1)]
-    pupil = (zernike.polynomials(orders, ell, m).T @ map_to_pupil).movedim(-1, 0)
-    by_l, by_m = ((g.T @ map_to_pupil).movedim(-1, 0) for g in zernike.gradients(orders, ell, m))
+def _interpolation(size: int, like: dict) -> tuple[Tensor, Tensor, Tensor]:
+    """Chebyshev nodes (K,), and matrices (N, K) that give a polynomial of them, and its slope, on the line of a grid.
+
+    The map from directions to the pupil is a polynomial in each of them: two small products instead of 66 terms a cell.
+    """
+    count = zernike.noll(_TERMS)[0] + 1
+    k = torch.arange(count, **like)
+    angle = math.pi * (k + 0.5) / count
+    terms = (2 - (k == 0).to(k.dtype)) / count * torch.cos(angle[:, None] * k)  # from values at nodes to coefficients
+    theta = torch.acos((2 * torch.arange(size, **like) + 1 - size) / size)[:, None]
+    slopes = k * torch.sin(k * theta) / torch.sin(theta)
+    return torch.cos(angle), torch.cos(k * theta) @ terms.T, slopes @ terms.T
+
+
+def _cells(scene: Scene, pupil: Tensor, by_l: Tensor, by_m: Tensor, *, size: int) -> tuple[Tensor, Tensor]:
+    """The wave (1, F, W, P) in cells of `size` across at points of the pupil (2, 1, F, W, P), and its |A|².
+
+    by_l, by_m: derivatives of the points by directions scaled to the disc.
+    """
     radius = safe_sqrt((pupil * pupil).sum(0))
     slope = safe_divide(safe_sqrt((pupil * by_l).sum(0) ** 2 + (pupil * by_m).sum(0) ** 2), radius)
     share = (0.5 + safe_divide(1 - radius, 2 / size * slope)).clamp(0.0, 1.0)

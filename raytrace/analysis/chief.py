@@ -3,9 +3,20 @@
 import torch
 from torch import Tensor
 
-from raytrace.analysis.setting import field_range, in_object_space, primary_number, unvignetted, wavelengths_of
+from raytrace.analysis.result import OverField
+from raytrace.analysis.setting import (
+    NothingToShow,
+    Numbers,
+    Points,
+    field_range,
+    in_object_space,
+    refuse_axis,
+    setting,
+    shown,
+    unvignetted,
+)
 from raytrace.maths.numerics import dot_2, safe_divide, safe_sqrt
-from raytrace.maths.result import Result, axis, masked
+from raytrace.maths.result import masked
 from raytrace.maths.value import value
 from raytrace.optics.arrivals import chief_points, keeps_coordinates
 from raytrace.optics.focus import image_rays
@@ -17,110 +28,136 @@ _NEAR_CHIEF = 1e-3  # of the pupil: close rays leave 1e-6 of the spherical aberr
 
 
 @value
-class Distortion(Result):
+class Distortion(OverField):
     """Heights (F, W) in mm of chief rays on the sensor, and by how much they miss the ideal image.
 
     height: along the meridian of the field, positive towards +y (+x where it is the x axis), as the ray's own y.
     f_tan: relative, height/(f tan θ) - 1, of an object at a finite distance height/(m h) - 1; 0 on the axis.
     f_theta: relative, height/(f θ) - 1; None for an object at a finite distance.
-    fields: (2, F); wavelengths: (W,) µm; valid: (F, W) bool.
+    fields: (2, F); valid: (F, W) bool.
     """
 
+    lens: Lens
+    fields: Tensor
     height: Tensor
     f_tan: Tensor
     f_theta: Tensor | None
-    fields: Tensor
-    wavelengths: Tensor
     valid: Tensor
 
+    COMMAND = "distortion"
+    FIGURE = "plot.analysis.distortion_curves"
+
     def columns(self) -> dict[str, Tensor]:
-        table = {**_heads(self), "height": masked(self.height, self.valid), "f_tan": masked(self.f_tan, self.valid)}
-        return table if self.f_theta is None else {**table, "f_theta": masked(self.f_theta, self.valid)}
+        curves = {"height": self.height, "f_tan": self.f_tan, "f_theta": self.f_theta}
+        found = {name: masked(curve, self.valid) for name, curve in curves.items() if curve is not None}
+        return {**self.heads(wavelength=self.wavelengths), **found}
+
+    def at(self, fields: Tensor) -> "Distortion":
+        return _distortion(self.lens, fields)
 
 
 @value
-class FieldCurvature(Result):
+class FieldCurvature(OverField):
     """Where close rays about the chief ray meet: (F, W) mm from the sensor, positive behind it.
 
-    tangential: of rays in the plane of the field; sagittal: across it; valid: (F, W) bool.
-    fields: (2, F); wavelengths: (W,) µm.
+    tangential: of rays in the plane of the field; sagittal: across it; fields: (2, F); valid: (F, W) bool.
     """
 
+    lens: Lens
+    fields: Tensor
     tangential: Tensor
     sagittal: Tensor
-    fields: Tensor
-    wavelengths: Tensor
     valid: Tensor
+
+    COMMAND = "field-curvature"
+    FIGURE = "plot.analysis.curvature_curves"
+    UNIT = "mm"
 
     def columns(self) -> dict[str, Tensor]:
         tangential, sagittal = masked(self.tangential, self.valid), masked(self.sagittal, self.valid)
-        return {**_heads(self), "tangential": tangential, "sagittal": sagittal}
+        return {**self.heads(wavelength=self.wavelengths), "tangential": tangential, "sagittal": sagittal}
+
+    def at(self, fields: Tensor) -> "FieldCurvature":
+        return _field_curvature(self.lens, fields)
 
 
 @value
-class LateralColour(Result):
+class LateralColour(OverField):
     """Height (F, W) in mm of each wavelength's chief ray on the sensor, less the primary wavelength's.
 
     Heights along the meridian of the field, positive towards +y (+x where it is the x axis).
-    fields: (2, F); wavelengths: (W,) µm; valid: (F, W) bool.
+    fields: (2, F); valid: (F, W) bool.
     """
 
-    shift: Tensor
+    lens: Lens
     fields: Tensor
-    wavelengths: Tensor
+    shift: Tensor
     valid: Tensor
 
+    COMMAND = "lateral-colour"
+    FIGURE = "plot.analysis.lateral_curves"
+
     def columns(self) -> dict[str, Tensor]:
-        return {**_heads(self), "shift": masked(self.shift, self.valid)}
+        return {**self.heads(wavelength=self.wavelengths), "shift": masked(self.shift, self.valid)}
+
+    def at(self, fields: Tensor) -> "LateralColour":
+        return _lateral_colour(self.lens, fields)
 
 
-def distortion(
-    lens: Lens, *, fields: Tensor | None = None, wavelengths: Tensor | None = None, size: int = 41
-) -> Distortion:
-    """Distortion of the chief ray, 1 = 100 %; fields: (2, F), by default `size` from the axis to the lens's largest.
+def distortion(lens: Lens, *, fields: Points = None, wavelengths: Numbers = None, samples: int = 11) -> Distortion:
+    """Distortion of the chief ray, 1 = 100 %; fields: y or (x, y), by default `samples` from the axis to the largest.
 
     The scale of the ideal image is that of each wavelength's own chief ray close to the axis, on the sensor as it
-    stands: an image out of focus is not distorted for that.
+    stands: an image out of focus is not distorted for that. wavelengths: µm. Raises NothingToShow for the axis alone.
     """
-    lens = unvignetted(lens)
-    fields = field_range(lens, size) if fields is None else fields
-    wavelengths = wavelengths_of(lens, wavelengths)
-    described, angles, extent, found = in_object_space(lens, fields)
+    lens, fields = setting(lens, fields, wavelengths, samples=samples)
+    refuse_axis(fields)
+    return shown(_distortion(lens, fields))
+
+
+def _distortion(lens: Lens, fields: Tensor) -> Distortion:
+    bare = unvignetted(lens)
+    described, angles, extent, found = in_object_space(bare, fields)
     close = field_range(lens, 2)[:, 1:] * _NEAR_AXIS
-    _, close_angles, close_extent, _ = in_object_space(lens, close)
+    _, close_angles, close_extent, _ = in_object_space(bare, close)
     length = dot_2(fields, _meridian(fields)).sign() * safe_sqrt(dot_2(extent, extent))
-    height, valid = _height(described, angles, wavelengths, fields)
-    scale = _height(described, close_angles, wavelengths, close)[0] / safe_sqrt(dot_2(close_extent, close_extent))
+    height, valid = _height(described, angles, fields)
+    scale = _height(described, close_angles, close)[0] / safe_sqrt(dot_2(close_extent, close_extent))
     f_tan = _relative(height, scale * length[:, None])
-    infinite = is_at_infinity(lens)
-    f_theta = _relative(height, scale * torch.atan(length)[:, None]) if infinite else None
-    return Distortion(height, f_tan, f_theta, fields, wavelengths, valid & found[:, None])
+    f_theta = _relative(height, scale * torch.atan(length)[:, None]) if is_at_infinity(lens) else None
+    return Distortion(lens, fields, height, f_tan, f_theta, valid & found[:, None])
 
 
 def field_curvature(
-    lens: Lens, *, fields: Tensor | None = None, wavelengths: Tensor | None = None, size: int = 41
+    lens: Lens, *, fields: Points = None, wavelengths: Numbers = None, samples: int = 11
 ) -> FieldCurvature:
     """Tangential and sagittal foci of close rays, s = -(∂x/∂p)/(∂m/∂p) with m = (L, M)/N, as Coddington's equations.
 
-    fields: (2, F), by default `size` from the axis to the lens's largest. Tangential is the plane through the axis and
-    the field point, sagittal the one across it. Close rays that leave the lens parallel have no focus: invalid.
+    fields: y or (x, y), by default `samples` from the axis to the lens's largest; wavelengths: µm. Tangential is the
+    plane through the axis and the field point, sagittal the one across it. Close rays that leave the lens parallel have
+    no focus: invalid.
     """
-    lens = unvignetted(lens)
-    fields = field_range(lens, size) if fields is None else fields
-    wavelengths = wavelengths_of(lens, wavelengths)
+    asked = fields is not None
+    lens, fields = setting(lens, fields, wavelengths, samples=samples)
+    if not asked:
+        refuse_axis(fields)
+    return shown(_field_curvature(lens, fields))
+
+
+def _field_curvature(lens: Lens, fields: Tensor) -> FieldCurvature:
+    bare = unvignetted(lens)
     along = torch.where((fields == 0).all(0), fields.new_tensor([[0.0], [1.0]]), _meridian(fields))
     alike = bool((along == along[:, :1]).all())
     groups = [(fields, along[:, :1])] if alike else zip(fields.split(1, 1), along.split(1, 1), strict=True)
-    each = [_close_foci(lens, group, wavelengths, meridian) for group, meridian in groups]
-    tangential, sagittal, valid = (torch.cat(found) for found in zip(*each, strict=True))
-    return FieldCurvature(tangential, sagittal, fields, wavelengths, valid)
+    each = [_close_foci(bare, group, meridian) for group, meridian in groups]
+    return FieldCurvature(lens, fields, *(torch.cat(found) for found in zip(*each, strict=True)))
 
 
-def _close_foci(lens: Lens, fields: Tensor, wavelengths: Tensor, along: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _close_foci(lens: Lens, fields: Tensor, along: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Tangential and sagittal foci (F, W) of fields (2, F) in one meridian (2, 1), and whether they exist."""
     across = torch.stack([along[1], -along[0]])
     pupil = torch.cat([along, -along, across, -across], 1) * _NEAR_CHIEF
-    rays = image_rays(lens, pupil, fields=fields, wavelengths=wavelengths)
+    rays = image_rays(lens, pupil, fields=fields)
     slope = safe_divide(rays.direction[:2], rays.direction[2].expand_as(rays.direction[:2]))
     foci, valid = [], (rays.valid | keeps_coordinates(rays.direction)).all(-1)
     for section, pair in ((along, slice(0, 2)), (across, slice(2, 4))):
@@ -132,22 +169,32 @@ def _close_foci(lens: Lens, fields: Tensor, wavelengths: Tensor, along: Tensor) 
 
 
 def lateral_colour(
-    lens: Lens, *, fields: Tensor | None = None, wavelengths: Tensor | None = None, size: int = 41
+    lens: Lens, *, fields: Points = None, wavelengths: Numbers = None, samples: int = 11
 ) -> LateralColour:
-    """Lateral colour of the chief rays; fields: (2, F), by default `size` from the axis to the lens's largest."""
-    lens = unvignetted(lens)
-    fields = field_range(lens, size) if fields is None else fields
-    primary = primary_number(lens, wavelengths)
-    wavelengths = wavelengths_of(lens, wavelengths)
-    height, valid = _height(lens, fields, wavelengths, fields)
-    valid = valid & valid[:, primary : primary + 1]
-    shift = torch.where(valid, height - height[:, primary : primary + 1], 0.0)
-    return LateralColour(shift, fields, wavelengths, valid)
+    """Lateral colour of the chief rays; fields: y or (x, y), by default `samples` from the axis to the largest.
+
+    wavelengths: µm, the first one primary. Raises NothingToShow for a single wavelength and for the axis alone.
+    """
+    lens, fields = setting(lens, fields, wavelengths, samples=samples)
+    if len(lens.wavelengths) < 2:
+        raise NothingToShow(
+            "nothing to show: lateral colour is a difference of wavelengths, and there is one, "
+            f"{float(lens.wavelengths[0]):g} µm; give several by --wavelength"
+        )
+    refuse_axis(fields)
+    return shown(_lateral_colour(lens, fields))
 
 
-def _height(lens: Lens, fields: Tensor, wavelengths: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
+def _lateral_colour(lens: Lens, fields: Tensor) -> LateralColour:
+    height, valid = _height(unvignetted(lens), fields, fields)
+    primary = slice(lens.primary_wavelength, lens.primary_wavelength + 1)
+    valid = valid & valid[:, primary]
+    return LateralColour(lens, fields, torch.where(valid, height - height[:, primary], 0.0), valid)
+
+
+def _height(lens: Lens, fields: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
     """Heights (F, W) of chief rays in the meridians of `along` (2, F), and whether they arrive or are but vignetted."""
-    points, valid = chief_points(lens, fields, wavelengths)
+    points, valid = chief_points(lens, fields, lens.wavelengths)
     return dot_2(points, _meridian(along)[:, :, None]), valid
 
 
@@ -161,9 +208,3 @@ def _meridian(fields: Tensor) -> Tensor:
 
 def _relative(height: Tensor, ideal: Tensor) -> Tensor:
     return safe_divide(height - ideal, ideal)
-
-
-def _heads(curve) -> dict[str, Tensor]:
-    """The columns of field and wavelength."""
-    x, y = (axis(component, 0, 2) for component in curve.fields)
-    return {"field_x": x, "field_y": y, "wavelength": axis(curve.wavelengths, 1, 2)}

@@ -6,93 +6,102 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.aperture import ExitPupil, exit_pupil
-from raytrace.analysis.setting import refuse_dark, scene_of, wavelength_weights, wavelengths_of
+from raytrace.analysis.result import Analysis, fine
+from raytrace.analysis.setting import (
+    Numbers,
+    Points,
+    primary_wavelength,
+    refuse_dark,
+    scene_of,
+    setting,
+    wavelength_shares,
+)
 from raytrace.budget import RAY_BYTES, afford, piece
 from raytrace.kernels.dft import phasor
 from raytrace.maths.numerics import safe_divide, safe_sqrt
-from raytrace.maths.result import Result, axis
 from raytrace.maths.value import value
 from raytrace.optics.focus import image_rays
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.scene import Scene
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, vector
 
 _RAYS = 4096
 _RINGS_PER_STEP = 16
 
 
 @value
-class EncircledEnergy(Result):
+class EncircledEnergy(Analysis):
     """Share (F, K) of the light that reaches the sensor within radii (K,) mm of the centroid (2, F) mm of the rays.
 
-    fields: (2, F); kind: "diffraction" or "geometric".
+    fields: (2, F); geometric: of rays, without diffraction; marked: whether the radii were asked for, and are marked on
+    the curves.
     """
 
-    share: Tensor
-    radii: Tensor
-    centroid: Tensor
+    lens: Lens
     fields: Tensor
-    kind: str
+    radii: Tensor
+    share: Tensor
+    centroid: Tensor
+    geometric: bool
+    marked: bool = False
+
+    COMMAND = "encircled-energy"
+    FIGURE = "plot.analysis.encircled_curves"
+    EVERY = 5
 
     def columns(self) -> dict[str, Tensor]:
-        return {
-            "field_x": axis(self.fields[0], 0, 2),
-            "field_y": axis(self.fields[1], 0, 2),
-            "radius": axis(self.radii, 1, 2),
-            "share": self.share,
-        }
+        return {**self.heads(radius=self.radii), "share": self.share}
+
+    def drawn(self) -> "EncircledEnergy":
+        return _encircled(self.lens, self.fields, fine(self.radii), self.geometric)
 
 
 def encircled_energy(
     lens: Lens,
-    radii: Tensor | None = None,
+    radii: Numbers = None,
     *,
-    kind: str = "diffraction",
-    fields: Tensor | None = None,
-    wavelengths: Tensor | None = None,
+    geometric: bool = False,
+    fields: Points = None,
+    wavelengths: Numbers = None,
 ) -> EncircledEnergy:
     """Encircled energy at radii (K,) mm, by default 41 up to the larger of the blur and six wavelengths times the F/#.
 
-        E(r) = ∬ OTF(ν) r J₁(2πrν)/ν d²ν        "diffraction"
-        E(r) = Σ_j w_j [|x_j - x̄| < r]           "geometric", linear between one ray and the next
+        E(r) = ∬ OTF(ν) r J₁(2πrν)/ν d²ν        of diffraction
+        E(r) = Σ_j w_j [|x_j - x̄| < r]           geometric, linear between one ray and the next
 
-    Differentiable in the lens. Raises ValueError for another kind, and where too few rays arrive.
+    fields: y or (x, y); wavelengths: µm. Differentiable in the lens. Raises ValueError where too few rays arrive.
     """
-    if kind not in ("diffraction", "geometric"):
-        raise ValueError(f"unknown kind of encircled energy {kind!r}; expected diffraction or geometric")
-    wavelengths_of(lens, wavelengths)
-    distance, energy, centroid = _rays(lens, fields, wavelengths)
+    lens, fields = setting(lens, fields, wavelengths, every=True)
+    return _encircled(lens, fields, None if radii is None else vector(radii, like=lens), geometric)
+
+
+def _encircled(lens: Lens, fields: Tensor, radii: Tensor | None, geometric: bool) -> EncircledEnergy:
+    distance, energy, centroid = _rays(lens, fields)
+    marked = radii is not None
     if radii is None:
-        airy = 6e-3 * lens.wavelengths[lens.primary_wavelength] * first_order(lens).working_f_number
+        airy = 6e-3 * primary_wavelength(lens) * first_order(lens).working_f_number
         blur = torch.where(energy > 0, distance, 0.0).max()
-        top = torch.maximum(blur * 1.02, airy * (kind == "diffraction")).detach()
+        top = torch.maximum(blur * 1.02, airy * (not geometric)).detach()
         radii = top * torch.linspace(0, 1, 41, dtype=top.dtype, device=top.device)
-    if kind == "geometric":
-        share = _of_rays(distance, energy, radii)
-    else:
-        share = _of_waves(scene_of(lens, fields, wavelengths), wavelength_weights(lens, wavelengths), centroid, radii)
-    fields = torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields
-    return EncircledEnergy(share, radii, centroid, fields, kind)
+    share = _of_rays(distance, energy, radii) if geometric else _of_waves(lens, fields, centroid, radii)
+    return EncircledEnergy(lens, fields, radii, share, centroid, geometric, marked)
 
 
-def _rays(lens: Lens, fields: Tensor | None, wavelengths: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+def _rays(lens: Lens, fields: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Distances (F, W·P) from the centroid (2, F) of all wavelengths, and shares (F, W·P) of the light."""
-    view = scene_of(lens, fields, wavelengths)
-    F, W = view.fields.shape[1], len(view.wavelengths)
+    F, W = fields.shape[1], len(lens.wavelengths)
     afford(64 * F * W * _RAYS, f"{F * W * _RAYS:,} rays ({F} fields × {W} wavelengths)", helps="ask for fewer fields")
-    parts = [_rays_of(lens, some, wavelengths) for some in view.fields.split(piece(RAY_BYTES * W * _RAYS), 1)]
+    parts = [_rays_of(lens, some) for some in fields.split(piece(RAY_BYTES * W * _RAYS), 1)]
     distance, energy, centroid = zip(*parts, strict=True)
     return torch.cat(distance), torch.cat(energy), torch.cat(centroid, 1)
 
 
-def _rays_of(lens: Lens, fields: Tensor, wavelengths: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    points = _spiral(_RAYS, lens.wavelengths)
-    rays = image_rays(lens, points, fields=fields, wavelengths=wavelengths)
-    energy = torch.where(rays.valid, wavelength_weights(lens, wavelengths)[:, None] / _RAYS, 0.0).flatten(1)
+def _rays_of(lens: Lens, fields: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    rays = image_rays(lens, _spiral(_RAYS, lens.wavelengths), fields=fields)
+    energy = torch.where(rays.valid, wavelength_shares(lens)[:, None] / _RAYS, 0.0).flatten(1)
     hits = torch.where(rays.valid, rays.position[:2], 0.0).flatten(2)
     total = energy.sum(-1)
-    given = scene_of(lens, fields, wavelengths)
-    refuse_dark(lens, given.fields, given.wavelengths, (total > 0)[:, None], "encircled energy")
+    refuse_dark(lens, fields, (total > 0)[:, None], "encircled energy")
     energy = energy / total[:, None]
     centroid = (energy * hits).sum(-1)
     x, y = torch.where(energy > 0, hits - centroid[..., None], 0.0)
@@ -115,11 +124,11 @@ def _of_rays(distance: Tensor, energy: Tensor, radii: Tensor) -> Tensor:
     return torch.where(radii >= place[:, -1:], 1.0, share)
 
 
-def _of_waves(scene: Scene, shares: Tensor, centroid: Tensor, radii: Tensor) -> Tensor:
-    rows = []
-    for f, field in enumerate(scene.fields.split(1, 1)):
-        pupil = exit_pupil(Scene(scene.lens, field, scene.wavelengths))
-        weights = shares * pupil.light[0]
+def _of_waves(lens: Lens, fields: Tensor, centroid: Tensor, radii: Tensor) -> Tensor:
+    whole, rows = scene_of(lens, fields), []
+    for f, field in enumerate(fields.split(1, 1)):
+        pupil = exit_pupil(Scene(whole.lens, field, whole.wavelengths))
+        weights = wavelength_shares(lens) * pupil.light[0]
         parts = torch.stack([_of_wave(pupil, w, centroid[:, f], radii) for w in range(len(weights))])
         rows.append((weights[:, None] * parts).sum(0) / weights.sum())
     return torch.stack(rows)

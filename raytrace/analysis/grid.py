@@ -3,34 +3,36 @@
 import torch
 from torch import Tensor
 
-from raytrace.analysis.setting import field_range, in_object_space, unvignetted
+from raytrace.analysis.result import Analysis
+from raytrace.analysis.setting import Numbers, field_range, in_object_space, primary_wavelength, unvignetted
 from raytrace.maths.numerics import safe_divide, safe_sqrt
-from raytrace.maths.result import Result, axis, masked
+from raytrace.maths.result import axis, cell, masked
 from raytrace.maths.value import value
 from raytrace.optics.arrivals import chief_points
 from raytrace.optics.launch import is_at_infinity
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, with_wavelengths
 
-_NEAR_AXIS = (
-    1e-4  # of the largest field: chief rays there give the scale of the image; it leaves 1e-8 of the distortion
-)
+_NEAR_AXIS = 1e-4  # of the largest field: its rays give the scale of the image; they leave 1e-8 of the distortion
 
 
 @value
-class GridDistortion(Result):
+class GridDistortion(Analysis):
     """Chief rays (2, W, N, N) mm on the sensor, of a grid of object points along y (rows) and x (columns).
 
     actual: where they land; ideal: where they would without distortion, by the linear map of rays close to the axis.
     distortion: (W, N, N) relative, |actual|/|ideal| - 1 from the image of the axis; 0 there. valid: (W, N, N) bool.
-    fields: (2, N, N) tan θ of an object at infinity, else mm of it; wavelengths: (W,) µm.
+    fields: (2, N, N) tan θ of an object at infinity, else mm of it.
     """
 
+    lens: Lens
+    fields: Tensor
     actual: Tensor
     ideal: Tensor
     distortion: Tensor
     valid: Tensor
-    fields: Tensor
-    wavelengths: Tensor
+
+    COMMAND = "distortion-grid"
+    FIGURE = "plot.analysis.distorted_grid"
 
     def columns(self) -> dict[str, Tensor]:
         (x, y), (ideal_x, ideal_y) = (masked(point, self.valid) for point in (self.actual, self.ideal))
@@ -45,43 +47,52 @@ class GridDistortion(Result):
             "distortion": masked(self.distortion, self.valid),
         }
 
+    def summary(self) -> dict[str, Tensor]:
+        return {"wavelength": self.wavelengths, "largest": self.largest()}
+
     def largest(self) -> Tensor:
         """The distortion (W,) of largest size, with its sign; 0 where no ray arrives."""
         shown = torch.where(self.valid, self.distortion, 0.0).flatten(1)
         return shown.gather(1, shown.abs().argmax(1, keepdim=True))[:, 0]
 
+    def __str__(self) -> str:
+        """A map in per cent for each wavelength, top row first."""
+        lines = []
+        maps = masked(100 * self.distortion, self.valid)
+        for wavelength, largest, grid in zip(self.wavelengths.tolist(), self.largest().tolist(), maps, strict=True):
+            lines.append(f"distortion in % at {wavelength:g} µm over the grid, largest {100 * largest:.6f} %")
+            lines += ["".join(cell(value, ">9.4f") for value in row) for row in grid.flip(0).tolist()]
+        return "\n".join(lines)
 
-def grid_distortion(lens: Lens, *, wavelengths: Tensor | None = None, size: int = 11) -> GridDistortion:
-    """Distortion over a `size` × `size` grid whose corners are the lens's largest field, square in tan θ or in mm.
+
+def distortion_grid(lens: Lens, *, wavelengths: Numbers = None, points: int = 11) -> GridDistortion:
+    """Distortion over `points` × `points` objects, at whose corners the largest field lies, square in tan θ or in mm.
 
     With the points (0, 0), (δ, 0) and (0, δ) close to the axis the ideal image of a field f is J f, J their differences
-    over δ, counted from the image of the axis: on the sensor as it stands, whatever its focus. wavelengths: (W,) µm,
-    the lens's primary one by default. Vignetting factors are left out: chief rays go through the middle of the pupil.
+    over δ, counted from the image of the axis: on the sensor as it stands, whatever its focus. wavelengths: µm, the
+    lens's primary one by default. Vignetting factors are left out: chief rays go through the middle of the pupil.
     """
-    lens = unvignetted(lens)
-    wavelengths = lens.wavelengths[lens.primary_wavelength][None] if wavelengths is None else wavelengths
-    lens, _, corner, found = in_object_space(lens, field_range(lens, 2)[:, 1:])
+    lens = with_wavelengths(unvignetted(lens), primary_wavelength(lens) if wavelengths is None else wavelengths)
+    described, _, corner, found = in_object_space(lens, field_range(lens, 2)[:, 1:])
     half = safe_sqrt((corner * corner).sum() / 2)
-    line = half * (2 * torch.arange(size, dtype=half.dtype, device=half.device) + 1 - size) / max(size - 1, 1)
+    line = half * (2 * torch.arange(points, dtype=half.dtype, device=half.device) + 1 - points) / max(points - 1, 1)
     y, x = torch.meshgrid(line, line, indexing="ij")
     step = _NEAR_AXIS * half
     zero = torch.zeros_like(step)
     close = torch.stack([torch.stack([zero, step, zero]), torch.stack([zero, zero, step])])
     wanted = torch.cat([close, torch.stack([x, y]).flatten(1)], 1)
-    points, valid = chief_points(
-        lens, torch.rad2deg(torch.atan(wanted)) if is_at_infinity(lens) else wanted, wavelengths
-    )
-    valid = valid & found
-    points = (points - points[:, :1]).movedim(1, -1)  # (2, W, 3 + N²)
-    along_x, along_y = points[..., 1:2] / step, points[..., 2:3] / step
+    angles = torch.rad2deg(torch.atan(wanted)) if is_at_infinity(lens) else wanted
+    landed, valid = chief_points(described, angles, lens.wavelengths)
+    landed = (landed - landed[:, :1]).movedim(1, -1)  # (2, W, 3 + N²)
+    along_x, along_y = landed[..., 1:2] / step, landed[..., 2:3] / step
     ideal = along_x * wanted[0, 3:] + along_y * wanted[1, 3:]
-    length, reached = (safe_sqrt((p * p).sum(0)) for p in (ideal, points[..., 3:]))
-    grid = (size, size)
+    length, reached = (safe_sqrt((p * p).sum(0)) for p in (ideal, landed[..., 3:]))
+    grid = (points, points)
     return GridDistortion(
-        actual=points[..., 3:].unflatten(-1, grid),
+        lens=lens,
+        fields=torch.stack([x, y]),
+        actual=landed[..., 3:].unflatten(-1, grid),
         ideal=ideal.unflatten(-1, grid),
         distortion=safe_divide(reached - length, length).unflatten(-1, grid),
-        valid=valid.movedim(0, -1)[:, 3:].unflatten(-1, grid),
-        fields=torch.stack([x, y]),
-        wavelengths=wavelengths,
+        valid=(valid & found).movedim(0, -1)[:, 3:].unflatten(-1, grid),
     )

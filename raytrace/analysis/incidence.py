@@ -3,20 +3,22 @@
 import torch
 from torch import Tensor
 
-from raytrace.analysis.setting import field_range
+from raytrace.analysis.result import OverField
+from raytrace.analysis.setting import Numbers, Points, primary_wavelength, setting
 from raytrace.maths.numerics import dot
-from raytrace.maths.result import Result, axis, masked
+from raytrace.maths.result import masked
 from raytrace.maths.value import value
 from raytrace.optics.launch import launch
 from raytrace.optics.trace import media, steps
 from raytrace.system.lens import Lens
 from raytrace.system.surface import Surface, normal
 
-_LOWER, _CHIEF, _UPPER = range(3)
+_RAYS = ("lower", "chief", "upper")
+_CHIEF = _RAYS.index("chief")
 
 
 @value
-class Incidence(Result):
+class Incidence(OverField):
     """Angles (F, W, 3, K) in degrees at surfaces 1 … K, the last of them the sensor.
 
     angle: between the normal of the surface and the ray in front of it, in the plane of the field: positive where the
@@ -24,51 +26,57 @@ class Incidence(Result):
         direction of the field. 0 where `valid` is False.
     height: (F, W, 3) mm, where they meet the sensor, along the direction of the field.
     valid: (F, W, 3, K) bool, whether they get there; a chief ray that is only vignetted does.
-    fields: (2, F); wavelengths: (W,) µm.
+    fields: (2, F); surfaces: whether the text lists every surface, not the sensor alone.
     """
 
+    lens: Lens
+    fields: Tensor
     angle: Tensor
     height: Tensor
     valid: Tensor
-    fields: Tensor
-    wavelengths: Tensor
+    surfaces: bool = False
+
+    COMMAND = "incidence"
+    FIGURE = "plot.analysis.incidence_curves"
 
     def columns(self) -> dict[str, Tensor]:
-        surfaces = torch.arange(1, self.angle.shape[-1] + 1, device=self.angle.device)
-        angle = masked(self.angle, self.valid)
-        return {
-            "field_x": axis(self.fields[0], 0, 3),
-            "field_y": axis(self.fields[1], 0, 3),
-            "wavelength": axis(self.wavelengths, 1, 3),
-            "surface": axis(surfaces, 2, 3),
-            "lower": angle[:, :, _LOWER],
-            "chief": angle[:, :, _CHIEF],
-            "upper": angle[:, :, _UPPER],
-        }
+        numbers = torch.arange(1, self.angle.shape[-1] + 1, device=self.angle.device)
+        angles = masked(self.angle, self.valid).unbind(2)
+        return self.heads(wavelength=self.wavelengths, surface=numbers) | dict(zip(_RAYS, angles, strict=True))
 
-    def on_sensor(self) -> dict[str, Tensor]:
-        """The columns of a table with a row for every field and wavelength: angles over the image height."""
-        table = {name: column[..., -1] for name, column in self.columns().items() if name != "surface"}
+    def summary(self) -> dict[str, Tensor]:
+        """A row for every field and wavelength: angles on the sensor over the image height."""
         height = masked(self.height, self.valid[..., -1])[:, :, _CHIEF]
-        angles = {name: table.pop(name) for name in ("lower", "chief", "upper")}
-        return {**table, "height": height, **angles}
+        angles = masked(self.angle, self.valid)[..., -1].unbind(2)
+        return {**self.heads(wavelength=self.wavelengths), "height": height, **dict(zip(_RAYS, angles, strict=True))}
+
+    def __str__(self) -> str:
+        return self.table(self.columns() if self.surfaces else self.summary())
+
+    def at(self, fields: Tensor) -> "Incidence":
+        return _incidence(self.lens, fields)
 
 
 def incidence(
-    lens: Lens, *, fields: Tensor | None = None, wavelengths: Tensor | None = None, size: int = 11
+    lens: Lens, *, fields: Points = None, wavelengths: Numbers = None, samples: int = 11, surfaces: bool = False
 ) -> Incidence:
-    """Angles of incidence at every surface; fields: (2, F), by default `size` from the axis to the lens's largest.
+    """Angles of incidence at every surface; fields: y or (x, y), by default `samples` from the axis to the largest.
 
-    wavelengths: (W,) µm, by default the lens's primary one. The rim is that of each field's beam, vignetting factors
-    and ray aiming applied.
+    wavelengths: µm, by default the lens's primary one; surfaces: whether the text lists every surface, not the sensor
+    alone. The rim is that of each field's beam, vignetting factors and ray aiming applied.
     """
-    fields = field_range(lens, size) if fields is None else fields
-    wavelengths = lens.wavelengths[lens.primary_wavelength][None] if wavelengths is None else wavelengths
+    lens, fields = setting(
+        lens, fields, primary_wavelength(lens) if wavelengths is None else wavelengths, samples=samples
+    )
+    return _incidence(lens, fields, surfaces=surfaces)
+
+
+def _incidence(lens: Lens, fields: Tensor, *, surfaces: bool = False) -> Incidence:
     along = _directions(lens, fields)[:, :, None, None]  # (2, F, 1, 1), beside (F, W, P)
-    rays = launch(lens, along * fields.new_tensor([-1.0, 0.0, 1.0]), fields=fields, wavelengths=wavelengths)
+    rays = launch(lens, along * fields.new_tensor([-1.0, 0.0, 1.0]), fields=fields)
     angles, valid, reached = [], [], rays.valid
     for surface, crossing in zip(
-        lens.surfaces[1:], steps(lens.surfaces[1:], rays, indices=media(lens, wavelengths[:, None])), strict=True
+        lens.surfaces[1:], steps(lens.surfaces[1:], rays, indices=media(lens, lens.wavelengths[:, None])), strict=True
     ):
         reached = reached & ~(crossing.missed | crossing.totally_reflected)
         angles.append(_angle(surface, rays.direction, crossing.rays.position, along))
@@ -77,11 +85,12 @@ def incidence(
         valid.append(reached & (rays.valid | is_chief))
     valid = torch.stack(valid, -1)
     return Incidence(
+        lens=lens,
+        fields=fields,
         angle=torch.where(valid, torch.rad2deg(torch.stack(angles, -1)), 0.0),
         height=(rays.position[:2] * along).sum(0),
         valid=valid,
-        fields=fields,
-        wavelengths=wavelengths,
+        surfaces=surfaces,
     )
 
 

@@ -3,27 +3,32 @@
 import torch
 from torch import Tensor
 
+from raytrace.analysis.result import Analysis
+from raytrace.analysis.setting import Numbers, like
 from raytrace.maths.numerics import safe_divide
-from raytrace.maths.result import Result, axis, masked
+from raytrace.maths.result import axis, masked
 from raytrace.maths.value import value
 from raytrace.optics.focus import image_rays
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, with_wavelengths
 
 _NEAR_AXIS = 1e-4  # of the pupil: the ray that stands for the centre leaves 1e-8 of the spherical aberration
 
 
 @value
-class LongitudinalAberration(Result):
+class LongitudinalAberration(Analysis):
     """Crossings (W, P) with the axis, mm along z from the sensor, of rays at heights `pupil` (P,) from 0 to 1.
 
-    The first one is the paraxial focus of each wavelength. valid: (W, P) bool, whether there is a crossing;
-    wavelengths: (W,) µm.
+    The first one is the paraxial focus of each wavelength. valid: (W, P) bool, whether there is a crossing.
     """
 
-    crossing: Tensor
+    lens: Lens
     pupil: Tensor
-    wavelengths: Tensor
+    crossing: Tensor
     valid: Tensor
+
+    COMMAND = "longitudinal-aberration"
+    FIGURE = "plot.analysis.longitudinal_curves"
+    EVERY = 5
 
     def columns(self) -> dict[str, Tensor]:
         return {
@@ -33,16 +38,17 @@ class LongitudinalAberration(Result):
         }
 
 
-def longitudinal_aberration(lens: Lens, *, wavelengths: Tensor | None = None, size: int = 41) -> LongitudinalAberration:
-    """Spherical aberration of every wavelength as -y N/M of rays (0, M, N) through `size` points of the pupil's y axis.
+def longitudinal_aberration(lens: Lens, *, wavelengths: Numbers = None, points: int = 41) -> LongitudinalAberration:
+    """Spherical aberration of every wavelength as -y N/M of rays (0, M, N) through points of the pupil's y axis.
 
-    A ray parallel to the axis behind the lens has no crossing, nor has a lost one.
+    wavelengths: µm; points: of the axis, from the middle to the rim. A ray parallel to the axis behind the lens has no
+    crossing, nor has a lost one.
     """
-    wavelengths = lens.wavelengths if wavelengths is None else wavelengths
-    pupil = torch.linspace(0.0, 1.0, size, dtype=wavelengths.dtype, device=wavelengths.device)
+    lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
+    pupil = torch.linspace(0.0, 1.0, points, **like(lens))
     heights = torch.cat([torch.full_like(pupil[:1], _NEAR_AXIS), pupil[1:]])
-    points = torch.stack([torch.zeros_like(heights), heights])
-    rays = image_rays(lens, points, fields=torch.zeros_like(points[:, :1]), wavelengths=wavelengths)
+    on_axis = torch.stack([torch.zeros_like(heights), heights])
+    rays = image_rays(lens, on_axis, fields=torch.zeros_like(on_axis[:, :1]))
     _, M, N = rays.direction[:, 0]
     crossing = -safe_divide(rays.position[1, 0] * N, M)
-    return LongitudinalAberration(crossing, pupil, wavelengths, rays.valid[0] & (M != 0))
+    return LongitudinalAberration(lens, pupil, crossing, rays.valid[0] & (M != 0))

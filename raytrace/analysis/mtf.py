@@ -6,62 +6,82 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.aperture import MARGIN, exit_pupil
-from raytrace.analysis.setting import primary_number, refuse_dark, scene_of, wavelength_weights, wavelengths_of
+from raytrace.analysis.result import Analysis, fine
+from raytrace.analysis.setting import (
+    Numbers,
+    Points,
+    like,
+    primary_wavelength,
+    refuse_dark,
+    scene_of,
+    setting,
+    wavelength_shares,
+)
 from raytrace.budget import RAY_BYTES, piece
 from raytrace.kernels.dft import phasor, rings_and_arms
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.pupil import gauss_rings
-from raytrace.maths.result import Result, axis
+from raytrace.maths.result import axis
 from raytrace.maths.value import value
 from raytrace.optics.focus import image_rays
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.scene import Scene
 from raytrace.optics.spot import spot_of
-from raytrace.system.lens import Lens, with_sensor_distance
+from raytrace.system.lens import Lens, vector, with_sensor_distance
 
 _LEAST_RINGS, _MOST_RAYS = 24, 100_000
+_FREQUENCIES, _DISTANCES = 41, 21  # that are told where none are asked for
 
 
 @value
-class Mtf(Result):
+class Mtf(Analysis):
     """Modulation of all wavelengths together, by field and spatial frequency.
 
     tangential, sagittal: (F, K), of patterns that vary along y and along x.
     limit: (K,) of a perfect lens of the paraxial working F/# on the axis, or None for rays alone.
-    frequencies: (K,) cycles/mm on the sensor; fields: (2, F); kind: "diffraction" or "geometric".
+    frequencies: (K,) cycles/mm on the sensor; fields: (2, F); geometric: of rays, without diffraction.
+    marked: whether the frequencies were asked for, and are marked on the curves.
     """
 
+    lens: Lens
+    fields: Tensor
+    frequencies: Tensor
     tangential: Tensor
     sagittal: Tensor
     limit: Tensor | None
-    frequencies: Tensor
-    fields: Tensor
-    kind: str
+    geometric: bool
+    marked: bool = False
+
+    COMMAND = "mtf"
+    FIGURE = "plot.analysis.mtf_curves"
+    EVERY = 5
 
     def columns(self) -> dict[str, Tensor]:
-        table = {
-            "field_x": axis(self.fields[0], 0, 2),
-            "field_y": axis(self.fields[1], 0, 2),
-            "frequency": axis(self.frequencies, 1, 2),
-            "tangential": self.tangential,
-            "sagittal": self.sagittal,
-        }
+        heads = self.heads(frequency=self.frequencies)
+        table = {**heads, "tangential": self.tangential, "sagittal": self.sagittal}
         return table if self.limit is None else {**table, "diffraction_limit": axis(self.limit, 1, 2)}
+
+    def drawn(self) -> "Mtf":
+        return _mtf(self.lens, self.fields, fine(self.frequencies), self.geometric)
 
 
 @value
-class ThroughFocusMtf(Result):
+class ThroughFocusMtf(Analysis):
     """Modulation at one frequency over sensor distances: tangential, sagittal (S, F); sensor_distances: (S,) mm.
 
-    frequency: cycles/mm; fields: (2, F); kind: "diffraction" or "geometric".
+    frequency: (1,) cycles/mm; fields: (2, F); geometric: of rays, without diffraction.
     """
 
+    lens: Lens
+    fields: Tensor
+    frequency: Tensor
+    sensor_distances: Tensor
     tangential: Tensor
     sagittal: Tensor
-    sensor_distances: Tensor
-    frequency: Tensor
-    fields: Tensor
-    kind: str
+    geometric: bool
+
+    COMMAND = "mtf"
+    FIGURE = "plot.analysis.mtf_through_focus_curves"
 
     def columns(self) -> dict[str, Tensor]:
         return {
@@ -76,64 +96,64 @@ class ThroughFocusMtf(Result):
 
 def mtf(
     lens: Lens,
-    frequencies: Tensor | None = None,
+    frequencies: Numbers = None,
     *,
-    kind: str = "diffraction",
-    fields: Tensor | None = None,
-    wavelengths: Tensor | None = None,
-) -> Mtf:
-    """MTF at frequencies (K,) cycles/mm, by default 41 of `frequency_range`; fields: (2, F).
+    geometric: bool = False,
+    through_focus: float | None = None,
+    fields: Points = None,
+    wavelengths: Numbers = None,
+) -> Mtf | ThroughFocusMtf:
+    """MTF at frequencies (K,) cycles/mm, by default 41 of `frequency_range`; of diffraction, or geometric:
 
-        OTF(ν) = ∬ A(L, M + λν) A*(L, M) dL dM / ∬ |A|²              "diffraction"
-        OTF(ν) = Σ_j w_j exp(-2πi ν y_j),  y_j where ray j lands      "geometric"
+        OTF(ν) = ∬ A(L, M + λν) A*(L, M) dL dM / ∬ |A|²              diffraction
+        OTF(ν) = Σ_j w_j exp(-2πi ν y_j),  y_j where ray j lands      geometric
 
     The wavelengths' OTFs add by weight and transmitted light, each at its own place on the sensor: lateral colour
-    counts. Raises ValueError for another kind, and where too few rays arrive or the blur is too large.
+    counts. through_focus: mm by which the sensor moves to either side, of one frequency. fields: y or (x, y);
+    wavelengths: µm. Raises ValueError where too few rays arrive or the blur is too large.
     """
-    functions = {"diffraction": _diffraction, "geometric": _geometric}
-    if kind not in functions:
-        raise ValueError(f"unknown kind of MTF {kind!r}; expected one of {', '.join(functions)}")
-    wavelengths_of(lens, wavelengths)
-    if frequencies is None:
-        frequencies = frequency_range(lens, 41, fields=fields)
-    tangential, sagittal = functions[kind](lens, frequencies, fields, wavelengths)
-    return Mtf(
-        tangential=tangential,
-        sagittal=sagittal,
-        limit=diffraction_limit(lens, frequencies, wavelengths) if kind == "diffraction" else None,
-        frequencies=frequencies,
-        fields=torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields,
-        kind=kind,
-    )
+    lens, fields = setting(lens, fields, wavelengths, every=True)
+    asked = None if frequencies is None else vector(frequencies, like=lens)
+    if through_focus is not None:
+        if asked is None or len(asked) != 1:
+            raise ValueError("--through-focus needs one spatial frequency: give --frequency F")
+        distances = lens.surfaces[-2].thickness + through_focus * torch.linspace(-1, 1, _DISTANCES, **like(lens))
+        return _through_focus(lens, fields, asked, distances, geometric)
+    given = frequency_range(lens, fields, _FREQUENCIES) if asked is None else asked
+    return _mtf(lens, fields, given, geometric, marked=asked is not None)
 
 
 def mtf_through_focus(
-    lens: Lens,
-    frequency: Tensor | float,
-    sensor_distances: Tensor,
-    *,
-    kind: str = "diffraction",
-    fields: Tensor | None = None,
-    wavelengths: Tensor | None = None,
+    lens: Lens, frequency: Tensor | float, sensor_distances: Tensor, *, geometric: bool = False, fields: Points = None
 ) -> ThroughFocusMtf:
     """MTF at one frequency (cycles/mm) with the sensor at each of the distances (S,) mm; the rest as for `mtf`."""
-    frequency = torch.as_tensor(frequency, dtype=sensor_distances.dtype, device=sensor_distances.device).reshape(1)
-    found = [
-        mtf(with_sensor_distance(lens, distance), frequency, kind=kind, fields=fields, wavelengths=wavelengths)
-        for distance in sensor_distances
-    ]
+    lens, fields = setting(lens, fields, None, every=True)
+    return _through_focus(lens, fields, vector(frequency, like=lens), sensor_distances, geometric)
+
+
+def _mtf(lens: Lens, fields: Tensor, frequencies: Tensor, geometric: bool, *, marked: bool = False) -> Mtf:
+    tangential, sagittal = (_geometric if geometric else _diffraction)(lens, fields, frequencies)
+    limit = None if geometric else diffraction_limit(lens, frequencies)
+    return Mtf(lens, fields, frequencies, tangential, sagittal, limit, geometric, marked)
+
+
+def _through_focus(
+    lens: Lens, fields: Tensor, frequency: Tensor, distances: Tensor, geometric: bool
+) -> ThroughFocusMtf:
+    found = [_mtf(with_sensor_distance(lens, distance), fields, frequency, geometric) for distance in distances]
     tangential, sagittal = (torch.stack([getattr(m, name)[:, 0] for m in found]) for name in ("tangential", "sagittal"))
-    return ThroughFocusMtf(tangential, sagittal, sensor_distances, frequency, found[0].fields, kind)
+    return ThroughFocusMtf(lens, fields, frequency, distances, tangential, sagittal, geometric)
 
 
-def frequency_range(lens: Lens, size: int, *, fields: Tensor | None = None) -> Tensor:
+def frequency_range(lens: Lens, fields: Tensor, size: int) -> Tensor:
     """Frequencies (size,) cycles/mm from 0 to 2/σ, σ along a section of the spot of the sharpest field (2, F), and to
     half the cutoff of diffraction at the most; not differentiated."""
     with torch.no_grad():
-        rays = image_rays(lens, gauss_rings(6)[0], fields=fields)
-        radius = spot_of(rays, gauss_rings(6)[1]).rms_radius
+        points, weights = gauss_rings(6, **like(lens))
+        rays = image_rays(lens, points, fields=fields)
+        radius = spot_of(rays, weights).rms_radius
         sharpest = torch.where(rays.valid.any(-1), radius, torch.inf).amin() * 0.5**0.5
-        top = torch.minimum(0.5 * cutoff(lens, lens.wavelengths[lens.primary_wavelength]), 2 / sharpest)
+        top = torch.minimum(0.5 * cutoff(lens, primary_wavelength(lens)), 2 / sharpest)
     return top * torch.linspace(0, 1, size, dtype=top.dtype, device=top.device)
 
 
@@ -142,20 +162,16 @@ def cutoff(lens: Lens, wavelength: Tensor) -> Tensor:
     return 1e3 / (wavelength * first_order(lens).working_f_number)
 
 
-def diffraction_limit(lens: Lens, frequencies: Tensor, wavelengths: Tensor | None = None) -> Tensor:
+def diffraction_limit(lens: Lens, frequencies: Tensor) -> Tensor:
     """MTF (K,) of a circular pupil without aberrations, (2/π)(acos s - s √(1 - s²)), s = ν/cutoff, by weights."""
-    shares = wavelength_weights(lens, wavelengths)
-    wavelengths = lens.wavelengths if wavelengths is None else wavelengths
-    return (_circle(frequencies[:, None] / cutoff(lens, wavelengths)) * shares).sum(-1)
+    return (_circle(frequencies[:, None] / cutoff(lens, lens.wavelengths)) * wavelength_shares(lens)).sum(-1)
 
 
-def _diffraction(lens: Lens, frequencies: Tensor, fields, wavelengths) -> tuple[Tensor, Tensor]:
-    whole = scene_of(lens, fields, wavelengths)
-    primary, shares = primary_number(lens, wavelengths), wavelength_weights(lens, wavelengths)
-    rows = []
-    for field in whole.fields.split(1, 1):  # each on a grid as fine as its own blur asks for
+def _diffraction(lens: Lens, fields: Tensor, frequencies: Tensor) -> tuple[Tensor, Tensor]:
+    whole, rows = scene_of(lens, fields), []
+    for field in fields.split(1, 1):  # each on a grid as fine as its own blur asks for
         pupil = exit_pupil(Scene(whole.lens, field, whole.wavelengths))
-        shift, weights = _from_primary(pupil.centre, primary), shares * pupil.light
+        shift, weights = _from_primary(lens, pupil.centre), wavelength_shares(lens) * pupil.light
         otfs = (_along(lines, pupil.energy, frequencies, pupil.step[axis]) for axis, lines in _lines(pupil.amplitude))
         rows.append([_modulation(otf, frequencies, s, weights) for otf, s in zip(otfs, shift.flip(0), strict=True)])
     tangential, sagittal = (torch.cat(parts) for parts in zip(*rows, strict=True))
@@ -192,10 +208,9 @@ def _circle(s: Tensor) -> Tensor:
     return torch.where(passes, (2 / math.pi) * (torch.acos(s) - s * safe_sqrt(1 - s * s)), 0.0)
 
 
-def _geometric(lens: Lens, frequencies: Tensor, fields, wavelengths) -> tuple[Tensor, Tensor]:
-    like = {"dtype": lens.wavelengths.dtype, "device": lens.wavelengths.device}
+def _geometric(lens: Lens, fields: Tensor, frequencies: Tensor) -> tuple[Tensor, Tensor]:
     with torch.no_grad():
-        probe = image_rays(lens, gauss_rings(6, **like)[0], fields=fields, wavelengths=wavelengths)
+        probe = image_rays(lens, gauss_rings(6, **like(lens))[0], fields=fields)
         reach = torch.where(probe.valid, probe.position[:2], torch.nan)
         blur = (reach - reach.nanmean(-1, keepdim=True)).abs().nan_to_num(0.0).max()
         rings, arms = rings_and_arms(2 * math.pi * float(blur * frequencies.max()), 0)
@@ -204,25 +219,22 @@ def _geometric(lens: Lens, frequencies: Tensor, fields, wavelengths) -> tuple[Te
         raise ValueError(
             f"the blur needs {rings * arms} rays at {float(frequencies.max()):g} cycles/mm: focus the lens"
         )
-    pupil = gauss_rings(rings, arms, **like)
-    whole = scene_of(lens, fields, wavelengths)
-    together = piece(2 * RAY_BYTES * len(whole.wavelengths) * rings * arms)
-    parts = [_of_spots(lens, frequencies, some, wavelengths, *pupil) for some in whole.fields.split(together, 1)]
+    pupil = gauss_rings(rings, arms, **like(lens))
+    together = piece(2 * RAY_BYTES * len(lens.wavelengths) * rings * arms)
+    parts = [_of_spots(lens, some, frequencies, *pupil) for some in fields.split(together, 1)]
     tangential, sagittal = (torch.cat(part) for part in zip(*parts, strict=True))
     return tangential, sagittal
 
 
-def _of_spots(lens: Lens, frequencies: Tensor, fields: Tensor, wavelengths, points: Tensor, rule: Tensor) -> tuple:
+def _of_spots(lens: Lens, fields: Tensor, frequencies: Tensor, points: Tensor, rule: Tensor) -> tuple:
     """Tangential and sagittal MTF (F, K) of rays."""
-    rays = image_rays(lens, points, fields=fields, wavelengths=wavelengths)
+    rays = image_rays(lens, points, fields=fields)
     energy = torch.where(rays.valid, rule, 0.0)
     light = energy.sum(-1)
-    given = scene_of(lens, fields, wavelengths)
-    refuse_dark(lens, given.fields, given.wavelengths, light > 0, "MTF")
+    refuse_dark(lens, fields, light > 0, "MTF")
     hits = torch.where(rays.valid, rays.position[:2], 0.0)
     mean = (energy * hits).sum(-1) / light
-    weights = wavelength_weights(lens, wavelengths) * light
-    shift = _from_primary(mean, primary_number(lens, wavelengths))
+    shift, weights = _from_primary(lens, mean), wavelength_shares(lens) * light
     result = []
     for along in (1, 0):
         offset = torch.where(rays.valid, hits[along] - mean[along][..., None], 0.0)
@@ -231,8 +243,9 @@ def _of_spots(lens: Lens, frequencies: Tensor, fields: Tensor, wavelengths, poin
     return tuple(result)
 
 
-def _from_primary(place: Tensor, primary: int) -> Tensor:
-    return place - place[..., primary : primary + 1]
+def _from_primary(lens: Lens, place: Tensor) -> Tensor:
+    """Places (..., W) of the wavelengths, from that of the primary one."""
+    return place - place[..., lens.primary_wavelength, None]
 
 
 def _modulation(otf: Tensor, frequencies: Tensor, shift: Tensor, weights: Tensor) -> Tensor:

@@ -16,17 +16,19 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from raytrace.maths.result import Result, axis
+from raytrace.analysis.result import Analysis
+from raytrace.analysis.setting import Points, field_words, primary_wavelength
+from raytrace.maths.result import cell
 from raytrace.maths.value import value
 from raytrace.optics.launch import paraxial_field
 from raytrace.optics.paraxial import FirstOrder, first_order, marginal_ray, signed
 from raytrace.optics.trace import media
-from raytrace.system.lens import Lens, largest_field
+from raytrace.system.lens import Lens, field_points, largest_field
 from raytrace.system.surface import Surface, is_even, vertex_curvature
 
 
 @value
-class Seidel(Result):
+class Seidel(Analysis):
     """Contributions (J, F, K) of surfaces 1 … K to J aberrations of F fields; their sums over K are the lens's.
 
     names: of the aberrations; kind: a key of KINDS, which says what they are; unit: "mm" or "waves".
@@ -35,46 +37,68 @@ class Seidel(Result):
     invariant: (F,) mm, H; fields: (2, F); wavelength: () µm, of the rays.
     """
 
+    lens: Lens
+    fields: Tensor
     contributions: Tensor
     marginal_yni: Tensor
     chief_yni: Tensor
     marginal_height: Tensor
     chief_height: Tensor
     invariant: Tensor
-    fields: Tensor
     wavelength: Tensor
     names: tuple[str, ...]
     kind: str
     unit: str
 
+    COMMAND = "seidel"
+    FIGURE = "plot.analysis.seidel_bars"
+
     def columns(self) -> dict[str, Tensor]:
         surfaces = torch.arange(1, self.contributions.shape[-1] + 1, device=self.fields.device)
         return {
-            "field_x": axis(self.fields[0], 0, 2),
-            "field_y": axis(self.fields[1], 0, 2),
-            "surface": axis(surfaces, 1, 2),
+            **self.heads(surface=surfaces),
             **dict(zip(self.names, self.contributions, strict=True)),
             "marginal_yni": self.marginal_yni,
             "chief_yni": self.chief_yni,
         }
 
-    def sums(self) -> dict[str, Tensor]:
-        """The columns of a table with a row for every field: the lens's aberrations and its invariant."""
+    def about(self) -> dict[str, str]:
+        return {"kind": self.kind, "unit": self.unit}
+
+    def summary(self) -> dict[str, Tensor]:
+        """A row for every field: the lens's aberrations, sums over the surfaces, and its invariant."""
         total = self.contributions.sum(-1)
-        heads = {"field_x": self.fields[0], "field_y": self.fields[1]}
-        return {**heads, **dict(zip(self.names, total, strict=True)), "optical_invariant": self.invariant}
+        return {**self.heads(), **dict(zip(self.names, total, strict=True)), "optical_invariant": self.invariant}
+
+    def __str__(self) -> str:
+        """A table for each field: a row for each surface, and their sums, of which y n i has none."""
+        lines = []
+        for f, field in enumerate(self.fields.unbind(1)):
+            invariant = cell(abs(float(self.invariant[f])), ".6g")
+            lines.append(
+                f"field {field_words(self.lens, field)}, optical invariant {invariant} mm, aberrations in {self.unit}"
+            )
+            columns = dict(zip(self.names, self.contributions[:, f], strict=True))
+            sums = [column.sum() for column in columns.values()]
+            if self.kind == "coefficients":
+                columns |= {"y n i": self.marginal_yni[f], "ȳ n ī": self.chief_yni[f]}
+            lines.append(f"{'surface':>7}" + "".join(f"{name:>13}" for name in columns))
+            for k, row in enumerate([*zip(*columns.values(), strict=True), sums], 1):
+                name = k if k <= self.contributions.shape[-1] else "sum"
+                lines.append(f"{name:>7}" + "".join(cell(float(value), ">13.6g") for value in row))
+        return "\n".join(lines)
 
 
-def seidel(lens: Lens, *, fields: Tensor | None = None, kind: str = "coefficients") -> Seidel:
+def seidel(lens: Lens, *, fields: Points = None, kind: str = "coefficients") -> Seidel:
     """Third-order aberrations at the primary wavelength, colours between the shortest and the longest wavelength.
 
     kind: "coefficients": S1 … S5, C1, C2 in mm. "waves": W040 = S1/8, W131 = S2/2, W222 = S3/2, W220P = S4/4,
     W311 = S5/2, W020 = C1/2, W111 = C2. "transverse": mm by which rays of the rim miss the paraxial image point, the
     upper one where there is a choice, in the order of `_transverse`. "longitudinal": mm along z from the paraxial
     focus to theirs. The last two are nan where image space is afocal.
-    fields: (2, F), of which the distance from the axis counts; the largest of the lens by default. Image heights are
-    those of the paraxial image. Raises ValueError for a kind not named here, and for a surface of
-    other terms than even powers of r.
+    fields: y or (x, y), of which the distance from the axis counts; the lens's largest by default. Image heights are
+    those of the paraxial image. Raises ValueError for a kind not named here, and for a surface of other terms than even
+    powers of r.
     """
     if kind not in KINDS:
         raise ValueError(f"Seidel aberrations as {kind!r}: expected one of {', '.join(KINDS)}")
@@ -83,7 +107,7 @@ def seidel(lens: Lens, *, fields: Tensor | None = None, kind: str = "coefficient
             what = "has a departure" if surface.departure is not None else f"is an {surface.kind}"
             raise ValueError(f"surface {number} {what}: Seidel's theory is of even powers of r")
     paraxial = first_order(lens)
-    fields = largest_field(lens) if fields is None else fields
+    fields = largest_field(lens) if fields is None else field_points(fields, like=lens)
     marginal, chief = marginal_ray(lens), _chief_ray(lens, fields, paraxial)
     H = chief[1] * marginal[0] - marginal[1] * chief[0]
     n, dispersion = _indices(lens)
@@ -93,15 +117,16 @@ def seidel(lens: Lens, *, fields: Tensor | None = None, kind: str = "coefficient
         row, marginal, chief = _cross(surface, marginal, chief, H, n[k : k + 2], dispersion[k : k + 2])
         rows.append(row)
     found = torch.stack([torch.stack(torch.broadcast_tensors(*row, H)[:-1]) for row in rows], -1)
-    wavelength = lens.wavelengths[lens.primary_wavelength]
+    wavelength = primary_wavelength(lens)
     return Seidel(
+        lens=lens,
+        fields=fields,
         contributions=convert(found[:7], marginal[1], n[-1], 1e-3 * wavelength),
         marginal_yni=found[7],
         chief_yni=found[8],
         marginal_height=found[9],
         chief_height=found[10],
         invariant=H,
-        fields=fields,
         wavelength=wavelength,
         names=names,
         kind=kind,
@@ -114,7 +139,7 @@ def _chief_ray(lens: Lens, fields: Tensor, paraxial: FirstOrder) -> tuple[Tensor
     upwards = torch.stack([torch.zeros_like(fields[0]), torch.hypot(*fields)])
     extent = paraxial_field(lens, upwards, paraxial)[1]
     distance, pupil = lens.surfaces[0].thickness, paraxial.entrance_pupil_position
-    n = media(lens, lens.wavelengths[lens.primary_wavelength])[0]
+    n = media(lens, primary_wavelength(lens))[0]
     if bool(torch.isinf(distance)):
         return -pupil * extent, n * extent
     if lens.fields.telecentric or not bool(torch.isfinite(pupil)):
@@ -127,7 +152,7 @@ def _indices(lens: Lens) -> tuple[list[Tensor], list[Tensor]]:
     """Signed n of the primary wavelength before every surface and behind the last, and δn from shortest to longest."""
     primary, shortest, longest = (
         signed(lens.surfaces[1:-1], media(lens, wavelength)[:-1])
-        for wavelength in (lens.wavelengths[lens.primary_wavelength], lens.wavelengths.amin(), lens.wavelengths.amax())
+        for wavelength in (primary_wavelength(lens), lens.wavelengths.amin(), lens.wavelengths.amax())
     )
     return primary, [long - short for short, long in zip(shortest, longest, strict=True)]
 

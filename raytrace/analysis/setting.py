@@ -1,64 +1,134 @@
 """What an analysis looks at: fields, wavelengths and their weights, as a scene of one object distance."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
+from torch.utils import _pytree as pytree
 
 from raytrace.maths.pupil import gauss_rings
+from raytrace.maths.result import flat
 from raytrace.optics.launch import is_at_infinity, object_field
-from raytrace.optics.losses import losses
+from raytrace.optics.losses import check_reach, losses
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.scene import Scene
 from raytrace.optics.scene import scene as make_scene
 from raytrace.optics.spot import EmptySpot
-from raytrace.system.lens import FIELD_UNITS, Lens, check_media, largest_field, name_of_field, with_field_kind
+from raytrace.system.lens import (
+    FIELD_UNITS,
+    Lens,
+    field_points,
+    largest_field,
+    name_of_field,
+    with_field_kind,
+    with_wavelengths,
+)
+
+#: What verbs take for fields, y or pairs (x, y), and for other numbers; None stands for the lens's own.
+Points = Tensor | Sequence | float | None
+Numbers = Tensor | Sequence[float] | float | None
+
+_DENSE = 65  # fields of a curve over the field that is drawn
+_HEADS = ("field_x", "field_y", "wavelength")
 
 
-def scene_of(lens: Lens, fields: Tensor | None, wavelengths: Tensor | None) -> Scene:
-    """The scene (1, F, W) of the lens at its own object distance; fields (2, F), wavelengths (W,) µm."""
-    fields = torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields
-    return make_scene(lens, fields, lens.surfaces[0].thickness[None], wavelengths_of(lens, wavelengths))
+class NothingToShow(ValueError):
+    """An analysis of a lens, or of fields, that would show nothing."""
 
 
-def wavelengths_of(lens: Lens, wavelengths: Tensor | None) -> Tensor:
-    """The wavelengths (W,) µm: the lens's own, or those given, checked as by `check_media`."""
-    if wavelengths is None:
-        return lens.wavelengths
-    check_media(lens, wavelengths)
-    return wavelengths
+class Incomplete(UserWarning):
+    """A field lacks something of what an analysis tells."""
 
 
-def wavelength_weights(lens: Lens, wavelengths: Tensor | None) -> Tensor:
-    """Shares (W,): the lens's for its own wavelengths, equal ones for others."""
-    weights = lens.wavelength_weights if wavelengths is None else torch.ones_like(wavelengths)
-    return weights / weights.sum()
+def setting(
+    lens: Lens, fields: Points, wavelengths: Numbers, *, samples: int | None = None, every: bool = False
+) -> tuple[Lens, Tensor]:
+    """The lens at the wavelengths of a verb, alike in weight and the first of them primary, and its fields (2, F).
+
+    fields: None for the lens's own, or for `samples` from the axis to its largest. Rays must reach the sensor from one
+    of those listed, or from `every` one, see `check_reach`; inside transforms of torch.func that cannot be told.
+    """
+    lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
+    if fields is None and samples is not None:
+        return lens, field_range(lens, samples)
+    found = field_points(fields, like=lens)
+    if not any(isinstance(leaf, Tensor) and is_functorch_wrapped_tensor(leaf) for leaf in pytree.tree_leaves(lens)):
+        check_reach(lens, None if fields is None else found, every=every)
+    return lens, found
 
 
-def primary_number(lens: Lens, wavelengths: Tensor | None) -> int:
-    """Which of the wavelengths is the reference: the lens's primary one, the first of others."""
-    return lens.primary_wavelength if wavelengths is None else 0
+def primary_wavelength(lens: Lens) -> Tensor:
+    """() µm."""
+    return lens.wavelengths[lens.primary_wavelength]
+
+
+def scene_of(lens: Lens, fields: Tensor) -> Scene:
+    """The scene (1, F, W) of the lens at its own object distance and wavelengths; fields: (2, F)."""
+    return make_scene(lens, fields, lens.surfaces[0].thickness[None], lens.wavelengths)
+
+
+def wavelength_shares(lens: Lens) -> Tensor:
+    """Weights (W,) of the wavelengths, 1 together."""
+    return lens.wavelength_weights / lens.wavelength_weights.sum()
+
+
+def like(lens: Lens) -> dict:
+    """dtype and device of a lens."""
+    return {"dtype": lens.wavelengths.dtype, "device": lens.wavelengths.device}
 
 
 def field_range(lens: Lens, size: int) -> Tensor:
     """Fields (2, size) along y from the axis to the lens's largest."""
-    largest = largest_field(lens)[1, 0]
-    y = largest * torch.linspace(0.0, 1.0, size, dtype=largest.dtype, device=largest.device)
-    return torch.stack([torch.zeros_like(y), y])
+    return largest_field(lens) * torch.linspace(0.0, 1.0, size, **like(lens))
 
 
-def refuse_dark(lens: Lens, fields: Tensor, wavelengths: Tensor, lit: Tensor, what: str) -> None:
-    """Raise EmptySpot that names the first field (2, F) and wavelength (W,) µm without light, and where its rays end.
+def field_line(fields: Tensor) -> Tensor:
+    """Many fields (2, F) from the axis to the largest of these, if they lie on one line to it; else these."""
+    size = torch.hypot(*fields)
+    largest = fields[:, size.argmax()]
+    along = (fields * largest[:, None]).sum(0) / size.max()
+    if not size.max() > 0 or bool((along < (1 - 1e-9) * size).any()):
+        return fields
+    return largest[:, None] * torch.linspace(0, 1, _DENSE, dtype=fields.dtype, device=fields.device)
+
+
+def field_words(lens: Lens, field: Tensor) -> str:
+    """A field (2,) with its unit."""
+    return f"{name_of_field(field)} {FIELD_UNITS[lens.fields.kind]}"
+
+
+def refuse_dark(lens: Lens, fields: Tensor, lit: Tensor, what: str) -> None:
+    """Raise EmptySpot that names the first field (2, F) and wavelength without light, and where its rays end.
 
     lit: (F, W); what: is not defined there.
     """
     if bool(lit.all()):
         return
     f, w = torch.nonzero(~lit)[0].tolist()
-    found = losses(lens, gauss_rings(6)[0].to(fields), fields=fields[:, f : f + 1], wavelengths=wavelengths[w : w + 1])
+    wavelength = lens.wavelengths[w : w + 1]
+    found = losses(lens, gauss_rings(6, **like(lens))[0], fields=fields[:, f : f + 1], wavelengths=wavelength)
     lost = found.words(0, 0) if int(found.arrived) == 0 else "too few rays reach the sensor"
-    where = f"field {name_of_field(fields[:, f])} {FIELD_UNITS[lens.fields.kind]}, {float(wavelengths[w]):g} µm"
+    where = f"field {field_words(lens, fields[:, f])}, {float(wavelength):g} µm"
     raise EmptySpot(f"{where} has no {what}: {lost}; leave the field out")
+
+
+def shown(found):
+    """A result that has a number to show. Raises NothingToShow if there is none."""
+    values = flat({name: column for name, column in found.columns().items() if name not in _HEADS})
+    if not any(torch.from_numpy(column).isfinite().any() for column in values.values()):
+        raise NothingToShow(
+            f"nothing to show: no number of {found.COMMAND.replace('-', ' ')} exists for this lens; `raytrace info` "
+            "tells whether it has a focal length and an image"
+        )
+    return found
+
+
+def refuse_axis(fields: Tensor) -> None:
+    """Raise NothingToShow for fields (2, F) that lie all on the axis."""
+    if not bool(fields.any()):
+        raise NothingToShow("nothing to show over the field: all fields are on the axis; give others by --field")
 
 
 def unvignetted(lens: Lens) -> Lens:

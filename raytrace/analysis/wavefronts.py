@@ -1,15 +1,18 @@
 """Wavefront maps: the OPD over the whole pupil, its Zernike coefficients and the Strehl ratio."""
 
 import dataclasses
+import warnings
 
 import torch
 from torch import Tensor
 
-from raytrace.analysis.setting import scene_of
+from raytrace.analysis.result import Analysis
+from raytrace.analysis.setting import Incomplete, Numbers, Points, field_words, like, scene_of, setting
 from raytrace.budget import RAY_BYTES, afford, piece
 from raytrace.kernels.diffraction import strehl
+from raytrace.maths import zernike
 from raytrace.maths.pupil import gauss_rings
-from raytrace.maths.result import Result, axis
+from raytrace.maths.result import cell
 from raytrace.maths.value import value
 from raytrace.optics.scene import Scene
 from raytrace.optics.wavefront import peak_to_valley, rms, wavefront_of, zernike_coefficients
@@ -19,10 +22,11 @@ _RINGS = 14, 56
 _GRID = 127
 _MAP_BYTES = 24  # of a point of a map, while it is made
 _BY_FIELD = ("opd", "valid", "coefficients", "rms", "peak_to_valley", "strehl")
+_UNITS = {"rms": "waves RMS", "rim": "waves at the rim"}
 
 
 @value
-class WavefrontMap(Result):
+class WavefrontMap(Analysis):
     """The wavefront of every field and wavelength.
 
     opd: (F, W, N, N) waves at pupil points y (rows) and x (columns) of `pupil` (N,), 0 where `valid` is False.
@@ -32,96 +36,109 @@ class WavefrontMap(Result):
         centre and ends of its axes among them.
     strehl: (F, W) the largest intensity on the sensor over that without aberrations, defocus counted among them; nan
         where the blur is too large for the sum of waves.
-    fields: (2, F); wavelengths: (W,) µm.
+    fields: (2, F); listed: whether the text lists the coefficients.
     """
 
+    lens: Lens
+    fields: Tensor
+    pupil: Tensor
     opd: Tensor
     valid: Tensor
-    pupil: Tensor
     coefficients: Tensor
     rms: Tensor
     peak_to_valley: Tensor
     strehl: Tensor
-    fields: Tensor
-    wavelengths: Tensor
     numbering: str
+    listed: bool = False
+
+    COMMAND = "wavefront"
+    FIGURE = "plot.analysis.wavefront_maps"
+    UNIT = "waves"
 
     def columns(self) -> dict[str, Tensor]:
         term = torch.arange(1, self.coefficients.shape[-1] + 1, device=self.opd.device)
-        return {
-            "field_x": axis(self.fields[0], 0, 3),
-            "field_y": axis(self.fields[1], 0, 3),
-            "wavelength": axis(self.wavelengths, 1, 3),
-            self.numbering: axis(term, 2, 3),
-            "coefficient": self.coefficients,
-        }
+        heads = self.heads(wavelength=self.wavelengths, **{self.numbering: term})
+        return {**heads, "coefficient": self.coefficients}
 
     def summary(self) -> dict[str, Tensor]:
-        """The columns of a table with a row for every field and wavelength."""
-        return {
-            "field_x": axis(self.fields[0], 0, 2),
-            "field_y": axis(self.fields[1], 0, 2),
-            "wavelength": axis(self.wavelengths, 1, 2),
-            "rms": self.rms,
-            "peak_to_valley": self.peak_to_valley,
-            "strehl": self.strehl,
-        }
+        measures = {name: getattr(self, name) for name in ("rms", "peak_to_valley", "strehl")}
+        return {**self.heads(wavelength=self.wavelengths), **measures}
+
+    def __str__(self) -> str:
+        listed = [self._listed(f) for f in range(self.fields.shape[1])] if self.listed else []
+        return "\n\n".join([self.table(self.summary()), *listed])
+
+    def _listed(self, field: int) -> str:
+        """The coefficients of one field: a row for each term, a column for each wavelength."""
+        order, unity = zernike.NUMBERINGS[self.numbering]
+        name = f"{self.numbering.capitalize()} coefficients of field {field_words(self.lens, self.fields[:, field])}"
+        heads = "".join(f"{f'{wavelength:g} µm':>14}" for wavelength in self.wavelengths.tolist())
+        lines = [f"{name}, {_UNITS[unity]}", f"{'j':>3} {'n':>3} {'m':>3}  {'term':<26}{heads}"]
+        for j, row in enumerate(self.coefficients[field].T.tolist(), 1):
+            n, m = order(j)
+            cells = "".join(cell(c, ">14.8f") for c in row)
+            lines.append(f"{j:>3} {n:>3} {m:>3}  {zernike.WORDS.get((n, m), ''):<26}{cells}")
+        return "\n".join(lines)
 
 
-def wavefront_map(
+def wavefront(
     lens: Lens,
     *,
-    fields: Tensor | None = None,
-    wavelengths: Tensor | None = None,
+    fields: Points = None,
+    wavelengths: Numbers = None,
     size: int = _GRID,
-    terms: int = 37,
-    numbering: str = "noll",
+    terms: int | None = None,
+    numbering: str | None = None,
 ) -> WavefrontMap:
     """OPD over `size` × `size` pupil points, and the coefficients 1 … `terms` of 784 rays, see `zernike_coefficients`.
 
-    What a field does not have is nan: everything where no ray arrives, the coefficients where the light fills too
-    little of the pupil. Raises budget.OverBudget for more points than memory holds.
+    fields: y or (x, y); wavelengths: µm; terms: 37 by default; numbering: "noll" (default) or "fringe"; the text lists
+    the coefficients where one of them is given.
+    What a wavelength does not have is nan: everything where no ray arrives, the coefficients, with a warning, where the
+    light fills too little of the pupil. Raises budget.OverBudget for more points than memory holds.
     """
-    view = scene_of(lens, fields, wavelengths)
-    F, W = view.fields.shape[1], len(view.wavelengths)
+    lens, fields = setting(lens, fields, wavelengths, every=True)
+    F, W = fields.shape[1], len(lens.wavelengths)
     afford(
         _MAP_BYTES * F * W * size * size,
         f"the wavefronts of {F} fields × {W} wavelengths at {size} × {size} points",
         helps="ask for a smaller --size, or fewer fields or wavelengths",
     )
-    together = piece(RAY_BYTES * W * max(size, _GRID) ** 2)
-    parts = [
-        _map_of(dataclasses.replace(view, fields=some), size, terms, numbering)
-        for some in view.fields.split(together, 1)
-    ]
-    if len(parts) == 1:
-        return parts[0]
+    rule = {"size": size, "terms": terms or 37, "numbering": numbering or "noll", "listed": bool(terms or numbering)}
+    parts = [_map_of(lens, some, **rule) for some in fields.split(piece(RAY_BYTES * W * max(size, _GRID) ** 2), 1)]
     joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in _BY_FIELD}
-    return dataclasses.replace(parts[0], fields=view.fields, **joined)
+    found = dataclasses.replace(parts[0], fields=fields, **joined)
+    unknown = found.coefficients.detach()[..., 0].isnan() & found.rms.detach().isfinite()
+    for f in torch.nonzero(unknown.any(1))[:, 0].tolist():
+        field = f"field {field_words(lens, fields[:, f])}"
+        words = f"{field}: the light fills too little of the entrance pupil for Zernike coefficients"
+        warnings.warn(words, Incomplete, stacklevel=2)
+    return found
 
 
-def _map_of(view: Scene, size: int, terms: int, numbering: str) -> WavefrontMap:
-    like = {"dtype": view.wavelengths.dtype, "device": view.wavelengths.device}
-    line, inside, points = _grid(size, **like)
+def _map_of(lens: Lens, fields: Tensor, *, size: int, terms: int, numbering: str, listed: bool) -> WavefrontMap:
+    view = scene_of(lens, fields)
+    line, inside, points = _grid(size, **like(lens))
     drawn = wavefront_of(view, points)
-    dense = drawn if size == _GRID else wavefront_of(view, _grid(_GRID, **like)[2])
-    front = wavefront_of(view, *gauss_rings(*_RINGS, **like))
-    wave = 1e-3 * view.wavelengths
+    dense = drawn if size == _GRID else wavefront_of(view, _grid(_GRID, **like(lens))[2])
+    front = wavefront_of(view, *gauss_rings(*_RINGS, **like(lens)))
+    wave = 1e-3 * lens.wavelengths
     opd = drawn.opd.new_zeros(*drawn.opd.shape[1:3], size, size)
     opd[..., inside] = drawn.opd[0] / wave[:, None]
     valid = torch.zeros_like(opd, dtype=torch.bool)
     valid[..., inside] = drawn.valid[0]
     return WavefrontMap(
+        lens=lens,
+        fields=fields,
+        pupil=line,
         opd=opd,
         valid=valid,
-        pupil=line,
         coefficients=zernike_coefficients(front, terms, numbering)[0] / wave[:, None],
         rms=rms(front)[0] / wave,
         peak_to_valley=peak_to_valley(dense)[0] / wave,
         strehl=_strehl(view),
-        fields=view.fields,
-        wavelengths=view.wavelengths,
         numbering=numbering,
+        listed=listed,
     )
 
 

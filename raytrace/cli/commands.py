@@ -1,7 +1,6 @@
 """The commands of `raytrace`: their words, their arguments, and what runs them. Imports no torch."""
 
 from raytrace.cli import wave
-from raytrace.cli.analysis_table import ANALYSES
 from raytrace.cli.command import Command
 from raytrace.cli.options import (
     count,
@@ -44,6 +43,13 @@ def _bench(parser):
     plot(parser, "speed over number of rays, or time over error,")
 
 
+#: The analyses, each a file of this folder.
+ANALYSES = (
+    *("mtf", "ray_fan", "opd_fan", "wavefront", "distortion", "field_curvature", "lateral_colour"),
+    *("relative_illumination", "seidel", "longitudinal_aberration", "distortion_grid", "incidence", "rms_over_field"),
+    "encircled_energy",
+)
+
 COMMANDS = (
     Command.of("cli.info"),
     Command.of("cli.check"),
@@ -74,7 +80,7 @@ COMMANDS = (
         _bench,
         "bench.command.bench",
     ),
-    *(Command(*entry) for entry in ANALYSES),
+    *(Command.of(f"cli.{name}") for name in ANALYSES),
     command("codesign"),
     Command("wave", wave.SUMMARY, wave.DESCRIPTION, wave.EXAMPLES, wave.options, "cli.wave.options"),
 )

@@ -248,6 +248,31 @@ def size(group, what: str, *, default: int | None = None) -> None:
     group.add_argument("--size", metavar="N", type=count, default=default, help=f"pixels across {what}")
 
 
+def analysis(parser: argparse.ArgumentParser, figure: str) -> None:
+    """LENS, --json, the conditions, --field and --plot."""
+    lens(parser)
+    conditions(parser)
+    fields(parser)
+    plot(parser, figure)
+
+
+def samples(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--samples",
+        metavar="N",
+        type=count,
+        help="fields from the axis to the largest, without --field (default 11)",
+    )
+
+
+def geometric(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--geometric", action="store_true", help="of rays alone, without diffraction")
+
+
+def reference(parser: argparse.ArgumentParser, what: str) -> None:
+    parser.add_argument("--reference", choices=("primary", "own"), help=what)
+
+
 def ray_aiming(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--ray-aiming",

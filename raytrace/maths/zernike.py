@@ -107,14 +107,24 @@ def fit(values: Tensor, basis: Tensor, weights: Tensor | None = None) -> Tensor:
     Raises ValueError if a fit has fewer points of positive weight than coefficients.
     """
     weights = torch.ones_like(values) if weights is None else weights.expand(values.shape)
-    points = int((weights > 0).sum(-1).min())
-    if points < len(basis):
-        raise ValueError(f"{points} points of positive weight cannot fit {len(basis)} coefficients")
+    _refuse_few(int((weights > 0).sum(-1).min()), len(basis))
     root = torch.sqrt(torch.where(weights > 0, weights, 1.0))
     root = torch.where(weights > 0, root, 0.0)
+    return _solved(values, root, *torch.linalg.qr(root[..., None] * basis.T))
+
+
+def fit_known(values: Tensor, basis: Tensor, weights: Tensor, *, worst: float) -> tuple[Tensor, Tensor]:
+    """`fit` of values (..., P) by weights that share it, and where (...) these tell the coefficients: elsewhere 0.
+
+    Known are those of a `condition` below `worst`. No derivative is taken by the weights: on what all have in common,
+    the light of a field, no fit depends. Raises ValueError for fewer points than coefficients.
+    """
+    _refuse_few(weights.shape[-1], len(basis))
+    root = torch.sqrt(weights.detach())
     q, r = torch.linalg.qr(root[..., None] * basis.T)
-    right = q.transpose(-1, -2) @ (root * torch.where(weights > 0, values, 0.0))[..., None]
-    return torch.linalg.solve_triangular(r, right, upper=True)[..., 0]
+    known = _condition(r, root) < worst
+    r = torch.where(known[..., None, None], r, torch.eye(len(basis), dtype=r.dtype, device=r.device))
+    return _solved(torch.where(known[..., None], values, 0.0), root, q, r), known
 
 
 def condition(basis: Tensor, weights: Tensor) -> Tensor:
@@ -123,9 +133,24 @@ def condition(basis: Tensor, weights: Tensor) -> Tensor:
     The largest over the smallest singular value of the weighted basis (J, P); weights: (..., P), not negative.
     """
     root = torch.sqrt(weights)
-    values = torch.linalg.svdvals(torch.linalg.qr(root[..., None] * basis.T, mode="r").R)
+    return _condition(torch.linalg.qr(root[..., None] * basis.T, mode="r").R, root)
+
+
+def _condition(r: Tensor, root: Tensor) -> Tensor:
+    values = torch.linalg.svdvals(r)
     found = values[..., 0] / values[..., -1].clamp_min(torch.finfo(values.dtype).tiny)
-    return torch.where((weights > 0).sum(-1) < len(basis), torch.inf, found)
+    return torch.where((root > 0).sum(-1) < r.shape[-1], torch.inf, found)
+
+
+def _solved(values: Tensor, root: Tensor, q: Tensor, r: Tensor) -> Tensor:
+    """Coefficients by the factors q r of the basis weighted by `root`."""
+    right = q.mT @ (root * torch.where(root > 0, values, 0.0))[..., None]
+    return torch.linalg.solve_triangular(r, right, upper=True)[..., 0]
+
+
+def _refuse_few(points: int, coefficients: int) -> None:
+    if points < coefficients:
+        raise ValueError(f"{points} points of positive weight cannot fit {coefficients} coefficients")
 
 
 def _degree(n: int, m: int) -> int:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor
 
+from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.pupil import hexapolar
 from raytrace.maths.value import value
 from raytrace.optics.launch import launch
@@ -140,6 +141,8 @@ def check_reach(lens: Lens, fields: Tensor | None = None, *, every: bool) -> Non
     tried = torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields
     pupil, _ = hexapolar(_RINGS, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
     primary = lens.wavelengths[lens.primary_wavelength][None]
+    F, P = tried.shape[1], pupil.shape[1]
+    afford(RAY_BYTES * F * P, f"{F * P:,} rays that try {F:,} fields", helps="ask for fewer fields")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what follows tells itself what aiming has to say
         found = losses(lens, pupil, fields=tried, wavelengths=primary)

@@ -183,12 +183,10 @@ def zernike_coefficients(
         raise ValueError(f"Zernike terms by {numbering!r}: expected one of {', '.join(zernike.NUMBERINGS)}")
     order, unity = zernike.NUMBERINGS[numbering]
     orders = [order(j) for j in range(1, count + 1)]
-    basis, energy = _basis(wavefront, orders), wavefront.energy
-    clear = zernike.condition(basis, energy.detach()) < _WORST_CONDITION
-    energy = torch.where(clear[..., None], energy, wavefront.weights)
-    found = zernike.fit(torch.where(clear[..., None], wavefront.opd, 0.0), basis, energy)
+    basis = _basis(wavefront, orders)
+    found, known = zernike.fit_known(wavefront.opd, basis, wavefront.energy, worst=_WORST_CONDITION)
     found = found * found.new_tensor([zernike.norm(*o) for o in orders]) if unity == "rim" else found
-    return where_lit(clear[..., None], found, empty=empty)[0]
+    return where_lit(known[..., None], found, empty=empty)[0]
 
 
 def without(wavefront: Wavefront, count: int) -> Tensor:

@@ -4,20 +4,6 @@ This folder is the only place that imports matplotlib, and it never touches pypl
 nothing behind.
 """
 
-from raytrace.plot.aberrations import distorted_grid as distorted_grid
-from raytrace.plot.aberrations import incidence_curves as incidence_curves
-from raytrace.plot.aberrations import longitudinal_curves as longitudinal_curves
-from raytrace.plot.aberrations import rms_curves as rms_curves
-from raytrace.plot.aberrations import seidel_bars as seidel_bars
-from raytrace.plot.analysis import curvature_curves as curvature_curves
-from raytrace.plot.analysis import distortion_curves as distortion_curves
-from raytrace.plot.analysis import encircled_curves as encircled_curves
-from raytrace.plot.analysis import fan_plot as fan_plot
-from raytrace.plot.analysis import illumination_curve as illumination_curve
-from raytrace.plot.analysis import lateral_curves as lateral_curves
-from raytrace.plot.analysis import mtf_curves as mtf_curves
-from raytrace.plot.analysis import mtf_through_focus_curves as mtf_through_focus_curves
-from raytrace.plot.analysis import wavefront_maps as wavefront_maps
 from raytrace.plot.layout import layout as layout
 from raytrace.plot.psf import model_grid as model_grid
 from raytrace.plot.psf import psf_grid as psf_grid

@@ -33,7 +33,7 @@ def psf_grid(found: Psf, *, close_up: CloseUp | None = None, log: bool = False) 
     """
     if close_up is None and not found.framed and found.order is not None:
         close_up = light_of(found)
-    distances, labels = found.object_distances.tolist(), field_labels(found.lens, found.fields)
+    distances, labels = found.object_distances.tolist(), field_labels(found)
     if not found.wavelengths_summed:
         labels = [f"{row}\n{1e3 * wavelength:.4g} nm" for row in labels for wavelength in found.wavelengths.tolist()]
     title = ": ".join(filter(None, (found.lens.name, f"{found.model} PSF")))

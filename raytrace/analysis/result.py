@@ -1,0 +1,112 @@
+"""What every analysis gives: a result that holds its lens, names its columns, and tells and draws itself."""
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from raytrace.analysis.setting import field_line, refuse_axis
+from raytrace.maths.numerics import broadcast_shape
+from raytrace.maths.result import Result, axis, cell, flat, rows
+from raytrace.system.lens import FIELD_UNITS
+
+#: Units of columns by their names; per cent are told of what is relative.
+_UNITS = {
+    "wavelength": "µm", "frequency": "1/mm", "sensor_distance": "mm", "radius": "mm", "height": "mm", "shift": "mm",
+    "f_tan": "%", "f_theta": "%", "projected_solid_angle": "sr", "crossing": "mm", "lower": "°", "chief": "°",
+    "upper": "°",
+}  # fmt: skip
+_FINE = 321  # points of a curve over frequency or radius, when it is drawn
+_OWN_UNIT = ("tangential", "sagittal", "rms", "peak_to_valley")
+
+
+class Analysis(Result):
+    """A value that holds `lens`, the lens as it was analysed, and mostly `fields` (2, F) in its kind of field."""
+
+    __slots__ = ()
+
+    #: The command, unit of the columns in _OWN_UNIT, and every how many-th point of a curve the text lists.
+    COMMAND: ClassVar[str] = ""
+    UNIT: ClassVar[str] = ""
+    EVERY: ClassVar[int] = 1
+
+    @property
+    def wavelengths(self) -> Tensor:
+        """(W,) µm, those of the lens."""
+        return self.lens.wavelengths
+
+    def heads(self, **others: Tensor) -> dict[str, Tensor]:
+        """The columns of the fields, along axis 0, and of vectors along the axes behind it."""
+        axes = 1 + len(others)
+        names = {"field_x": self.fields[0], "field_y": self.fields[1]}
+        table = {name: axis(values, 0, axes) for name, values in names.items()}
+        return table | {name: axis(values, k, axes) for k, (name, values) in enumerate(others.items(), 1)}
+
+    def about(self) -> dict[str, str]:
+        """What a document says of the result as a whole."""
+        return {}
+
+    def summary(self) -> dict[str, Tensor]:
+        """The columns of a shorter table, if there is one: it is the text, and stands beside the results in JSON."""
+        return {}
+
+    def document(self) -> dict:
+        found = {"analysis": self.COMMAND, **self.about(), "results": rows(self.columns())}
+        summary = self.summary()
+        return {**found, "summary": rows(summary)} if summary else found
+
+    def drawn(self) -> "Analysis":
+        """The same curves with points as close as a line needs that is drawn through them."""
+        return self
+
+    def plot(self, path=None, **options):
+        """The figure (matplotlib), also saved under `path` (.png, .pdf, .svg) if one is given."""
+        marks = {"asked": self} if getattr(self, "marked", False) else {}
+        return Result.plot(self.drawn(), path, **marks, **options)
+
+    def __str__(self) -> str:
+        summary = self.summary()
+        return self.table(summary) if summary else self.table(self.columns(), self.EVERY)
+
+    def table(self, columns: dict[str, Tensor], every: int = 1) -> str:
+        """Columns as text under their names and units, every so many-th point of curves that are longer than twice."""
+        length = broadcast_shape(*(c.shape for c in columns.values()))[-1]
+        thin = every if length > 2 * every else 1
+        listed = flat({name: c[..., ::thin] if c.shape[-1] == length else c for name, c in columns.items()})
+        if "field_x" in listed and not listed["field_x"].any():
+            del listed["field_x"]
+        units = {name: self._unit(name) for name in listed}
+        scaled = (100 * column if units[name] == "%" else column for name, column in listed.items())
+        texts = (
+            [name, units[name], *(cell(value, ".6g") for value in column)]
+            for name, column in zip(listed, scaled, strict=True)
+        )
+        padded = [[f"{text:>{max(len(column[0]), 9)}}" for text in column] for column in texts]
+        lines = ["  ".join(row) for row in zip(*padded, strict=True)]
+        if thin > 1:
+            lines.append(f"{len(range(0, length, thin))} of {length} points of each curve; --json lists all")
+        return "\n".join(lines)
+
+    def _unit(self, name: str) -> str:
+        if name.startswith("field"):
+            return FIELD_UNITS[self.lens.fields.kind]
+        return self.UNIT if name in _OWN_UNIT else _UNITS.get(name, "")
+
+
+def fine(places: Tensor) -> Tensor:
+    """Frequencies or radii from 0 to the last of these, close enough for a smooth curve."""
+    return places.max() * torch.linspace(0, 1, _FINE, dtype=places.dtype, device=places.device)
+
+
+class OverField(Analysis):
+    """Curves over the field: their figure is drawn through many fields on the line to the outermost."""
+
+    __slots__ = ()
+
+    def at(self, fields: Tensor) -> "OverField":
+        """The same analysis at other fields (2, F), which need not be in reach."""
+        raise NotImplementedError
+
+    def drawn(self) -> "OverField":
+        refuse_axis(self.fields)
+        return self.at(field_line(self.fields))
