@@ -83,6 +83,38 @@ def test_a_batch_is_its_single_kernels_in_the_order_asked_for(model):
         torch.testing.assert_close(whole.covariance[:, d], one.covariance[:, 0], atol=1e-12, rtol=2e-3)
 
 
+def test_plain_numbers_are_as_good_as_tensors():
+    numbers = {"fields": [0, (1, 2)], "object_distances": [25e3, math.inf], "wavelengths": [0.5, 0.6], "size": 7}
+    tensors = {
+        "fields": number([[0.0, 1.0], [0.0, 2.0]]),
+        "object_distances": number([25e3, math.inf]),
+        "wavelengths": number([0.5, 0.6]),
+        "grid": grid(0.01, 7),
+    }
+    one, other = (psf(double_gauss(), "gaussian", order=3, **o) for o in ({**numbers, "pixel": 0.01}, tensors))
+    torch.testing.assert_close(one.kernel, other.kernel, rtol=0, atol=0)
+    with pytest.raises(ValueError, match="grid says pixel and size"):
+        psf(double_gauss(), "gaussian", grid=grid(0.01, 7), size=7)
+    with pytest.raises(ValueError, match="below 90 degrees"):
+        psf(double_gauss(), "gaussian", fields=[90])
+
+
+@pytest.mark.parametrize("per_wavelength", [False, True])
+def test_a_psf_is_a_table_a_document_and_words(per_wavelength):
+    options = {"fields": [0, (1, 2)], "object_distances": [25e3, math.inf], "wavelengths": [0.5, 0.6]}
+    found = psf(double_gauss(), "gaussian", order=3, center="chief", per_wavelength=per_wavelength, **options)
+    frame, entries = found.to_frame(), found.document()["results"]
+    assert len(frame) == len(entries) == found.energy.numel() == (8 if per_wavelength else 4)
+    for row, entry, line in zip(frame.itertuples(), entries, str(found).splitlines()[3:], strict=True):
+        assert [row.field_x, row.field_y] == entry["field"]
+        assert row.object_distance == (entry["object_distance"] or math.inf)
+        assert [row.centroid_x, row.centroid_y] == entry["centroid"]
+        assert row.sigma_x**2 == pytest.approx(entry["covariance"][0][0], rel=1e-12)
+        assert row.energy == entry["energy"]
+        assert f"{row.energy:.4f}" in line
+        assert not per_wavelength or row.wavelength == entry["wavelength"]
+
+
 def test_normalised_by_its_window_a_kernel_sums_to_one_and_keeps_the_energy():
     lens, where = double_gauss(), grid(0.005, 3)
     by_energy, by_window = (

@@ -12,10 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.budget import piece
+from raytrace.budget import afford, piece
 from raytrace.maths.grid import Grid, centres
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.pupil import gauss_rings
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.scene import Scene
 
 
 class EmptyPupil(ValueError):
@@ -123,12 +125,12 @@ def _in_pieces(sum_of: Callable[..., Tensor], *waves: Tensor, each: float) -> Te
 
 def bessel_j0(x: Tensor) -> Tensor:
     """J₀ with its derivatives (those of torch.special detach silently)."""
-    return _J0.apply(x)
+    return _Bessel.apply(x, 0)
 
 
 def bessel_j1(x: Tensor) -> Tensor:
     """J₁ with its derivatives (those of torch.special detach silently)."""
-    return _J1.apply(x)
+    return _Bessel.apply(x, 1)
 
 
 def rings_and_arms(phase: float, order: int) -> tuple[int, int]:
@@ -198,45 +200,65 @@ def _fraction(waves: Tensor) -> Tensor:
     return waves - torch.round(waves.detach())
 
 
-class _J0(torch.autograd.Function):
-    """J₀' = -J₁."""
+class _Bessel(torch.autograd.Function):
+    """J_0 or J_1: J₀' = -J₁; J₁' = J₀ - J₁/x, 1/2 at 0."""
 
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(x):
-        return torch.special.bessel_j0(x)
+    def forward(x, number: int):
+        return (torch.special.bessel_j0, torch.special.bessel_j1)[number](x)
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        ctx.save_for_backward(*inputs)
-        ctx.save_for_forward(*inputs)
+        x, ctx.number = inputs
+        ctx.save_for_backward(x)
+        ctx.save_for_forward(x)
 
     @staticmethod
     def backward(ctx, gradient):
-        return -gradient * _J1.apply(*ctx.saved_tensors)
-
-    jvp = backward
-
-
-class _J1(torch.autograd.Function):
-    """J₁' = J₀ - J₁/x, 1/2 at 0."""
-
-    generate_vmap_rule = True
+        return gradient * _bessel_slope(*ctx.saved_tensors, ctx.number), None
 
     @staticmethod
-    def forward(x):
-        return torch.special.bessel_j1(x)
+    def jvp(ctx, tangent, _):
+        return tangent * _bessel_slope(*ctx.saved_tensors, ctx.number)
 
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        ctx.save_for_backward(*inputs)
-        ctx.save_for_forward(*inputs)
 
-    @staticmethod
-    def backward(ctx, gradient):
-        (x,) = ctx.saved_tensors
-        quotient = torch.where(x == 0, 0.5, safe_divide(_J1.apply(x), x))
-        return gradient * (_J0.apply(x) - quotient)
+def _bessel_slope(x: Tensor, number: int) -> Tensor:
+    if number == 0:
+        return -bessel_j1(x)
+    return bessel_j0(x) - torch.where(x == 0, 0.5, safe_divide(bessel_j1(x), x))
 
-    jvp = backward
+
+# -- what waves take in memory, told in the words of a lens ------------------------------------------------------------
+
+_HELPS = "give a larger --tol, a smaller --size or --pixel, a slower aperture (--f-number), --model drt"
+
+
+def afford_rings(what: str, scene: Scene, rings: int, phase: float) -> None:
+    """Raise OverBudget where a pupil of so many Gauss rings is too much.
+
+    phase: radians along a pupil radius. n rings are counted as a matrix n × n: so do the points that they serve grow.
+    """
+    D, F, W = scene.shape
+    turns = phase / (2 * math.pi)
+    afford(
+        24.0 * rings**2 + 128.0 * rings * D * F * W,
+        f"{what} at {_speed(scene)} needs {rings:,} rings of the pupil: the phase turns {turns:,.0f} times",
+        helps=_HELPS,
+    )
+
+
+def afford_sensor(what: str, scene: Scene, grid: Grid, nodes: int) -> None:
+    """Raise OverBudget where the light at `nodes`² points of each pixel is too much; fields come one by one."""
+    D, _, W = scene.shape
+    rows, columns = grid.rows * nodes, grid.columns * nodes
+    afford(
+        64.0 * D * W * rows * columns,
+        f"{what} at {_speed(scene)} needs {columns:,} × {rows:,} points of the sensor for {D * W} kernels",
+        helps=_HELPS,
+    )
+
+
+def _speed(scene: Scene) -> str:
+    return f"F/{float(first_order(scene.lens).working_f_number.detach().abs().min()):.3g}"

@@ -18,8 +18,9 @@ import torch
 from torch import Tensor
 
 from raytrace.kernels.clear import between, clear_arms
-from raytrace.kernels.cost import afford_rings, afford_sensor
 from raytrace.kernels.dft import (
+    afford_rings,
+    afford_sensor,
     disc_rule,
     integrate,
     nodes_per_pixel,

@@ -18,8 +18,9 @@ import torch
 from torch import Tensor
 
 from raytrace.budget import piece
-from raytrace.kernels.cost import afford_rings, afford_sensor
 from raytrace.kernels.dft import (
+    afford_rings,
+    afford_sensor,
     bessel_j0,
     disc_rule,
     integrate,

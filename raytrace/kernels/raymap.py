@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.kernels.cost import afford_cells
 from raytrace.kernels.radial import energy_of_rings, is_centred, lit_part, unfold
 from raytrace.kernels.rays import (
     Fans,
+    afford_cells,
     cell_width,
     energy_of_fans,
     kernels_of_fans,

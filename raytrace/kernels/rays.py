@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.kernels.cost import afford_cells
+from raytrace.budget import afford
 from raytrace.kernels.result import Kernels, moments
 from raytrace.kernels.splat import cell_energy, cell_widths, cells, clear_share, histogram, splat_cells, splat_smooth
 from raytrace.maths import pupil
@@ -203,6 +203,20 @@ def refined(fans: Fans, parts: Sequence[int]) -> Fans:
 
     points, *clearances = (cut(t) for t in (fans.points, *fans.clearances))
     return Fans(points, cut_line(fans.radius, along), tuple(clearances), fans.rays)
+
+
+def afford_cells(kernels: Sequence[int], across: int, along: int, *, each: float) -> None:
+    """Raise OverBudget where cells of the pupil narrow enough for the pixels, `each` so many bytes, are too much.
+
+    kernels: (D, F, W); across, along: cells round the pupil and from its centre to its rim.
+    """
+    count = math.prod(kernels)
+    afford(
+        each * count * across * along,
+        f"the ray-traced PSF needs {across:,} × {along:,} cells of the pupil for each of {count} kernels: the blur is "
+        "wide beside a pixel",
+        helps="give a larger --pixel, fewer fields or wavelengths at once, --rays, --model gaussian",
+    )
 
 
 def cut_line(t: Tensor, parts: int) -> Tensor:
