@@ -9,6 +9,8 @@ from torch.utils import _pytree as pytree
 
 _VALUE_TYPES: set[type] = set()
 
+Value = typing.TypeVar("Value")
+
 
 def value(cls: type) -> type:
     """Make a class a frozen, slotted dataclass and register it as a pytree.
@@ -47,7 +49,7 @@ def _holds_numbers(annotation: object) -> bool:
     return annotation is torch.Tensor or annotation in _VALUE_TYPES
 
 
-def to(instance, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None):
+def to(instance: Value, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Value:
     """The same value with every floating-point tensor in it converted to `dtype` and moved to `device`.
 
     A tensor that stands in several places (the coefficients of air, say) stays one tensor.
