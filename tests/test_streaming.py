@@ -11,6 +11,7 @@ import pytest
 import torch
 from problems import NANOMETRE, PICOMETRE, aspheric_singlet, double_gauss, fields, lens, scalar, surface, vector
 
+import raytrace as rt
 from raytrace.kernels import psf
 from raytrace.kernels import rays as plain
 from raytrace.kernels.streaming import stream_kernels
@@ -338,6 +339,16 @@ def test_a_spot_that_no_ray_reaches_makes_the_mean_nan_and_no_derivative():
     assert weighed.isfinite()
     with pytest.raises(EmptySpot):
         mean_square_gradient(system, curvatures, 300, fields=both, empty="error")
+
+
+def test_gradient_by_the_door_takes_plain_numbers():
+    curvatures = [s.curvature.clone().requires_grad_() for s in double_gauss().surfaces if s.curvature is not None]
+    system = bent(curvatures, scalar(1.0))
+    plain = rt.mean_square_gradient(system, curvatures, 300, fields=[0, 7.0], wavelengths=[0.55])
+    given = vector(0.0, 0.0, 0.0, 7.0).reshape(2, 2), vector(0.55)
+    tensors = rt.mean_square_gradient(system, curvatures, 300, fields=given[0], wavelengths=given[1])
+    assert plain[0] == tensors[0]
+    assert plain[1] == tensors[1]
 
 
 def test_gradient_of_a_sum_over_chunks():

@@ -102,15 +102,11 @@ def _terms(row: Row, unit: float) -> tuple[str, Tensor | None]:
     powers = {n: column for column in row.cells if (n := order(column)) is not None}
     terms = {n: found for n, column in powers.items() if (found := _cell(row, column)) is not None}
     words = set(_words(row.cells.get("type", "")))
-    odd = next((n for n in terms if n % 2), 0)
-    for kind in sorted(KINDS.values(), key=lambda kind: not words & set(kind.words)):
-        if not any(found and n % kind.step for n, found in terms.items()):
-            filled = [n for n in terms if n % kind.step == 0]
-            numbers = [
-                terms.get(n, 0.0) / unit ** (n - 1) for n in range(kind.step, max(filled, default=0) + 1, kind.step)
-            ]
-            return kind.name, double(numbers) if numbers else None
-    raise UnsupportedSurface(f"the term r^{odd} is odd; modelled are conics and {', '.join(KINDS)}s", row.place)
+    named_first = sorted(KINDS.values(), key=lambda kind: not words & set(kind.words))
+    kind = next(kind for kind in named_first if not any(found and n % kind.step for n, found in terms.items()))
+    last = max((n for n in terms if n % kind.step == 0), default=0)
+    numbers = [terms.get(n, 0.0) / unit ** (n - 1) for n in range(kind.step, last + 1, kind.step)]
+    return kind.name, double(numbers) if numbers else None
 
 
 def _semi_diameter(row: Row, unit: float) -> float | None:

@@ -9,7 +9,7 @@ from torch.utils import _pytree as pytree
 from raytrace.maths.numerics import safe_divide
 from raytrace.optics.spot import where_lit
 from raytrace.optics.streaming import MAX_BYTES, Progress, Shot, chunk_size, hits, pupil_chunks, shots_of, stream_spot
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, field_points
 
 
 def stream_gradient(
@@ -36,8 +36,8 @@ def mean_square_gradient(
     leaves: Sequence[Tensor],
     rays: int,
     *,
-    fields: Tensor | None = None,
-    wavelengths: Tensor | None = None,
+    fields: Tensor | Sequence | None = None,
+    wavelengths: Tensor | Sequence[float] | None = None,
     weights: Tensor | None = None,
     sampling: str = "sobol",
     seed: int = 0,
@@ -50,12 +50,15 @@ def mean_square_gradient(
 
         R² = (1/n) Σ |q - q̄|²,   dR² = (2/n) Σ (q - q̄)·dq:  q̄ may be held, for Σ (q - q̄) = 0
 
-    lens: made from the leaves by differentiable operations; weights: (F, W), alike by default. The rays are traced
-    twice: for the centroids, then for the sum. The graph is cut at the numbers of the lens that rays see, so what made
-    the lens is gone through once, not for every chunk.
+    lens: made from the leaves by differentiable operations; fields: (2, F), y, or (x, y), and wavelengths: µm, the
+    lens's own by default; weights: (F, W), alike by default. The rays are traced twice: for the centroids, then for the
+    sum. The graph is cut at the numbers of the lens that rays see, so what made the lens is gone through once, not for
+    every chunk.
     empty: what the mean is if a spot of any weight has no rays: "nan", the derivatives those of the other spots, or
     "error", which raises EmptySpot.
     """
+    fields = None if fields is None else field_points(fields, like=lens.fields.y)
+    wavelengths = None if wavelengths is None else torch.as_tensor(wavelengths).to(lens.wavelengths)
     common = {"sampling": sampling, "seed": seed, "max_bytes": max_bytes, "progress": progress}
     conditions = {"fields": fields, "wavelengths": wavelengths, "ray_aiming": ray_aiming}
     light = stream_spot(lens, rays, **conditions, **common)
