@@ -36,12 +36,7 @@ class Settings:
     def of(cls, given: Mapping, **more) -> Self:
         """Settings by options, where they were given; `more` goes before them."""
         found = {field.name: given.get(field.name) for field in dataclasses.fields(cls)}
-        return cls.read({name: value for name, value in found.items() if value is not None} | more)
-
-    @classmethod
-    def read(cls, document: Mapping) -> Self:
-        """Settings as JSON has them. Raises TypeError where they are not of this kind."""
-        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in document.items()})
+        return read(cls, {name: value for name, value in found.items() if value is not None} | more)
 
     def words(self) -> list[str]:
         """What is not as by default, as options of the command."""
@@ -52,6 +47,11 @@ class Settings:
                 name = (field.metadata["name"] or field.name).replace("_", "-")
                 found.append(f"--{name} {' '.join(f'{one:g}' for one in value) if isinstance(value, tuple) else value}")
         return found
+
+
+def read(kind: type, document: Mapping):
+    """A value of plain fields as JSON has it, lists for tuples. Raises TypeError where it is not of this kind."""
+    return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in document.items()})
 
 
 def add_options(group, settings: type[Settings], *names: str) -> None:
@@ -65,13 +65,13 @@ def add_options(group, settings: type[Settings], *names: str) -> None:
 def whole(least: int) -> Callable[[str], int]:
     """What reads whole numbers from `least` on."""
 
-    def read(text: str) -> int:
+    def reader(text: str) -> int:
         found = 0 if text == "0" else count(text)
         if found < least:
             raise argparse.ArgumentTypeError(f"{text!r}: expected {least} at least")
         return found
 
-    return read
+    return reader
 
 
 def pictures(parser, what: str, *names: str, settings: type[Settings] = Settings, limit: int | None = None):

@@ -16,6 +16,7 @@ from raytrace.formats.pictures import dead_leaves
 from raytrace.pages import machine, write_page
 from raytrace.plot.style import save
 from raytrace.studies.codesign import figures, optima
+from raytrace.studies.codesign import study as runs
 from raytrace.studies.codesign.claims import is_of_paper
 from raytrace.studies.codesign.experiment import STEPS, Outcome, batch, camera, lens_at_start, outcome
 from raytrace.studies.codesign.page import CAPTIONS, Report
@@ -29,19 +30,7 @@ from raytrace.studies.codesign.setup import (
     settings_of,
     train_run,
 )
-from raytrace.studies.codesign.study import (
-    COLUMNS,
-    blur_diameters,
-    courses,
-    examples,
-    losses_by_distance,
-    outcomes,
-    run_folder,
-    run_settings,
-    step_time,
-    summaries,
-    trained,
-)
+from raytrace.studies.options import read
 
 
 def compare(arguments: argparse.Namespace) -> None:
@@ -75,7 +64,7 @@ def compare(arguments: argparse.Namespace) -> None:
 
 def _recorded_settings(path: Path) -> Settings:
     known = {field.name for field in dataclasses.fields(Settings)}
-    return Settings.read({key: value for key, value in recorded(path).items() if key in known})
+    return read(Settings, {key: value for key, value in recorded(path).items() if key in known})
 
 
 def _asked(arguments: argparse.Namespace, study: Path) -> tuple[list[str], list[int]]:
@@ -86,7 +75,7 @@ def _asked(arguments: argparse.Namespace, study: Path) -> tuple[list[str], list[
         usual_models, usual_seeds = [row for row, _ in begun], sorted({seed for _, seed in begun})
     models = [row for row in NAMES if row in (arguments.models or usual_models)]
     seeds = list(dict.fromkeys(arguments.seeds or usual_seeds))
-    is_lacking = any(outcome(run_folder(study, "paraxial", seed)) is None for seed in seeds)
+    is_lacking = any(outcome(runs.run_folder(study, "paraxial", seed)) is None for seed in seeds)
     if AFTER_PARAXIAL in models and "paraxial" not in models and is_lacking:
         raise CommandError(f"{AFTER_PARAXIAL} begins where paraxial ended: add paraxial to --models")
     return models, seeds
@@ -96,19 +85,19 @@ def _train(given: Experiment, study: Path, models: Sequence[str], seeds: Sequenc
     # Seeds outside: a study that is stopped has compared as many models as possible.
     asked = [(row, seed) for seed in seeds for row in models]
     for number, (row, seed) in enumerate(asked, 1):
-        own = run_settings(study, row, seed, given.settings)
-        train_run(given, own, run_folder(study, row, seed), f"{number}/{len(asked)} {row} {seed}")
+        own = runs.run_settings(study, row, seed, given.settings)
+        train_run(given, own, runs.run_folder(study, row, seed), f"{number}/{len(asked)} {row} {seed}")
 
 
 def _report(given: Experiment, study: Path, models: Sequence[str], seeds: Sequence[int], docs: Path) -> Report:
     """Write everything; returns what the page says."""
-    found = outcomes(study, models, seeds)
+    found = runs.outcomes(study, models, seeds)
     done = {(one.model, one.seed) for one in found}
     own = [dataclasses.replace(given.settings, model=model) for model in models if model in MODELS]
     say("the closed form, and the time of a step, of every model")
     spectrum = given.spectrum()
     best = optima.closed_forms(given.lens, given.settings, spectrum, models)
-    times = [step_time(camera(given.lens, s), batch(given.train, s, list(range(s.batch)), 0)) for s in own]
+    times = [runs.step_time(camera(given.lens, s), batch(given.train, s, list(range(s.batch)), 0)) for s in own]
     drawn = _training_figures(given, study, found) | _lens_figures(given, study, found)
     drawn |= _scan_figure(given, spectrum, best, found)
     report = Report(
@@ -126,7 +115,7 @@ def _report(given: Experiment, study: Path, models: Sequence[str], seeds: Sequen
     )
     folder = docs / "codesign"
     folder.mkdir(parents=True, exist_ok=True)
-    write_table(folder / "table2.csv", found, COLUMNS)
+    write_table(folder / "table2.csv", found, runs.COLUMNS)
     write_table(folder / "spectral.csv", best, optima.COLUMNS)
     for name, figure in drawn.items():
         save(figure, folder / name)
@@ -135,11 +124,11 @@ def _report(given: Experiment, study: Path, models: Sequence[str], seeds: Sequen
 
 
 def _training_figures(given: Experiment, study: Path, found: Sequence[Outcome]) -> Mapping[str, figures.Figure]:
-    joint, refined = (courses(study, found, "loss", step) for step in STEPS)
+    joint, refined = (runs.courses(study, found, "loss", step) for step in STEPS)
     if not joint:
         return {}
     drawn = {"loss.png": figures.loss_figure(joint, refined, given.steps_per_epoch)}
-    if sensors := courses(study, found, "sensor"):
+    if sensors := runs.courses(study, found, "sensor"):
         scale = conjugates(given.lens, given.settings)
         drawn["focus.png"] = figures.focus_figure(sensors, scale, given.steps_per_epoch)
     return drawn
@@ -155,19 +144,19 @@ def _lens_figures(given: Experiment, study: Path, found: Sequence[Outcome]) -> M
     restored: dict[str, dict[str, np.ndarray]] = {}
     leaves = dead_leaves(2, size=2 * (given.settings.patch + given.settings.size))
     for one in found:
-        settings = run_settings(study, one.model, one.seed, given.settings)
-        own = trained(given.lens, settings, run_folder(study, one.model, one.seed))
+        settings = runs.run_settings(study, one.model, one.seed, given.settings)
+        own = runs.trained(given.lens, settings, runs.run_folder(study, one.model, one.seed))
         lens = own.variables()
-        blur = blur_diameters(lens, lens.wavelengths.new_tensor(distances)).tolist()
+        blur = runs.blur_diameters(lens, lens.wavelengths.new_tensor(distances)).tolist()
         diameters.setdefault(one.model, []).append(blur)
         if one.model not in restored:
             # Of dead leaves: the page may be published, pictures of a data set often may not.
-            patches = examples(own, leaves, settings, shown)
+            patches = runs.examples(own, leaves, settings, shown)
             restored[one.model] = {key: patch.float().numpy() for key, patch in patches.items()}
     means = {model: np.mean(seeds, 0).tolist() for model, seeds in diameters.items()}
     return {
         "blur.png": figures.blur_figure(distances.tolist(), means, given.settings.pixel),
-        "distance.png": figures.distance_figure(*losses_by_distance(found)),
+        "distance.png": figures.distance_figure(*runs.losses_by_distance(found)),
         "examples.png": figures.examples_figure(restored, shown),
     }
 
@@ -178,7 +167,7 @@ def _scan_figure(
     """The closed form over the sensor's place, if the sensor is what varies."""
     if given.settings.vary.split() != ["sensor"] or not best:
         return {}
-    ends = {one.model: one.mean["sensor_mm"] for one in summaries(found)}
+    ends = {one.model: one.mean["sensor_mm"] for one in runs.summaries(found)}
     start = float(lens_at_start(given.lens, given.settings).surfaces[-2].thickness)
     places = [start, *(one.sensor_mm for one in best), *ends.values()]
     margin = 0.15 * (max(places) - min(places)) + 0.02

@@ -76,7 +76,7 @@ def edof(arguments: argparse.Namespace) -> Learned:
     """Learn one element, or go on with it; then say what it is worth."""
     world, settings, folder = _world(arguments), _settings(arguments), Path(arguments.folder)
     train, test = split(_pictures(arguments, "sharp leaves"))
-    camera = _learn(settings, world, train, folder, f"{settings.kind}, seed {settings.seed}")
+    camera = learn(settings, world, train, folder, f"{settings.kind}, seed {settings.seed}")
     with torch.no_grad():
         elements = camera.variables()
         found = kernels(elements, world)
@@ -122,7 +122,7 @@ def _settings(arguments: argparse.Namespace) -> Settings:
     return Settings.of(named, **more)
 
 
-def _learn(settings: Settings, world: World, train: Pictures, folder: Path, label: str) -> EdofCamera:
+def learn(settings: Settings, world: World, train: Pictures, folder: Path, label: str) -> EdofCamera:
     """A learned camera, trained as far as is left, with a bar."""
     S = spectrum(periodic(train, settings.size))
     try:
@@ -240,7 +240,7 @@ def _learned(
         for name, learning in asked.items():
             folder = Path(arguments.folder or unkept) / name
             with torch.enable_grad():
-                camera = _learn(Settings.of(common, **learning), world, train, folder, ROWS[name].title)
+                camera = learn(Settings.of(common, **learning), world, train, folder, ROWS[name].title)
             found[name] = camera.variables()
     return found
 

@@ -22,6 +22,7 @@ from raytrace.camera.phase import PhaseVariables
 from raytrace.camera.training import DamagedRun, Record, Run, Share, read_state, train
 from raytrace.files import write_atomically
 from raytrace.formats.pictures import Pictures, crop, draws
+from raytrace.maths.value import detached
 from raytrace.media.catalog import find_glass
 from raytrace.media.glass import index
 from raytrace.optics.reuse import Memo
@@ -115,13 +116,10 @@ def start(
     )
     if settings.kind == "smooth":
         return best
-    (element,) = best()
-    element = Element(element.profile, element.radius.detach(), element.glass)
+    (element,) = detached(best())
     if settings.levels:
         element = wrapped(element, made_for.wavelength, levels=settings.levels)
-    rings = as_rings(element, settings.pitch)
-    profile = dataclasses.replace(rings.profile, heights=rings.profile.heights.detach())
-    return PhaseVariables(dataclasses.replace(rings, profile=profile), tolerance=settings.tolerance)
+    return PhaseVariables(as_rings(element, settings.pitch), tolerance=settings.tolerance)
 
 
 def _zernike(settings: Settings, lens: Element) -> PhaseVariables:

@@ -18,11 +18,13 @@ from torch import Tensor
 
 from raytrace.camera.deconvolve import blind_filter, errors, psnr
 from raytrace.camera.phase import PhaseVariables
-from raytrace.camera.training import DamagedRun, Record, load_state, read_json
-from raytrace.formats.pictures import Pictures, draws
+from raytrace.camera.training import DamagedRun, load_state, read_json
+from raytrace.formats.pictures import draws
+from raytrace.maths.value import detached
 from raytrace.optics.reuse import Memo
+from raytrace.studies import options
 from raytrace.studies.edof.settings import Settings
-from raytrace.studies.edof.training import EdofCamera, begin, learn_element, scheduled
+from raytrace.studies.edof.training import begin, scheduled
 from raytrace.studies.edof.world import World, expected_error, scene, spectrum, transfer
 from raytrace.studies.edof.world import kernels as kernels_of
 from raytrace.wave.element import Element, Pixels, Rings, period, with_tolerance, wrapped
@@ -76,9 +78,7 @@ def made(element: Element, levels: int, *, wrap: bool) -> Element:
     if not levels:
         return element
     step = period(element.glass, WAVELENGTH).to(element.radius) / levels
-    heights = element.profile.heights
-    stepped = torch.floor((heights / step).detach() + 1e-4) * step
-    return dataclasses.replace(element, profile=dataclasses.replace(element.profile, heights=stepped))
+    return element.with_numbers(torch.floor((element.numbers / step).detach() + 1e-4) * step)
 
 
 class Judge:
@@ -136,8 +136,7 @@ def learn_on(
         error = judge.error(variables()[0])
         if float(error.detach()) < least:
             least = float(error.detach())
-            heights = variables.numbers().detach().clone()
-            best = dataclasses.replace(element, profile=dataclasses.replace(element.profile, heights=heights))
+            best = element.with_numbers(variables.numbers().detach().clone())
         if step == steps:
             break
         for group in optimizer.param_groups:
@@ -151,14 +150,6 @@ def learn_on(
 # --- the learned element
 
 
-def learned(
-    settings: Settings, world: World, S: Tensor, pictures: Pictures, folder: str | Path
-) -> Iterable[tuple[int, Record]]:
-    """The steps of learning rings in a folder of `raytrace wave edof`, those that are left; then `read` has them."""
-    camera, run = begin(settings, world, S, folder)
-    return learn_element(camera, pictures, settings, run)
-
-
 def read(folder: str | Path, S: Tensor) -> tuple[Element, World]:
     """The element of a run's last checkpoint as it was learned, and its world.
 
@@ -169,32 +160,19 @@ def read(folder: str | Path, S: Tensor) -> tuple[Element, World]:
         raise ValueError(f"{folder}: no settings.json; expected the folder of a run of `raytrace wave edof`")
     given = read_json(written)
     try:
-        world, settings = World(**_tuples(given.pop("world"))), Settings.read(given)
+        world, settings = options.read(World, given.pop("world")), options.read(Settings, given)
     except (KeyError, TypeError, AttributeError) as error:
         raise DamagedRun(f"{written}: no settings of `raytrace wave edof` ({error})") from error
     camera, run = begin(settings, world, S, folder)
-    return _ringed(_loaded(camera, run), folder), world
-
-
-def _loaded(camera: EdofCamera, run) -> Element:
     state = run.load()
     if state is None:
         raise ValueError(f"{run.folder}: no checkpoint; let `raytrace wave edof` finish")
     load_state(camera, state, run.checkpoint)
-    with torch.no_grad():
-        return camera.variables()[0]
-
-
-def _ringed(element: Element, name: str | Path) -> Element:
+    element = detached(camera.variables()[0])
     if not isinstance(element.profile, Rings):
         kind = type(element.profile).__name__
-        raise ValueError(f"{name}: heights are {kind}; expected Rings: learn with --element rings")
-    heights = element.profile.heights.detach()
-    return dataclasses.replace(element, profile=dataclasses.replace(element.profile, heights=heights))
-
-
-def _tuples(found: dict) -> dict:
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in found.items()}
+        raise ValueError(f"{folder}: heights are {kind}; expected Rings: learn with --element rings")
+    return element, world
 
 
 # --- what it costs

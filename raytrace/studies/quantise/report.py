@@ -13,7 +13,9 @@ from raytrace.cli.progress import progress
 from raytrace.files import write_table
 from raytrace.formats.pictures import Pictures, dead_leaves, split
 from raytrace.maths.result import Result
+from raytrace.maths.value import detached
 from raytrace.pages import grid, write_page
+from raytrace.studies.edof.report import learn
 from raytrace.studies.edof.settings import Settings as Learning
 from raytrace.studies.edof.world import World, periodic, spectrum
 from raytrace.studies.pictures import pictures
@@ -25,7 +27,6 @@ from raytrace.studies.quantise.experiment import (
     Tolerance,
     efficiency,
     law,
-    learned,
     made,
     read,
     steps_of,
@@ -113,7 +114,7 @@ def _element(
         (element,) = baseline("fresnel", aim(radius=world.radius, sensor=world.sensor_distance, focus=world.design))
         return name, element, world
     if name == "learned":
-        return name, *_learned(settings, world, train, S, folder)
+        return name, *_learned(settings, world, train, folder)
     if path.is_dir():
         return path.name, *read(path, S)
     if path.suffix.lower() not in FORMATS:
@@ -126,12 +127,11 @@ def _element(
     return path.name, element, dataclasses.replace(world, radius=0.5 * settings.aperture)
 
 
-def _learned(settings: Settings, world: World, train: Pictures, S: Tensor, folder: str | None) -> tuple[Element, World]:
+def _learned(settings: Settings, world: World, train: Pictures, folder: str | None) -> tuple[Element, World]:
     how = Learning(steps=settings.learn, starts=settings.starts, seed=settings.seed)
     with tempfile.TemporaryDirectory() as temporary:
-        for _ in progress(learned(how, world, S, train, folder or temporary), what="learning"):
-            pass
-        return read(folder or temporary, S)
+        camera = learn(how, world, train, Path(folder or temporary), "learned")
+    return detached(camera.variables()[0]), world
 
 
 def _ways(settings: Settings, name: str) -> list[str]:

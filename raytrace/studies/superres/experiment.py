@@ -22,6 +22,7 @@ from torch import Tensor
 from raytrace.camera.deconvolve import mean_square_error, psnr
 from raytrace.camera.phase import PhaseVariables
 from raytrace.formats.pictures import Pictures, draws
+from raytrace.maths.value import detached
 from raytrace.media.catalog import find_glass
 from raytrace.media.glass import index
 from raytrace.optics.reuse import Memo
@@ -124,7 +125,7 @@ def learned_lens(
         found = learn(own, world, S, factor, steps=steps, start=spread * random if number else None)
         if min(found) < least:
             best, least = own, min(found)
-    return _frozen(best())
+    return detached(best())
 
 
 def taken(pictures: Tensor, T: Tensor, factor: int, noise: Tensor) -> Tensor:
@@ -233,7 +234,7 @@ def learn_heights(plate: Plate, elements: Elements, S: Tensor, factor: int, *, s
         return joint_error_of(kernel, plate.places, S, plate.world.noise, factor)
 
     minimise([variables.change], error, steps=steps)
-    return _frozen(variables())
+    return detached(variables())
 
 
 def wide_kernels(elements: Elements, world: World, *, samples: int = 2 * _CELLS, memo: Memo | None = None) -> Tensor:
@@ -337,10 +338,3 @@ def multiplexed(
     G = joint_inversion(T, S, noise, factor)
     found = joint_superresolve(views(sensor, kernel, places, factor), G, factor)
     return row_of(name, joint_error_of(kernel, places, S, noise, factor), found, test), sensor
-
-
-def _frozen(elements: Elements) -> Elements:
-    """Elements without gradients."""
-    first, *rest = elements
-    numbers = {field.name: getattr(first.profile, field.name).detach() for field in dataclasses.fields(first.profile)}
-    return dataclasses.replace(first, profile=type(first.profile)(**numbers)), *rest
