@@ -11,10 +11,9 @@ from torch import Tensor
 from raytrace.camera.training import Run, share
 from raytrace.cli.door import CommandError, say
 from raytrace.cli.run import present
-from raytrace.files import write_table
+from raytrace.files import table
 from raytrace.formats.pictures import dead_leaves
-from raytrace.pages import machine, write_page
-from raytrace.plot.style import save
+from raytrace.pages import machine
 from raytrace.studies.codesign import figures, optima
 from raytrace.studies.codesign import study as runs
 from raytrace.studies.codesign.claims import is_of_paper
@@ -31,6 +30,7 @@ from raytrace.studies.codesign.setup import (
     train_run,
 )
 from raytrace.studies.options import read
+from raytrace.studies.publish import publish
 
 
 def compare(arguments: argparse.Namespace) -> None:
@@ -50,10 +50,8 @@ def compare(arguments: argparse.Namespace) -> None:
         _train(given, study, models, seeds)
     if share().rank:
         return  # the first process writes
-    docs = Path(arguments.docs or study)
-    report = _report(given, study, models, seeds, docs)
+    report = _report(given, study, models, seeds, Path(arguments.docs or study))
     present(report, arguments)
-    say(f"written: {docs / 'codesign.md'}")
     nowhere = [one for one in (*report.optima, *report.found) if one.no_optimum]
     for one in nowhere:
         kind = "the closed form" if isinstance(one, optima.Optimum) else f"seed {one.seed}"
@@ -113,13 +111,8 @@ def _report(given: Experiment, study: Path, models: Sequence[str], seeds: Sequen
         sweep=(docs / "codesign_sweep.md").exists(),
         of_paper=is_of_paper(given.lens),
     )
-    folder = docs / "codesign"
-    folder.mkdir(parents=True, exist_ok=True)
-    write_table(folder / "table2.csv", found, runs.COLUMNS)
-    write_table(folder / "spectral.csv", best, optima.COLUMNS)
-    for name, figure in drawn.items():
-        save(figure, folder / name)
-    write_page(docs / "codesign.md", report.parts())
+    tables = {"table2.csv": table(found, runs.COLUMNS), "spectral.csv": table(best, optima.COLUMNS)}
+    publish(docs / "codesign.md", "codesign", report.parts(), tables=tables, figures=drawn)
     return report
 
 

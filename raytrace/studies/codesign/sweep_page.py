@@ -15,15 +15,16 @@ from raytrace.camera.training import share
 from raytrace.cli.door import CommandError, say
 from raytrace.cli.progress import progress
 from raytrace.cli.run import present
-from raytrace.files import write_table
+from raytrace.files import table
 from raytrace.maths.result import Result, plain
-from raytrace.pages import grid, picture, shown, write_page
+from raytrace.pages import grid, picture, shown
 from raytrace.studies.codesign.claims import SIMPLE, is_of_paper, percent
 from raytrace.studies.codesign.settings import MODELS, NAMES
 from raytrace.studies.codesign.setup import Experiment, experiment, settings_of
 from raytrace.studies.codesign.study import PAPER
 from raytrace.studies.codesign.sweep import COLUMNS, COMBINED, TOGETHER, Reading, Row, distinct, readings
 from raytrace.studies.codesign.sweep import sweep as sweep_all
+from raytrace.studies.publish import publish
 
 _NEAR = 2.0  # m: so close to the paper's number is its number
 
@@ -166,13 +167,9 @@ def sweep(arguments: argparse.Namespace) -> None:
     if share().rank:
         return  # the first process writes
     found, docs = Sweep(rows, given, is_of_paper(given.lens)), Path(arguments.docs or arguments.folder)
-    folder = docs / "codesign"
-    folder.mkdir(parents=True, exist_ok=True)
-    write_table(folder / "sweep.csv", rows, COLUMNS)
-    found.plot(folder / "sweep.png")
-    write_page(docs / "codesign_sweep.md", found.parts())
+    tables, figures = {"sweep.csv": table(rows, COLUMNS)}, {"sweep.png": found.plot()}
+    publish(docs / "codesign_sweep.md", "codesign", found.parts(), tables=tables, figures=figures)
     present(found, arguments)
-    say(f"written: {docs / 'codesign_sweep.md'}")
     for row in rows:
         if row.no_optimum:
             say(f"warning: {row.factor} {row.value}, {row.model}: {row.no_optimum}")

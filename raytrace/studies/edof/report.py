@@ -11,17 +11,18 @@ import torch
 from raytrace.camera.training import NotFinite, OtherSettings
 from raytrace.cli.door import CommandError, say
 from raytrace.cli.progress import progress
-from raytrace.files import write_json, write_table
+from raytrace.files import table as csv
+from raytrace.files import write_json
 from raytrace.formats.pictures import Pictures, dead_leaves, split
 from raytrace.maths.result import Result, called, plain
-from raytrace.pages import grid, picture, write_page
-from raytrace.plot.style import save
+from raytrace.pages import grid, picture
 from raytrace.studies.edof.scene import deep, flat
 from raytrace.studies.edof.settings import Settings
 from raytrace.studies.edof.table import ROWS, Content, elements_of, records, table_of
 from raytrace.studies.edof.training import EdofCamera, begin, learn_element
 from raytrace.studies.edof.world import Judged, Quality, World, depth_text, kernels, periodic, quality, spectrum
 from raytrace.studies.pictures import pictures
+from raytrace.studies.publish import publish
 from raytrace.wave.element import Element, as_made, as_pixels
 from raytrace.wave.element_file import write_element
 from raytrace.words import did_you_mean
@@ -213,7 +214,10 @@ def table(arguments: argparse.Namespace) -> Table:
     elements = elements_of(rows, world, spectrum(contents[0].train), learned=learned)
     found = table_of(contents, elements, world, progress=lambda given: progress(given, "row"))
     if arguments.docs:
-        _document(Table(found), Path(arguments.docs), elements, world, arguments)
+        drawn = _figures(found, elements, world, arguments.seed or 0)
+        parts = _parts(Table(found), world, _command(arguments), [name for name in CAPTIONS if name in drawn])
+        rows = {"table.csv": csv(records(found), floats=lambda number: round(number, 3))}
+        publish(Path(arguments.docs) / "wave_edof.md", "wave", parts, tables=rows, figures=drawn)
     return Table(found)
 
 
@@ -243,21 +247,6 @@ def _learned(
                 camera = learn(Settings.of(common, **learning), world, train, folder, ROWS[name].title)
             found[name] = camera.variables()
     return found
-
-
-def _document(
-    table: Table, docs: Path, elements: Mapping[str, Sequence[Element]], world: World, arguments: argparse.Namespace
-) -> None:
-    """The page, its figures and its table."""
-    page, folder = docs / "wave_edof.md", docs / "wave"
-    folder.mkdir(parents=True, exist_ok=True)
-    rows = [{key: round(n, 3) if isinstance(n, float) else n for key, n in row.items()} for row in records(table.found)]
-    write_table(folder / "table.csv", rows)
-    drawn = _figures(table.found, elements, world, arguments.seed or 0)
-    for name, figure in drawn.items():
-        save(figure, folder / name)
-    write_page(page, _parts(table, world, _command(arguments), [name for name in CAPTIONS if name in drawn]))
-    say(f"written: {page}")
 
 
 def _command(arguments: argparse.Namespace) -> str:

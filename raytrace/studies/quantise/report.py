@@ -8,17 +8,18 @@ from pathlib import Path
 
 from torch import Tensor
 
-from raytrace.cli.door import CommandError, say
+from raytrace.cli.door import CommandError
 from raytrace.cli.progress import progress
-from raytrace.files import write_table
+from raytrace.files import table
 from raytrace.formats.pictures import Pictures, dead_leaves, split
 from raytrace.maths.result import Result
 from raytrace.maths.value import detached
-from raytrace.pages import grid, write_page
+from raytrace.pages import grid
 from raytrace.studies.edof.report import learn
 from raytrace.studies.edof.settings import Settings as Learning
 from raytrace.studies.edof.world import World, periodic, spectrum
 from raytrace.studies.pictures import pictures
+from raytrace.studies.publish import publish
 from raytrace.studies.quantise.command import Settings
 from raytrace.studies.quantise.experiment import (
     WAYS,
@@ -101,7 +102,11 @@ def quantise(arguments: argparse.Namespace) -> Fabrication:
             nm = (0.0, *settings.tolerance)
             found.tolerances.extend(tolerances_of(title, way, elements[way, count], judge, nm=nm, seed=settings.seed))
     if arguments.docs:
-        _document(found, Path(arguments.docs), settings, ["--data DIR"] if arguments.data else [])
+        kept = {"quantise.csv": "levels", "quantise_tolerance.csv": "tolerance"}
+        rows = {name: table(found.tables()[own], floats=lambda n: round(n, 4)) for name, own in kept.items()}
+        parts = _parts(found, settings, ["--data DIR"] if arguments.data else [])
+        page, figures = Path(arguments.docs) / "wave_quantise.md", {"quantise.png": found.plot()}
+        publish(page, "wave", parts, tables=rows, figures=figures)
     return found
 
 
@@ -160,17 +165,6 @@ def _text(rows: Sequence[dict]) -> str:
 
 def _cell(value) -> str:
     return f"{value:.4f}" if isinstance(value, float) else str(value)
-
-
-def _document(found: Fabrication, docs: Path, settings: Settings, words: Sequence[str]) -> None:
-    """The page, its figure and its tables."""
-    page, folder, tables = docs / "wave_quantise.md", docs / "wave", found.tables()
-    folder.mkdir(parents=True, exist_ok=True)
-    found.plot(folder / "quantise.png")
-    for name, rows in (("quantise", tables["levels"]), ("quantise_tolerance", tables["tolerance"])):
-        write_table(folder / f"{name}.csv", rows, floats=lambda number: round(number, 4))
-    write_page(page, _parts(found, settings, words))
-    say(f"written: {page}")
 
 
 def _parts(found: Fabrication, settings: Settings, more: Sequence[str]) -> list[str]:

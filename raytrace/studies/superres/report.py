@@ -8,14 +8,14 @@ from pathlib import Path
 from torch import Tensor
 
 from raytrace.camera.deconvolve import psnr
-from raytrace.cli.door import say
 from raytrace.cli.progress import progress
-from raytrace.files import write_table
+from raytrace.files import table
 from raytrace.formats.pictures import Pictures, dead_leaves, split
 from raytrace.maths.result import Result
-from raytrace.pages import grid, write_page
+from raytrace.pages import grid
 from raytrace.studies.edof.world import World, periodic, spectrum
 from raytrace.studies.pictures import pictures
+from raytrace.studies.publish import publish
 from raytrace.studies.superres.command import Settings
 from raytrace.studies.superres.experiment import (
     Plate,
@@ -37,6 +37,7 @@ from raytrace.studies.superres.experiment import (
 from raytrace.studies.superres.inversion import least_error
 
 _NOISES = (0.0003, 0.001, 0.003, 0.01, 0.03)
+_KEYS = ("factor", "colours", "scene", "way", "closed", "restored", "gain")
 _COLUMNS = ("scene", "optics and restoration", "expected", "restored", "over bicubic")
 
 
@@ -119,8 +120,16 @@ def superres(arguments: argparse.Namespace) -> Superresolution:
     blocks = [_block(settings, factor, colours, train, test) for factor, colours in progress(cameras, "camera")]
     found = Superresolution(settings.noise, kind, blocks)
     if arguments.docs:
-        words = ["--data DIR"] if arguments.data else []
-        _document(found, Path(arguments.docs), settings, words, _over_noise(settings, train, test))
+        noises = _over_noise(settings, train, test)
+        lines = [(one.factor, one.colours, *line) for one in blocks for line in one.lines]
+        tables = {
+            "superres_noise.csv": table(noises, floats=lambda number: round(number, 4)),
+            "superres.csv": table([dict(zip(_KEYS, line, strict=True)) for line in lines]),
+        }
+        # Pictures of others are not for pages.
+        figures = {"superres.png": found.plot()} if kind == "dead leaves" else {}
+        parts = _parts(found, settings, ["--data DIR"] if arguments.data else [], noises)
+        publish(Path(arguments.docs) / "wave_superres.md", "wave", parts, tables=tables, figures=figures)
     return found
 
 
@@ -168,22 +177,6 @@ def _over_noise(settings: Settings, train: Pictures, test: Pictures) -> list[dic
         scene, _ = _small(settings, world, settings.factor[0], train, test, settings.places[:1])
         found.append({"noise": noise, **{row.name: row.psnr for row in scene.rows}})
     return found
-
-
-def _document(
-    found: Superresolution, docs: Path, settings: Settings, words: Sequence[str], noises: Sequence[dict]
-) -> None:
-    """The page, its figure and its tables."""
-    page, folder = docs / "wave_superres.md", docs / "wave"
-    folder.mkdir(parents=True, exist_ok=True)
-    if found.kind == "dead leaves":  # pictures of others are not for pages
-        found.plot(folder / "superres.png")
-    columns = ("factor", "colours", "scene", "way", "closed", "restored", "gain")
-    lines = [(one.factor, one.colours, *line) for one in found.blocks for line in one.lines]
-    write_table(folder / "superres_noise.csv", noises, floats=lambda number: round(number, 4))
-    write_table(folder / "superres.csv", [dict(zip(columns, line, strict=True)) for line in lines])
-    write_page(page, _parts(found, settings, words, noises))
-    say(f"written: {page}")
 
 
 def _parts(found: Superresolution, settings: Settings, more: Sequence[str], noises: Sequence[dict]) -> list[str]:
