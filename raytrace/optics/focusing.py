@@ -1,7 +1,7 @@
 """Focusing: the best sensor distance by a criterion, and what it does to the spots."""
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from os import PathLike
 
 import torch
@@ -180,7 +180,12 @@ def focus(
     _tell_losses(lens, at, distances, fields, wavelengths)
     if not bool(torch.isfinite(rms)):
         raise NoFocus("one ray, or parallel rays, have no focus; give more --rings or --points")
-    best = _CRITERIA[criterion](lens, at, weights, paraxial=paraxial, rms=rms, rule=looked_at)
+    best = rms
+    if criterion == "mean":
+        best = focus_of_mean_radius(lens, at, weights, **looked_at)
+    elif criterion == "paraxial":
+        shares = looked_at["distance_weights"]
+        best = paraxial.mean() if shares is None else (shares * paraxial).sum() / shares.sum()
     found = Focus(
         with_sensor_distance(lens, best), lens, paraxial, rms, points=at, weights=weights, criterion=criterion,
         **looked_at,
@@ -190,19 +195,6 @@ def focus(
         told = f"the image is virtual, at {place}: no sensor can stand there; take the object further away"
         warnings.warn(told, VirtualImage, stacklevel=2)
     return found
-
-
-def _of_paraxial(lens: Lens, points: Tensor, weights: Tensor, *, paraxial: Tensor, rms: Tensor, rule: dict) -> Tensor:
-    shares = torch.ones_like(paraxial) if rule["distance_weights"] is None else rule["distance_weights"]
-    return (shares * paraxial).sum() / shares.sum()
-
-
-#: The sensor distance of each criterion, of what is known already.
-_CRITERIA: dict[str, Callable[..., Tensor]] = {
-    "rms": lambda lens, points, weights, *, paraxial, rms, rule: rms,
-    "paraxial": _of_paraxial,
-    "mean": lambda lens, points, weights, *, paraxial, rms, rule: focus_of_mean_radius(lens, points, weights, **rule),
-}
 
 
 def _weights(lens: Lens, given, count: int, option: str) -> Tensor | None:

@@ -190,7 +190,8 @@ def _of_many(lens, fields, rays: int, sampling: str, progress, *, seed: int, ray
     else:
         with progress(rays * fields.shape[1] * len(lens.wavelengths), "ray") as bar:
             each, whole = stream_spots(lens, rays, fields=fields, **how, progress=bar.update)
-    warn_of_losses(lens, pupil.sobol(min(rays, _TRIED))[0], each.rays == 0, fields=fields, ray_aiming=ray_aiming)
+    tried = pupil.sobol(min(rays, _TRIED))[0].to(lens.surfaces[-2].thickness)
+    warn_of_losses(lens, tried, each.rays == 0, fields=fields, ray_aiming=ray_aiming)
     return Spots(lens, fields, each, whole)
 
 

@@ -59,7 +59,7 @@ def lens(
         raise BadPrescription(f"field_kind {kind!r}: expected one of {', '.join(FIELD_UNITS)}")
     points = field_points(fields, like=wavelengths)
     found = Lens(
-        surfaces=(Surface(_scalar(object_distance)), *surfaces, Surface(_scalar(0.0))),
+        surfaces=(Surface(_tensor(object_distance)), *surfaces, Surface(_tensor(0.0))),
         stop=stop,
         aperture=_aperture(aperture),
         fields=Fields(kind, points[0], points[1], torch.ones_like(points[0])),
@@ -88,7 +88,7 @@ def surface(row: Mapping, number: int = 0, catalogs: Sequence[str] = ()) -> Surf
         given = {key: value for key, value in given.items() if key not in plane}
     given["glass"] = medium(given.get("glass", AIR), catalogs, where)
     try:
-        return changed(Surface(_scalar(0.0)), given, where, like=_scalar(0.0))
+        return changed(Surface(_tensor(0.0)), given, where, like=_tensor(0.0))
     except (TypeError, ValueError) as error:
         raise BadPrescription(str(error) if str(error).startswith(where) else f"{where}: {error}") from error
 
@@ -121,10 +121,6 @@ def _is_empty(value) -> bool:
 
 def _tensor(value) -> Tensor:
     return value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=torch.float64)
-
-
-def _scalar(number: float | Tensor) -> Tensor:
-    return _tensor(number)
 
 
 def _vector(numbers, what: str) -> Tensor:
