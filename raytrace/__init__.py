@@ -81,10 +81,13 @@ PUBLIC = {
     "wavefront": "analysis.wavefronts",
     "grid": "maths.grid",
     "psf": "kernels",
+    # waves behind thin elements
     "element_lens": "wave.bridge",
     "elements": "wave.compute",
     "hybrid_psf": "wave.bridge",
+    "read_element": "wave.element_file",
     "wave_psf": "wave.compute",
+    "write_element": "wave.element_file",
     # pictures and learning
     "add_noise": "camera.noise",
     "add_shot_noise": "camera.noise",
@@ -94,13 +97,17 @@ PUBLIC = {
     "count_electrons": "camera.noise",
     "depth_masks": "camera.image",
     "digitise": "camera.noise",
+    "power_law": "camera.deconvolve",
+    "power_spectrum": "camera.deconvolve",
     "psnr": "camera.deconvolve",
     "restore": "camera.deconvolve",
     "wiener": "camera.deconvolve",
     "Camera": "camera",
     "PhaseVariables": "camera",
     "RedNet": "camera",
+    "Run": "camera.training",
     "Variables": "camera",
+    "train": "camera.training",
 }
 
 __all__ = [*PUBLIC]

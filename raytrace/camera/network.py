@@ -5,7 +5,6 @@ Connections", NIPS 2016 (arXiv:1606.08921).
 """
 
 import dataclasses
-import time
 
 import torch
 from torch import Tensor, nn
@@ -64,21 +63,3 @@ class RedNet(nn.Module):
             if i < last:
                 x = (x.add_(features[last - i - 1]) if i % 2 else x).relu_()
         return picture + x
-
-
-def faster_precision(shape: RedNetShape, *, size: int = 64, count: int = 4) -> str:
-    """Whether this machine's processor trains the network faster in "bfloat16" or in "float32", by trying both.
-
-    Processors without instructions for bfloat16 emulate it, ten times slower.
-    """
-    network = RedNet(shape).to(memory_format=torch.channels_last)
-    picture = torch.rand(count, 1, size, size)
-    seconds = {}
-    for name, enabled in (("float32", False), ("bfloat16", True)):
-        for _ in range(2):  # the first call prepares
-            start = time.perf_counter()
-            with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
-                restored = network(picture)
-            restored.float().abs().mean().backward()
-            seconds[name] = time.perf_counter() - start
-    return min(seconds, key=seconds.get)
