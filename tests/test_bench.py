@@ -6,9 +6,17 @@ from dataclasses import asdict
 import pytest
 import torch
 
-from raytrace.bench.measure import SAMPLE, Own, errors_of, field_rays, reference_of
+from raytrace.bench.measure import (
+    SAMPLE,
+    Own,
+    errors_of,
+    field_rays,
+    reference_of,
+    squared_radius,
+    variables,
+    with_leaves,
+)
 from raytrace.bench.reference import reference_surface, spot_gradient, trace_reference
-from raytrace.bench.tracers import squared_radius, variables, with_leaves
 from raytrace.cli import main
 from raytrace.files import shipped
 from raytrace.formats import read_lens

@@ -5,10 +5,11 @@ import dataclasses
 import pytest
 import torch
 
-from raytrace.bench import less_work, speed
-from raytrace.bench.less_work import cases, measure, with_spheres_for_planes
-from raytrace.bench.speed import Sizes, double_gauss
-from raytrace.bench.speed_own import with_sensor_leaf
+from raytrace.bench import less_work
+from raytrace.bench import measure as timing
+from raytrace.bench.less_work import cases, double_gauss, measure, with_spheres_for_planes
+from raytrace.bench.measure import with_leaf, with_sensor_leaf
+from raytrace.bench.speed import Sizes
 from raytrace.fused import prepare, tracing
 from raytrace.kernels import MODELS, fourier, psf
 from raytrace.maths.pupil import sobol
@@ -39,7 +40,7 @@ def test_less_work_gives_the_same_result(case):
 
 
 def test_rows_say_what_was_compared(monkeypatch):
-    monkeypatch.setattr(speed, "_SHORTEST", 0.0)
+    monkeypatch.setattr(timing, "SHORTEST", 0.0)
     few = [case for case in cases(TINY) if case.what.startswith(("prefix", "planes"))]
     monkeypatch.setattr(less_work, "cases", lambda sizes: few)
     words, before = [], torch.get_num_threads()
@@ -55,7 +56,7 @@ def test_rows_say_what_was_compared(monkeypatch):
 @pytest.mark.parametrize(("number", "again"), [(None, 1), (11, 2)])
 def test_memo_of_the_cases_traces_only_what_moves(number, again):
     """Surfaces crossed by a second call: the image alone, or also the last one before it."""
-    lens, _ = with_sensor_leaf(double_gauss()) if number is None else less_work._with_curvature_leaf(double_gauss(), 11)
+    lens, _ = with_sensor_leaf(double_gauss()) if number is None else with_leaf(double_gauss(), 11, "curvature")
     bundle = (
         lens,
         torch.zeros(2, 1, dtype=torch.float64),
@@ -76,7 +77,7 @@ def test_planes_and_symmetry_are_taken_away():
     number = torch.tensor([25e3], dtype=torch.float64)
     kinds = [
         symmetry(scene(double_gauss(), torch.tensor([[x], [y]], dtype=torch.float64), number, number * 0 + 0.53))
-        for x, y in ((0.0, 0.0), (less_work._SKEW, 0.0), (0.0, less_work._FIELD), (less_work._FIELD, 0.0))
+        for x, y in ((0.0, 0.0), (less_work.SKEW, 0.0), (0.0, less_work.FIELD), (less_work.FIELD, 0.0))
     ]
     assert kinds == ["round", "none", "mirror", "none"]
 
@@ -84,8 +85,7 @@ def test_planes_and_symmetry_are_taken_away():
 def test_wavelengths_share_all_of_a_launch_but_their_paths():
     """Bit for bit the rays of each wavelength alone, in a medium that disperses."""
     lens = with_object_distance(double_gauss(), 25e3)
-    water = dataclasses.replace(lens.surfaces[0], glass=lens.surfaces[1].glass)
-    lens = dataclasses.replace(lens, surfaces=(water, *lens.surfaces[1:]))
+    lens = lens.replace(0, glass=lens.surfaces[1].glass)
     field, pupil = torch.tensor([0.0, 10.0], dtype=torch.float64)[:, None, None], sobol(32)[0]
     colours = torch.tensor([0.48, 0.53, 0.64], dtype=torch.float64)
     together = rays_of_field(lens, field, pupil, wavelength=colours[:, None])

@@ -12,11 +12,12 @@ import torch
 from problems import plano_hyperbolic, scene_of, vector
 
 from raytrace.bench import psf as bench
-from raytrace.bench import psf_cases
+from raytrace.bench import psf_cases, psf_report
 from raytrace.bench.huygens import Sampling, clear_rings, direct_sum, moments, solid_angle
 from raytrace.bench.psf import PsfRow, gradient, measure, random_rows, steps, truth_of, with_all_leaves
 from raytrace.bench.psf_cases import Case, Method, cases, random_histogram
-from raytrace.bench.psf_report import judged, markdown, table, targets
+from raytrace.bench.psf_report import judged, lines, targets
+from raytrace.bench.report import Measured
 from raytrace.cli import main
 from raytrace.formats import read_lens
 from raytrace.kernels import MODELS, diffraction, raymap
@@ -133,9 +134,7 @@ def test_gradients_are_by_all_that_is_modelled():
     pattern = torch.cos(torch.arange(21 * 21, dtype=torch.float64))
 
     def value(step):
-        moved = list(own.surfaces)
-        moved[-2] = dataclasses.replace(moved[-2], thickness=lens.surfaces[-2].thickness + step)
-        s = dataclasses.replace(case, lens=dataclasses.replace(lens, surfaces=tuple(moved))).scene
+        s = dataclasses.replace(case, lens=own.at(sensor_distance=lens.surfaces[-2].thickness + step)).scene
         with torch.no_grad():
             return float(method.run(s, case.window(vector(0.0, 0.0))).kernel.flatten() @ pattern)
 
@@ -174,18 +173,22 @@ def test_targets_compare_the_quickest_that_come_as_close():
     assert words[5:] == ["50% of 2", "50% of 2"]
 
 
-def test_table_and_report_hold_every_row():
+def test_table_and_report_hold_every_row(tmp_path):
     rows = [row(), row(dtype="float32", l1_error=None), row(model="wave", estimate=1e-3, own_error=1e-4)]
-    read = list(csv.DictReader(io.StringIO(table(rows))))
+    titles = {("l", 0.0): "l, 0°"}
+    page = lines(rows, targets(rows), titles=titles, about={"torch threads": 1}, repeats=3)
+    found = Measured(rows, page, {}, ("psf_figure", titles))
+    found.save_table(tmp_path / "r.csv")
+    read = list(csv.DictReader(io.StringIO((tmp_path / "r.csv").read_text())))
     assert [line["l1_error"] for line in read] == ["0.005", "", "0.005"]
     assert list(read[0]) == [field.name for field in dataclasses.fields(PsfRow)]
-    text = markdown(rows, titles={("l", 0.0): "l, 0°"}, about={"torch threads": 1}, repeats=3)
+    text = str(found)
     assert "| drt | order 1 | 9 | 10 / 10 |" in text
     assert "| l, 0° | wave | order 1 | float64 | 1.0e-03 | 1.0e-04 | yes | yes |" in text
 
 
 def test_random_rays_reach_the_error_they_are_asked_for(monkeypatch):
-    monkeypatch.setattr(bench, "RAYS_ERROR", 0.1)
+    monkeypatch.setattr(psf_report, "RAYS_ERROR", 0.1)
     monkeypatch.setattr(bench, "_PILOT", 4000)
     case = cases([("double_gauss", read_lens("double_gauss"))])[0]
     window = case.window(vector(0.0, 0.0))
@@ -261,7 +264,7 @@ def test_progress_adds_up_and_refusals_are_said(few, monkeypatch):
 
 def test_peer_sees_the_same_kernels():
     """Optiland at full field, coma and all: turned or shifted by a pixel, its kernels would be off by 0.3 and more."""
-    peer = pytest.importorskip("raytrace.bench.psf_peer", reason="needs the extra [bench]", exc_type=ImportError)
+    peer = pytest.importorskip("raytrace.bench.peers", reason="needs the extra [bench]", exc_type=ImportError)
     case = cases([("double_gauss", read_lens("double_gauss"))])[1]
     window = case.window(moments(case.scene, 8, 32).centroid)
     kernels = {
@@ -270,7 +273,7 @@ def test_peer_sees_the_same_kernels():
     }
     truth = bench.Truth(case, kernels, dict.fromkeys(kernels, window), window.centre, vector(0.02, 0.02))
     found = {}
-    for method in peer.peer_methods(truth):
+    for method in peer.psf_methods(truth):
         if method.sampling.startswith(("100,000", "64²", "128²")):
             kernel = method.run(case.scene, window).kernel
             found[method.model] = bench.relative_l1(kernel, kernels[method.against])

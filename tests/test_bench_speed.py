@@ -3,7 +3,6 @@
 Whole processes are stood in for, but for one slow test: each would start torch anew.
 """
 
-import dataclasses
 import json
 import math
 import re
@@ -11,15 +10,24 @@ import re
 import pytest
 import torch
 
-from raytrace.bench import command_speed as command
-from raytrace.bench import speed, speed_processes
-from raytrace.bench.figure_speed import speed_figure
+from raytrace.bench import measure as timing
+from raytrace.bench import processes as whole_processes
+from raytrace.bench import speed
 from raytrace.bench.limit import Limit, build
-from raytrace.bench.measure import errors_of, field_rays, surfaces_of
-from raytrace.bench.speed import Bench, Row, Sizes, interleaved, measure, stages
-from raytrace.bench.speed_own import Engine, leaves_of, three_aspheres, with_sensor_leaf
-from raytrace.bench.speed_report import KEPT, document, markdown, table, targets
-from raytrace.bench.tracers import squared_radius
+from raytrace.bench.measure import (
+    Own,
+    errors_of,
+    field_rays,
+    in_turns,
+    leaves_of,
+    slope,
+    squared_radius,
+    surfaces_of,
+    with_sensor_leaf,
+)
+from raytrace.bench.report import KEPT, Measured
+from raytrace.bench.speed import Bench, Row, Sizes, measure, stages, three_aspheres
+from raytrace.bench.speed_report import document, lines, targets
 from raytrace.cli import main
 from raytrace.formats import read_lens
 from raytrace.fused import NoCompiler, tracing
@@ -50,7 +58,7 @@ def processes(monkeypatch):
     monkeypatch.setattr(speed, "bytes_per_ray", lambda dtype, rays, threads: (100.0 * dtype.itemsize, rays))
     monkeypatch.setattr(speed, "spot_process_ratio", lambda repeats: (1.25, 2.5, 2.0))
     monkeypatch.setattr(speed, "two_process_gain", lambda dtype, rays, seconds, repeats: (1.8, 10.0, 18.0))
-    monkeypatch.setattr(speed, "_SHORTEST", 0.0)  # one call a turn
+    monkeypatch.setattr(timing, "SHORTEST", 0.0)  # one call a turn
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +166,7 @@ def test_no_compiler_is_said():
 
 def test_the_aspheres_are_strong_and_right():
     lens = three_aspheres()
-    errors = errors_of(Engine(lens, torch.float64, "eager"), lens, field_rays(lens, 24))
+    errors = errors_of(Own(lens, torch.float64, engine="eager"), lens, field_rays(lens, 24))
     assert errors.position < 1e-7  # nm
     for surface in lens.surfaces[1:4]:
         powers = torch.tensor([3.0 ** (2 * j) for j in range(1, 6)], dtype=torch.float64)
@@ -169,10 +177,10 @@ def test_gradient_is_by_curvatures_thicknesses_and_every_index():
     """The last of the leaves are indices; theirs against central differences of the merit."""
     lens = read_lens("double_gauss")
     rays, centroid = field_rays(lens, 50), torch.zeros(2, dtype=torch.float64)
-    own = Engine(lens, torch.float64, "eager")
-    found = own.gradient_by_all(rays, centroid)
+    found = Own(lens, torch.float64, engine="eager", by_indices=True).gradient(rays, centroid)
     surfaces, indices, leaves = leaves_of(lens)
-    assert torch.equal(torch.stack(found[:19]), own.gradient(rays, centroid))  # 8 curvatures and 11 thicknesses
+    few = Own(lens, torch.float64, engine="eager").gradient(rays, centroid)  # 8 curvatures and 11 thicknesses
+    assert torch.equal(torch.stack(found[:19]), torch.stack(few))
     assert len(found) == len(leaves) == 19 + 11  # runs of one medium: air in front to air behind
     assert indices[5] is indices[6]  # the stop bends nothing
 
@@ -184,8 +192,8 @@ def test_gradient_is_by_curvatures_thicknesses_and_every_index():
         return float(squared_radius(*end.position[:2], centroid).detach())
 
     for number in range(11):
-        slope = (merit(number, 1e-6) - merit(number, -1e-6)) / 2e-6
-        assert float(found[19 + number]) == pytest.approx(slope, rel=1e-6)
+        expected = (merit(number, 1e-6) - merit(number, -1e-6)) / 2e-6
+        assert float(found[19 + number]) == pytest.approx(expected, rel=1e-6)
 
 
 def test_slope_of_the_sensor_step_is_a_derivative_with_and_without_memory():
@@ -195,25 +203,19 @@ def test_slope_of_the_sensor_step_is_a_derivative_with_and_without_memory():
     bundle = (lens, torch.zeros(2, 1, dtype=torch.float64), lens.wavelengths[0], pupil)
     memo = Memo()
     for _ in range(2):
-        assert float(speed._slope(trace_bundle(bundle, memo), leaf)) == pytest.approx(
-            float(speed._slope(trace_bundle(bundle), leaf)), rel=1e-13
+        assert float(slope(trace_bundle(bundle, memo), leaf)) == pytest.approx(
+            float(slope(trace_bundle(bundle), leaf)), rel=1e-13
         )
 
     def merit(step: float) -> float:
         with torch.no_grad():
-            x, y, _ = trace_bundle((with_sensor_leaf_at(lens, leaf + step), *bundle[1:])).position
+            x, y, _ = trace_bundle((lens.at(sensor_distance=leaf + step), *bundle[1:])).position
             return float(((x - x.mean()) ** 2 + (y - y.mean()) ** 2).mean())
 
-    slope = (merit(0.01) - merit(-0.01)) / 0.02
-    assert float(speed._slope(trace_bundle(bundle), leaf)) == pytest.approx(slope, rel=1e-9)
+    expected = (merit(0.01) - merit(-0.01)) / 0.02
+    assert float(slope(trace_bundle(bundle), leaf)) == pytest.approx(expected, rel=1e-9)
     parabola = torch.stack(spot_parabola(speed.detached(trace_bundle(bundle))))
-    assert float(speed.slope_of_parabolas(parabola, leaf, float(leaf.detach()))) == pytest.approx(slope, rel=1e-9)
-
-
-def with_sensor_leaf_at(lens, thickness):
-    surfaces = list(lens.surfaces)
-    surfaces[-2] = dataclasses.replace(surfaces[-2], thickness=thickness)
-    return dataclasses.replace(lens, surfaces=tuple(surfaces))
+    assert float(speed.slope_of_parabolas(parabola, leaf, float(leaf.detach()))) == pytest.approx(expected, rel=1e-9)
 
 
 def test_entrants_take_turns_each_prepared(monkeypatch):
@@ -222,21 +224,20 @@ def test_entrants_take_turns_each_prepared(monkeypatch):
     def job(name):
         return lambda: said.append(name), lambda: said.append(f"({name})")
 
-    bench = Bench(torch.float64, TINY, 3, 1, None)
-    seconds = interleaved({"a": job("a"), "b": job("b")}, bench)
-    assert set(seconds) == {"a", "b"}
+    seconds = in_turns({"a": job("a"), "b": job("b")}, repeats=3, threads=1)
+    assert {name: len(taken) for name, taken in seconds.items()} == {"a": 3, "b": 3}
     turn = ["(a)", "a", "(b)", "b"]
     assert said[8:] == 3 * turn  # behind two calls of each to warm up
     assert said[:8] == ["(a)", "a"] * 2 + ["(b)", "b"] * 2
 
 
-class Peer(Engine):
+class Peer(Own):
     """A peer that is this package under another name."""
 
     backend = "torch"
 
     def __init__(self, lens, dtype):
-        super().__init__(lens, dtype, "eager")
+        super().__init__(lens, dtype, engine="eager", by_indices=True)
         self.name = "Optiland, torch"
 
 
@@ -247,7 +248,7 @@ def measured(request):
         patch.setattr(speed, "bytes_per_ray", lambda dtype, rays, threads: (100.0 * dtype.itemsize, rays))
         patch.setattr(speed, "spot_process_ratio", lambda repeats: (1.25, 2.5, 2.0))
         patch.setattr(speed, "two_process_gain", lambda dtype, rays, seconds, repeats: (1.8, 10.0, 18.0))
-        patch.setattr(speed, "_SHORTEST", 0.0)
+        patch.setattr(timing, "SHORTEST", 0.0)
         lenses = speed.double_gauss(), three_aspheres()
         benches = [
             Bench(dtype, TINY, 1, 1, request.getfixturevalue("built"), *([Peer(lens, dtype)] for lens in lenses))
@@ -301,19 +302,23 @@ def test_accuracy_stands_beside_every_speed_of_the_tables(measured):
             assert row.what != "backward" or 0 < row.gradient < 1e-3, row
 
 
-def test_page_table_and_figure_hold_the_figures(measured):
+def test_page_table_and_figure_hold_the_figures(measured, tmp_path):
     rows, ratios = measured
     about = {"processor": "one", "torch threads": 2}
-    page = markdown(rows, ratios, sizes=TINY, about=about, compiler="cc -O3", repeats=1, kept="words")
+    said = lines(rows, ratios, sizes=TINY, about=about, compiler="cc -O3", repeats=1)
+    found = Measured(rows, said, {}, ("speed_figure",), ("speed.md", "speed"))
+    (tmp_path / "speed.md").write_text(f"stale\n{KEPT}\nwords\n")
+    found.save_page(tmp_path)
+    page = (tmp_path / "speed.md").read_text(encoding="utf-8")
     assert page.endswith(f"{KEPT}\nwords\n")
     assert "built by cc -O3" in page
-    assert "of the time of day; processor one" in page
+    assert "of time of day; processor one" in page
     for target in targets(TINY):
         line = next(line for line in page.splitlines() if line.startswith(f"| {target.words} |"))
         assert re.search(r"\| (yes|no) \|", line), line
     assert "| × retracing" not in page
-    assert len(table(rows).splitlines()) == 1 + len(rows)
-    figure = speed_figure([dataclasses.asdict(row) for row in rows])
+    assert len((tmp_path / "speed.csv").read_text().splitlines()) == 1 + len(rows)
+    figure = found.plot()
     assert [panel.get_title() for panel in figure.axes] == ["float32", "float64"]
     assert all(panel.get_xscale() == panel.get_yscale() == "log" for panel in figure.axes)
     labels = {line.get_label() for line in figure.axes[0].get_lines()}
@@ -349,7 +354,7 @@ def test_command_without_compiler_and_peers_says_so_and_leaves_their_ratios_out(
     def refuse():
         raise NoCompiler("no C++ compiler found")
 
-    monkeypatch.setattr(command, "build", refuse)
+    monkeypatch.setattr(speed, "build", refuse)
     monkeypatch.setattr(speed, "QUICK", TINY)
     kept = tmp_path / "speed.md"
     kept.write_text(f"stale\n{KEPT}\nwhat bounds it\n", encoding="utf-8")
@@ -385,10 +390,10 @@ def test_options_of_other_benchmarks_are_refused(capsys):
 @pytest.mark.slow
 def test_processes_answer():
     """Each in its units; the memory of a ray is at least what comes back: 6 numbers and a flag."""
-    found, rays = speed_processes.bytes_per_ray(torch.float32, 2**16, threads=1)
+    found, rays = whole_processes.bytes_per_ray(torch.float32, 2**16, threads=1)
     assert rays == 2**16
     assert 25 < found < 1e5
-    gain, one, two = speed_processes.two_process_gain(torch.float64, 2**12, seconds=0.2, repeats=1)
+    gain, one, two = whole_processes.two_process_gain(torch.float64, 2**12, seconds=0.2, repeats=1)
     assert gain == two / one > 0
-    ratio, spot, bare = speed_processes.spot_process_ratio(1)
+    ratio, spot, bare = whole_processes.spot_process_ratio(1)
     assert ratio == spot / bare > 0.3

@@ -1,7 +1,6 @@
 """The benchmark of wave PSFs: its references, its opponent and its page. No timings."""
 
 import csv
-import dataclasses
 import io
 import math
 
@@ -9,9 +8,23 @@ import pytest
 import torch
 
 from raytrace.bench import wave as bench
-from raytrace.bench.figure_wave import bench_figure
-from raytrace.bench.wave import ERROR, SITZMANN, WaveRow, agreement, bench_scene, gradient, measure, reference, target
-from raytrace.bench.wave_report import KEPT, markdown, table
+from raytrace.bench.report import KEPT, Measured
+from raytrace.bench.wave import (
+    ERROR,
+    SITZMANN,
+    WaveRow,
+    agreement,
+    bench_scene,
+    coefficients_of,
+    distance,
+    entrant,
+    gradient,
+    lines,
+    measure,
+    reference,
+    refused,
+    target,
+)
 
 SMALL = 64  # pixels of 3.69 µm: all of the blur but its rim
 
@@ -21,9 +34,8 @@ def scene():
     return bench_scene(size=SMALL)
 
 
-def error(entrant):
-    kernel = entrant.prepare()(bench._coefficients(entrant.dtype)).double()
-    return float((kernel - entrant.truth).norm() / entrant.truth.norm())
+def error(one):
+    return distance(one.prepare()(coefficients_of(one.dtype)), one.truth)
 
 
 def test_two_converged_references_agree(scene, monkeypatch):
@@ -34,27 +46,27 @@ def test_two_converged_references_agree(scene, monkeypatch):
 
 def test_sitzmanns_method_comes_to_the_same_waves(scene):
     """At 3.125 µm a sample, just below λz/(D + blur): right to the staircase of its rim, 1e-3 of the light."""
-    entrant = bench.sitzmann_method(scene, torch.float64, samples=1600)
-    assert "padded to 2396²" in entrant.sampling
-    assert error(entrant) < 2e-3
+    method = bench.sitzmann_method(scene, torch.float64, samples=1600)
+    assert "padded to 2396²" in method.sampling
+    assert error(method) < 2e-3
 
 
 def test_engines_are_as_good_as_predicted_and_refused_ones_are_wrong(scene):
     truth = reference(scene)
-    good = bench._entrant(scene, truth, torch.float64, "pupil", samples=160)
+    good = entrant(scene, truth, torch.float64, "pupil", samples=160)
     assert error(good) < 2 * good.predicted
-    wrong = bench._coarse(scene, truth, 40)
+    wrong = refused(scene, truth, 40)
     assert wrong.refused
     assert error(wrong) > 0.5
     with pytest.raises(ValueError, match="not refused"):
-        bench._coarse(scene, truth, 160)
+        refused(scene, truth, 160)
 
 
 def test_all_take_the_same_gradient(scene):
     """Of the kernel by the lens's coefficient: two engines, one number, to the errors of their kernels."""
-    truth, start = reference(scene), bench._coefficients(torch.float64)
+    truth, start = reference(scene), coefficients_of(torch.float64)
     found = [
-        gradient(bench._entrant(scene, truth, torch.float64, engine, **how).prepare(), start)
+        gradient(entrant(scene, truth, torch.float64, engine, **how).prepare(), start)
         for engine, how in (("pupil", {"samples": 256, "nodes": 7}), ("radial", {"tol": 1e-6}))
     ]
     assert float(found[0]) == pytest.approx(float(found[1]), rel=1e-3)
@@ -85,23 +97,27 @@ def test_target_is_judged_by_the_fastest_within_the_error():
     assert found[0].opponent.dtype == "float32"
 
 
-def test_page_and_table_hold_the_figures():
-    page = markdown(ROWS, agreement=3e-6, about={"processor": "one"}, repeats=5, kept="words of a reader")
+def test_page_and_table_hold_the_figures(tmp_path):
+    said = lines(ROWS, agreement=3e-6, about={"processor": "one"}, repeats=5)
+    found = Measured(ROWS, said, {}, ("wave_figure",), ("wave_bench.md", "wave/speed"))
+    (tmp_path / "wave_bench.md").write_text(f"stale\n{KEPT}\nwords of a reader\n")
+    found.save_page(tmp_path)
+    page = (tmp_path / "wave_bench.md").read_text()
+    assert "stale" not in page
+    assert (tmp_path / "wave" / "speed.png").read_bytes().startswith(b"\x89PNG")
     assert page.endswith(f"{KEPT}\nwords of a reader\n")
     assert "| ring integrals | 95 radii, float64 | 1.0e-06 | 600 × | 150 × | yes |" in page
     assert "| *pupil matrix DFT* | *128²* | *float64* | *2.4* | *–* |" in page
-    lines = list(csv.DictReader(io.StringIO(table(ROWS))))
-    assert [float(line["both_s"]) for line in lines] == [one.both_s for one in ROWS]
-    assert lines[-1]["predicted"] == ""
-    figure = bench_figure([dataclasses.asdict(one) for one in ROWS])
-    assert len(figure.axes) == 2
+    read = list(csv.DictReader(io.StringIO((tmp_path / "wave" / "speed.csv").read_text())))
+    assert [float(line["both_s"]) for line in read] == [one.both_s for one in ROWS]
+    assert read[-1]["predicted"] == ""
+    assert len(found.plot().axes) == 2
 
 
 def test_measure_counts_its_progress(scene):
     truth = reference(scene)
     done = []
-    entrant = bench._entrant(scene, truth, torch.float32, "radial", tol=1e-3)
-    (found,) = measure([entrant], repeats=2, progress=done.append)
+    found = measure(entrant(scene, truth, torch.float32, "radial", tol=1e-3), repeats=2, progress=done.append)
     assert sum(done) == 3
     assert found.error < 1e-3
     assert found.dtype == "float32"

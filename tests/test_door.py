@@ -31,7 +31,7 @@ ROWS = [
 
 def test_every_public_name_is_what_the_table_says_when_all_of_the_package_is_imported():
     """No module may stand in a function's place: `import raytrace.x` puts x into the package."""
-    without = ("bench.peer", "bench.psf_peer", "bench.speed_peer", "__main__")  # these need the extra [bench], or run
+    without = ("bench.peers", "__main__")  # these need the extra [bench], or run
     for found in pkgutil.walk_packages(rt.__path__, "raytrace."):
         if not found.name.endswith(without):
             importlib.import_module(found.name)
@@ -269,8 +269,8 @@ def test_a_lens_shows_itself():
 
 # -- one verb, one door ------------------------------------------------------------------------------------------------
 
-#: Commands that are a verb, each in a file of its own; those of studies are none.
-VERBS = [one for one in COMMANDS if not isinstance(one.run, str) and ".studies." not in one.run.__name__]
+#: Commands that are a verb, each in a file of its own; those of studies and of bench are none.
+VERBS = [one for one in COMMANDS if not isinstance(one.run, str) and runner._verb(one.run) in rt.PUBLIC]
 OF_A_LENS = [command for command in VERBS if not hasattr(command.run, "run")]
 
 

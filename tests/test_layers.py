@@ -46,10 +46,10 @@ COMMANDS = re.compile(r"cli(\.|$)|studies\.\w+\.(\w+_)?command$")
 
 #: What only these files may import.
 RESERVED = {
-    "matplotlib": (r"plot", r"studies\.(\w+\.)?figures", r"bench\.figure_\w+"),
+    "matplotlib": (r"plot", r"studies\.(\w+\.)?figures", r"bench\.figures"),
     "pandas": (r"formats\.(frame|ray_table)", r"cli", r"bench"),
     "tqdm": (r"cli", r"studies\.codesign\.setup", r"bench"),
-    "optiland": (r"bench",),
+    "optiland": (r"bench\.peers",),
 }
 
 

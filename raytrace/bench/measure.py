@@ -1,31 +1,188 @@
-"""Measure tracers side by side: time of the same call on the same rays, and the error of what it returns.
+"""What the benchmarks of the trace share: who traces, calls timed in turns, and the error against the reference.
 
 A speed is rays × surfaces / s. Surfaces are those a ray is carried to: all of the file but the object, the stop and the
 image among them.
 """
 
+import contextlib
 import dataclasses
-import statistics
+import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from raytrace.bench.reference import ReferenceSurface, reference_surface, spot_gradient, trace_reference
-from raytrace.bench.tracers import Own, Tracer, in_pieces, variables
+from raytrace.fused import engine as engine_asked_for
+from raytrace.fused import tracing
 from raytrace.maths.pupil import sobol
 from raytrace.maths.value import to
 from raytrace.optics.launch import rays_of_field
-from raytrace.optics.trace import media
+from raytrace.optics.trace import axial_path, media, trace_lens, trace_surfaces
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
-from raytrace.system.surface import is_even
+from raytrace.system.surface import Surface, is_even
 
+DTYPES = (torch.float32, torch.float64)
 SAMPLE = 24  # rays of the check against the reference
-_PIECES = (2**15, 2**16)  # numbers of rays traced at a time that are tried, beside all at once
-_TRIAL = 400_000  # at most so many rays in a trial
-_LARGEST_GRAPH = 200_000  # rays whose graph is held at once
+SHORTEST = 0.02  # s: shorter calls are timed many at a time
+_MOST_CALLS = 200
+
+#: A call to be timed, and what stands before it untimed.
+Job = tuple[Callable[[], object], Callable[[], object]]
+
+
+def nothing(*_) -> None:
+    """What stands before a call that needs no preparation; progress that nobody follows."""
+
+
+def name_of(dtype: torch.dtype) -> str:
+    return str(dtype).removeprefix("torch.")
+
+
+# -- who traces --------------------------------------------------------------------------------------------------------
+
+
+class Tracer(Protocol):
+    """A tracer with a lens: name, dtype and whether it computes the optical path are part of it.
+
+    prepare: called before every timed call, untimed.
+    forward: (positions (2, P) on the image, path (P,) or None) without gradient.
+    gradient: derivatives of the mean squared distance from `centroid` (2,), numbers in the order of `variables`, then
+    by the indices of all media where it takes those.
+    """
+
+    name: str
+    dtype: torch.dtype
+    with_path: bool
+    has_gradient: bool
+
+    def prepare(self) -> None: ...
+
+    def forward(self, rays: Rays) -> tuple[Tensor, Tensor | None]: ...
+
+    def gradient(self, rays: Rays, centroid: Tensor) -> Sequence[Tensor]: ...
+
+
+class Own:
+    """This package's trace by an engine: "auto" (the program's choice), "eager", or None, the one asked for.
+
+    by_indices: gradients also by the index of every medium.
+    """
+
+    has_gradient = True
+
+    def __init__(self, lens: Lens, dtype: torch.dtype, *, engine: str | None = None, with_path=False, by_indices=False):
+        self.dtype, self.with_path, self.engine = dtype, with_path, engine or engine_asked_for()
+        self.name = "raytrace" if engine in (None, "auto") else f"raytrace, {engine}"
+        self.lens, self.wavelength = to(lens, dtype=dtype), lens.wavelengths[lens.primary_wavelength]
+        self.surfaces, self.indices, self.leaves = leaves_of(self.lens, by_indices=by_indices)
+
+    def prepare(self) -> None:
+        pass
+
+    def forward(self, rays: Rays) -> tuple[Tensor, Tensor | None]:
+        with torch.no_grad(), tracing(self.engine):
+            end = trace_lens(self.lens, self._with_path(rays), self.wavelength)
+        return end.position[:2], end.opl
+
+    def gradient(self, rays: Rays, centroid: Tensor) -> tuple[Tensor, ...]:
+        with tracing(self.engine):
+            end = trace_surfaces(self.surfaces, self._with_path(rays), indices=self.indices)
+            return torch.autograd.grad(squared_radius(*end.position[:2], centroid), self.leaves)
+
+    def full_path(self, reduced: Tensor) -> Tensor:
+        """The whole optical path of rays whose reduced path is given."""
+        return reduced + axial_path(self.lens.surfaces[1:], media(self.lens, self.wavelength))
+
+    def _with_path(self, rays: Rays) -> Rays:
+        path = torch.zeros_like(rays.direction[0]) if self.with_path else None
+        return dataclasses.replace(rays, opl=path)
+
+
+def squared_radius(x: Tensor, y: Tensor, centroid: Tensor) -> Tensor:
+    """Mean squared distance from a fixed point.
+
+    About the rays' own centroid its gradient is that of the mean squared spot radius, for the centroid moves by the
+    mean of what the rays move by, and the distances from it sum to zero.
+    """
+    return ((x - centroid[0]) ** 2 + (y - centroid[1]) ** 2).mean()
+
+
+def slope(rays: Rays, leaf: Tensor) -> Tensor:
+    """Derivative of the mean squared spot radius by a number of the lens."""
+    x, y = rays.position[0], rays.position[1]
+    centroid = torch.stack([x.detach().mean(), y.detach().mean()])
+    return torch.autograd.grad(squared_radius(x, y, centroid), leaf)[0]
+
+
+def variables(lens: Lens) -> list[tuple[int, str]]:
+    """What gradients are taken by: every modelled curvature and every thickness, as (surface number, name)."""
+    last = len(lens.surfaces) - 1
+    curved = [(i, "curvature") for i in range(1, last + 1) if lens.surfaces[i].curvature is not None]
+    return curved + [(i, "thickness") for i in range(1, last)]
+
+
+def with_leaf(lens: Lens, number: int, name: str) -> tuple[Lens, Tensor]:
+    """The lens with one number of a surface a leaf, and the leaf."""
+    leaf = getattr(lens.surfaces[number], name).detach().clone().requires_grad_()
+    return lens.replace(number, **{name: leaf}), leaf
+
+
+def with_leaves(lens: Lens, chosen: Sequence[tuple[int, str]] | None = None) -> tuple[Lens, list[Tensor]]:
+    """The lens with a leaf for each of the chosen numbers, by default `variables`, and the leaves."""
+    leaves = []
+    for number, name in variables(lens) if chosen is None else chosen:
+        lens, leaf = with_leaf(lens, number, name)
+        leaves.append(leaf)
+    return lens, leaves
+
+
+def with_sensor_leaf(lens: Lens) -> tuple[Lens, Tensor]:
+    """The lens with its sensor distance a leaf, and the leaf."""
+    return with_leaf(lens, len(lens.surfaces) - 2, "thickness")
+
+
+def leaves_of(lens: Lens, *, by_indices: bool = True) -> tuple[tuple[Surface, ...], list[Tensor], list[Tensor]]:
+    """Surfaces after the object with the leaves of `variables`, the indices of all media, and the leaves.
+
+    by_indices: the indices are leaves, too. Neighbouring gaps of one medium share one: the surface between bends
+    nothing.
+    """
+    moving, leaves = with_leaves(lens)
+    fixed = media(lens, lens.wavelengths[lens.primary_wavelength])
+    indices = list(fixed)
+    for number, index in enumerate(fixed if by_indices else ()):
+        if number > 0 and index is fixed[number - 1]:
+            indices[number] = indices[number - 1]
+        else:
+            indices[number] = index.detach().clone().requires_grad_()
+            leaves.append(indices[number])
+    return moving.surfaces[1:], indices, leaves
+
+
+# -- rays, and what becomes of them in 50 digits -----------------------------------------------------------------------
+
+
+def field_rays(lens: Lens, count: int) -> Rays:
+    """`count` rays (Sobol points of the pupil) of the lens's middle field at its primary wavelength, float64."""
+    field = torch.stack([lens.fields.x, lens.fields.y])[:, len(lens.fields.x) // 2, None]
+    wavelength = lens.wavelengths[lens.primary_wavelength]
+    with torch.no_grad():
+        rays = rays_of_field(lens, field, sobol(count)[0], wavelength=wavelength, ray_aiming="off")
+    return dataclasses.replace(rays, opl=None)
+
+
+def some(rays: Rays, change: Callable[[Tensor], Tensor]) -> Rays:
+    """Rays without path whose every tensor (…, P) is changed."""
+    return Rays(*(change(x) for x in (rays.position, rays.direction, rays.valid)))
+
+
+def surfaces_of(lens: Lens) -> int:
+    """Number of surfaces that a ray is carried to."""
+    return len(lens.surfaces) - 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,109 +193,74 @@ class Errors:
     by curvatures and by thicknesses, |g - g_ref|/|g_ref| in the largest component, the larger of the two.
     """
 
-    position: float
+    position: float | None
     path: float | None
     gradient: float | None
 
 
-@dataclasses.dataclass(frozen=True)
-class Row:
-    """One figure: what was traced, how fast, how well. seconds: median; ratio: speed over that of the peer."""
-
-    tracer: str
-    dtype: str
-    what: str
-    path: bool
-    rays: int
-    piece: int
-    seconds: float
-    fastest: float
-    speed: float
-    errors: Errors
-    ratio: float | None = None
-
-
-@dataclasses.dataclass(frozen=True)
-class Job:
-    """One call to be timed over and over."""
-
-    tracer: Tracer
-    what: str
-    rays: Rays
-    piece: int
-    centroid: Tensor
-
-    def run(self) -> None:
-        if self.what == "forward":
-            in_pieces(self.rays, self.piece, self.tracer.forward)
-        else:
-            in_pieces(self.rays, self.piece, lambda rays: self.tracer.gradient(rays, self.centroid))
-
-
-def field_rays(lens: Lens, count: int) -> Rays:
-    """`count` rays (Sobol points of the pupil) of the lens's middle field at its primary wavelength, float64."""
-    field = torch.stack([lens.fields.x, lens.fields.y])[:, len(lens.fields.x) // 2, None]
-    wavelength = lens.wavelengths[lens.primary_wavelength]
-    points, _ = sobol(count)
-    with torch.no_grad():
-        rays = rays_of_field(lens, field, points, wavelength=wavelength, ray_aiming="off")
-    return dataclasses.replace(rays, opl=None)
-
-
-def surfaces_of(lens: Lens) -> int:
-    """Number of surfaces that a ray is carried to."""
-    return len(lens.surfaces) - 1
+def shape_of(surface: Surface, number: int) -> tuple[float, float, list[float]]:
+    """Curvature, conic and terms of r², r⁴, …: the shapes that everyone here knows. Raises ValueError for others."""
+    if not is_even(surface):
+        raise ValueError(f"surface {number} is no conic with even terms: its shape is not handed over")
+    c, k = (0.0 if one is None else float(one) for one in (surface.curvature, surface.conic))
+    return c, k, [] if surface.coefficients is None else surface.coefficients.tolist()
 
 
 def reference_of(lens: Lens) -> tuple[list[ReferenceSurface], float]:
-    """The lens in front of surface 1 and behind, for `trace_reference`: its surfaces and the first index."""
-    if not all(map(is_even, lens.surfaces)):
-        raise ValueError("the reference traces conics and even aspheres: this lens has others")
+    """The surfaces behind the object and the first index, for `trace_reference`."""
     indices = [float(index) for index in media(lens, lens.wavelengths[lens.primary_wavelength])]
     surfaces = [
-        reference_surface(
-            *(0.0 if shape is None else float(shape) for shape in (surface.curvature, surface.conic)),
-            () if surface.coefficients is None else surface.coefficients.tolist(),
-            float(surface.thickness),
-            index,
-            surface.is_mirror,
-        )
-        for surface, index in zip(lens.surfaces[1:], indices[1:], strict=True)
+        reference_surface(*shape_of(surface, number), float(surface.thickness), index, surface.is_mirror)
+        for number, (surface, index) in enumerate(zip(lens.surfaces[1:], indices[1:], strict=True), 1)
     ]
     return surfaces, indices[0]
 
 
-def errors_of(tracer: Tracer, lens: Lens, rays: Rays) -> Errors:
-    """Compare a tracer with the reference on a few rays (3, P); both get the numbers as rounded to the dtype."""
+def errors_of(tracer: Tracer, lens: Lens, rays: Rays, *, copies: int = 1, gradient: bool = True) -> Errors:
+    """Compare a tracer with the reference on a few rays (3, P); both get the numbers as rounded to the dtype.
+
+    copies: how often the rays stand in the batch, so that it takes the way of large ones; gradient: whether to compare
+    that, too, where there is one.
+    """
     lens, rays = to(lens, dtype=tracer.dtype), to(rays, dtype=tracer.dtype)
     surfaces, index = reference_of(lens)
     starts = list(zip(rays.position.T.tolist(), rays.direction.T.tolist(), strict=True))
-    exact = [trace_reference(surfaces, index, *start) for start in starts]
+    exact, count = [trace_reference(surfaces, index, *start) for start in starts], len(starts)
+    batch = some(rays, lambda x: x.repeat(*(1,) * (x.dim() - 1), copies))
     tracer.prepare()
-    (x, y), path = tracer.forward(rays)
-    position = max(
-        _worst(x.tolist(), [ray.position[0] for ray in exact]), _worst(y.tolist(), [ray.position[1] for ray in exact])
+    points, path = tracer.forward(batch)
+    points = points[:, :count]
+    found = Errors(
+        1e6 * max(_worst(points[axis].tolist(), [ray.position[axis] for ray in exact]) for axis in (0, 1)), None, None
     )
-    waves = None
     if path is not None:
-        found = path.double() - path[0].double()
-        wavelength = float(lens.wavelengths[lens.primary_wavelength])
-        waves = _worst(found.tolist(), [ray.path - exact[0].path for ray in exact]) * 1e3 / wavelength
-    gradient = None
-    if tracer.has_gradient:
+        waves = 1e3 / float(lens.wavelengths[lens.primary_wavelength])
+        own = path[:count].double() - path[0].double()
+        found = dataclasses.replace(
+            found, path=waves * _worst(own.tolist(), [ray.path - exact[0].path for ray in exact])
+        )
+    if gradient and tracer.has_gradient:
         names = variables(lens)
         expected = spot_gradient(surfaces, index, starts, [(number - 1, name) for number, name in names])
-        found = tracer.gradient(rays, torch.stack([x.mean(), y.mean()])).tolist()
-        gradient = 0.0
-        for kind in ("curvature", "thickness"):
-            pairs = [(g, e) for g, e, (_, name) in zip(found, expected, names, strict=True) if name == kind]
-            if pairs:
-                gradient = max(gradient, _worst(*zip(*pairs, strict=True)) / float(max(abs(e) for _, e in pairs)))
-    return Errors(position * 1e6, waves, gradient)
+        own = [float(slope) for slope in tracer.gradient(batch, points.mean(1))][: len(names)]
+        found = dataclasses.replace(found, gradient=_worst_by_kind(own, expected, [name for _, name in names]))
+    return found
+
+
+def _worst_by_kind(found: Sequence[float], expected: Sequence, kinds: Sequence[str]) -> float:
+    """The largest error relative to the largest component of its kind."""
+    worst = 0.0
+    for kind in set(kinds):
+        pairs = [(a, b) for a, b, own in zip(found, expected, kinds, strict=True) if own == kind]
+        worst = max(worst, _worst(*zip(*pairs, strict=True)) / float(max(abs(b) for _, b in pairs)))
+    return worst
 
 
 def _worst(found: Sequence[float], expected: Sequence) -> float:
     return max(float(abs(a - b)) for a, b in zip(found, expected, strict=True))
+
+
+# -- time --------------------------------------------------------------------------------------------------------------
 
 
 def clock(threads: int) -> Callable[[], float]:
@@ -146,102 +268,75 @@ def clock(threads: int) -> Callable[[], float]:
     return time.process_time if threads == 1 else time.perf_counter
 
 
-def measure(
-    lens: Lens,
-    counts: Sequence[int],
-    *,
-    repeats: int,
-    peers: Sequence[Tracer] = (),
-    threads: int,
-    progress: Callable[[int], object] = lambda done: None,
-) -> list[Row]:
-    """Time every tracer on every number of rays, interleaved so that a busy machine meets all alike.
+@contextlib.contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """So many threads of torch for a while."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
-    threads: of torch; progress: called with the number of calls done since the last time, of `calls(…)` in all.
+
+def seconds_of(job: Job, calls: int, threads: int) -> float:
+    """Of one call, the mean of several."""
+    call, prepare = job
+    with torch_threads(threads):
+        prepare()
+        now = clock(threads)
+        began = now()
+        for _ in range(calls):
+            call()
+        return (now() - began) / calls
+
+
+def in_turns(
+    jobs: Mapping[object, Job], *, repeats: int, threads: int, progress: Callable[[int], object] = nothing
+) -> dict[object, list[float]]:
+    """Seconds of each job, one call of each in turn so that a busy machine meets all alike; short calls many at a time.
+
+    progress: called with 1 for each, `repeats` times the jobs.
     """
-    dtypes = (torch.float32, torch.float64)
-    tracers = [*(Own(lens, dtype, with_path=path) for dtype in dtypes for path in (True, False)), *peers]
-    torch.set_num_threads(threads)
-    errors = {id(tracer): errors_of(tracer, lens, field_rays(lens, SAMPLE)) for tracer in tracers}
-    rows = []
-    for count in sorted(counts):
-        jobs = _jobs(lens, tracers, count)
-        seconds: list[list[float]] = [[] for _ in jobs]
-        jobs = [dataclasses.replace(job, piece=_best_piece(job, threads)) for job in jobs]
-        for _ in range(repeats):
-            for job, taken in zip(jobs, seconds, strict=True):
-                taken.append(_time(job, threads))
-                progress(1)
-        rows += [_row(job, lens, taken, errors[id(job.tracer)]) for job, taken in zip(jobs, seconds, strict=True)]
-    return [dataclasses.replace(row, ratio=_ratio(row, rows)) for row in rows]
+    calls = {}
+    for name, job in jobs.items():
+        seconds_of(job, 1, threads)  # warm up
+        once = seconds_of(job, 1, threads)
+        calls[name] = max(1, min(_MOST_CALLS, math.ceil(SHORTEST / max(once, 1e-6))))
+    taken: dict[object, list[float]] = {name: [] for name in jobs}
+    for _ in range(repeats):
+        for name, job in jobs.items():
+            taken[name].append(seconds_of(job, calls[name], threads))
+            progress(1)
+    return taken
 
 
-def calls(counts: Sequence[int], *, repeats: int, peers: Sequence[Tracer] = ()) -> int:
-    """How many timed calls `measure` makes."""
-    return len(counts) * repeats * (8 + sum(1 + peer.has_gradient for peer in peers))
+def in_best_pieces(
+    function: Callable[[Rays], object],
+    rays: Rays,
+    prepare: Callable[[], object],
+    *,
+    sizes: Sequence[int],
+    threads: int,
+    most: int | None = None,
+) -> tuple[Job, int]:
+    """A call on all rays, as many at a time as a trial finds fastest, and how many: of `sizes`, or at most `most`."""
+    count = rays.direction.shape[1]
+    whole = min(count, most or count)
+    jobs = {
+        size: (_by_pieces(function, rays, size), prepare) for size in {*(min(size, whole) for size in sizes), whole}
+    }
+    if len(jobs) == 1:
+        return jobs[whole], whole
+    for job in jobs.values():
+        seconds_of(job, 1, threads)
+    best = min(jobs, key=lambda size: min(seconds_of(jobs[size], 1, threads) for _ in range(2)))
+    return jobs[best], best
 
 
-def _jobs(lens: Lens, tracers: Sequence[Tracer], count: int) -> list[Job]:
-    by_dtype = {dtype: to(field_rays(lens, count), dtype=dtype) for dtype in (torch.float32, torch.float64)}
-    jobs = []
-    for tracer in tracers:
-        rays = by_dtype[tracer.dtype]
-        centroid = torch.zeros(2, dtype=tracer.dtype)
-        jobs.append(Job(tracer, "forward", rays, count, centroid))
-        if tracer.has_gradient:
-            jobs.append(Job(tracer, "forward+backward", rays, count, centroid))
-    return jobs
-
-
-def _time(job: Job, threads: int) -> float:
-    now = clock(threads)
-    torch.set_num_threads(threads)
-    job.tracer.prepare()
-    began = now()
-    job.run()
-    return now() - began
-
-
-def _best_piece(job: Job, threads: int) -> int:
-    """How many rays at a time suit this tracer best: each is given its own best, tried before it is measured."""
-    count = job.rays.direction.shape[1]
-    whole = count if job.what == "forward" else min(count, _LARGEST_GRAPH)
-    if count <= min(_PIECES):
-        _time(job, threads)  # warm up
-        return whole
-    trial = dataclasses.replace(job, rays=_first(job.rays, min(count, _TRIAL)))
-    sizes = [*(size for size in _PIECES if size < whole), whole]
-    tried = {size: min(_time(dataclasses.replace(trial, piece=size), threads) for _ in range(2)) for size in sizes}
-    return min(tried, key=tried.get)
-
-
-def _first(rays: Rays, count: int) -> Rays:
-    return Rays(*(x[..., :count] for x in (rays.position, rays.direction, rays.valid)))
-
-
-def _row(job: Job, lens: Lens, seconds: list[float], errors: Errors) -> Row:
-    count, median = job.rays.direction.shape[1], statistics.median(seconds)
-    return Row(
-        tracer=job.tracer.name,
-        dtype=str(job.tracer.dtype).removeprefix("torch."),
-        what=job.what,
-        path=job.tracer.with_path,
-        rays=count,
-        piece=job.piece,
-        seconds=median,
-        fastest=min(seconds),
-        speed=count * surfaces_of(lens) / max(median, 1e-9),
-        errors=errors,
-    )
-
-
-def _ratio(row: Row, rows: Sequence[Row]) -> float | None:
-    """Speed over that of Optiland's torch back end at the same task; None for Optiland itself or without it."""
-    if row.tracer != Own.name:
-        return None
-    same = [
-        other
-        for other in rows
-        if other.tracer.endswith("torch") and (other.dtype, other.what, other.rays) == (row.dtype, row.what, row.rays)
-    ]
-    return row.speed / same[0].speed if same else None
+def _by_pieces(function: Callable[[Rays], object], rays: Rays, size: int) -> Callable[[], object]:
+    count = rays.direction.shape[1]
+    if size >= count:
+        return lambda: function(rays)
+    pieces = [some(rays, lambda x, first=first: x[..., first : first + size]) for first in range(0, count, size)]
+    return lambda: [function(piece) for piece in pieces]

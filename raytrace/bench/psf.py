@@ -1,4 +1,4 @@
-"""Measure PSFs: time forward and forward+backward beside the error against converged references.
+"""Speed of PSFs beside their error: time forward and forward + backward of every model against converged references.
 
 Geometric models are compared with `raymap.reference` (10⁸ random rays would be no closer), waves with the direct
 Huygens sum, the others with their own limit: Gaussians with that of converged moments, the Fourier model with its
@@ -11,13 +11,17 @@ import statistics
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from raytrace.bench import psf_report
 from raytrace.bench.huygens import Sampling, direct_sum, moments
-from raytrace.bench.measure import clock
-from raytrace.bench.psf_cases import DIRECT, RANDOM, Case, Method, doors, methods, random_histogram
+from raytrace.bench.measure import clock, name_of, nothing, with_leaves
+from raytrace.bench.psf_cases import DIRECT, RANDOM, USUAL, Case, Method, cases, doors, methods, random_histogram
+from raytrace.bench.report import Asked, Measured
+from raytrace.cli.progress import progress
 from raytrace.kernels import MODELS, NotConverged, Psf, diffraction, paraxial, raymap
 from raytrace.kernels.dft import nodes_per_pixel, rings_and_arms
 from raytrace.kernels.pixels import gaussian_pixels
@@ -29,8 +33,6 @@ from raytrace.optics.scene import Scene
 from raytrace.optics.wavefront import wavefront_of
 from raytrace.system.lens import Lens
 
-RAYS_ERROR = 0.01  # that random rays are brought to
-WAVE_ERROR = 1e-3  # that direct sums are brought to
 _PIECE = 2**16  # random rays at a time
 _PILOT = 2**17  # random rays that find how many are needed
 _PATIENCE = 20.0  # s: what would take longer is extrapolated
@@ -70,6 +72,9 @@ class PsfRow:
     extrapolated: bool = False
 
 
+# -- what a case converges to ------------------------------------------------------------------------------------------
+
+
 @dataclasses.dataclass(frozen=True)
 class Truth:
     """What a case converges to. kernels: (rows, columns) by the name of the limit; windows: their grids.
@@ -87,18 +92,82 @@ class Truth:
     nodes: int = 0
 
 
+@torch.no_grad()
+def truth_of(case: Case, say: Callable[[str], object] = nothing) -> Truth:
+    """The converged kernels of a case; without those of a model that refuses the lens, which is said."""
+    scene = case.scene
+    light = moments(scene)
+    window = case.window(light.centroid)
+    shape = gaussian_pixels(window, *(t.reshape(2, 1, 1, 1) for t in (light.centroid, light.variance)))
+    own = case.window(paraxial.chief_ray_height(scene).flatten())
+    kernels = {
+        "rays": raymap.reference(scene, window)[0, 0, 0],
+        "gaussian": light.energy * shape[0, 0, 0],
+        "paraxial": paraxial.kernels(scene, own).kernel[0, 0, 0],
+    }
+    windows = dict.fromkeys(("rays", "gaussian", "wave"), window) | dict.fromkeys(("paraxial", "fourier"), own)
+    sampling = 0, 0, 0
+    try:
+        kernels["fourier"] = MODELS["fourier"].kernels(scene, own, order=MODELS["fourier"].orders[-1]).kernel[0, 0, 0]
+    except ValueError as refusal:
+        say(f"{case.title}: {refusal}")
+    try:
+        rings, arms, nodes = sampling = wave_sampling(scene, window)
+        finest = Sampling(*_scaled(rings + 4, arms + 16, _REFERENCE), nodes + 2)
+        waves = direct_sum(scene, window, finest)[0]
+        kernels["finest wave"] = MODELS["wave"].kernels(scene, window, order=_FINEST_WAVE).kernel[0, 0, 0]
+        kernels["wave"] = waves
+    except ValueError as refusal:
+        say(f"{case.title}: {refusal}")
+    return Truth(case, kernels, windows, light.centroid, torch.sqrt(light.variance), *sampling)
+
+
+def wave_sampling(scene: Scene, grid: Grid) -> tuple[int, int, int]:
+    """Rings, arms and nodes across a pixel that the wave model takes at order 0, from the phase over the pupil."""
+    front = wavefront_of(scene, *gauss_rings(8, 32))
+    offset = torch.linalg.vector_norm(grid.centre - front.centre[:2, 0, 0, 0])
+    reach = float(offset + grid.pitch * math.hypot(grid.rows, grid.columns) / 2)
+    L, M = front.direction[:2, 0, 0, 0]
+    spread = torch.hypot(L - L.mean(), M - M.mean()).max()
+    cutoff = 2e3 * float(spread * front.index[0] / front.wavelength[0])
+    return (
+        *rings_and_arms(diffraction.phase_along_radius(front, reach), 0),
+        nodes_per_pixel(float(grid.pitch), cutoff, 0),
+    )
+
+
+def _scaled(rings: int, arms: int, part: float) -> tuple[int, int]:
+    return max(4, round(part * rings)), max(8, 4 * round(part * arms / 4))
+
+
+# -- the measurement ---------------------------------------------------------------------------------------------------
+
+
+def bench(asked: Asked) -> Measured:
+    """Every method on every case."""
+    found = cases([(Path(name).stem, asked.open_lens(name)) for name in dict.fromkeys(asked.arguments.lenses or USUAL)])
+    repeats = asked.arguments.repeats
+    others = {"peer_methods": asked.peers.psf_methods} if asked.peers else {}
+    with progress(steps(found), what="measuring") as bar:
+        rows = measure(found, repeats=repeats, threads=asked.threads, progress=bar.update, say=bar.write, **others)
+    about = asked.about()
+    titles, goals = {(case.name, case.field): case.title for case in found}, psf_report.targets(rows)
+    lines = psf_report.lines(rows, goals, titles=titles, about=about, repeats=repeats)
+    document = {"repeats": repeats, "machine": about, "targets": [dataclasses.asdict(one) for one in goals]}
+    return Measured(rows, lines, document, ("psf_figure", titles))
+
+
 def measure(
     cases: Sequence[Case],
     *,
     repeats: int,
     threads: int,
     peer_methods: Callable[[Truth], Sequence[Method]] = lambda truth: (),
-    progress: Callable[[int], object] = lambda done: None,
-    say: Callable[[str], object] = lambda words: None,
+    progress: Callable[[int], object] = nothing,
+    say: Callable[[str], object] = nothing,
 ) -> list[PsfRow]:
     """Every method on every case; what a method refuses is said, and left out. progress: of `steps(cases)`."""
-    torch.set_num_threads(threads)
-    rows = []
+    rows: list[PsfRow] = []
     for case in cases:
         truth = truth_of(case, say)
         progress(1)
@@ -122,48 +191,15 @@ def steps(cases: Sequence[Case]) -> int:
     return len(cases) * (2 * len([*methods(), *doors()]) + 5)
 
 
-@torch.no_grad()
-def truth_of(case: Case, say: Callable[[str], object] = lambda words: None) -> Truth:
-    """The converged kernels of a case; without "wave" where the wave model refuses the lens, which is said."""
-    scene = case.scene
-    light = moments(scene)
-    window = case.window(light.centroid)
-    shape = gaussian_pixels(window, *(t.reshape(2, 1, 1, 1) for t in (light.centroid, light.variance)))
-    own = case.window(paraxial.chief_ray_height(scene).flatten())
-    kernels = {
-        "rays": raymap.reference(scene, window)[0, 0, 0],
-        "gaussian": light.energy * shape[0, 0, 0],
-        "paraxial": paraxial.kernels(scene, own).kernel[0, 0, 0],
-    }
+def _kept(truth: Truth, method: Method, dtype: torch.dtype, repeats: int, threads: int, say) -> list[PsfRow]:
+    """The row of a method, or none where it has no limit or refuses the case."""
+    if method.against not in truth.kernels:
+        return []
     try:
-        kernels["fourier"] = MODELS["fourier"].kernels(scene, own, order=MODELS["fourier"].orders[-1]).kernel[0, 0, 0]
+        return [one_row(truth, method, dtype, repeats=repeats, threads=threads)]
     except ValueError as refusal:
-        say(f"{case.title}: {refusal}")
-    windows = dict.fromkeys(("rays", "gaussian", "wave"), window) | dict.fromkeys(("paraxial", "fourier"), own)
-    truth = Truth(case, kernels, windows, light.centroid, torch.sqrt(light.variance))
-    try:
-        rings, arms, nodes = wave_sampling(scene, window)
-        finest = Sampling(*_scaled(rings + 4, arms + 16, _REFERENCE), nodes + 2)
-        kernels["wave"] = direct_sum(scene, window, finest)[0]
-        kernels["finest wave"] = MODELS["wave"].kernels(scene, window, order=_FINEST_WAVE).kernel[0, 0, 0]
-    except ValueError as refusal:
-        say(f"{case.title}: {refusal}")
-        return truth
-    return dataclasses.replace(truth, rings=rings, arms=arms, nodes=nodes)
-
-
-def wave_sampling(scene: Scene, grid: Grid) -> tuple[int, int, int]:
-    """Rings, arms and nodes across a pixel that the wave model takes at order 0, from the phase over the pupil."""
-    front = wavefront_of(scene, *gauss_rings(8, 32))
-    offset = torch.linalg.vector_norm(grid.centre - front.centre[:2, 0, 0, 0])
-    reach = float(offset + grid.pitch * math.hypot(grid.rows, grid.columns) / 2)
-    L, M = front.direction[:2, 0, 0, 0]
-    spread = torch.hypot(L - L.mean(), M - M.mean()).max()
-    cutoff = 2e3 * float(spread * front.index[0] / front.wavelength[0])
-    return (
-        *rings_and_arms(diffraction.phase_along_radius(front, reach), 0),
-        nodes_per_pixel(float(grid.pitch), cutoff, 0),
-    )
+        say(f"{truth.case.title}, {method.model}, {method.sampling}: {refusal}")
+        return []
 
 
 def one_row(truth: Truth, method: Method, dtype: torch.dtype, *, repeats: int, threads: int) -> PsfRow:
@@ -184,26 +220,28 @@ def one_row(truth: Truth, method: Method, dtype: torch.dtype, *, repeats: int, t
 def random_rows(truth: Truth, dtype: torch.dtype, threads: int) -> list[PsfRow]:
     """Random rays: some thousands, and as many as bring the histogram to RAYS_ERROR (error ∝ rays^-1/2)."""
     scene, grid = to(truth.case.scene, dtype=dtype), to(truth.windows["rays"], dtype=dtype)
+    wanted = psf_report.RAYS_ERROR
 
+    @torch.no_grad()
     def run(count: int) -> PsfRow:
-        with torch.no_grad():
-            began = clock(threads)()
-            found = random_histogram(scene, grid, count, piece=_PIECE)
-            seconds = clock(threads)() - began
-        method = Method(RANDOM, f"{count:,} rays", random_histogram, "rays", has_gradient=False)
+        now = clock(threads)
+        began = now()
+        found = random_histogram(scene, grid, count, piece=_PIECE)
+        seconds = now() - began
+        method = Method(RANDOM, f"{count:,} rays", random_histogram, "rays")
         return _row(truth, method, dtype, count, forward_s=seconds, **errors_of(truth, "rays", found))
 
     run(1000)  # fills caches
     rows = [run(1000), run(10_000), run(_PILOT)]
     pilot = rows[-1]
-    needed = math.ceil(_PILOT * (pilot.l1_error / RAYS_ERROR) ** 2)
+    needed = math.ceil(_PILOT * (pilot.l1_error / wanted) ** 2)
     if needed <= 1000:
         return rows
     if needed * pilot.forward_s / _PILOT > _PATIENCE:
-        return [*rows, _extrapolated(pilot, needed, RAYS_ERROR)]
+        return [*rows, _extrapolated(pilot, needed, wanted)]
     rows.append(run(needed))
-    if RAYS_ERROR < rows[-1].l1_error < 1.5 * RAYS_ERROR:  # errors of random rays scatter; more than that is rounding
-        rows.append(run(math.ceil(1.1 * needed * (rows[-1].l1_error / RAYS_ERROR) ** 2)))
+    if wanted < rows[-1].l1_error < 1.5 * wanted:  # errors of random rays scatter; more than that is rounding
+        rows.append(run(math.ceil(1.1 * needed * (rows[-1].l1_error / wanted) ** 2)))
     return rows
 
 
@@ -212,28 +250,27 @@ def direct_rows(truth: Truth, threads: int) -> list[PsfRow]:
 
     The error of a square grid falls with a power of its rays: it is that of its ragged rim.
     """
-    window, rows = truth.windows["wave"], []
+    window, rows, wanted = truth.windows["wave"], [], psf_report.WAVE_ERROR
 
     def run(sampling: Sampling) -> PsfRow:
-        began = clock(threads)()
+        now = clock(threads)
+        began = now()
         kernel, count = direct_sum(truth.case.scene, window, sampling)
-        seconds = clock(threads)() - began
-        model = f"{DIRECT}, {'rings' if sampling.arms else 'grid'}"
-        method = Method(model, str(sampling), direct_sum, "wave", has_gradient=False)
+        seconds = now() - began
+        method = Method(f"{DIRECT}, {'rings' if sampling.arms else 'grid'}", str(sampling), direct_sum, "wave")
         l1 = relative_l1(kernel, truth.kernels["wave"])
         return _row(truth, method, torch.float64, count, forward_s=seconds, l1_error=l1, model_error=l1)
 
     for part, more in _LADDER:
         nodes = max(2, truth.nodes + more)
         rows.append(run(Sampling(*_scaled(truth.rings, truth.arms, part), nodes)))
-        if rows[-1].l1_error <= WAVE_ERROR:
+        if rows[-1].l1_error <= wanted:
             break
-    square = [run(Sampling(across, 0, nodes)) for across in _SQUARE]
+    coarse, fine = square = [run(Sampling(across, 0, nodes)) for across in _SQUARE]
     rows += square
-    coarse, fine = square
-    if fine.l1_error > WAVE_ERROR and fine.l1_error < coarse.l1_error:
+    if fine.l1_error > wanted and fine.l1_error < coarse.l1_error:
         power = math.log(coarse.l1_error / fine.l1_error) / math.log(fine.rays / coarse.rays)
-        rows.append(_extrapolated(fine, math.ceil(fine.rays * (fine.l1_error / WAVE_ERROR) ** (1 / power)), WAVE_ERROR))
+        rows.append(_extrapolated(fine, math.ceil(fine.rays * (fine.l1_error / wanted) ** (1 / power)), wanted))
     return rows
 
 
@@ -257,16 +294,9 @@ def gradient(method: Method, scene: Scene, grid: Grid) -> tuple[Tensor | None, .
 
 def with_all_leaves(lens: Lens) -> tuple[Lens, list[Tensor]]:
     """The lens with leaves for every shape that is modelled and every thickness behind surface 1, and the leaves."""
-    surfaces, leaves = list(lens.surfaces), []
-    for number in range(1, len(surfaces) - 1):
-        changed = {}
-        for name in ("curvature", "conic", "coefficients", "thickness"):
-            value = getattr(surfaces[number], name)
-            if value is not None:
-                changed[name] = value.detach().clone().requires_grad_()
-        surfaces[number] = dataclasses.replace(surfaces[number], **changed)
-        leaves += changed.values()
-    return dataclasses.replace(lens, surfaces=tuple(surfaces)), leaves
+    names = ("curvature", "conic", "coefficients", "thickness")
+    numbers = [(k, name) for k in range(1, len(lens.surfaces) - 1) for name in names]
+    return with_leaves(lens, [(k, name) for k, name in numbers if getattr(lens.surfaces[k], name) is not None])
 
 
 def timed(call: Callable[[], object], repeats: int, threads: int) -> float:
@@ -313,29 +343,6 @@ def relative_l1(kernel: Tensor, reference: Tensor) -> float:
     return float((kernel - reference).abs().sum() / reference.sum())
 
 
-def _kept(truth: Truth, method: Method, dtype: torch.dtype, repeats: int, threads: int, say) -> list[PsfRow]:
-    """The row of a method, or none where it has no limit or refuses the case."""
-    if method.against not in truth.kernels:
-        return []
-    try:
-        return [one_row(truth, method, dtype, repeats=repeats, threads=threads)]
-    except ValueError as refusal:
-        say(f"{truth.case.title}, {method.model}, {method.sampling}: {refusal}")
-        return []
-
-
 def _row(truth: Truth, method: Method, dtype: torch.dtype, rays: int, **figures) -> PsfRow:
-    return PsfRow(
-        lens=truth.case.name,
-        field=truth.case.field,
-        model=method.model,
-        sampling=method.sampling,
-        dtype=str(dtype).removeprefix("torch."),
-        rays=rays,
-        against=method.against,
-        **figures,
-    )
-
-
-def _scaled(rings: int, arms: int, part: float) -> tuple[int, int]:
-    return max(4, round(part * rings)), max(8, 4 * round(part * arms / 4))
+    case, name = truth.case, name_of(dtype)
+    return PsfRow(case.name, case.field, method.model, method.sampling, name, rays, against=method.against, **figures)

@@ -15,12 +15,10 @@ from raytrace.maths import pupil
 from raytrace.maths.grid import Grid, grid
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.scene import Scene, scene
-from raytrace.system.lens import Lens, with_object_distance
+from raytrace.system.lens import Lens, largest_field, with_object_distance
 
 PIXELS = 21  # across every window
-RANDOM = "random rays"
-DIRECT = "direct sum"
-
+RANDOM, DIRECT = "random rays", "direct sum"
 #: Field angles in degrees, object distance in mm (None: the lens's own) and pixel pitch in mm of the usual cases.
 USUAL = {
     "double_gauss": ((0.0, 14.0), 1e4, 0.005),
@@ -82,59 +80,50 @@ def cases(lenses: Sequence[tuple[str, Lens]]) -> list[Case]:
     found = []
     for name, lens in lenses:
         own = float(lens.surfaces[0].thickness)
-        if name in USUAL:
-            fields, distance, pitch = USUAL[name]
-            distance = own if distance is None else distance
-        else:
-            largest = float(torch.stack([lens.fields.x, lens.fields.y]).norm(dim=0).max())
-            fields, distance, pitch = dict.fromkeys((0.0, largest)), own, None
+        fields, distance, pitch = USUAL.get(name, (dict.fromkeys((0.0, float(largest_field(lens)[1]))), None, None))
+        distance = own if distance is None else distance
         found += [Case(lens, name, field, distance, pitch or _pitch(lens, field, distance)) for field in fields]
     return found
 
 
 def methods() -> list[Method]:
     """Every model at the orders that are measured."""
-    found = [Method("paraxial", "closed form", lambda scene, grid: paraxial.kernels(scene, grid), "paraxial")]
+    found = [Method("paraxial", "closed form", paraxial.kernels, "paraxial")]
     for model, orders in _ORDERS.items():
-        against = "rays" if model == "drt" else model
         for order in orders:
             sampling = f"{order} rings" if model == "gaussian" else f"order {order}"
-            found.append(Method(model, sampling, functools.partial(_at_order, model, order), against))
-    sobol = (Method("Sobol rays", f"{n} rays", functools.partial(_sobol, n), "rays") for n in _SOBOL)
+            run = functools.partial(MODELS[model].kernels, order=order)
+            found.append(Method(model, sampling, run, _limit_of(model)))
+    sobol = (Method("Sobol rays", f"{n} rays", functools.partial(rays.kernels, rays=n), "rays") for n in _SOBOL)
     return [*found, *sobol]
 
 
 def doors() -> list[Method]:
     """`psf(…, tol=…)` as it is called, the estimate of its error included."""
     return [
-        Method(model, f"tol {tol:.0e}".replace("e-0", "e-"), functools.partial(_to_tolerance, model, tol), against)
+        Method(
+            model, f"tol {tol:.0e}".replace("e-0", "e-"), functools.partial(_to_tolerance, model, tol), _limit_of(model)
+        )
         for model, tolerances in _TOLERANCES.items()
         for tol in tolerances
-        for against in ["rays" if model == "drt" else model]
     ]
+
+
+def _limit_of(model: str) -> str:
+    return "rays" if model == "drt" else model
 
 
 def random_histogram(scene: Scene, grid: Grid, count: int, *, piece: int, seed: int = 0) -> Kernels:
     """The plain histogram of independent random rays, some at a time."""
     generator = torch.Generator().manual_seed(seed)
     sampling = functools.partial(pupil.random, generator=generator)
-    parts, sizes = [], [min(piece, count - first) for first in range(0, count, piece)]
-    for size in sizes:
-        parts.append(rays.kernels(scene, grid, rays=size, sampling=sampling, width=0))
-    share = [size / count for size in sizes]
+    sizes = [min(piece, count - first) for first in range(0, count, piece)]
+    parts = [rays.kernels(scene, grid, rays=size, sampling=sampling, width=0) for size in sizes]
     centroid, covariance, kernel = (
-        sum(s * getattr(part, name) for s, part in zip(share, parts, strict=True))
+        sum(size / count * getattr(part, name) for size, part in zip(sizes, parts, strict=True))
         for name in ("centroid", "covariance", "kernel")
     )
     return Kernels(kernel, grid, centroid, covariance, count)
-
-
-def _at_order(model: str, order: int, scene: Scene, grid: Grid) -> Kernels:
-    return MODELS[model].kernels(scene, grid, order=order)
-
-
-def _sobol(count: int, scene: Scene, grid: Grid) -> Kernels:
-    return rays.kernels(scene, grid, rays=count)
 
 
 def _to_tolerance(model: str, tol: float, scene: Scene, grid: Grid) -> Psf:

@@ -1,4 +1,4 @@
-"""Measure PSFs of waves: time forward and forward + backward beside the error, of every engine and Sitzmann's method.
+"""Speed of PSFs of waves beside their error, of every engine and of the method of Sitzmann et al. (2018).
 
 The scene is one kernel of the comparison of extended depth of field: a PMMA lens of 5 mm for 1 m, 35.5 mm before the
 sensor, and a point at 0.5 m in blue, where the blur is widest and the wave shortest. Errors are relative L2 norms
@@ -9,17 +9,21 @@ import dataclasses
 import math
 import statistics
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
 
-from raytrace.bench.measure import clock
+from raytrace.bench.measure import clock, name_of, nothing, torch_threads
+from raytrace.bench.report import Asked, Measured, digits, table, yes
+from raytrace.cli.progress import progress
 from raytrace.kernels.dft import Aliased, phasor
 from raytrace.maths.grid import grid
+from raytrace.maths.result import number
 from raytrace.maths.value import to
 from raytrace.media.glass import index
 from raytrace.optics.reuse import Memo
+from raytrace.pages import measured
 from raytrace.wave import radial
 from raytrace.wave.designs import aim, singlet
 from raytrace.wave.plan import AliasedSampling
@@ -29,7 +33,7 @@ from raytrace.wave.scene import WaveScene
 
 WAVELENGTH, DEPTH, PIXEL, SIZE = 0.46, 500.0, 0.00369, 128
 #: Samples across and padding of Sitzmann's method: 2 µm over 5 mm, half as wide again.
-SAMPLES, PITCH, PADDED = 2500, 2e-3, 3744
+SAMPLES, PADDED = 2500, 3744
 SITZMANN = "sitzmann"
 #: What the opponent is to be beaten by, at an error of at most so much.
 TARGET, ERROR = 100.0, 3e-4
@@ -41,6 +45,13 @@ _TRANSFER = (1700, 2500)
 _SLOW, _FEW = 0.5, 3  # s: what takes longer is repeated so often
 _FINEST = {"samples": 130, "nodes": 10}  # radii between steps of the element, and nodes of pixels, of the limit
 _OTHER = {"samples": 768, "nodes": 8}  # of the pupil engine beside it
+_NAMES = {
+    "pupil": "pupil matrix DFT",
+    "radial": "ring integrals",
+    "fresnel": "Fresnel transfer function, band limit",
+    "angular_spectrum": "angular spectrum, band limit, true spheres",
+    SITZMANN: "Fresnel transfer function as Sitzmann et al. (2018)",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +89,18 @@ class Entrant:
     refused: bool = False
 
 
+def bench(asked: Asked) -> Measured:
+    """Every engine at several samplings beside the method of Sitzmann et al. (2018), in one thread."""
+    found, repeats = entrants(), asked.arguments.repeats
+    with progress(len(found) * (1 + repeats), what="measuring") as bar:
+        rows = [measure(entrant, repeats=repeats, progress=bar.update) for entrant in found]
+    apart, goals = agreement(bench_scene()), target(rows)
+    document = {"repeats": repeats, "machine": asked.about(), "agreement": number(apart)}
+    document["targets"] = [dataclasses.asdict(one) | {"met": one.met} for one in goals]
+    page = lines(rows, agreement=apart, about=document["machine"], repeats=repeats)
+    return Measured(rows, page, document, ("wave_figure",), ("wave_bench.md", "wave/speed_vs_error"))
+
+
 def bench_scene(*, exact: bool = False, size: int = SIZE) -> WaveScene:
     """The scene: one depth, one wavelength."""
     number = torch.tensor(1.0, dtype=torch.float64).new_tensor
@@ -98,70 +121,55 @@ def reference(scene: WaveScene) -> Tensor:
 
 def agreement(scene: WaveScene) -> float:
     """Relative L2 distance of that from a converged kernel of the pupil engine: two rules, two integrals."""
-    limit = reference(scene)
-    other = psf(scene, engine="pupil", **_OTHER).kernel[0, 0]
-    return float((other - limit).norm() / limit.norm())
+    return distance(psf(scene, engine="pupil", **_OTHER).kernel[0, 0], reference(scene))
+
+
+def distance(kernel: Tensor, truth: Tensor) -> float:
+    """Relative L2."""
+    return float((kernel.double() - truth).norm() / truth.norm())
 
 
 def entrants(*, size: int = SIZE, sitzmann: int = SAMPLES) -> list[Entrant]:
     """Everyone: the engines, coarse to fine, and Sitzmann's method, with `sitzmann` samples across."""
     scene, exact = bench_scene(size=size), bench_scene(exact=True, size=size)
-    truths = reference(scene), reference(exact)
+    truths, double = (reference(scene), reference(exact)), torch.float64
     found = []
-    for dtype in (torch.float64, torch.float32):
-        found += [_entrant(scene, truths[0], dtype, "pupil", samples=n) for n in _PUPIL]
-        found += [_entrant(scene, truths[0], dtype, "radial", **how) for how in _RADIAL]
-    double = torch.float64
-    found += [_coarse(scene, truths[0], n) for n in _REFUSED]
-    found += [_entrant(scene, truths[0], double, "fresnel", samples=n) for n in _TRANSFER]
-    found += [_entrant(exact, truths[1], double, "angular_spectrum", samples=n) for n in _TRANSFER]
-    return found + [sitzmann_method(scene, dtype, samples=sitzmann) for dtype in (torch.float64, torch.float32)]
+    for dtype in (double, torch.float32):
+        found += [entrant(scene, truths[0], dtype, "pupil", samples=n) for n in _PUPIL]
+        found += [entrant(scene, truths[0], dtype, "radial", **how) for how in _RADIAL]
+    found += [refused(scene, truths[0], n) for n in _REFUSED]
+    found += [entrant(scene, truths[0], double, "fresnel", samples=n) for n in _TRANSFER]
+    found += [entrant(exact, truths[1], double, "angular_spectrum", samples=n) for n in _TRANSFER]
+    return found + [sitzmann_method(scene, dtype, samples=sitzmann) for dtype in (double, torch.float32)]
 
 
-def measure(
-    found: Sequence[Entrant], *, repeats: int, progress: Callable[[int], object] = lambda done: None
-) -> list[WaveRow]:
-    """Everyone in turns, in one thread: processor time. progress: of len(found) · (1 + repeats)."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        rows = []
-        for entrant in found:
-            rows.append(measure_one(entrant, repeats=repeats, progress=progress))
-        return rows
-    finally:
-        torch.set_num_threads(before)
-
-
-def measure_one(entrant: Entrant, *, repeats: int, progress: Callable[[int], object] = lambda done: None) -> WaveRow:
-    """Error, and median times of warm calls."""
-    now = clock(1)
-    start = _coefficients(entrant.dtype)
-    began = now()
-    run = entrant.prepare()
-    with torch.no_grad():
-        kernel = run(start).double()
-    cold = now() - began
-    error = float((kernel - entrant.truth).norm() / entrant.truth.norm())
-    progress(1)
-    forward, both = [], []
-    for turn in range(repeats):
-        progress(1)
-        if turn >= _FEW and statistics.median(both) > _SLOW:
-            continue
+def measure(entrant: Entrant, *, repeats: int, progress: Callable[[int], object] = nothing) -> WaveRow:
+    """Error, and median processor times of warm calls in one thread; progress: of 1 + repeats."""
+    now, start, forward, both = clock(1), coefficients_of(entrant.dtype), [], []
+    with torch_threads(1):
         began = now()
+        run = entrant.prepare()
         with torch.no_grad():
-            run(start)
-        forward.append(now() - began)
-        began = now()
-        gradient(run, start)
-        both.append(now() - began)
+            kernel = run(start)
+        cold = now() - began
+        progress(1)
+        for turn in range(repeats):
+            progress(1)
+            if turn >= _FEW and statistics.median(both) > _SLOW:
+                continue
+            began = now()
+            with torch.no_grad():
+                run(start)
+            forward.append(now() - began)
+            began = now()
+            gradient(run, start)
+            both.append(now() - began)
     return WaveRow(
         engine=entrant.engine,
         sampling=entrant.sampling,
-        dtype=str(entrant.dtype).removeprefix("torch."),
+        dtype=name_of(entrant.dtype),
         samples=entrant.samples,
-        error=error,
+        error=distance(kernel, entrant.truth),
         predicted=entrant.predicted,
         cold_s=cold,
         forward_s=statistics.median(forward),
@@ -182,18 +190,17 @@ def gradient(run: Callable[[Tensor], Tensor], coefficients: Tensor) -> Tensor:
 # -- the engines -------------------------------------------------------------------------------------------------------
 
 
-def _entrant(scene: WaveScene, truth: Tensor, dtype: torch.dtype, engine: str, **sampling) -> Entrant:
+def entrant(scene: WaveScene, truth: Tensor, dtype: torch.dtype, engine: str, **sampling) -> Entrant:
+    """An engine at a sampling, as its plan allows it."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Aliased)
         chosen = plan_of(scene, engine=engine, **sampling)
-    if engine == "radial":
-        words = f"{chosen.samples} radii"
-    else:
-        words = f"{chosen.samples}²" + (f", padded {chosen.pad:g}×" if engine != "pupil" else "")
+    padded = "" if engine == "pupil" else f", padded {chosen.pad:g}×"
+    words = f"{chosen.samples} radii" if engine == "radial" else f"{chosen.samples}²{padded}"
     return Entrant(engine, words, dtype, chosen.samples, _prepared(scene, chosen, dtype), truth, chosen.error)
 
 
-def _coarse(scene: WaveScene, truth: Tensor, samples: int) -> Entrant:
+def refused(scene: WaveScene, truth: Tensor, samples: int) -> Entrant:
     """What the plan refuses: copies of the image inside the window."""
     try:
         plan_of(scene, engine="pupil", samples=samples)
@@ -223,11 +230,9 @@ def _with(scene: WaveScene, coefficients: Tensor) -> WaveScene:
     return dataclasses.replace(scene, elements=(dataclasses.replace(element, profile=profile),))
 
 
-def _coefficients(dtype: torch.dtype) -> Tensor:
+def coefficients_of(dtype: torch.dtype) -> Tensor:
+    """The coefficient of r² that every entrant starts from, (1,)."""
     return bench_scene().elements[0].profile.coefficients[:1].to(dtype)
-
-
-# -- Sitzmann's method -------------------------------------------------------------------------------------------------
 
 
 def sitzmann_method(scene: WaveScene, dtype: torch.dtype, *, samples: int = SAMPLES) -> Entrant:
@@ -308,3 +313,64 @@ def target(rows: Sequence[WaveRow]) -> list[Target]:
             ratios = opponent.forward_s / best.forward_s, opponent.both_s / best.both_s
             found.append(Target(best, opponent, *ratios, opponent.forward_s / best.cold_s))
     return sorted(found, key=lambda one: -one.both)
+
+
+def lines(rows: Sequence[WaveRow], *, agreement: float, about: Mapping[str, str | int], repeats: int) -> list[str]:
+    """The page."""
+    return [
+        "# Waves behind a phase element: speed beside error",
+        "",
+        "    raytrace bench wave --docs docs",
+        "",
+        f"One kernel: a PMMA lens of 5 mm made for 1 m, 35.5 mm before the sensor, a point at {DEPTH / 1e3:g} m in "
+        f"{1e3 * WAVELENGTH:g} nm, {SIZE} × {SIZE} pixels of {1e3 * PIXEL:g} µm, integrated over them. Error: relative "
+        "L² of the kernel against converged ring integrals, from which a converged matrix DFT differs by "
+        f"{agreement:.1e}. Times are of a step that changes heights alone, as in learning: *forward*, and *with "
+        "gradient* by the coefficients of the lens; *first* is a forward call that nothing is kept from.",
+        "",
+        "![Time over error of the engines](wave/speed_vs_error.png)",
+        "",
+        f"Target: {TARGET:g} × less time than their method at an error of at most {ERROR:g}. The fastest sampling "
+        "of each engine that comes so close, beside the fastest run of their method:",
+        "",
+        *table(_GOALS, target(rows)),
+        "",
+        *table({name: _in_italics(form) for name, form in _ROWS.items()}, rows),
+        "",
+        "Rows in italics are refused by `plan` (`AliasedSampling`) and forced here. *Predicted* is what `plan` says of "
+        "the error.",
+        "",
+        measured(f"up to {repeats} calls", about) + ". All figures: [speed_vs_error.csv](wave/speed_vs_error.csv).",
+    ]
+
+
+def _ratio(value: float) -> str:
+    return f"{value:.0f} ×" if value >= 10 else f"{value:.2g} ×"
+
+
+def _error(value: float | None) -> str:
+    return digits(value, ".1e" if value is not None and value < 1 else ".1f", "–")
+
+
+def _in_italics(form: Callable[[WaveRow], str]) -> Callable[[WaveRow], str]:
+    return lambda row: f"*{form(row)}*" if row.refused else form(row)
+
+
+_GOALS = {
+    "engine": lambda one: _NAMES[one.best.engine],
+    "sampling": lambda one: f"{one.best.sampling}, {one.best.dtype}",
+    "error": lambda one: f"{one.best.error:.1e}",
+    "forward": lambda one: _ratio(one.forward),
+    "with gradient": lambda one: _ratio(one.both),
+    "met": lambda one: yes(one.met),
+}
+_ROWS = {
+    "engine": lambda row: _NAMES[row.engine],
+    "sampling": lambda row: row.sampling,
+    "dtype": lambda row: row.dtype,
+    "error": lambda row: _error(row.error),
+    "predicted": lambda row: _error(row.predicted),
+    "forward, ms": lambda row: f"{1e3 * row.forward_s:.3g}",
+    "with gradient, ms": lambda row: f"{1e3 * row.both_s:.3g}",
+    "first, ms": lambda row: f"{1e3 * row.cold_s:.3g}",
+}

@@ -2,46 +2,7 @@
 
 from raytrace.cli import wave
 from raytrace.cli.command import Command
-from raytrace.cli.options import (
-    count,
-    file_name,
-    json,
-    output,
-    plot,
-)
 from raytrace.cli.studies import command
-
-
-def _bench(parser):
-    parser.add_argument("what", choices=("trace", "psf", "codesign", "wave", "speed"), help="what to measure")
-    parser.add_argument(
-        "lenses",
-        metavar="LENS",
-        type=file_name,
-        nargs="*",
-        help="psf: lenses to measure, on the axis and at the largest field "
-        "(default double_gauss phone hubble, in conditions of their own)",
-    )
-    json(parser)
-    parser.add_argument("--lens", metavar="LENS", help="trace: lens to trace (default double_gauss)")
-    parser.add_argument(
-        "--rays", metavar="N", type=count, nargs="+", help="trace: numbers of rays (default 1000 10000 100000 1000000)"
-    )
-    parser.add_argument("--repeats", metavar="N", type=count, default=5, help="runs of which the median is kept")
-    parser.add_argument("--threads", metavar="N", type=count, help="threads of torch")
-    parser.add_argument("--no-peers", action="store_true", help="leave out Optiland even if it is installed")
-    output(parser, "report to write (.md)")
-    parser.add_argument("--csv", metavar="FILE", type=file_name, help="psf: table to write, one line a figure")
-    parser.add_argument(
-        "--docs",
-        metavar="DOCS",
-        type=file_name,
-        help="codesign, wave, speed: folder for codesign_accuracy.md and codesign/, wave_bench.md and wave/, or "
-        "speed.md, .csv and .png",
-    )
-    parser.add_argument("--quick", action="store_true", help="speed: few rays, to try it; its ratios mean little")
-    plot(parser, "speed over number of rays, or time over error,")
-
 
 #: The analyses, each a file of this folder.
 ANALYSES = (
@@ -61,25 +22,7 @@ COMMANDS = (
     Command.of("cli.psf"),
     Command.of("cli.compare"),
     Command.of("cli.glass"),
-    Command(
-        "bench",
-        "measure speed against error",
-        "Measure, forward and backward, in float32 and float64: the trace against a high-precision reference, or every "
-        "PSF model at every sampling against converged ones (minutes), or what learns lenses in co-design: few rays "
-        "beside many, and the models beside DRT (minutes), or every engine of wave PSFs beside the transfer function "
-        "it replaces (a minute), or the targets of speed: the trace beside limits of the machine (C++, built here if "
-        "there is a compiler), its memory and whole processes (minutes). With the extra [bench] Optiland runs beside "
-        "trace, psf and speed.",
-        """examples:
-  raytrace bench trace
-  raytrace bench psf -o speed_vs_error.md --csv speed_vs_error.csv --plot speed_vs_error.png
-  raytrace bench trace --rays 1000 100000 -o bench.md --plot bench.png
-  raytrace bench codesign --docs docs
-  raytrace bench wave --docs docs
-  raytrace bench speed --quick --repeats 1""",
-        _bench,
-        "bench.command.bench",
-    ),
+    Command.of("cli.bench"),
     *(Command.of(f"cli.{name}") for name in ANALYSES),
     command("codesign"),
     Command("wave", wave.SUMMARY, wave.DESCRIPTION, wave.EXAMPLES, wave.options, "cli.wave.options"),

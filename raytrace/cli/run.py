@@ -57,7 +57,7 @@ def _carry_out(command: ModuleType, arguments: argparse.Namespace) -> None:
 
 
 def takes(command: ModuleType, keyword: str) -> bool:
-    """Whether the verb of a command has a keyword; the command of a study is no verb."""
+    """Whether the verb of a command has a keyword; those of studies and of bench are no verbs."""
     return _verb(command) in raytrace.PUBLIC and keyword in inspect.signature(verb_of(command)).parameters
 
 

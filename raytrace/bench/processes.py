@@ -10,14 +10,12 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import torch
 
-from raytrace.bench.measure import field_rays
-from raytrace.bench.speed_own import Engine
-from raytrace.files import shipped
+from raytrace.bench.measure import Own, field_rays, name_of, some
 from raytrace.formats import read_lens
 from raytrace.fused import prepare
 from raytrace.maths.value import to
@@ -56,19 +54,11 @@ def spot_process_ratio(repeats: int) -> tuple[float, float, float]:
 
 def two_process_gain(dtype: torch.dtype, rays: int, *, seconds: float, repeats: int) -> tuple[float, float, float]:
     """Rays a second of two processes of one thread over those of one; then both, rays/s. Medians, in turns."""
-    workers = [_start("serve_rate", dtype, rays, 1) for _ in range(2)]
-    try:
-        for worker in workers:
+    with _worker("serve_rate", dtype, rays, 1) as first, _worker("serve_rate", dtype, rays, 1) as second:
+        for worker in (first, second):
             _read(worker)
-        alone, together = [], []
-        for _ in range(repeats):
-            alone.append(sum(_rates(workers[:1], seconds)))
-            together.append(sum(_rates(workers, seconds)))
-    finally:
-        for worker in workers:
-            worker.stdin.close()
-            worker.wait(timeout=60)
-    one, two = statistics.median(alone), statistics.median(together)
+        turns = [(sum(_rates([first], seconds)), sum(_rates([first, second], seconds))) for _ in range(repeats)]
+    one, two = (statistics.median(rates) for rates in zip(*turns, strict=True))
     return two / one, one, two
 
 
@@ -77,13 +67,13 @@ def serve_memory(dtype: str, rays: int, threads: int) -> None:
     torch.set_num_threads(threads)
     tracer, batch = _tracer_and_rays(dtype, rays)
     centroid = torch.zeros(2, dtype=tracer.dtype)
-    few = Rays(*(x[..., :_WARM_UP].clone() for x in (batch.position, batch.direction, batch.valid)))
+    few = some(batch, lambda x: x[..., :_WARM_UP].clone())
     for _ in range(2):
-        tracer.gradient_by_all(few, centroid)
+        tracer.gradient(few, centroid)
     # A system that takes back idle pages would bring the inputs in again, and count them.
     float(batch.position.sum() + batch.direction.sum())
     before = _peak_from_now()
-    tracer.gradient_by_all(batch, centroid)
+    tracer.gradient(batch, centroid)
     print((_highest() - before) / rays, flush=True)
 
 
@@ -102,10 +92,11 @@ def serve_rate(dtype: str, rays: int, threads: int) -> None:
         print(done / (time.perf_counter() - began), flush=True)
 
 
-def _tracer_and_rays(dtype: str, count: int) -> tuple[Engine, Rays]:
+def _tracer_and_rays(dtype: str, count: int) -> tuple[Own, Rays]:
     prepare()
-    tracer = Engine(read_lens(shipped("lenses") / "double_gauss.zmx"), getattr(torch, dtype))
-    few = to(field_rays(tracer.lens_as_read, _PATTERN), dtype=tracer.dtype)
+    lens = read_lens("double_gauss")
+    tracer = Own(lens, getattr(torch, dtype), engine="auto", by_indices=True)
+    few = to(field_rays(lens, _PATTERN), dtype=tracer.dtype)
     position, direction = (torch.empty(3, count, dtype=tracer.dtype) for _ in range(2))
     for first in range(0, count, _PATTERN):
         width = min(_PATTERN, count - first)
@@ -115,11 +106,8 @@ def _tracer_and_rays(dtype: str, count: int) -> tuple[Engine, Rays]:
 
 
 def _peak(dtype: torch.dtype, rays: int, threads: int) -> float:
-    worker = _start("serve_memory", dtype, rays, threads)
-    found = float(_read(worker))
-    worker.stdin.close()
-    worker.wait(timeout=60)
-    return found
+    with _worker("serve_memory", dtype, rays, threads) as worker:
+        return float(_read(worker))
 
 
 def _rates(workers: Sequence[subprocess.Popen], seconds: float) -> list[float]:
@@ -129,12 +117,17 @@ def _rates(workers: Sequence[subprocess.Popen], seconds: float) -> list[float]:
     return [float(_read(worker)) for worker in workers]
 
 
-def _start(function: str, dtype: torch.dtype, rays: int, threads: int) -> subprocess.Popen:
-    words = f"{str(dtype).removeprefix('torch.')!r}, {rays}, {threads}"
-    code = f"from raytrace.bench.speed_processes import {function}; {function}({words})"
-    environment = _environment() | {"OMP_NUM_THREADS": str(threads)}
-    pipe = subprocess.PIPE
-    return subprocess.Popen([sys.executable, _SAFE, "-c", code], env=environment, stdin=pipe, stdout=pipe, text=True)
+@contextlib.contextmanager
+def _worker(function: str, dtype: torch.dtype, rays: int, threads: int) -> Iterator[subprocess.Popen]:
+    """A process that runs one of these functions; it ends with its input."""
+    code = f"from {__name__} import {function}; {function}({name_of(dtype)!r}, {rays}, {threads})"
+    environment, pipe = _environment() | {"OMP_NUM_THREADS": str(threads)}, subprocess.PIPE
+    worker = subprocess.Popen([sys.executable, _SAFE, "-c", code], env=environment, stdin=pipe, stdout=pipe, text=True)
+    try:
+        yield worker
+    finally:
+        worker.stdin.close()
+        worker.wait(timeout=60)
 
 
 def _read(worker: subprocess.Popen) -> str:

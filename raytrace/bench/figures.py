@@ -1,0 +1,206 @@
+"""The benchmarks as pictures: on logarithmic axes a line for each entrant, a panel for each task, case or dtype."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
+
+from raytrace.plot import style
+
+#: By the start of an entrant's name: number of its colour (None: grey), dashes, marker.
+_TRACERS = {
+    "raytrace, eager": (0, (0, (4, 2)), "o"),
+    "raytrace": (0, "-", "o"),
+    "safe limit": (None, "-", "s"),
+    "plain limit": (None, (0, (2, 2)), "s"),
+    "Optiland, torch": (2, "-", "^"),
+    "Optiland, numpy": (2, (0, (4, 2)), "v"),
+    "ray-optics": (4, "-", "D"),
+}
+#: Number of the colour, marker and order in the legend, by model of a PSF.
+_MODELS = {
+    "random rays": (7, "o"),
+    "Sobol rays": (5, "o"),
+    "drt": (0, "o"),
+    "gaussian": (1, "s"),
+    "fourier": (4, "D"),
+    "wave": (2, "^"),
+    "direct sum, rings": (6, "v"),
+    "direct sum, grid": (6, "P"),
+    "Optiland histogram": (3, "o"),
+    "Optiland FFT": (3, "D"),
+    "Optiland Huygens": (3, "v"),
+}
+#: Number of the colour, marker and name, by wave engine.
+_ENGINES = {
+    "pupil": (0, "o", "pupil matrix DFT"),
+    "radial": (1, "s", "ring integrals"),
+    "fresnel": (4, "D", "Fresnel transfer, band limit"),
+    "angular_spectrum": (3, "v", "angular spectrum"),
+    "sitzmann": (2, "*", "as Sitzmann 2018"),
+}
+_TASKS = {"forward": "Forward", "forward+backward": "Forward and backward"}
+_LEAST = 1e-9  # errors below are rounding
+
+
+@style.styled
+def trace_figure(rows: Sequence[Mapping]) -> Figure:
+    """Rows of `bench trace` as mappings: speed over the number of rays, a panel for each task.
+
+    Only rows with the optical path are drawn: all tracers compute it, so that they are seen at the same task.
+    """
+    rows = [row for row in rows if row["path"]]
+    colours = {tracer: (0, 2, 4)[k % 3] for k, tracer in enumerate(dict.fromkeys(row["tracer"] for row in rows))}
+
+    def look(tracer: str, dtype: str) -> dict:
+        return _look(colours[tracer], "--" if dtype == "float32" else "-", "o", hollow=dtype == "float32")
+
+    return _speeds(rows, "what", _TASKS, lambda row: (row["tracer"], row["dtype"]), look, width=3.6, columns=3)
+
+
+@style.styled
+def speed_figure(rows: Sequence[Mapping]) -> Figure:
+    """Rows of `bench speed` as mappings; those forward count, a panel for each dtype."""
+    rows = [row for row in rows if row["what"] == "forward"]
+    dtypes = {dtype: dtype for dtype in dict.fromkeys(row["dtype"] for row in rows)}
+
+    def look(tracer: str) -> dict:
+        colour, dashes, marker = _TRACERS.get(tracer, (6, "-", "*"))
+        return _look(colour, dashes, marker, hollow=dashes != "-")
+
+    return _speeds(rows, "dtype", dtypes, lambda row: (row["tracer"],), look, width=3.7, columns=4)
+
+
+def _speeds(
+    rows: Sequence[Mapping], panel_by: str, titles: Mapping[str, str], name: Callable, look: Callable, *, width, columns
+) -> Figure:
+    """Speed over the number of rays: a panel for each value of a column, a line for each name."""
+    figure = style.new_figure(width * len(titles), width)
+    panels = figure.subplots(1, len(titles), sharex=True, sharey=True, squeeze=False)[0]
+    for panel, (value, title) in zip(panels, titles.items(), strict=True):
+        own = [row for row in rows if row[panel_by] == value]
+        for entrant in dict.fromkeys(map(name, own)):
+            points = sorted((row["rays"], row["speed"]) for row in own if name(row) == entrant)
+            panel.plot(*zip(*points, strict=True), label=", ".join(entrant), **look(*entrant))
+        _framed(panel, title, "rays")
+    _ticks(panels[0], [row["speed"] for row in rows])
+    panels[0].set_ylabel("rays × surfaces per second, millions")
+    labelled = {label: line for panel in panels for line, label in zip(*panel.get_legend_handles_labels(), strict=True)}
+    figure.legend(labelled.values(), labelled.keys(), loc="outside lower center", ncols=columns)
+    return figure
+
+
+@style.styled
+def psf_figure(rows: Sequence[Mapping], titles: Mapping[tuple[str, float], str]) -> Figure:
+    """Rows of `bench psf` as mappings: time over error, a panel for each case, samplings from coarse to fine.
+
+    titles: of the panels, by lens and field. Rows driven by a tolerance are left out: they hold the same kernels.
+    """
+    rows = [row for row in rows if row["l1_error"] and row["l1_error"] > _LEAST and row["estimate"] is None]
+    columns = 2 if len(titles) > 1 else 1
+    lines = -(-len(titles) // columns)
+    figure = style.new_figure(3.9 * columns, 3.1 * lines + 0.7)
+    panels = list(figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).flat)
+    for panel, (case, title) in zip(panels, titles.items(), strict=False):
+        for model, (colour, marker) in _MODELS.items():
+            own = [row for row in rows if (row["lens"], row["field"], row["model"]) == (*case, model)]
+            _samplings(panel, own, _look(colour, "-", marker, hollow=False))
+        _framed(panel, title, "")
+        for axis in (panel.xaxis, panel.yaxis):
+            axis.set_major_locator(LogLocator(numticks=12))
+            axis.set_minor_locator(NullLocator())
+        panel.tick_params(labelbottom=True, labelleft=True)
+    for panel in panels[len(titles) :]:
+        panel.remove()
+    for number, panel in enumerate(figure.axes):
+        panel.set_xlabel("relative L1 error of the kernel" if number + columns >= len(titles) else "")
+        panel.set_ylabel("time of one kernel, s" if number % columns == 0 else "")
+    shown = {row["model"] for row in rows}
+    handles = [_key(model, **_look(c, "-", m, hollow=False)) for model, (c, m) in _MODELS.items() if model in shown]
+    handles += [*_dtypes(), _key("extrapolated", marker="x", color=style.INK, linestyle="none")]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2 * columns)
+    return figure
+
+
+def _samplings(panel: Axes, rows: Sequence[Mapping], look: dict) -> None:
+    """The samplings of one model: float64 joined in the order of their rays, what was extrapolated by dots."""
+    for dtype in ("float64", "float32"):
+        own = sorted((row for row in rows if row["dtype"] == dtype), key=lambda row: row["rays"])
+        run = [(row["l1_error"], row["forward_s"]) for row in own if not row["extrapolated"]]
+        far = [(row["l1_error"], row["forward_s"]) for row in own if row["extrapolated"]]
+        if run:
+            single = {"linestyle": "none", "markerfacecolor": "white", "alpha": 0.8} if dtype == "float32" else {}
+            panel.plot(*zip(*run, strict=True), **look | single)
+        if far:
+            panel.plot(*zip(*run[-1:], *far, strict=True), ":", color=look["color"], linewidth=1.0)
+            panel.plot(*zip(*far, strict=True), "x", color=look["color"], markersize=5)
+
+
+@style.styled
+def wave_figure(rows: Sequence[Mapping]) -> Figure:
+    """Rows of `bench wave` as mappings: time over error, forward and with the gradient.
+
+    Full marks are float64, open ones float32; crosses are refused samplings.
+    """
+    figure = style.new_figure(7.6, 3.6)
+    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    for panel, key, title in zip(panels, ("forward_s", "both_s"), ("forward", "forward and gradient"), strict=True):
+
+        def places(chosen: Callable[[Mapping], bool], key: str = key) -> tuple[list, list]:
+            own = [row for row in rows if chosen(row)]
+            return [row["error"] for row in own], [1e3 * row[key] for row in own]
+
+        for engine, (colour, marker, label) in _ENGINES.items():
+            for dtype, line in (("float64", "-"), ("float32", ":")):
+                look = _look(colour, line, marker, hollow=dtype == "float32") | {"linewidth": 0.9}
+                kind = (engine, dtype, False)
+                own = places(lambda row, kind=kind: (row["engine"], row["dtype"], row["refused"]) == kind)
+                panel.plot(*own, label=label if dtype == "float64" else None, **look)
+        panel.plot(*places(lambda row: row["refused"]), "x", color=style.field_colour(7), label="refused by the plan")
+        _framed(panel, title, "relative L² error of the kernel")
+    panels[0].set_ylabel("time of one kernel, ms")
+    handles = [*panels[0].get_legend_handles_labels()[0], *_dtypes()]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4)
+    return figure
+
+
+def _look(colour: int | None, line, marker: str, *, hollow: bool) -> dict:
+    return {
+        "color": style.GREY if colour is None else style.field_colour(colour),
+        "linestyle": line,
+        "marker": marker,
+        "markersize": 8 if marker == "*" else 4,
+        "markerfacecolor": "white" if hollow else None,
+        "linewidth": 1.1,
+    }
+
+
+def _dtypes() -> list[Line2D]:
+    """What stands for a dtype."""
+    look = {"marker": "o", "color": style.INK, "linestyle": "none"}
+    return [_key("float64", **look), _key("float32", markerfacecolor="white", **look)]
+
+
+def _key(label: str, **look) -> Line2D:
+    return Line2D([], [], label=label, **{"markersize": 4} | look)
+
+
+def _framed(panel: Axes, title: str, abscissa: str) -> None:
+    panel.set(xscale="log", yscale="log", title=title, xlabel=abscissa)
+    panel.grid(True, which="major", color=style.FAINT, linewidth=0.5)
+    panel.set_axisbelow(True)
+
+
+def _ticks(panel: Axes, speeds: Sequence[float]) -> None:
+    """Round speeds, in millions: decades where there are three, else 1, 2, 5."""
+    low, high = min(speeds) / 1.4, max(speeds) * 1.4
+    decades = [10.0**e for e in range(2, 12)]
+    inside = [tick for tick in decades if low <= tick <= high]
+    if len(inside) < 3:
+        inside = [m * tick for tick in decades for m in (1, 2, 5) if low <= m * tick <= high]
+    panel.yaxis.set_major_locator(FixedLocator(inside))
+    panel.yaxis.set_minor_locator(NullLocator())
+    panel.yaxis.set_major_formatter(FuncFormatter(lambda speed, _: f"{speed / 1e6:g}"))
+    panel.set_ylim(low, high)
