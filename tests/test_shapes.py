@@ -32,7 +32,7 @@ from raytrace.optics.streaming import stream_spot
 from raytrace.optics.trace import trace_lens, trace_surfaces
 from raytrace.plot.outline import depth
 from raytrace.system import shapes
-from raytrace.system.aperture import Aperture, clearance, inside, reach, stands_inside
+from raytrace.system.aperture import SHAPES, Aperture, Edge, Shape, clearance, inside, reach, stands_inside
 from raytrace.system.build import lens as lens_of_rows
 from raytrace.system.departure import Sag
 from raytrace.system.places import number_at, places, with_number
@@ -458,3 +458,35 @@ def test_slits_of_a_real_file():
     assert aperture.centre == (-0.5, 0.0)
     x = vector(-4.5, -3.5, -2.5, 0.5, 1.5, 5.5, 6.5) - 0.5
     assert inside((aperture,), torch.stack([x, 0 * x])).tolist() == [True, False, True, False, True, True, False]
+
+
+def test_a_shape_of_aperture_added_at_run_time_is_found_by_everything(monkeypatch, tmp_path):
+    """A diamond |x|/a + |y|/b ≤ 1: traced, drawn, in kernels and in files; refused where it is unknown."""
+    diamond = Aperture("diamond", (4.0, 3.0))
+    system = lens([surface(0.02, 5.0, 1.5, apertures=(diamond,), semi_diameter=9.0), surface(-0.02, 60.0)])
+    with pytest.raises(ValueError, match="surface 1: an aperture of shape 'diamond'; expected one of circular, rect"):
+        system.at(object_distance=1e4)
+    row = Shape(
+        lambda x, y, sizes: [Edge(x.abs() / sizes[0] + y.abs() / sizes[1], 1.0)],
+        lambda sizes: (0.0, sizes[1]), "mirror", ("DIAP", "DIOB"),
+    )  # fmt: skip
+    monkeypatch.setitem(SHAPES, "diamond", row)
+    assert system.at(object_distance=1e4).surfaces[1].apertures == (diamond,)
+    assert not is_expressible(system.surfaces[1])
+    position = torch.stack([vector(0.0, 4.0, 2.0, 2.1, 0.0), vector(0.0, 0.0, 1.5, 1.5, -3.1), torch.zeros(5).double()])
+    axis = torch.zeros_like(position)
+    axis[2] = 1
+    for engine in ("eager", "fused"):
+        with tracing(engine):
+            valid = trace_lens(system, start(position, axis), system.wavelengths[0]).valid
+        assert valid.tolist() == [True, True, True, False, False]
+    assert symmetry(scene_of(system)) == "mirror"
+    rt.layout(system).plot(tmp_path / "layout.png")
+    found = psf(system, "drt", fields=field(0.0), grid=grid(0.5, 9), tol=3e-2)
+    assert float(found.energy) == pytest.approx(2 * 4 * 3 / (math.pi * 25), rel=3e-2)
+    for suffix in (".zmx", ".csv"):
+        write_lens(system, tmp_path / f"diamond{suffix}")
+        (back,) = read_lens(tmp_path / f"diamond{suffix}").surfaces[1].apertures
+        assert (back.shape, back.extent, back.obscures) == ("diamond", (4.0, 3.0), False)
+    with pytest.raises(ValueError, match=r"surface 1: an aperture \(diamond\) has a negative size"):
+        system.replace(1, apertures=(Aperture("diamond", (4.0, -3.0)),)).at(object_distance=1e4)

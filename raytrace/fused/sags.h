@@ -89,7 +89,7 @@ void sum_terms(const Rays<T>& to, Notes<T>& notes, int n, int count, T* sums) {
 // Calls work(kind, terms) for a surface with terms: loops are compiled for these kinds, and up to so many terms.
 template <typename Work>
 void by_kind_of_terms(const Layout& at, Work work) {
-  if (at.kind == kOdd) work(Constant<kOdd>{}, Constant<kTerms>{});
+  if (at.kind == kOdd) work(Constant<kOdd>{}, Constant<8>{});
   else if (at.terms <= 4) work(Constant<kEven>{}, Constant<4>{});
   else if (at.terms <= 8) work(Constant<kEven>{}, Constant<8>{});
   else work(Constant<kEven>{}, Constant<kTerms>{});

@@ -50,8 +50,8 @@ class Structure:
 
 
 def is_expressible(surface: Surface) -> bool:
-    """Whether the compiled trace knows the surface: no departure, a compiled kind and not too many of its terms."""
-    if surface.departure is not None:
+    """Whether the compiled trace knows the surface: kind and apertures compiled, no departure, not too many terms."""
+    if surface.departure is not None or any(SHAPES[aperture.shape].code is None for aperture in surface.apertures):
         return False
     kind = KINDS[surface.kind]
     return surface.coefficients is None or (kind.code is not None and len(surface.coefficients) <= kind.compiled)

@@ -66,7 +66,7 @@ class Shape:
     reach: sizes -> from which to which |y| it extends in the cross section.
     symmetry: "round", "mirror" (in x and y) or "none".
     zemax: keywords of a .zmx file for it as an aperture and as an obscuration.
-    code: of fused/apertures.h.
+    code: of fused/apertures.h; None: clipped by torch alone.
     sizes: how many numbers it has, of 0 or more; None: points x, y, as many as there are, from 3 on.
     is_hollow: sizes -> whether light may be stopped within it.
     """
@@ -75,7 +75,7 @@ class Shape:
     reach: Callable[[Sequence[float]], tuple[float, float]]
     symmetry: str
     zemax: tuple[str, str]
-    code: int
+    code: int | None = None
     sizes: int | None = 2
     is_hollow: Callable[[Sequence[float]], bool] = lambda sizes: False
 

@@ -9,6 +9,7 @@ from torch import Tensor
 from raytrace.maths.result import lent
 from raytrace.maths.value import value
 from raytrace.media.glass import check_unit, check_wavelengths, refractive_index
+from raytrace.system.aperture import SHAPES
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface
 from raytrace.words import did_you_mean
@@ -313,8 +314,20 @@ def check(lens: Lens) -> None:
     if at_infinity and lens.aperture.kind in ("object_na", "object_cone_angle"):
         raise ValueError(f"aperture {lens.aperture.kind} needs an object at a finite distance")
     _check_cone(lens)
+    for number, surface in enumerate(lens.surfaces):
+        _check_apertures(surface, f"surface {number}")
     if lens.fields.kind == "angle" and bool((torch.hypot(lens.fields.x, lens.fields.y) >= 90).any()):
         raise ValueError("field angles reach 90 degrees: rays start from the plane of the entrance pupil")
+
+
+def _check_apertures(surface: Surface, where: str) -> None:
+    """Refuse a shape of aperture that there is not, and sizes that it does not have."""
+    for aperture in surface.apertures:
+        if aperture.shape not in SHAPES:
+            known = ", ".join(SHAPES)
+            raise ValueError(f"{where}: an aperture of shape {aperture.shape!r}; expected one of {known}")
+        if wrong := SHAPES[aperture.shape].objection(aperture.extent):
+            raise ValueError(f"{where}: an aperture ({aperture.shape}) {wrong}")
 
 
 def _check_cone(lens: Lens) -> None:

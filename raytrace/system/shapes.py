@@ -94,7 +94,7 @@ KINDS = {
     kind.name: kind
     for kind in (
         Kind(EVEN, even_terms, zemax="EVENASPH", words=("even", "evenasph"), code=3),
-        Kind("odd asphere", odd_terms, step=1, zemax="ODDASPHE", words=("odd", "oddasphe"), code=4),
+        Kind("odd asphere", odd_terms, step=1, zemax="ODDASPHE", words=("odd", "oddasphe"), code=4, compiled=8),
     )
 }
 
