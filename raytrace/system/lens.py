@@ -10,7 +10,7 @@ from raytrace.maths.result import lent
 from raytrace.maths.value import value
 from raytrace.media.glass import check_unit, check_wavelengths, refractive_index
 from raytrace.system.aperture import SHAPES
-from raytrace.system.shapes import EVEN, KINDS
+from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface
 from raytrace.words import did_you_mean
 
@@ -155,8 +155,6 @@ def changed(surface: Surface, numbers: Mapping[str, object], where: str, *, like
         if name not in (*known, "radius"):
             meant = did_you_mean(name, [*known, "radius"])
             raise ValueError(f"{where} has no {name!r}{meant} (it has {', '.join(known)}, radius)")
-    if given.get("kind", EVEN) not in KINDS:
-        raise ValueError(f"{where}: kind {given['kind']!r}; expected one of {', '.join(KINDS)}")
     if "radius" in given:
         if "curvature" in given:
             raise ValueError(f"{where}: both radius and curvature are given; leave one out")
@@ -164,10 +162,10 @@ def changed(surface: Surface, numbers: Mapping[str, object], where: str, *, like
         if bool(radius == 0):
             raise ValueError(f"{where}: radius 0; a plane has radius inf")
         given["curvature"] = 1 / radius
-    return dataclasses.replace(
-        surface,
-        **{name: _like(v, like) if name in numeric and v is not None else v for name, v in given.items()},
-    )
+    made = {name: _like(v, like) if name in numeric and v is not None else v for name, v in given.items()}
+    found = dataclasses.replace(surface, **made)
+    _check_kinds(found, where)
+    return found
 
 
 def field_points(fields: Tensor | Sequence | float | None, *, like: "Lens | Tensor") -> Tensor:
@@ -315,13 +313,15 @@ def check(lens: Lens) -> None:
         raise ValueError(f"aperture {lens.aperture.kind} needs an object at a finite distance")
     _check_cone(lens)
     for number, surface in enumerate(lens.surfaces):
-        _check_apertures(surface, f"surface {number}")
+        _check_kinds(surface, f"surface {number}")
     if lens.fields.kind == "angle" and bool((torch.hypot(lens.fields.x, lens.fields.y) >= 90).any()):
         raise ValueError("field angles reach 90 degrees: rays start from the plane of the entrance pupil")
 
 
-def _check_apertures(surface: Surface, where: str) -> None:
-    """Refuse a shape of aperture that there is not, and sizes that it does not have."""
+def _check_kinds(surface: Surface, where: str) -> None:
+    """Refuse a kind of sag or a shape of aperture that there is not, and sizes that a shape does not have."""
+    if surface.kind not in KINDS:
+        raise ValueError(f"{where}: kind {surface.kind!r}; expected one of {', '.join(KINDS)}")
     for aperture in surface.apertures:
         if aperture.shape not in SHAPES:
             known = ", ".join(SHAPES)
