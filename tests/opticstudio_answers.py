@@ -14,7 +14,6 @@ from pathlib import Path
 import torch
 
 import raytrace as rt
-from raytrace.analysis.mtf import mtf_through_focus as mtf_through_focus_of
 from raytrace.kernels import diffraction
 from raytrace.maths import pupil, zernike
 from raytrace.media import glass
@@ -372,8 +371,8 @@ def mtf_geometric(case):
 def mtf_through_focus(case):
     lens = lens_of(case)
     distances = lens.surfaces[-2].thickness + tensor(case["shift"])
-    found = mtf_through_focus_of(lens, case["frequency"], distances, fields=fields_of(case))
-    return flat(found.tangential, found.sagittal)
+    found = [rt.mtf(lens.at(sensor_distance=d), case["frequency"], fields=fields_of(case)) for d in distances]
+    return flat(*(mtf.tangential for mtf in found), *(mtf.sagittal for mtf in found))
 
 
 def encircled(case):

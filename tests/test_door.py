@@ -373,3 +373,79 @@ def test_an_element_at_the_stop_of_a_lens_and_an_element_as_a_lens():
     traced = rt.element_lens(small, sensor_distance=35.5, object_distance=1000.0, substrate=0.5)
     focus = rt.paraxial_image_distance(traced, traced.surfaces[0].thickness)
     assert float(focus) == pytest.approx(35.5, rel=2e-3)  # the plane face stands half a millimetre before the thin one
+
+
+# -- analyses ----------------------------------------------------------------------------------------------------------
+
+#: Verb, its keywords in plain numbers, the same for the command, a column of the table and a word of the text.
+ANALYSES = (
+    ("ray_fan", {"fields": [0, (3, 9)], "points": 5}, "--field 0 3,9 --points 5", "sagittal", "pupil"),
+    (
+        "opd_fan",
+        {"reference": "own", "points": 5, "wavelengths": [0.55, 0.5]},
+        "--reference own --points 5 --wavelength 0.55 0.5",
+        "tangential",
+        "waves",
+    ),
+    (
+        "wavefront",
+        {"fields": [9], "size": 16, "terms": 9, "numbering": "fringe"},
+        "--field 9 --size 16 --terms 9 --numbering fringe",
+        "coefficient",
+        "spherical",
+    ),
+    ("distortion", {"samples": 3}, "--samples 3", "f_theta", "%"),
+    ("field_curvature", {"fields": [5, 9]}, "--fields 5 9", "sagittal", "mm"),
+    ("lateral_colour", {"wavelengths": [0.5, 0.6], "samples": 3}, "--wavelengths 0.5 0.6 --samples 3", "shift", "µm"),
+    ("relative_illumination", {"fields": [3, 9]}, "--field 3 9", "illumination", "sr"),
+    ("seidel", {"fields": [9], "kind": "waves"}, "--field 9 --kind waves", "W040", "optical invariant"),
+    ("longitudinal_aberration", {"points": 5, "wavelengths": [0.55]}, "--points 5 --wavelength 0.55", "crossing", "mm"),
+    ("distortion_grid", {"points": 3}, "--points 3", "distortion", "largest"),
+    ("incidence", {"samples": 3, "surfaces": True}, "--samples 3 --surfaces", "chief", "upper"),
+    ("rms_over_field", {"samples": 3, "spot": True}, "--samples 3 --spot", "rms", "all, weighted"),
+    ("mtf", {"frequencies": [10, 20], "fields": [9]}, "--frequency 10 20 --field 9", "diffraction_limit", "1/mm"),
+    (
+        "mtf",
+        {"frequencies": [20], "through_focus": 0.1, "geometric": True},
+        "--frequency 20 --through-focus 0.1 --geometric",
+        "sensor_distance",
+        "mm",
+    ),
+    ("encircled_energy", {"radii": [0.01, 0.02], "geometric": True}, "--radius 0.01 0.02 --geometric", "share", "mm"),
+)
+
+
+@pytest.mark.parametrize(("verb", "keywords", "words", "column", "said"), ANALYSES, ids=lambda value: str(value)[:24])
+def test_an_analysis_takes_plain_numbers_and_tabulates_prints_and_draws_itself(
+    verb, keywords, words, column, said, capsys, tmp_path
+):
+    lens = rt.read_lens("cooke_triplet")
+    found = getattr(rt, verb)(lens, **keywords)
+    frame = found.to_frame()
+    assert frame[column].notna().any()
+    assert len(frame) == len(found.document()["results"])
+    assert said in str(found)
+    assert found.plot(tmp_path / "figure.png").axes
+    assert (tmp_path / "figure.png").stat().st_size > 10_000
+    command = [verb.replace("_", "-"), "cooke_triplet", *words.split()]
+    assert main([*command, "--json"]) == 0
+    assert_alike(json.loads(capsys.readouterr().out), found.document())
+    assert main([*command, "--plot", str(tmp_path / "command.png")]) == 0
+    assert len(capsys.readouterr().out.split()) == len(str(found).split())
+    assert (tmp_path / "command.png").stat().st_size > 10_000
+
+
+def test_analyses_carry_a_gradient_and_tell_what_they_lack():
+    lens = rt.read_lens("cooke_triplet")
+    curvature = lens.surfaces[3].curvature.clone().requires_grad_()
+    found = rt.mtf(lens.replace(3, curvature=curvature), frequencies=[20], fields=[9])
+    (slope,) = torch.autograd.grad(found.tangential.sum(), curvature)
+    assert slope.isfinite()
+    assert str(found)
+    assert rt.ray_fan(lens.replace(3, curvature=curvature)).plot().axes
+    with pytest.warns(rt.LostRays, match="no ray of field 80 degrees reaches the sensor"):
+        rt.ray_fan(lens, fields=[0, 80])
+    with pytest.raises(rt.OutOfReach, match="no ray of field 80 degrees reaches the sensor"):
+        rt.wavefront(lens, fields=[0, 80])
+    with pytest.raises(ValueError, match="all fields are on the axis"):
+        rt.distortion(lens, fields=[0])

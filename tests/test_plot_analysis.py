@@ -102,6 +102,17 @@ def test_curves_are_drawn_finer_than_they_are_printed_and_what_was_asked_is_mark
             assert min(np.abs(y - mark.get_ydata()).max() for y in near) < 0.01
 
 
+def test_mtf_through_focus_is_smooth_and_passes_through_what_is_told():
+    found = rt.mtf(read_lens(LENSES / "cooke_triplet.zmx"), [20], through_focus=0.3, geometric=True, fields=[0, 10])
+    (panel,) = found.plot().axes
+    lines = curves(panel)
+    assert len(lines) == 4
+    for line, values in zip(lines, torch.stack([found.tangential, found.sagittal], -1).flatten(1).T, strict=True):
+        x, y = line.get_data()
+        np.testing.assert_allclose(np.interp(found.sensor_distances, x, y), values, atol=1e-3)
+        assert np.abs(np.diff(y, 2)).max() < 0.01  # no corners
+
+
 @pytest.mark.parametrize("lens", ["phone", "cooke_triplet", "singlet"])
 def test_illumination_is_a_line(drawn, lens):
     (panel,) = drawn("relative-illumination", lens).axes

@@ -123,18 +123,10 @@ def mtf(
     return _mtf(lens, fields, given, geometric, marked=asked is not None)
 
 
-def mtf_through_focus(
-    lens: Lens, frequency: Tensor | float, sensor_distances: Tensor, *, geometric: bool = False, fields: Points = None
-) -> ThroughFocusMtf:
-    """MTF at one frequency (cycles/mm) with the sensor at each of the distances (S,) mm; the rest as for `mtf`."""
-    lens, fields = setting(lens, fields, None, every=True)
-    return _through_focus(lens, fields, vector(frequency, like=lens), sensor_distances, geometric)
-
-
 def _mtf(lens: Lens, fields: Tensor, frequencies: Tensor, geometric: bool, *, marked: bool = False) -> Mtf:
     tangential, sagittal = (_geometric if geometric else _diffraction)(lens, fields, frequencies)
-    limit = None if geometric else diffraction_limit(lens, frequencies)
-    return Mtf(lens, fields, frequencies, tangential, sagittal, limit, geometric, marked)
+    perfect = _circle(frequencies[:, None] / cutoff(lens, lens.wavelengths)) @ wavelength_shares(lens)
+    return Mtf(lens, fields, frequencies, tangential, sagittal, None if geometric else perfect, geometric, marked)
 
 
 def _through_focus(
@@ -162,25 +154,16 @@ def cutoff(lens: Lens, wavelength: Tensor) -> Tensor:
     return 1e3 / (wavelength * first_order(lens).working_f_number)
 
 
-def diffraction_limit(lens: Lens, frequencies: Tensor) -> Tensor:
-    """MTF (K,) of a circular pupil without aberrations, (2/π)(acos s - s √(1 - s²)), s = ν/cutoff, by weights."""
-    return (_circle(frequencies[:, None] / cutoff(lens, lens.wavelengths)) * wavelength_shares(lens)).sum(-1)
-
-
 def _diffraction(lens: Lens, fields: Tensor, frequencies: Tensor) -> tuple[Tensor, Tensor]:
     whole, rows = scene_of(lens, fields), []
     for field in fields.split(1, 1):  # each on a grid as fine as its own blur asks for
         pupil = exit_pupil(Scene(whole.lens, field, whole.wavelengths))
         shift, weights = _from_primary(lens, pupil.centre), wavelength_shares(lens) * pupil.light
-        otfs = (_along(lines, pupil.energy, frequencies, pupil.step[axis]) for axis, lines in _lines(pupil.amplitude))
-        rows.append([_modulation(otf, frequencies, s, weights) for otf, s in zip(otfs, shift.flip(0), strict=True)])
+        sections = zip((pupil.amplitude.mT, pupil.amplitude), pupil.step.flip(0), shift.flip(0), strict=True)
+        otfs = ((_along(lines, pupil.energy, frequencies, step), place) for lines, step, place in sections)
+        rows.append([_modulation(otf, frequencies, place, weights) for otf, place in otfs])
     tangential, sagittal = (torch.cat(parts) for parts in zip(*rows, strict=True))
     return tangential, sagittal
-
-
-def _lines(amplitude: Tensor) -> tuple[tuple[int, Tensor], tuple[int, Tensor]]:
-    """Lines of the pupil along y, and along x."""
-    return (1, amplitude.transpose(-1, -2)), (0, amplitude)
 
 
 def _along(lines: Tensor, energy: Tensor, frequencies: Tensor, step: Tensor) -> Tensor:

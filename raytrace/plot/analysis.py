@@ -4,6 +4,7 @@ import matplotlib
 import numpy as np
 from matplotlib.colors import Colormap, ListedColormap, Normalize
 from matplotlib.figure import Figure
+from scipy.interpolate import CubicSpline
 
 from raytrace.analysis.chief import Distortion, FieldCurvature, LateralColour
 from raytrace.analysis.encircled import EncircledEnergy
@@ -43,6 +44,7 @@ _SEIDEL = {
     "C2": "lateral colour", "W040": "spherical", "W131": "coma", "W222": "astigmatism", "W220P": "Petzval",
     "W311": "distortion", "W020": "axial colour", "W111": "lateral colour",
 }  # fmt: skip
+_FINE = 241  # places of a smooth curve
 _COLOURS = ("C1", "C2", "W020", "W111", "TAXC", "TLAC", "LAXC")
 
 
@@ -136,11 +138,14 @@ def mtf_curves(found: Mtf, *, asked: Mtf | None = None) -> Figure:
 
 @styled
 def mtf_through_focus_curves(found: ThroughFocusMtf) -> Figure:
-    """Modulation at one frequency over the sensor distance."""
+    """Modulation at one frequency over the sensor distance, a smooth curve through the places computed."""
     modulation = f"modulation at {number_text(float(found.frequency), 4)} cycles/mm"
     _, panel = chart(6.4, 4.0, "sensor distance (mm)", modulation)
     distance = array(found.sensor_distances)
-    by_field(panel, found, distance, tangential=array(found.tangential).T, sagittal=array(found.sagittal).T)
+    fine = np.linspace(distance.min(), distance.max(), _FINE)
+    curves = {"tangential": found.tangential, "sagittal": found.sagittal}
+    smooth = {name: CubicSpline(distance, array(curve))(fine).T.clip(0, 1) for name, curve in curves.items()}
+    by_field(panel, found, fine, **smooth)
     panel.axvline(float(found.lens.surfaces[-2].thickness), color=GREY, linewidth=0.8)
     panel.set(xlim=(distance.min(), distance.max()), ylim=(0, 1.0))
     return finished(panel, found, f"{_light(found)} MTF through focus", 6)
