@@ -32,7 +32,7 @@ from raytrace.kernels.dft import (
     to_grid_mirrored,
     window_moments,
 )
-from raytrace.kernels.radial import is_centred, radii_of_waves, round_moments, second_moments_of_waves, unfold
+from raytrace.kernels.radial import is_centred, light_of_radii, radii_of_waves
 from raytrace.kernels.result import Kernels, combined
 from raytrace.maths import zernike
 from raytrace.maths.grid import Grid
@@ -143,9 +143,8 @@ def _field_kernels(scene: Scene, grid: Grid, order: int) -> Kernels:
     is_round = symmetry(scene) == "round" and is_centred(grid, scene)
     if is_round:
         # One radius tells all: as a row of points, without pixels.
-        radii, matrix = radii_of_waves(grid, cutoff, order)
-        x, y = radii, torch.zeros_like(radii[:1])
-        corner = radii.detach().max()
+        x, _ = radii_of_waves(grid, cutoff, order)
+        y, corner = torch.zeros_like(x[:1]), x.detach().max()
     else:
         nodes = nodes_per_pixel(float(grid.pitch.detach()), cutoff, order)
         afford_sensor("the wave PSF", scene, grid, nodes)
@@ -155,10 +154,7 @@ def _field_kernels(scene: Scene, grid: Grid, order: int) -> Kernels:
     U = amplitude(light, x, y)
     intensity = U.real**2 + U.imag**2
     if is_round:
-        kernel = unfold(grid, intensity[..., 0, :] @ matrix.mT)
-        centroid, covariance = round_moments(
-            intensity[..., 0, :] @ second_moments_of_waves(grid, cutoff, order).mT, kernel
-        )
+        kernel, centroid, covariance = light_of_radii(grid, cutoff, order, intensity[..., 0, :])
     else:
         kernel = integrate(intensity, weight, grid.pitch)
         centroid, covariance = window_moments(intensity, x, y, weight, grid.pitch)

@@ -33,7 +33,7 @@ from raytrace.kernels.dft import (
     window_moments,
 )
 from raytrace.kernels.paraxial import chief_ray_height
-from raytrace.kernels.radial import is_centred, radii_of_waves, reach, round_moments, second_moments_of_waves, unfold
+from raytrace.kernels.radial import is_centred, light_of_radii, radii_of_waves, reach
 from raytrace.kernels.result import Kernels, moments
 from raytrace.maths import zernike as polynomials
 from raytrace.maths.grid import Grid
@@ -126,7 +126,7 @@ def _round_kernels(scene: Scene, lens: Paraxial, window: Grid, order: int) -> tu
     shared = bool((lens.frequency == lens.frequency[:1]).all())
     frequency = (lens.frequency[:1] if shared else lens.frequency)[..., None]
     steepest = float(scene.largest(lens.frequency.detach().abs().max()))
-    radii, matrix = radii_of_waves(window, 2 * steepest, order)
+    radii, _ = radii_of_waves(window, 2 * steepest, order)
     corner = float(window.pitch.detach()) * reach(window)
     phase = 2 * math.pi * steepest * corner + 2 * float(scene.largest(lens.defocus.detach().abs().max()))
     rings = rings_and_arms(phase, order)[0]
@@ -139,8 +139,7 @@ def _round_kernels(scene: Scene, lens: Paraxial, window: Grid, order: int) -> tu
         real, imag = (torch.einsum("dfwkj,dfwj->dfwk", J0, part) for part in (spectrum.real, spectrum.imag))
         intensities.append(math.pi * lens.frequency[..., None] ** 2 * (real * real + imag * imag))
     intensity = torch.cat(intensities, -1)
-    kernel = unfold(window, intensity @ matrix.mT)
-    return kernel, *round_moments(intensity @ second_moments_of_waves(window, 2 * steepest, order).mT, kernel)
+    return light_of_radii(window, 2 * steepest, order, intensity)
 
 
 def paraxial(scene: Scene) -> Paraxial:

@@ -47,18 +47,16 @@ def radii_of_waves(grid: Grid, cutoff: float, order: int) -> tuple[Tensor, Tenso
     return radii * grid.pitch, matrix * grid.pitch**2
 
 
-def second_moments_of_waves(grid: Grid, cutoff: float, order: int) -> Tensor:
-    """Matrix (2, K) mm⁴ from the intensity at the same radii to ∬ I x² and ∬ I y² over the window."""
-    return grid.pitch.new_tensor(_rule_of(grid, cutoff, order)[2]) * grid.pitch**4
-
-
-def round_moments(second: Tensor, kernel: Tensor) -> tuple[Tensor, Tensor]:
-    """Centroid (2, ...) mm and covariance (3, ...) mm² of round light about the axis inside the window; 0 if there is
-    none. second: (..., 2) of `second_moments_of_waves`; kernel: (..., rows, columns).
+def light_of_radii(grid: Grid, cutoff: float, order: int, intensity: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Kernel (..., rows, columns), and of the light inside the window centroid (2, ...) mm and covariance (3, ...) mm²,
+    0 if there is none, of round light about the axis, from its intensity (..., K) at those radii.
     """
-    xx, yy = (safe_divide(part, kernel.sum((-2, -1))) for part in second.unbind(-1))
+    _, matrix, second = (grid.pitch.new_tensor(a) for a in _rule_of(grid, cutoff, order))
+    kernel = unfold(grid, intensity @ (matrix * grid.pitch**2).mT)
+    squares = intensity @ (second * grid.pitch**4).mT
+    xx, yy = (safe_divide(part, kernel.sum((-2, -1))) for part in squares.unbind(-1))
     zero = torch.zeros_like(xx)
-    return torch.stack([zero, zero]), torch.stack([xx, zero, yy])
+    return kernel, torch.stack([zero, zero]), torch.stack([xx, zero, yy])
 
 
 def _rule_of(grid: Grid, cutoff: float, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -121,15 +121,17 @@ def clear_share(clearances: Sequence[Tensor], radius: Tensor, *, closed: bool = 
     share = None
     for clearance in clearances:
         centre, along, across = cells(clearance, radius, closed=closed)
-        passed = 1 - below_edge(-centre, along, across)
+        passed = 1 - below_edge(-centre, along, across)[0]
         share = passed if share is None else torch.minimum(share, passed)
     return 1.0 if share is None else share
 
 
-def below_edge(z: Tensor, a: Tensor, b: Tensor) -> Tensor:
+def below_edge(z: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
     """P(a s + b t < z) for s, t uniform in [-1, 1]: a straight middle and two parabolic ends; finite if a = b = 0.
 
     p = max(|a|, |b|), q = min(|a|, |b|):  1/2 + z/2p for |z| < p - q;  a tail of (p + q - |z|)²/8pq beyond
+
+    And its derivative in z, the density there; 0 for a cell without width.
     """
     p, q = torch.maximum(a.abs(), b.abs()), torch.minimum(a.abs(), b.abs())
     distance = z.abs()
@@ -139,7 +141,9 @@ def below_edge(z: Tensor, a: Tensor, b: Tensor) -> Tensor:
     straight = 0.5 - 0.5 * torch.where(wide, distance, 0.0) / torch.where(wide, p, 1.0)
     reach = torch.where(on_end, p + q - distance, 0.0)
     tail = torch.where(middle, straight, reach * reach / torch.where(on_end, 8 * p * q, 1.0))
-    return torch.where(z > 0, 1 - tail, tail)
+    end = reach / torch.where(on_end, 4 * p * q, 1.0)
+    density = torch.where(wide, 0.5 / torch.where(p > 0, p, 1.0), end)
+    return torch.where(z > 0, 1 - tail, tail), density
 
 
 def _shares(centre: Tensor, along: Tensor, across: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -147,18 +151,8 @@ def _shares(centre: Tensor, along: Tensor, across: Tensor, count: int) -> tuple[
     reached = (centre > -1) & (centre < count + 1)
     centre = torch.where(reached, centre, -1.0)
     edge = torch.round(centre).detach()
-    return edge.long() - 1, 1 - below_edge(edge - centre, along, across), _density(edge - centre, along, across)
-
-
-def _density(z: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """The derivative of `below_edge` in z; 0 for a cell without width."""
-    p, q = torch.maximum(a.abs(), b.abs()), torch.minimum(a.abs(), b.abs())
-    distance = z.abs()
-    middle = distance <= p - q
-    on_end = ~middle & (distance < p + q)
-    top = 0.5 / torch.where(p > 0, p, 1.0)
-    end = torch.where(on_end, p + q - distance, 0.0) / torch.where(on_end, 4 * p * q, 1.0)
-    return torch.where(middle & (p > 0), top, end)
+    below, density = below_edge(edge - centre, along, across)
+    return edge.long() - 1, 1 - below, density
 
 
 def _in_pixels(grid: Grid, points: Tensor, axis: int) -> Tensor:
