@@ -9,7 +9,7 @@ from torch import Tensor
 
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
-from raytrace.optics.focus import focus_moments, image_rays, real_image_distance
+from raytrace.optics.focus import best_focus, focus_moments, image_rays, real_image_distance
 from raytrace.optics.paraxial import paraxial_image_distance
 from raytrace.system.lens import Lens, with_object_distance
 
@@ -57,3 +57,12 @@ def sensor_range(lens: Lens, distances: Sequence[float], *, fields: Tensor, widt
     images = torch.cat([one.flatten() for one in found])
     margin = 0.5 * width / math.sqrt(2 * float(torch.cat(steepness).max()) or math.inf)
     return float(images.min()) - margin, float(images.max()) + margin
+
+
+def place_of(lens: Lens) -> dict[str, float]:
+    """Where the sensor is, mm, and the object distances from vertex 1 in focus there, m: by name of the column."""
+    return {
+        "sensor_mm": float(lens.surfaces[-2].thickness),
+        "focus_paraxial_m": 1e-3 * distance_in_focus(lens, paraxial_image),
+        "focus_rms_m": 1e-3 * distance_in_focus(lens, best_focus),
+    }

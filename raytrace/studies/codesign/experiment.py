@@ -27,12 +27,12 @@ from raytrace.formats import write_lens
 from raytrace.formats.pictures import Pictures, crop, draws
 from raytrace.maths.grid import grid
 from raytrace.maths.result import plain
-from raytrace.optics.focus import best_focus, focused, real_image_distance
+from raytrace.optics.focus import focused, real_image_distance
+from raytrace.studies.codesign import conjugates
 from raytrace.studies.codesign.closed_form import optimise_closed_form, out_of_focus, power_spectrum
-from raytrace.studies.codesign.conjugates import distance_in_focus, paraxial_image
 from raytrace.studies.codesign.settings import Settings
 from raytrace.studies.descent import NoOptimum
-from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance, with_wavelengths
+from raytrace.system.lens import Lens, with_object_distance, with_sensor_distance, with_wavelengths
 
 _SAMPLE = 10  # last number of the key of what a sample draws
 _TEST_EPOCH = 2**20  # test samples are those of an epoch that no training reaches
@@ -77,10 +77,7 @@ def lens_at_start(lens: Lens, settings: Settings) -> Lens:
     wavelengths, weights = (lens.wavelengths.new_tensor(n) for n in (settings.wavelengths, settings.wavelength_weights))
     if weights.shape != wavelengths.shape or not bool((weights >= 0).all() and weights.sum() > 0):
         raise ValueError(f"{len(weights)} weights of {len(wavelengths)} wavelengths; expected one ≥ 0 for each")
-    lens = with_wavelengths(lens, wavelengths, weights)
-    if settings.f_number is not None:
-        number = SystemAperture("image_f_number", wavelengths.new_tensor(settings.f_number))
-        lens = dataclasses.replace(lens, aperture=number)
+    lens = with_wavelengths(lens, wavelengths, weights).at(f_number=settings.f_number)
     real_image_distance(lens, wavelengths.new_tensor([settings.near, settings.far]))  # refuses what has none
     if settings.start in ("paraxial", "rms", "spectral"):
         return focused(lens, settings.focus_distance, on="rms" if settings.start == "rms" else "paraxial")
@@ -273,9 +270,7 @@ def run_model(
         l1_joint=l1_joint,
         l1_before=l1_before,
         l1_drt=held_out_error(own, test_pictures, settings, progress=progress),
-        focus_paraxial_m=1e-3 * distance_in_focus(found, paraxial_image),
-        focus_rms_m=1e-3 * distance_in_focus(found, best_focus),
-        sensor_mm=float(found.surfaces[-2].thickness),
+        **conjugates.place_of(found),
         variables=own.variables.numbers(),
         penalty=float(own.variables.violation().detach()),
         no_optimum=out_of_focus(own),

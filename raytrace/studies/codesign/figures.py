@@ -195,15 +195,20 @@ def _sweep_tick(factor: Factor, value: str) -> str:
 
 
 def _distance_ticks(panel: Axes) -> None:
-    """Marks of object distances in m on an axis of -1/z, none so close to another that their numbers would touch."""
+    """Marks of object distances in m on an axis of -1/z."""
     low, high = panel.get_ylim()
-    chosen: list[float] = []
-    for distance in (np.inf, *_SWEEP_MARKS):
-        place = -1 / distance
-        if low <= place <= high and all(abs(place + 1 / other) > (high - low) / 15 for other in chosen):
-            chosen.append(distance)
-    panel.set_yticks([-1 / z for z in chosen], ["∞" if np.isinf(z) else f"{z:g}" for z in chosen])
+    chosen = _apart({z: -1 / z for z in (np.inf, *_SWEEP_MARKS)}, low, high, 15)
+    panel.set_yticks([*chosen.values()], ["∞" if np.isinf(z) else f"{z:g}" for z in chosen])
     panel.set_ylim(low, high)
+
+
+def _apart(places: Mapping[float, float], low: float, high: float, parts: int) -> dict[float, float]:
+    """Of marks with their places those from low to high, none nearer to an earlier one than 1/parts of that."""
+    chosen: dict[float, float] = {}
+    for mark, place in places.items():
+        if low <= place <= high and all(abs(place - other) > (high - low) / parts for other in chosen.values()):
+            chosen[mark] = place
+    return chosen
 
 
 def _legend(figure: Figure, panel: Axes, more: Sequence[Line2D] = ()) -> None:
@@ -239,10 +244,5 @@ def _image(distance: float, conjugates: tuple[Sequence[float], Sequence[float]])
 
 def _marks(conjugates: tuple[Sequence[float], Sequence[float]], low: float, high: float) -> list[int]:
     """Round object distances in m whose images lie from low to high, none closer than a twelfth of that to another."""
-    chosen: dict[int, float] = {}
-    for distance in _MARKS:
-        place = _image(distance, conjugates)
-        known = min(conjugates[1]) <= distance <= max(conjugates[1])
-        if known and low <= place <= high and all(abs(place - o) > (high - low) / 12 for o in chosen.values()):
-            chosen[distance] = place
-    return sorted(chosen)
+    nearest, furthest = min(conjugates[1]), max(conjugates[1])
+    return sorted(_apart({z: _image(z, conjugates) for z in _MARKS if nearest <= z <= furthest}, low, high, 12))

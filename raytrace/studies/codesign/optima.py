@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from raytrace.camera.camera import Camera
-from raytrace.optics.focus import best_focus
+from raytrace.studies.codesign import conjugates
 from raytrace.studies.codesign.closed_form import camera_error, even_distances, optimise_closed_form
-from raytrace.studies.codesign.conjugates import distance_in_focus, paraxial_image
 from raytrace.studies.codesign.experiment import camera
 from raytrace.studies.codesign.settings import AFTER_PARAXIAL, Settings
 from raytrace.system.lens import Lens
@@ -68,9 +67,7 @@ def closed_form(lens: Lens, settings: Settings, spectrum: Tensor) -> Optimum:
         error_drt = camera_error(own, spectrum, even_distances(own))
     return Optimum(
         model=settings.model,
-        sensor_mm=float(found.surfaces[-2].thickness),
-        focus_paraxial_m=1e-3 * distance_in_focus(found, paraxial_image),
-        focus_rms_m=1e-3 * distance_in_focus(found, best_focus),
+        **conjugates.place_of(found),
         error=float(error),
         error_drt=float(error_drt),
         variables=own.variables.numbers(),
