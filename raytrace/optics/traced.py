@@ -227,7 +227,9 @@ def _flat(rays: Rays) -> Rays:
 
 def _cells(part: dict[str, Tensor]) -> list[list]:
     """The columns as numbers and words; None for what is not there."""
-    plain = {name: column.tolist() for name, column in part.items()} | {"status": [STATUS[s] for s in part["status"]]}
+    plain = {name: column.tolist() for name, column in part.items()} | {
+        "status": [STATUS[s] for s in part["status"].tolist()]
+    }
     return [[None if cell != cell else cell for cell in column] for column in plain.values()]
 
 
