@@ -16,7 +16,7 @@ from raytrace.bench.measure import (
     variables,
     with_leaves,
 )
-from raytrace.bench.reference import reference_surface, spot_gradient, trace_reference
+from raytrace.bench.reference import ReferenceSurface, spot_gradient, trace_reference
 from raytrace.cli import main
 from raytrace.files import shipped
 from raytrace.formats import read_lens
@@ -100,7 +100,7 @@ def test_one_surface_agrees_with_the_reference(conic, coefficients, is_mirror):
     indices = [tensor(1.0), tensor(1.0 if is_mirror else 1.6)]
     end = trace_surfaces([surface], rays, indices=indices)
     assert bool(end.valid.all())
-    reference = [reference_surface(0.04, conic, coefficients, 0.0, float(indices[1]), is_mirror)]
+    reference = [ReferenceSurface(0.04, conic, coefficients, 0.0, float(indices[1]), is_mirror)]
     for i in range(3):
         exact = trace_reference(reference, 1.0, position[:, i].tolist(), direction[:, i].tolist())
         assert end.position[:, i].tolist() == pytest.approx([float(x) for x in exact.position], rel=1e-14, abs=1e-14)
@@ -141,7 +141,7 @@ def test_reference_gradient_is_a_derivative():
     [((0, 30, -5), (0, 0, 1), 0.05, "misses"), ((0, 9, 0), (0, 0.9, 0.1), -0.1, "totally reflected")],
 )
 def test_lost_reference_ray_is_an_error(position, direction, curvature, words):
-    glass = [reference_surface(curvature, index=1.0)]
+    glass = [ReferenceSurface(curvature, index=1.0)]
     with pytest.raises(ValueError, match=words):
         trace_reference(glass, 1.8, position, direction)
 

@@ -70,8 +70,12 @@ def cases(sizes) -> list[Case]:
     compiled trace lack."""
     engines = ["fused", "eager"] if prepare() == "fused" else ["eager"]
     found = [Case(what, engine, *pair) for engine in engines for what, pair in _traced(sizes.less).items()]
-    kernels = _symmetries(sizes.distances) | _wavelengths(sizes.less) | _object_distances(sizes.distances)
-    return [*found, *(Case(what, "auto", *pair) for what, pair in kernels.items())]
+    others = _kernel_cases(sizes.distances) | _launched(sizes.less)
+    return [*found, *(Case(what, "auto", *pair) for what, pair in sorted(others.items(), key=_kind))]
+
+
+def _kind(case: tuple[str, object]) -> int:
+    return ("symmetry", "wavelengths", "object distances").index(case[0].partition(":")[0])
 
 
 def _gain(case: Case, repeats: int) -> Gain:
@@ -133,14 +137,14 @@ def _through(lens: Lens, rays: Rays) -> Rays:
 # -- kernels: symmetry, wavelengths, object distances ------------------------------------------------------------------
 
 
-def _symmetries(distances: int) -> dict[str, tuple[Callable, Callable]]:
-    """On the axis a meridian, off it half the pupil; over the same light where `scene.symmetry` sees none.
+def _kernel_cases(distances: int) -> dict[str, tuple[Callable, Callable]]:
+    """Symmetry: on the axis a meridian, off it half the pupil; over the same light where `scene.symmetry` sees none.
 
     A field 1e-12 degrees off in x is on the axis to rounding; one along x is one along y, columns and rows exchanged.
     """
     found = {}
     for model, count in (("gaussian", distances), ("drt", 3), ("wave", 1)):
-        many, at = _distances(count), functools.partial(_kernels, model)
+        at, many = functools.partial(_kernels, model), _distances(count)
         words = "one object distance" if count == 1 else f"{count} object distances"
         found[f"symmetry: a meridian over the whole pupil, {model} on the axis, {words}"] = (
             functools.partial(at, (0.0, 0.0), many),
@@ -150,18 +154,21 @@ def _symmetries(distances: int) -> dict[str, tuple[Callable, Callable]]:
             functools.partial(at, (0.0, FIELD), many),
             lambda at=at, many=many: at((FIELD, 0.0), many).mT,
         )
+    for model in ("gaussian", "drt"):
+        at, many = functools.partial(_kernels, model, (0.0, 0.0)), _distances(distances)
+        found[f"wavelengths: {len(_WAVELENGTHS)} in one call over a call each, {model} on the axis"] = (
+            functools.partial(at, _distances(1), _WAVELENGTHS),
+            lambda at=at: torch.stack([at(_distances(1), (one,)) for one in _WAVELENGTHS]).mean(0),
+        )
+        found[f"object distances: {distances} in one call over a call each, {model} on the axis"] = (
+            functools.partial(at, many),
+            lambda at=at, many=many: torch.cat([at(distance[None]) for distance in many]),
+        )
     return found
 
 
-def _wavelengths(rays: int) -> dict[str, tuple[Callable, Callable]]:
-    words = f"wavelengths: {len(_WAVELENGTHS)} in one call over a call each"
-    found = {}
-    for model in ("gaussian", "drt"):
-        at = functools.partial(_kernels, model, (0.0, 0.0), _distances(1))
-        found[f"{words}, {model} on the axis"] = (
-            functools.partial(at, _WAVELENGTHS),
-            lambda at=at: torch.stack([at((one,)) for one in _WAVELENGTHS]).mean(0),
-        )
+def _launched(rays: int) -> dict[str, tuple[Callable, Callable]]:
+    """All wavelengths launched and traced at once."""
     lens, pupil = double_gauss(), sobol(max(1, rays // 4))[0]
     field = torch.tensor([0.0, FIELD], dtype=torch.float64)[:, None, None]
 
@@ -170,22 +177,10 @@ def _wavelengths(rays: int) -> dict[str, tuple[Callable, Callable]]:
         with torch.no_grad():
             return trace_bundle((lens, field, colours, pupil)).position[:2]
 
-    found[f"{words}, launch and trace of {pupil.shape[1]:,} rays"] = (
-        lambda: hits(_WAVELENGTHS),
-        lambda: torch.cat([hits([one]) for one in _WAVELENGTHS], 1),
+    words = (
+        f"wavelengths: {len(_WAVELENGTHS)} in one call over a call each, launch and trace of {pupil.shape[1]:,} rays"
     )
-    return found
-
-
-def _object_distances(count: int) -> dict[str, tuple[Callable, Callable]]:
-    many, found = _distances(count), {}
-    for model in ("gaussian", "drt"):
-        at = functools.partial(_kernels, model, (0.0, 0.0))
-        found[f"object distances: {count} in one call over a call each, {model} on the axis"] = (
-            functools.partial(at, many),
-            lambda at=at: torch.cat([at(distance[None]) for distance in many]),
-        )
-    return found
+    return {words: (lambda: hits(_WAVELENGTHS), lambda: torch.cat([hits([one]) for one in _WAVELENGTHS], 1))}
 
 
 def _distances(count: int) -> Tensor:

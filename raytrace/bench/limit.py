@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from raytrace.bench.measure import name_of, shape_of
 from raytrace.fused.library import NoCompiler, compiler, run_compiler
 from raytrace.fused.trust import private_folder
 from raytrace.maths.value import to
@@ -30,15 +31,8 @@ _PLANE, _SPHERE, _ASPHERE = range(3)
 
 class _Surface(ctypes.Structure):
     _fields_ = (
-        ("kind", ctypes.c_int32),
-        ("bends", ctypes.c_int32),
-        ("terms", ctypes.c_int32),
-        ("reserved", ctypes.c_int32),
-        ("gap", ctypes.c_double),
-        ("curvature", ctypes.c_double),
-        ("shape", ctypes.c_double),
-        ("before", ctypes.c_double),
-        ("behind", ctypes.c_double),
+        *((name, ctypes.c_int32) for name in ("kind", "bends", "terms", "reserved")),
+        *((name, ctypes.c_double) for name in ("gap", "curvature", "shape", "before", "behind")),
         ("coefficients", ctypes.c_double * _TERMS),
     )
 
@@ -101,7 +95,7 @@ class Limit:
         self.dtype, self.safe, self.steps, self.threads = dtype, safe, steps, threads
         lens = to(lens, dtype=dtype)
         self._surfaces = _surfaces(lens, safe)
-        self._call = getattr(built.library, f"trace_{str(dtype).removeprefix('torch.')}")
+        self._call = getattr(built.library, f"trace_{name_of(dtype)}")
         self._call.restype = None
         self._out: Rays | None = None
 
@@ -133,27 +127,19 @@ class Limit:
 
 def _surfaces(lens: Lens, safe: bool) -> ctypes.Array:
     indices = media(lens, lens.wavelengths[lens.primary_wavelength])
-    found = [
-        _surface(surface, number, gap, n1, n2)
-        for number, (surface, gap, n1, n2) in enumerate(
-            zip(lens.surfaces[1:], _gaps(lens), indices[:-1], indices[1:], strict=True), 1
-        )
-    ]
+    gaps = [0.0, *(float(surface.thickness) for surface in lens.surfaces[1:-1])]  # rays stand at the first surface
+    rows = zip(lens.surfaces[1:], gaps, indices[:-1], indices[1:], strict=True)
+    found = [_surface(number, *row) for number, row in enumerate(rows, 1)]
     if not safe and any(one.kind == _ASPHERE for one in found):
         raise ValueError("the plain limit knows planes and spheres only")
     return (_Surface * len(found))(*found)
 
 
-def _gaps(lens: Lens) -> Sequence[float]:
-    """mm before every surface after the object; rays stand in the frame of the first."""
-    return [0.0, *(float(surface.thickness) for surface in lens.surfaces[1:-1])]
-
-
-def _surface(surface: Surface, number: int, gap: float, n1: Tensor, n2: Tensor) -> _Surface:
+def _surface(number: int, surface: Surface, gap: float, n1: Tensor, n2: Tensor) -> _Surface:
     conic_alone = surface.conic is not None and surface.coefficients is None
     if surface.is_mirror or surface.apertures or not is_even(surface) or conic_alone:
         raise ValueError(f"surface {number}: the limits know planes, spheres and even aspheres that refract")
-    a = [] if surface.coefficients is None else surface.coefficients.tolist()
+    curvature, conic, a = shape_of(surface, number)
     if len(a) > _TERMS:
         raise ValueError(f"surface {number}: {len(a)} aspheric terms; the limits know up to {_TERMS}")
     return _Surface(
@@ -161,8 +147,8 @@ def _surface(surface: Surface, number: int, gap: float, n1: Tensor, n2: Tensor) 
         bends=int(n2 is not n1),
         terms=len(a),
         gap=gap,
-        curvature=0.0 if surface.curvature is None else float(surface.curvature),
-        shape=1.0 if surface.conic is None else 1 + float(surface.conic),
+        curvature=curvature,
+        shape=1 + conic,
         before=float(n1),
         behind=float(n2),
         coefficients=(ctypes.c_double * _TERMS)(*a),

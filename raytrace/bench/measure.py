@@ -14,7 +14,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from raytrace.bench.reference import ReferenceSurface, reference_surface, spot_gradient, trace_reference
+from raytrace.bench.reference import ReferenceSurface, spot_gradient, trace_reference
 from raytrace.fused import engine as engine_asked_for
 from raytrace.fused import tracing
 from raytrace.maths.pupil import sobol
@@ -210,7 +210,7 @@ def reference_of(lens: Lens) -> tuple[list[ReferenceSurface], float]:
     """The surfaces behind the object and the first index, for `trace_reference`."""
     indices = [float(index) for index in media(lens, lens.wavelengths[lens.primary_wavelength])]
     surfaces = [
-        reference_surface(*shape_of(surface, number), float(surface.thickness), index, surface.is_mirror)
+        ReferenceSurface(*shape_of(surface, number), float(surface.thickness), index, surface.is_mirror)
         for number, (surface, index) in enumerate(zip(lens.surfaces[1:], indices[1:], strict=True), 1)
     ]
     return surfaces, indices[0]

@@ -15,14 +15,17 @@ _STEP = "1e-25"  # of the differences that give gradients: good to about 25 digi
 
 @dataclass(frozen=True)
 class ReferenceSurface:
-    """One surface in mpmath numbers; mm. index: of the medium behind it; coefficients: of r², r⁴, …"""
+    """One surface in machine numbers, each taken as exactly what it is, or in mpmath's; mm.
 
-    curvature: mpf
-    conic: mpf
-    coefficients: tuple[mpf, ...]
-    thickness: mpf
-    index: mpf
-    is_mirror: bool
+    coefficients: of r², r⁴, …; index: of the medium behind it.
+    """
+
+    curvature: mpf | float = 0.0
+    conic: mpf | float = 0.0
+    coefficients: Sequence[float] = ()
+    thickness: mpf | float = 0.0
+    index: mpf | float = 1.0
+    is_mirror: bool = False
 
 
 @dataclass(frozen=True)
@@ -32,20 +35,6 @@ class ReferenceRay:
     position: tuple[mpf, mpf, mpf]
     direction: tuple[mpf, mpf, mpf]
     path: mpf
-
-
-def reference_surface(
-    curvature: float = 0.0,
-    conic: float = 0.0,
-    coefficients: Sequence[float] = (),
-    thickness: float = 0.0,
-    index: float = 1.0,
-    is_mirror: bool = False,
-) -> ReferenceSurface:
-    """A surface from machine numbers, each taken as exactly what it is."""
-    return ReferenceSurface(
-        mpf(curvature), mpf(conic), tuple(mpf(a) for a in coefficients), mpf(thickness), mpf(index), is_mirror
-    )
 
 
 def trace_reference(
@@ -66,9 +55,9 @@ def trace_reference(
             p = [a + t * b for a, b in zip(p, d, strict=True)]
             path += n * t
             d = _bend(surface, p, d, n)
-            n = n if surface.is_mirror else surface.index
+            n = n if surface.is_mirror else mpf(surface.index)
             if number < len(surfaces) - 1:
-                p[2] -= surface.thickness
+                p[2] -= mpf(surface.thickness)
         return ReferenceRay(tuple(p), tuple(d), path)
 
 
@@ -96,7 +85,7 @@ def spot_gradient(
         here = merit(surfaces)
         for number, name in variables:
             moved = list(surfaces)
-            moved[number] = replace(moved[number], **{name: getattr(moved[number], name) + step})
+            moved[number] = replace(moved[number], **{name: mpf(getattr(moved[number], name)) + step})
             gradient.append((merit(moved) - here) / step)
         return gradient
 
@@ -121,7 +110,7 @@ def _distance(surface: ReferenceSurface, p: list[mpf], d: list[mpf]) -> mpf:
 
 
 def _distance_to_conic(surface: ReferenceSurface, p: list[mpf], d: list[mpf]) -> mpf:
-    c, shape = surface.curvature, 1 + surface.conic
+    c, shape = mpf(surface.curvature), 1 + mpf(surface.conic)
     to_plane = -p[2] / d[2]
     if c == 0:
         return to_plane
@@ -143,10 +132,10 @@ def _distance_to_conic(surface: ReferenceSurface, p: list[mpf], d: list[mpf]) ->
 
 def _sag(surface: ReferenceSurface, u: mpf) -> tuple[mpf, mpf]:
     """Sag and its derivative by u = r²."""
-    c = surface.curvature
-    w = sqrt(1 - (1 + surface.conic) * c * c * u)
+    c = mpf(surface.curvature)
+    w = sqrt(1 - (1 + mpf(surface.conic)) * c * c * u)
     sag, slope = c * u / (1 + w), c / (2 * w)
-    for power, a in enumerate(surface.coefficients, 1):
+    for power, a in enumerate(map(mpf, surface.coefficients), 1):
         sag += a * u**power
         slope += power * a * u ** (power - 1)
     return sag, slope
@@ -162,7 +151,7 @@ def _bend(surface: ReferenceSurface, p: list[mpf], d: list[mpf], n: mpf) -> list
         normal, cosine = [-component for component in normal], -cosine
     if surface.is_mirror:
         return [a - 2 * cosine * b for a, b in zip(d, normal, strict=True)]
-    ratio = n / surface.index
+    ratio = n / mpf(surface.index)
     sine_squared = ratio**2 * (1 - cosine**2)
     if sine_squared > 1:
         raise ValueError("the reference ray is totally reflected")

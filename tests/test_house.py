@@ -1,0 +1,40 @@
+"""The house stays small: lines of the package, lengths of its functions, and no helper of the tests written twice."""
+
+import ast
+from collections import defaultdict
+from pathlib import Path
+
+import house
+
+#: `python tests/house.py` tells what they are now.
+MOST_LINES, MOST_OF_LIBRARY, MEDIAN_BODY = 37_200, 27_400, 6
+
+
+def test_the_package_is_no_longer_than_it_needs_to_be():
+    rooms = house.lines_of_rooms()
+    assert sum(rooms.values()) <= MOST_LINES, rooms.most_common()
+    assert house.lines_of_library() <= MOST_OF_LIBRARY, rooms.most_common()
+
+
+def test_most_functions_are_a_few_lines():
+    assert house.median_body() <= MEDIAN_BODY
+
+
+def helpers() -> dict[str, list[str]]:
+    """Where the functions of all test files stand that are no tests, by their bodies without docstring; methods not."""
+    found = defaultdict(list)
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        methods = {id(part) for node in ast.walk(tree) if isinstance(node, ast.ClassDef) for part in node.body}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef) and not node.name.startswith("test_") and id(node) not in methods:
+                body = node.body[ast.get_docstring(node) is not None :]
+                found["\n".join(map(ast.dump, body))].append(f"{path.name}:{node.lineno} {node.name}")
+    return found
+
+
+def test_no_two_test_files_define_the_same_helper():
+    """What two need stands in problems.py, or is a fixture of conftest.py."""
+    for places in helpers().values():
+        files = {place.partition(":")[0] for place in places}
+        assert len(files) == 1, f"the same function in {places}"
