@@ -64,6 +64,8 @@ PUBLIC = {
     # images and analyses
     "Memo": "optics.reuse",
     "Psf": "kernels",
+    "Incomplete": "analysis.setting",
+    "NothingToShow": "analysis.setting",
     "compare": "analysis",
     "distortion": "analysis.chief",
     "distortion_grid": "analysis.grid",
