@@ -18,7 +18,6 @@ from raytrace.camera.training import Run, Share
 from raytrace.camera.variables import BadVariables, Variables
 from raytrace.files import shipped
 from raytrace.formats import read_lens
-from raytrace.formats.pictures import dead_leaves, split
 from raytrace.kernels import psf
 from raytrace.maths.grid import grid
 from raytrace.optics.focus import NoImage, best_focus
@@ -44,6 +43,7 @@ from raytrace.studies.codesign.experiment import (
     write_outcome,
 )
 from raytrace.studies.codesign.settings import Settings
+from raytrace.studies.pictures import dead_leaves, split
 from raytrace.system.lens import with_object_distance
 
 LENS = Path(__file__).parents[1] / "lenses" / "double_gauss.zmx"

@@ -5,8 +5,8 @@ import torch
 
 from raytrace.camera.deconvolve import blind_filter, errors, errors_knowing
 from raytrace.camera.image import transfer_functions
-from raytrace.formats.pictures import dead_leaves
 from raytrace.studies.codesign.closed_form import power_spectrum
+from raytrace.studies.pictures import dead_leaves
 
 SIZE = 24
 

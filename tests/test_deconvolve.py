@@ -24,7 +24,7 @@ from raytrace.camera.deconvolve import (
     within,
 )
 from raytrace.camera.image import blur, transfer_functions
-from raytrace.formats.pictures import dead_leaves
+from raytrace.studies.pictures import dead_leaves
 
 
 def gaussians(*widths: float, size: int = 11) -> torch.Tensor:

@@ -10,7 +10,6 @@ import torch
 from raytrace.camera.deconvolve import blind_filter, errors, psnr, wiener
 from raytrace.camera.phase import PhaseVariables
 from raytrace.camera.training import OtherSettings
-from raytrace.formats.pictures import dead_leaves
 from raytrace.maths.zernike import polynomials
 from raytrace.media.glass import index
 from raytrace.studies.edof import table as edof_table
@@ -30,6 +29,7 @@ from raytrace.studies.edof.world import (
     spectrum,
     transfer,
 )
+from raytrace.studies.pictures import dead_leaves
 from raytrace.wave.designs import aim, baseline
 from raytrace.wave.element import Element, EvenPowers, height
 from raytrace.wave.psf import psf

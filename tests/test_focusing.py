@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from raytrace.formats.pictures import dead_leaves
 from raytrace.studies.focusing.experiment import (
     Setting,
     _behind,
@@ -18,6 +17,7 @@ from raytrace.studies.focusing.experiment import (
     sampled,
     scene_of,
 )
+from raytrace.studies.pictures import dead_leaves
 from raytrace.wave.psf import psf
 
 AIRY = 1.2197 * 0.55e-3 * 25

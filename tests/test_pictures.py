@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from raytrace.formats import pictures
-from raytrace.formats.pictures import NoPictures, Pictures, crop, dead_leaves, draws, files, order, read, split
+from raytrace.studies import pictures
+from raytrace.studies.pictures import NoPictures, Pictures, crop, dead_leaves, draws, files, order, read, split
 
 
 @pytest.fixture

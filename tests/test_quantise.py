@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from raytrace.cli import main
-from raytrace.formats.pictures import dead_leaves
 from raytrace.media.catalog import find_glass
 from raytrace.studies.edof.world import World, expected_error, periodic, quality, scene, spectrum, transfer
+from raytrace.studies.pictures import dead_leaves
 from raytrace.studies.quantise.experiment import (
     WAYS,
     Judge,

@@ -11,7 +11,6 @@ import torch
 
 from raytrace.files import shipped, write_table
 from raytrace.formats import read_lens
-from raytrace.formats.pictures import dead_leaves
 from raytrace.optics.focus import best_focus
 from raytrace.optics.paraxial import first_order
 from raytrace.pages import kept_of, markdown
@@ -36,6 +35,7 @@ from raytrace.studies.codesign.study import (
     step_time,
     summaries,
 )
+from raytrace.studies.pictures import dead_leaves
 from raytrace.system.lens import with_object_distance, with_sensor_distance
 
 SMALL = Settings(depth=2, width=2, patch=16, size=7, epochs=1, batch=4, crops=2)

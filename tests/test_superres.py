@@ -8,8 +8,8 @@ import torch
 
 from raytrace.camera.deconvolve import errors, mean_square_error, psnr
 from raytrace.cli.studies import command
-from raytrace.formats.pictures import dead_leaves
 from raytrace.studies.edof.world import periodic, scene, spectrum, transfer
+from raytrace.studies.pictures import dead_leaves
 from raytrace.studies.superres.experiment import (
     FIELD,
     Plate,

@@ -8,7 +8,7 @@ from problems import covariance, draws, gaussian
 
 from raytrace.camera.deconvolve import blind_filter, errors, mean_square_error, power_law, psnr, restore, within
 from raytrace.camera.image import blur, transfer_functions, visible
-from raytrace.formats.pictures import dead_leaves
+from raytrace.studies.pictures import dead_leaves
 from raytrace.studies.superres.inversion import (
     bicubic,
     coarse_image,

@@ -13,7 +13,6 @@ import torch
 from raytrace.cli import main
 from raytrace.files import shipped, write_table
 from raytrace.formats import read_lens
-from raytrace.formats.pictures import dead_leaves
 from raytrace.pages import KEPT, kept_of, markdown
 from raytrace.studies.codesign import sweep as module
 from raytrace.studies.codesign.closed_form import power_spectrum
@@ -32,6 +31,7 @@ from raytrace.studies.codesign.sweep import (
     sweep,
 )
 from raytrace.studies.codesign.sweep_page import Sweep, answers
+from raytrace.studies.pictures import dead_leaves
 
 SMALL = Settings(depth=2, width=2, patch=16, size=7, crops=2)
 

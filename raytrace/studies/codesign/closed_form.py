@@ -9,9 +9,9 @@ from torch import Tensor
 from raytrace.camera.camera import Camera
 from raytrace.camera.deconvolve import kernel_error
 from raytrace.camera.deconvolve import power_spectrum as periodogram
-from raytrace.formats.pictures import Pictures, crop
 from raytrace.studies.codesign.conjugates import sensor_range
 from raytrace.studies.descent import Descent, minimise
+from raytrace.studies.pictures import Pictures, crop
 
 #: Length of the first step, mm of thickness or of sag. L-BFGS-B takes 1 of its own units, and a sensor moved by 1 mm
 #: lands behind the next optimum: where windows hold but the middle of a blur.

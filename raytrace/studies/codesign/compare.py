@@ -12,7 +12,6 @@ from raytrace.camera.training import Run, share
 from raytrace.cli.door import CommandError, say
 from raytrace.cli.run import present
 from raytrace.files import table
-from raytrace.formats.pictures import dead_leaves
 from raytrace.pages import machine
 from raytrace.studies.codesign import figures, optima
 from raytrace.studies.codesign import study as runs
@@ -30,6 +29,7 @@ from raytrace.studies.codesign.setup import (
     train_run,
 )
 from raytrace.studies.options import read
+from raytrace.studies.pictures import dead_leaves
 from raytrace.studies.publish import publish
 
 

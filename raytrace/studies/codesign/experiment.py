@@ -24,7 +24,6 @@ from raytrace.camera.training import DamagedRun, Record, Run, Share, read_json, 
 from raytrace.camera.variables import Variables, parse_bounds
 from raytrace.files import write_json
 from raytrace.formats import write_lens
-from raytrace.formats.pictures import Pictures, crop, draws
 from raytrace.maths.grid import grid
 from raytrace.maths.result import plain
 from raytrace.optics.focus import focused, real_image_distance
@@ -32,6 +31,7 @@ from raytrace.studies.codesign import conjugates
 from raytrace.studies.codesign.closed_form import optimise_closed_form, out_of_focus, power_spectrum
 from raytrace.studies.codesign.settings import Settings
 from raytrace.studies.descent import NoOptimum
+from raytrace.studies.pictures import Pictures, crop, draws
 from raytrace.system.lens import Lens, with_object_distance, with_sensor_distance, with_wavelengths
 
 _SAMPLE = 10  # last number of the key of what a sample draws

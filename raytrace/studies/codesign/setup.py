@@ -19,14 +19,13 @@ from raytrace.camera.training import NotFinite, Record, read_json
 from raytrace.cli.door import CommandError, catalogs, field_points, find_lens, open_lens, refuse_untraceable, say
 from raytrace.cli.progress import progress
 from raytrace.formats import FORMATS
-from raytrace.formats.pictures import Pictures, dead_leaves, split
 from raytrace.optics.focus import NoImage
 from raytrace.optics.paraxial import paraxial_image_distance
 from raytrace.shards import share
 from raytrace.studies.codesign.closed_form import power_spectrum
 from raytrace.studies.codesign.experiment import STEPS, Outcome, camera, lens_at_start, outcome, run_model, variables
 from raytrace.studies.codesign.settings import Settings
-from raytrace.studies.pictures import pictures
+from raytrace.studies.pictures import Pictures, dead_leaves, pictures, split
 from raytrace.system.lens import Lens
 
 _LEAVES = 100  # pictures, where none are given

@@ -17,7 +17,6 @@ from torch import Tensor
 from raytrace.camera.camera import Camera
 from raytrace.camera.image import blur
 from raytrace.camera.training import load_state, read_log, read_state
-from raytrace.formats.pictures import Pictures
 from raytrace.maths.pupil import gauss_rings
 from raytrace.optics.launch import launch
 from raytrace.optics.spot import spot_of
@@ -25,6 +24,7 @@ from raytrace.optics.trace import trace_lens
 from raytrace.studies.codesign.experiment import STEPS, Batch, Outcome, batch, outcome
 from raytrace.studies.codesign.experiment import camera as camera_at_start
 from raytrace.studies.codesign.settings import AFTER_PARAXIAL, Settings
+from raytrace.studies.pictures import Pictures
 from raytrace.system.lens import Lens, with_object_distance
 
 #: The paper's table: L1 after step 1, L1 with DRT PSFs after step 2, focus distance in m.

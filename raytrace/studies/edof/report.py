@@ -13,7 +13,6 @@ from raytrace.cli.door import CommandError, say
 from raytrace.cli.progress import progress
 from raytrace.files import table as csv
 from raytrace.files import write_json
-from raytrace.formats.pictures import Pictures, dead_leaves, split
 from raytrace.maths.result import Result, called, plain
 from raytrace.pages import grid, picture
 from raytrace.studies.edof.scene import deep, flat
@@ -21,7 +20,7 @@ from raytrace.studies.edof.settings import Settings
 from raytrace.studies.edof.table import ROWS, Content, elements_of, records, table_of
 from raytrace.studies.edof.training import EdofCamera, begin, learn_element
 from raytrace.studies.edof.world import Judged, Quality, World, depth_text, kernels, periodic, quality, spectrum
-from raytrace.studies.pictures import pictures
+from raytrace.studies.pictures import Pictures, dead_leaves, pictures, split
 from raytrace.studies.publish import publish
 from raytrace.wave.element import Element, as_made, as_pixels
 from raytrace.wave.element_file import write_element

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from raytrace.camera.deconvolve import blind_filter, psnr, restore
 from raytrace.camera.image import blur_layers, depth_masks
-from raytrace.formats.pictures import dead_leaves, draws
 from raytrace.studies.edof.world import World, depth_text, kernels, mirrored, spectrum, transfer
+from raytrace.studies.pictures import dead_leaves, draws
 from raytrace.wave.element import Element
 
 _KEY = 99  # of what is drawn

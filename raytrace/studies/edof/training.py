@@ -21,13 +21,13 @@ from raytrace.camera.network import RedNet, RedNetShape
 from raytrace.camera.phase import PhaseVariables
 from raytrace.camera.training import DamagedRun, Record, Run, Share, read_state, train
 from raytrace.files import write_atomically
-from raytrace.formats.pictures import Pictures, crop, draws
 from raytrace.maths.value import detached
 from raytrace.media.catalog import find_glass
 from raytrace.media.glass import index
 from raytrace.optics.reuse import Memo
 from raytrace.studies.edof.settings import Settings
 from raytrace.studies.edof.world import World, best_of_starts, expected_error, mirrored, restored, scene, transfer
+from raytrace.studies.pictures import Pictures, crop, draws
 from raytrace.wave.designs import aim, converging
 from raytrace.wave.element import Element, EvenPowers, Zernike, as_rings, wrapped
 from raytrace.wave.plan import plan

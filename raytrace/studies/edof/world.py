@@ -17,11 +17,11 @@ from torch import Tensor, nn
 
 from raytrace.camera.deconvolve import blind_error, blind_filter, errors, power_spectrum, psnr, wiener
 from raytrace.camera.image import transfer_functions
-from raytrace.formats.pictures import Pictures, draws
 from raytrace.maths.grid import grid
 from raytrace.maths.result import Result
 from raytrace.optics.reuse import Memo
 from raytrace.studies.descent import NoOptimum, minimise
+from raytrace.studies.pictures import Pictures, draws
 from raytrace.wave.element import Element, Rings
 from raytrace.wave.plan import plan
 from raytrace.wave.psf import ElementPsf, psf

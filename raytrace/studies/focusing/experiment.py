@@ -17,7 +17,6 @@ from torch import Tensor
 
 from raytrace.camera.image import blur, visible
 from raytrace.camera.phase import PhaseVariables
-from raytrace.formats.pictures import Pictures, crop, dead_leaves
 from raytrace.kernels.dft import phasor
 from raytrace.maths.grid import grid
 from raytrace.maths.result import Result
@@ -25,6 +24,7 @@ from raytrace.media.catalog import find_glass
 from raytrace.media.glass import index
 from raytrace.optics.reuse import Memo
 from raytrace.studies.options import Settings
+from raytrace.studies.pictures import Pictures, crop, dead_leaves
 from raytrace.wave.designs import Aim, aim, ideal
 from raytrace.wave.element import Element, Pixels, height
 from raytrace.wave.element_file import write_element

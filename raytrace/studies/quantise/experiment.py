@@ -19,7 +19,6 @@ from torch import Tensor
 from raytrace.camera.deconvolve import blind_filter, errors, psnr
 from raytrace.camera.phase import PhaseVariables
 from raytrace.camera.training import DamagedRun, load_state, read_json
-from raytrace.formats.pictures import draws
 from raytrace.maths.value import detached
 from raytrace.optics.reuse import Memo
 from raytrace.studies import options
@@ -27,6 +26,7 @@ from raytrace.studies.edof.settings import Settings
 from raytrace.studies.edof.training import begin, scheduled
 from raytrace.studies.edof.world import World, expected_error, scene, spectrum, transfer
 from raytrace.studies.edof.world import kernels as kernels_of
+from raytrace.studies.pictures import draws
 from raytrace.wave.element import Element, Pixels, Rings, period, with_tolerance, wrapped
 from raytrace.wave.plan import plan
 from raytrace.wave.psf import psf

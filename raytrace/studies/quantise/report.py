@@ -11,14 +11,13 @@ from torch import Tensor
 from raytrace.cli.door import CommandError
 from raytrace.cli.progress import progress
 from raytrace.files import table
-from raytrace.formats.pictures import Pictures, dead_leaves, split
 from raytrace.maths.result import Result
 from raytrace.maths.value import detached
 from raytrace.pages import grid
 from raytrace.studies.edof.report import learn
 from raytrace.studies.edof.settings import Settings as Learning
 from raytrace.studies.edof.world import World, periodic, spectrum
-from raytrace.studies.pictures import pictures
+from raytrace.studies.pictures import Pictures, dead_leaves, pictures, split
 from raytrace.studies.publish import publish
 from raytrace.studies.quantise.command import Settings
 from raytrace.studies.quantise.experiment import (

@@ -21,13 +21,13 @@ from torch import Tensor
 
 from raytrace.camera.deconvolve import mean_square_error, psnr
 from raytrace.camera.phase import PhaseVariables
-from raytrace.formats.pictures import Pictures, draws
 from raytrace.maths.value import detached
 from raytrace.media.catalog import find_glass
 from raytrace.media.glass import index
 from raytrace.optics.reuse import Memo
 from raytrace.studies.descent import minimise
 from raytrace.studies.edof.world import World, scene, spectrum
+from raytrace.studies.pictures import Pictures, draws
 from raytrace.studies.superres.inversion import (
     bicubic,
     coarse_transfer,

@@ -10,11 +10,10 @@ from torch import Tensor
 from raytrace.camera.deconvolve import psnr
 from raytrace.cli.progress import progress
 from raytrace.files import table
-from raytrace.formats.pictures import Pictures, dead_leaves, split
 from raytrace.maths.result import Result
 from raytrace.pages import grid
 from raytrace.studies.edof.world import World, periodic, spectrum
-from raytrace.studies.pictures import pictures
+from raytrace.studies.pictures import Pictures, dead_leaves, pictures, split
 from raytrace.studies.publish import publish
 from raytrace.studies.superres.command import Settings
 from raytrace.studies.superres.experiment import (
