@@ -151,6 +151,8 @@ def test_a_file_of_rings_is_the_element_it_was_written_from(capsys, tmp_path):
     for row in rows:
         assert row["efficiency"] == efficiency(made(element, row["levels"], wrap=True), world)
         assert 5 < row["closed"] < 40
+    assert main([*given, "--wrap"]) == 0
+    assert "\nwrapped: wrapped and quantised afterwards\n" in capsys.readouterr().out
     assert main([*given, "--aperture", "5"]) == 1
     assert "less than the aperture of 5 mm" in capsys.readouterr().err
     assert main(["wave", "quantise", "--element", "lens.txt"]) == 1

@@ -9,6 +9,7 @@ import math
 import pytest
 import torch
 
+from raytrace.cli import build_parser
 from raytrace.files import shipped, write_table
 from raytrace.formats import read_lens
 from raytrace.optics.focus import best_focus
@@ -23,6 +24,7 @@ from raytrace.studies.codesign.figures import _marks
 from raytrace.studies.codesign.optima import Optimum, closed_form, closed_forms, scan
 from raytrace.studies.codesign.page import CAPTIONS, Report
 from raytrace.studies.codesign.settings import AFTER_PARAXIAL, Settings
+from raytrace.studies.codesign.setup import settings_of
 from raytrace.studies.codesign.study import (
     COLUMNS,
     StepTime,
@@ -315,6 +317,22 @@ def test_the_page_names_settings_that_are_not_usual():
     assert "--rho 0.3" in page_of_begun
     assert "--bounds sensor:57,58" in page_of_begun
     assert markdown(report.parts(), kept_of(page)) == page
+
+
+def test_the_options_of_a_page_are_read_back_as_its_settings():
+    settings = dataclasses.replace(
+        SMALL,
+        f_number=4.0,
+        fields=(0.0, 10.0),
+        vary="sensor thickness:5",
+        bounds="sensor:57,58",
+        wavelengths=(0.5, 0.6),
+        wavelength_weights=(1.0, 2.0),
+        normalise="energy",
+        edge=0.3,
+    )
+    words = " ".join(settings.words()).split()
+    assert settings_of(build_parser().parse_args(["codesign", "double_gauss", *words])) == settings
 
 
 def test_marks_of_the_focus_axis_are_round_and_apart():
