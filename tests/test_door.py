@@ -231,15 +231,22 @@ def test_a_lens_is_focused_by_every_criterion(tmp_path):
 
 
 def test_a_curvature_goes_through_every_verb():
-    """lens.replace with a tensor that requires a gradient, and the same number through the verbs of rays."""
+    """lens.replace with a tensor that requires a gradient: every verb carries it, or shows the lens all the same."""
     lens = rt.read_lens("cooke_triplet")
     curvature = lens.surfaces[3].curvature.clone().requires_grad_()
     bent = lens.replace(3, curvature=curvature)
     for found in (
+        rt.first_order(bent).power,
         rt.trace(bent).position,
         rt.trace(bent, rt.rays(bent, fields=[0, 14])).position,
         rt.focus(bent).sensor_distance,
         rt.spot(rt.focus(bent).lens).mean_square_radius,
+        rt.psf(bent, "gaussian", fields=[0], tol=1e-2).covariance,
+        rt.psf(bent, "drt", fields=[0], rays=256).kernel.square(),
+        rt.mtf(bent, fields=[10]).tangential,
+        rt.ray_fan(bent, fields=[10]).tangential,
+        rt.wavefront(bent, fields=[10]).rms,
+        rt.distortion(bent, fields=[10]).f_tan,
     ):
         (slope,) = torch.autograd.grad(found.sum(), curvature)
         assert torch.isfinite(slope)
