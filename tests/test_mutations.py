@@ -14,10 +14,9 @@ from problems import number
 from test_prescriptions import LOWENTHAL, NOCTILUX, summilux
 
 from raytrace.camera.training import DamagedRun, OtherSettings, Run, load_state, read_state
-from raytrace.cli import ray_table
-from raytrace.cli.door import CommandError
 from raytrace.formats import LensFileError, read_lens, read_lens_with_report
 from raytrace.formats.pictures import PictureError, read_grey
+from raytrace.formats.ray_table import RayTableError, read_rays
 from raytrace.maths.arrays import ArrayError, read_npy, read_npz
 from raytrace.media.agf import CatalogError, read_agf
 from raytrace.media.catalog import UnknownGlass
@@ -86,12 +85,12 @@ def rays(folder: Path) -> Reader:
     originals = [f"x,y,z,l,m,n,wavelength\n{coloured}", f"x, y, z, l, m, n,,\n{plain}"]
 
     def read(path: Path) -> None:
-        batches, count = ray_table.read(str(path), lens)
-        found = list(batches)
-        assert sum(len(batch.wavelength) for batch in found) == count
-        assert all(bool(torch.isfinite(batch.rays.position).all()) for batch in found)
+        found = read_rays(path, lens)
+        count = found.position[0].numel()
+        assert found.wavelength is None or found.wavelength.numel() == count
+        assert all(bool(torch.isfinite(one).all()) for one in (*found.position, *found.direction))
 
-    errors = (CommandError, ImplausibleWavelength, InvalidIndex)
+    errors = (RayTableError, ImplausibleWavelength, InvalidIndex)
     return Reader(tuple(text.encode() for text in originals), from_file(read, folder / "rays.csv"), errors)
 
 
