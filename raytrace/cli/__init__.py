@@ -13,7 +13,6 @@ import warnings
 from collections.abc import Callable, Sequence
 
 from raytrace.cli.options import max_bytes
-from raytrace.cli.several import each_distance
 from raytrace.words import did_you_mean
 
 DESCRIPTION = "A sequential, differentiable ray tracer: read a lens file, trace it, focus it, plot it."
@@ -108,7 +107,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 importlib.import_module("raytrace.cli.progress").heartbeat(arguments.command),
                 importlib.import_module("raytrace.budget").within(getattr(arguments, "max_bytes", None)),
             ):
-                _run(arguments)
+                importlib.import_module("raytrace.cli.run").carry_out(arguments.run, arguments)
         except KeyboardInterrupt:
             return _fail("interrupted", 130)
         except BrokenPipeError:
@@ -127,18 +126,6 @@ def main(argv: Sequence[str] | None = None) -> int:
                 f"{kind}: {_one_line(error)} (a defect of raytrace; RAYTRACE_TRACEBACK=1 shows where, please report)", 1
             )
     return 0
-
-
-def _run(arguments: argparse.Namespace) -> None:
-    if not isinstance(arguments.run, str):
-        importlib.import_module("raytrace.cli.run").carry_out(arguments.run, arguments)
-        return
-    module, function = arguments.run.rsplit(".", 1)
-    run = getattr(importlib.import_module(f"raytrace.{module}"), function)
-    if getattr(arguments, "object_distances", None) and not arguments.distances_together:
-        each_distance(run, arguments)
-    else:
-        run(arguments)
 
 
 def script() -> None:

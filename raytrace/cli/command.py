@@ -18,14 +18,14 @@ from types import ModuleType
 
 @dataclass(frozen=True)
 class Command:
-    """One command: its words on the help page, its options, and what runs it: "room.file.function", or its module."""
+    """One command: its words on the help page, its options, and the module that it stands in."""
 
     name: str
     summary: str
     description: str
     examples: str
     add_arguments: Callable[[argparse.ArgumentParser], None]
-    run: str | ModuleType
+    run: ModuleType
 
     @classmethod
     def of(cls, place: str) -> "Command":

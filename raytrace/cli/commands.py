@@ -1,6 +1,5 @@
 """The commands of `raytrace`: their words, their arguments, and what runs them. Imports no torch."""
 
-from raytrace.cli import wave
 from raytrace.cli.command import Command
 from raytrace.cli.studies import command
 
@@ -11,19 +10,10 @@ ANALYSES = (
     "encircled_energy",
 )
 
+#: All commands, in the order of the help page.
 COMMANDS = (
-    Command.of("cli.info"),
-    Command.of("cli.check"),
-    Command.of("cli.convert"),
-    Command.of("cli.layout"),
-    Command.of("cli.spot"),
-    Command.of("cli.focus"),
-    Command.of("cli.trace"),
-    Command.of("cli.psf"),
-    Command.of("cli.compare"),
-    Command.of("cli.glass"),
-    Command.of("cli.bench"),
-    *(Command.of(f"cli.{name}") for name in ANALYSES),
+    *(Command.of(f"cli.{name}") for name in ("info", "check", "convert", "layout", "spot", "focus", "trace", "psf")),
+    *(Command.of(f"cli.{name}") for name in ("compare", "glass", "bench", *ANALYSES)),
     command("codesign"),
-    Command("wave", wave.SUMMARY, wave.DESCRIPTION, wave.EXAMPLES, wave.options, "cli.wave.options"),
+    Command.of("cli.wave"),
 )

@@ -1,26 +1,17 @@
 """The door of every command: open the lens, set the conditions asked for, refuse what cannot be traced."""
 
 import argparse
-import dataclasses
 import json
 import sys
 from pathlib import Path
 
-import torch
-from torch import Tensor
-
 from raytrace.files import shipped
 from raytrace.formats import FORMATS, read_lens, shipped_lens
-from raytrace.system.lens import (
-    Lens,
-    SystemAperture,
-    check,
-    check_media,
-    with_object_distance,
-    with_sensor_distance,
-    with_wavelengths,
-)
+from raytrace.system.lens import Lens, check_media
 from raytrace.words import did_you_mean
+
+#: Options that set the lens, by the keywords of `Lens.at`.
+CONDITIONS = ("sensor_distance", "f_number", "entrance_pupil_diameter", "wavelengths")
 
 
 class CommandError(ValueError):
@@ -43,32 +34,17 @@ def find_lens(name: str) -> Path:
 
 
 def open_lens(arguments: argparse.Namespace) -> Lens:
-    """Read the lens and set the conditions that the arguments name."""
+    """Read the lens and set the conditions that the arguments name; one object distance at a time."""
     path = find_lens(arguments.lens)
     lens = read_lens(path, catalogs=catalogs(arguments))
-    wavelengths = getattr(arguments, "wavelengths", None)
-    if wavelengths:
-        lens = with_wavelengths(lens, wavelengths, where=str(path))
-    if getattr(arguments, "f_number", None):
-        lens = _with_aperture(lens, "image_f_number", arguments.f_number)
-    if getattr(arguments, "entrance_pupil_diameter", None):
-        lens = _with_aperture(lens, "entrance_pupil_diameter", arguments.entrance_pupil_diameter)
+    given = {name: getattr(arguments, name, None) for name in CONDITIONS}
     distance = getattr(arguments, "object_distances", None)
-    if isinstance(distance, float):
-        lens = with_object_distance(lens, distance)
-    if getattr(arguments, "sensor_distance", None) is not None:
-        lens = with_sensor_distance(lens, arguments.sensor_distance)
-    refuse_untraceable(lens, str(path))
-    check_media(lens, lens.wavelengths, where=str(path))
-    return lens
-
-
-def refuse_untraceable(lens: Lens, path: str) -> None:
-    """Raise for a lens that makes no sense as a whole."""
     try:
-        check(lens)
+        lens = lens.at(**given, object_distance=distance if isinstance(distance, float) else None)
+        check_media(lens, lens.wavelengths)
     except ValueError as error:
         raise CommandError(f"{path}: {error}") from error
+    return lens
 
 
 def catalogs(arguments: argparse.Namespace) -> tuple[Path, ...]:
@@ -78,32 +54,6 @@ def catalogs(arguments: argparse.Namespace) -> tuple[Path, ...]:
         if not path.is_file():
             raise CommandError(f"{path}: no such glass catalog; expected an .agf file after --catalog")
     return paths
-
-
-def field_points(lens: Lens, arguments: argparse.Namespace, *, on_axis: bool = False) -> Tensor:
-    """(2, F) field points: those of --field, else the axis alone or the lens's own."""
-    given = getattr(arguments, "fields", None)
-    if given:
-        for angle in (angle for point in given for angle in point):
-            if lens.fields.kind == "angle" and abs(angle) >= 90:
-                raise CommandError(
-                    f"--field {angle:g}: a field angle is below 90 degrees, for rays start from the plane "
-                    "of the entrance pupil"
-                )
-        return lens.fields.y.new_tensor(given).T
-    if on_axis:
-        return lens.fields.y.new_zeros(2, 1)
-    return torch.stack([lens.fields.x, lens.fields.y])
-
-
-def ray_aiming(arguments: argparse.Namespace) -> str | None:
-    """--ray-aiming as the library takes it: None leaves it to the file."""
-    return None if arguments.ray_aiming == "file" else arguments.ray_aiming
-
-
-def primary(lens: Lens) -> Tensor:
-    """The primary wavelength, µm."""
-    return lens.wavelengths[lens.primary_wavelength]
 
 
 def refuse_suffix(option: str, path: str | None, known: tuple[str, ...]) -> None:
@@ -120,8 +70,3 @@ def print_json(document: dict) -> None:
 def say(message: str) -> None:
     """One line for people, beside the results: to standard error."""
     print(f"raytrace: {message}", file=sys.stderr)
-
-
-def _with_aperture(lens: Lens, kind: str, value: float) -> Lens:
-    number = torch.as_tensor(value, dtype=lens.aperture.value.dtype)
-    return dataclasses.replace(lens, aperture=SystemAperture(kind, number))

@@ -161,7 +161,7 @@ def conditions(parser: argparse.ArgumentParser, *, several: str = "") -> None:
     """
     group = parser.add_argument_group("conditions other than the file's")
     object_distance(group, several or "several: one result after the other")
-    parser.set_defaults(distances_together=bool(several), suffix="")
+    parser.set_defaults(suffix="")
     group.add_argument(
         "--sensor-distance", metavar="MM", type=finite, help="from the last vertex before the image to the image"
     )

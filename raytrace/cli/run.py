@@ -10,7 +10,7 @@ from pathlib import Path
 from types import ModuleType
 
 import raytrace
-from raytrace.cli.door import CommandError, open_lens, print_json, say
+from raytrace.cli.door import CONDITIONS, CommandError, open_lens, print_json, say
 from raytrace.cli.progress import progress
 from raytrace.maths.result import Result, called
 from raytrace.shards import processes, share
@@ -18,8 +18,7 @@ from raytrace.shards import processes, share
 #: Options that are for the runner: they set the lens, or say where the result goes. A verb that has one gets it too.
 _RUNNERS = (
     *("command", "subcommand", "run", "lens", "catalog", "json", "plot", "output", "suffix", "max_bytes"),
-    *("object_distances", "distances_together", "sensor_distance", "wavelengths"),
-    *("f_number", "entrance_pupil_diameter"),
+    *("object_distances", *CONDITIONS),
 )
 _DRAWING = "plot_"  # options of the figure begin with it: --log, dest="plot_log"
 

@@ -25,7 +25,7 @@ class Settings(options.Settings):
     Object distances are drawn evenly from `near` to `far`; samples take the fields (in y) in turn.
     """
 
-    model: str = option("gaussian", "PSF model of step 1", choices=MODELS)
+    model: str = option("gaussian", "PSF model of step 1", "MODEL", choices=MODELS)
     vary: str = option(
         "sensor", "variables: sensor (default), thickness:5,6 curvature:1-4 conic:3, of surfaces", "WHAT", nargs="+"
     )
@@ -52,7 +52,7 @@ class Settings(options.Settings):
     near: float = option(10e3, "nearest object", "MM")
     far: float = option(50e3, "furthest object", "MM")
     fields: tuple[float, ...] = option(
-        (0.0,), "field points, in the file's own kind of field (default 0)", "Y", name="field", type=field_point
+        (0.0,), "field points Y, in the file's own kind of field (default 0)", "F", name="field", type=field_point
     )
     pixel: float = option(0.005, "pixel pitch", "MM")
     size: int = option(21, "pixels across the window of the PSF")

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from raytrace.camera.limits import Limits
 from raytrace.camera.network import PRESETS, RedNet, RedNetShape
 from raytrace.camera.training import NotFinite, Record, read_json
-from raytrace.cli.door import CommandError, catalogs, field_points, find_lens, open_lens, refuse_untraceable, say
+from raytrace.cli.door import CommandError, catalogs, find_lens, open_lens, say
 from raytrace.cli.progress import progress
 from raytrace.formats import FORMATS
 from raytrace.optics.focus import NoImage
@@ -26,7 +26,7 @@ from raytrace.studies.codesign.closed_form import power_spectrum
 from raytrace.studies.codesign.experiment import STEPS, Outcome, camera, lens_at_start, outcome, run_model, variables
 from raytrace.studies.codesign.settings import Settings
 from raytrace.studies.pictures import Pictures, dead_leaves, pictures, split
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, check, field_points
 
 _LEAVES = 100  # pictures, where none are given
 _DISTANCES = 9  # at which a finished run is tested
@@ -71,14 +71,17 @@ def experiment(arguments: argparse.Namespace, settings: Settings) -> Experiment:
     path, lens = find_lens(arguments.lens), _lens(arguments)
     if settings.near >= settings.far:
         raise CommandError(f"--near {settings.near:g} is not nearer than --far {settings.far:g}")
-    field_points(lens, argparse.Namespace(fields=[(0.0, y) for y in settings.fields]))
+    field_points(settings.fields, like=lens)  # refuses angles of 90 degrees
     try:
         camera(lens, settings)  # refuses bad variables, starts and networks
     except NoImage as error:
         message = "give --near, --far and --focus-distance beyond the focal length"
         raise CommandError(f"{arguments.lens}: {error}; {message}") from error
     begun = lens_at_start(lens, settings)
-    refuse_untraceable(begun, str(path))
+    try:
+        check(begun)
+    except ValueError as error:
+        raise CommandError(f"{path}: {error}") from error
     FORMATS[".zmx"].write(begun, str(path), catalogs=catalogs(arguments))  # refuses what a learned lens could not keep
     given, kind = pictures(arguments, settings.patch + settings.size - 1, lambda: _leaves(arguments, settings))
     about = {
