@@ -72,7 +72,7 @@ def test_an_option_means_the_same_everywhere():
 def test_data_pixels_and_figures_have_their_own_options(name):
     known = PARSERS[name]._option_string_actions
     if "-o" in known:
-        assert known["-o"].dest == "output"
+        assert known["-o"].option_strings == ["-o", "--output"]
         assert "figure" not in known["-o"].help
         assert known["-o"].type is data_file or name == "wave focus"
     if "--size" in known:
