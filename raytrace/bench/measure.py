@@ -20,7 +20,7 @@ from raytrace.fused import tracing
 from raytrace.maths.pupil import sobol
 from raytrace.maths.value import to
 from raytrace.optics.launch import rays_of_field
-from raytrace.optics.trace import axial_path, media, trace_lens, trace_surfaces
+from raytrace.optics.trace import media, trace_lens, trace_surfaces
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface, is_even
@@ -92,10 +92,6 @@ class Own:
         with tracing(self.engine):
             end = trace_surfaces(self.surfaces, self._with_path(rays), indices=self.indices)
             return torch.autograd.grad(squared_radius(*end.position[:2], centroid), self.leaves)
-
-    def full_path(self, reduced: Tensor) -> Tensor:
-        """The whole optical path of rays whose reduced path is given."""
-        return reduced + axial_path(self.lens.surfaces[1:], media(self.lens, self.wavelength))
 
     def _with_path(self, rays: Rays) -> Rays:
         path = torch.zeros_like(rays.direction[0]) if self.with_path else None
