@@ -1,6 +1,7 @@
 """The measures of the house, counted: lines of the package and of each room, and how long its functions are.
 
     python tests/house.py
+    python tests/house.py walks    # files that a refraction, a PSF and a training step run through; calls that go up
 
 Lines are all those of the .py files. The body of a function is what stands behind its docstring, from the first line of
 its first statement to the last of its last; functions inside functions count by themselves, too.
@@ -8,8 +9,16 @@ its first statement to the last of its last; functions inside functions count by
 
 import ast
 import statistics
+import sys
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
+
+import torch
+from test_layers import FLOORS
+
+import raytrace as rt
+from raytrace.optics.trace import cross, media
 
 PACKAGE = Path(__file__).parents[1] / "raytrace"
 #: Rooms that nothing imports: experiments and measurements, no part of the library.
@@ -49,6 +58,59 @@ def median_body() -> float:
     return statistics.median(body_lengths().values())
 
 
+def walked(run: Callable[[], object]) -> tuple[set[str], set[tuple[str, str]]]:
+    """The files of the package whose functions run, and the calls (from, to) that go up to a higher floor."""
+    files, upward = set(), set()
+
+    def inside(frame) -> str | None:
+        path = Path(frame.f_code.co_filename)
+        return path.relative_to(PACKAGE).as_posix() if path.is_relative_to(PACKAGE) else None
+
+    def profile(frame, event, argument) -> None:
+        if event != "call" or (name := inside(frame)) is None:
+            return
+        files.add(name)
+        caller = frame.f_back
+        while caller and inside(caller) is None:
+            caller = caller.f_back
+        if caller and _floor(name) > _floor(inside(caller)):
+            upward.add((inside(caller), name))
+
+    sys.setprofile(profile)
+    try:
+        run()
+    finally:
+        sys.setprofile(None)
+    return files, upward
+
+
+def _floor(name: str) -> int:
+    return FLOORS[name.split("/")[0].removesuffix(".py")]
+
+
+def walks() -> dict[str, Callable[[], object]]:
+    """One refraction at a sphere, the PSF of traced rays, and a training step of lens and network."""
+    lens = rt.read_lens("double_gauss").at(object_distance=25e3)
+    first, second = media(lens, lens.wavelengths[:1])[:2]
+    start, along = (torch.tensor(v, dtype=torch.float64)[:, None] for v in ([0.0, 5.0, 0.0], [0.0, 0.0, 1.0]))
+    camera = rt.Camera(rt.Variables(lens, "curvature:1-4 sensor"), rt.RedNet(), model="gaussian")
+    pictures, distances = torch.rand(2, 84, 84), torch.tensor([2e4, 3e4], dtype=torch.float64)
+    rays = rt.Rays(start, along, torch.ones(1, dtype=torch.bool))
+    return {
+        "refraction": lambda: cross(lens.surfaces[1], rays, None, 1, first, second),
+        'psf(lens, "drt")': lambda: rt.psf(lens, "drt"),
+        "training step": lambda: (camera(pictures, distances) - camera.target(pictures)).abs().mean().backward(),
+    }
+
+
+def tell_walks() -> None:
+    for name, run in walks().items():
+        files, upward = walked(run)
+        work = sorted(file for file in files if _floor(file) >= FLOORS["optics"])
+        print(f"{name}: {len(files)} files, {len(work)} of them from optics/ up, {len(upward)} calls upward")
+        print(f"  {' '.join(sorted(files))}")
+
+
 def main() -> None:
     rooms, lengths = lines_of_rooms(), body_lengths()
     for room, lines in sorted(rooms.items(), key=lambda one: -one[1]):
@@ -61,4 +123,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    tell_walks() if "walks" in sys.argv[1:] else main()

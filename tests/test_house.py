@@ -5,12 +5,20 @@ from collections import defaultdict
 from pathlib import Path
 
 import house
+import pytest
 
 MEDIAN_BODY = 6  # lines; `python tests/house.py` tells what it is now
 
 
 def test_most_functions_are_a_few_lines():
     assert house.median_body() <= MEDIAN_BODY
+
+
+@pytest.mark.parametrize(("what", "most"), [("refraction", 5), ('psf(lens, "drt")', 30), ("training step", 35)])
+def test_work_walks_downhill_through_few_files(what, most):
+    files, upward = house.walked(house.walks()[what])
+    assert len(files) <= most, sorted(files)
+    assert not upward
 
 
 def helpers() -> dict[str, list[str]]:
