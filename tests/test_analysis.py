@@ -401,7 +401,9 @@ def test_a_field_without_light_is_named_with_where_its_rays_end(analyse, geometr
 
 
 @pytest.mark.parametrize(
-    ("analyse", "geometric"), [(rt.mtf, False), (rt.mtf, True), (rt.encircled_energy, False)], ids=str
+    ("analyse", "geometric"),
+    [(rt.mtf, False), (rt.mtf, True), (rt.encircled_energy, False)],
+    ids=["mtf", "mtf of rays", "encircled energy"],
 )
 def test_a_wavelength_without_light_is_named_too(analyse, geometric):
     """Out of a glass of n = 1.55 at an angle that is critical for n = 1.556: red light leaves it, blue does not."""
