@@ -456,3 +456,12 @@ def test_analyses_carry_a_gradient_and_tell_what_they_lack():
         rt.wavefront(lens, fields=[0, 80])
     with pytest.raises(rt.NothingToShow, match="all fields are on the axis"):
         rt.distortion(lens, fields=[0])
+
+
+def test_errors_speak_of_keywords_from_python_and_of_options_from_the_command(capsys):
+    with pytest.raises(ValueError, match=r"`through_focus` needs one spatial frequency: give `frequencies`"):
+        rt.mtf(rt.read_lens("cooke_triplet"), through_focus=0.1)
+    assert main(["mtf", "cooke_triplet", "--through-focus", "0.1"]) == 1
+    assert "--through-focus needs one spatial frequency: give --frequency" in capsys.readouterr().err
+    assert main(["spot", "cooke_triplet", "--sampling", "sobol", "--rings", "4"]) == 1
+    assert "--rings belongs to --sampling gauss, hexapolar; sobol takes --points" in capsys.readouterr().err

@@ -179,7 +179,7 @@ def lateral_colour(
     if len(lens.wavelengths) < 2:
         raise NothingToShow(
             "nothing to show: lateral colour is a difference of wavelengths, and there is one, "
-            f"{float(lens.wavelengths[0]):g} µm; give several by --wavelength"
+            f"{float(lens.wavelengths[0]):g} µm; give several by `wavelengths`"
         )
     refuse_axis(fields)
     return shown(_lateral_colour(lens, fields))

@@ -198,7 +198,7 @@ def compare(
     except NoImage as error:
         length = float(first_order(lens).effective_focal_length)
         raise NoImage(
-            f"{error}; its focal length is {length:.6g} mm, give --focus-distance and --object-distance beyond, or inf"
+            f"{error}; its focal length is {length:.6g} mm, give `focus_distance` and `object_distances` beyond, or inf"
         ) from error
     pixels = grid(lens.wavelengths.new_tensor(pixel), size)
     with warnings.catch_warnings():

@@ -116,7 +116,7 @@ def mtf(
     asked = None if frequencies is None else vector(frequencies, like=lens)
     if through_focus is not None:
         if asked is None or len(asked) != 1:
-            raise ValueError("--through-focus needs one spatial frequency: give --frequency F")
+            raise ValueError("`through_focus` needs one spatial frequency: give `frequencies`")
         distances = lens.surfaces[-2].thickness + through_focus * torch.linspace(-1, 1, _DISTANCES, **like(lens))
         return _through_focus(lens, fields, asked, distances, geometric)
     given = frequency_range(lens, fields, _FREQUENCIES) if asked is None else asked

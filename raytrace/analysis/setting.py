@@ -128,7 +128,7 @@ def shown(found):
 def refuse_axis(fields: Tensor) -> None:
     """Raise NothingToShow for fields (2, F) that lie all on the axis."""
     if not bool(fields.any()):
-        raise NothingToShow("nothing to show over the field: all fields are on the axis; give others by --field")
+        raise NothingToShow("nothing to show over the field: all fields are on the axis; give others by `fields`")
 
 
 def unvignetted(lens: Lens) -> Lens:

@@ -102,7 +102,7 @@ def wavefront(
     afford(
         _MAP_BYTES * F * W * size * size,
         f"the wavefronts of {F} fields × {W} wavelengths at {size} × {size} points",
-        helps="ask for a smaller --size, or fewer fields or wavelengths",
+        helps="ask for a smaller `size`, or fewer fields or wavelengths",
     )
     rule = {"size": size, "terms": terms or 37, "numbering": numbering or "noll", "listed": bool(terms or numbering)}
     parts = [_map_of(lens, some, **rule) for some in fields.split(piece(RAY_BYTES * W * max(size, _GRID) ** 2), 1)]

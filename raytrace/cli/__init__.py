@@ -10,9 +10,9 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
-from raytrace.cli.options import max_bytes
+from raytrace.cli.command import as_options
 from raytrace.words import did_you_mean
 
 DESCRIPTION = "A sequential, differentiable ray tracer: read a lens file, trace it, focus it, plot it."
@@ -77,16 +77,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"raytrace {_version()}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for command in importlib.import_module("raytrace.cli.commands").COMMANDS:  # they import from this room
-        child = commands.add_parser(
-            command.name,
-            help=command.summary,
-            description=command.description,
-            epilog=command.examples,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        command.add_arguments(child)
-        max_bytes(child)
-        child.set_defaults(run=command.run)
+        command.add_to(commands)
     return parser
 
 
@@ -101,7 +92,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return stop.code if isinstance(stop.code, int) else 2
     with warnings.catch_warnings():
         warnings.simplefilter("always")
-        warnings.showwarning = _shower()
+        spelled = arguments.spelled
+        warnings.showwarning = _shower(spelled)
         try:
             with (
                 importlib.import_module("raytrace.cli.progress").heartbeat(arguments.command),
@@ -118,7 +110,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             if os.environ.get("RAYTRACE_TRACEBACK"):
                 raise
             if isinstance(error, (ValueError, LookupError, OSError)) and not isinstance(error, KeyError | IndexError):
-                return _fail(_one_line(error), 1)
+                return _fail(as_options(_one_line(error), spelled), 1)
             if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
                 return _fail("not enough memory; ask for less (--rings, --points, --rays), or set --max-bytes", 1)
             kind = type(error).__name__
@@ -149,12 +141,12 @@ def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def _shower() -> Callable[..., None]:
+def _shower(spelled: Mapping[str, str]) -> Callable[..., None]:
     """Shows warnings of this package, one line each and none twice; those of libraries speak to programmers."""
     said = set()
 
     def show(message, category, filename, lineno, file=None, line=None) -> None:
-        words = _one_line(message)
+        words = as_options(_one_line(message), spelled)
         if category.__module__.startswith("raytrace") and words not in said:
             said.add(words)
             print(f"raytrace: warning: {words}", file=sys.stderr)

@@ -11,9 +11,12 @@ A command is a file of this folder with
 
 import argparse
 import importlib
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import ModuleType
+
+from raytrace.cli.options import max_bytes
 
 
 @dataclass(frozen=True)
@@ -33,3 +36,28 @@ class Command:
         module = importlib.import_module(f"raytrace.{place}")
         name = place.rpartition(".")[2].replace("_", "-")
         return cls(name, module.SUMMARY, module.DESCRIPTION, module.EXAMPLES, module.options, module)
+
+    def add_to(self, commands, name: str = "") -> None:
+        """Give a group of parsers the one of this command, under its own name or another."""
+        child = commands.add_parser(
+            name or self.name,
+            help=self.summary,
+            description=self.description,
+            epilog=self.examples,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        self.add_arguments(child)
+        max_bytes(child)
+        spelled = {action.dest: action.option_strings[-1] for action in child._actions if action.option_strings}
+        child.set_defaults(run=self.run, spelled=spelled)
+
+
+def as_options(message: str, spelled: Mapping[str, str]) -> str:
+    """A message with keywords in backticks, `fields` or `model=drt`, spelled as options: --field, --model drt."""
+
+    def option(found: re.Match) -> str:
+        if found[1] not in spelled:
+            return found[0]
+        return spelled[found[1]] + (f" {found[2]}" if found[2] else "")
+
+    return re.sub(r"`(\w+)(?:=([^`]*))?`", option, message)

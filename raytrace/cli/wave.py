@@ -3,7 +3,6 @@
 import argparse
 
 from raytrace.cli.command import Command
-from raytrace.cli.options import max_bytes
 from raytrace.cli.studies import command
 
 SUMMARY = "phase elements: their PSFs, and learning them"
@@ -26,13 +25,4 @@ SUBCOMMANDS = (
 def options(parser: argparse.ArgumentParser) -> None:
     children = parser.add_subparsers(dest="subcommand", metavar="SUB", required=True)
     for one in SUBCOMMANDS:
-        child = children.add_parser(
-            one.name.removeprefix("wave-"),
-            help=one.summary,
-            description=one.description,
-            epilog=one.examples,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        one.add_arguments(child)
-        max_bytes(child)
-        child.set_defaults(run=one.run)
+        one.add_to(children, one.name.removeprefix("wave-"))

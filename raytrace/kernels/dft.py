@@ -232,7 +232,7 @@ def _bessel_slope(x: Tensor, number: int) -> Tensor:
 
 # -- what waves take in memory, told in the words of a lens ------------------------------------------------------------
 
-_HELPS = "give a larger --tol, a smaller --size or --pixel, a slower aperture (--f-number), --model drt"
+_HELPS = "give a larger `tol`, a smaller `size` or `pixel`, a slower aperture (`f_number`), `model=drt`"
 
 
 def afford_rings(what: str, scene: Scene, rings: int, phase: float) -> None:

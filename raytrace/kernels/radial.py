@@ -68,7 +68,7 @@ def _rule_of(grid: Grid, cutoff: float, order: int) -> tuple[np.ndarray, np.ndar
     afford(
         8.0 * (8 * distinct * nodes**2 + (2 * distinct + 2 * count) * count),
         f"the PSF needs its light at {count:,} radii and {nodes:,}² points of each pixel",
-        helps="ask for a smaller --size or --pixel, a slower aperture (--f-number) or --model drt",
+        helps="ask for a smaller `size` or `pixel`, a slower aperture (`f_number`) or `model=drt`",
     )
     return _wave_rule(grid.rows, grid.columns, nodes, count)
 
@@ -142,7 +142,7 @@ def _wave_rule(rows: int, columns: int, nodes: int, count: int) -> tuple[np.ndar
     forewarn(
         5e-9 * count * len(places) * nodes**2,
         f"a PSF takes its light at {count:,} radii and {nodes:,}² points of each pixel",
-        helps="ask for a smaller --size or --pixel, a slower aperture (--f-number) or --model drt",
+        helps="ask for a smaller `size` or `pixel`, a slower aperture (`f_number`) or `model=drt`",
     )
     x, y = (places[:, axis, None] + node for axis in (0, 1))
     # T_2m by its recurrence in T_2: a tenth of the time of as many cosines.

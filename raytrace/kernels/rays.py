@@ -215,7 +215,7 @@ def afford_cells(kernels: Sequence[int], across: int, along: int, *, each: float
         each * count * across * along,
         f"the ray-traced PSF needs {across:,} × {along:,} cells of the pupil for each of {count} kernels: the blur is "
         "wide beside a pixel",
-        helps="give a larger --pixel, fewer fields or wavelengths at once, --rays, --model gaussian",
+        helps="give a larger `pixel`, fewer fields or wavelengths at once, `rays`, `model=gaussian`",
     )
 
 

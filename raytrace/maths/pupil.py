@@ -161,6 +161,6 @@ def sampled(
     wrong = "points" if counted == "rings" else "rings"
     if given[wrong] is not None:
         takers = ", ".join(name for name, (_, what, _) in SAMPLINGS.items() if what == wrong)
-        raise ValueError(f"--{wrong} belongs to --sampling {takers}; {sampling} takes --{counted}")
+        raise ValueError(f"`{wrong}` belongs to `sampling={takers}`; {sampling} takes `{counted}`")
     own = {"seed": seed} if rule in (sobol, random) else {}
     return rule(size if given[counted] is None else given[counted], **own, dtype=dtype, device=device)

@@ -170,16 +170,16 @@ def focus(
         "object_distances": distances,
         "fields": fields,
         "wavelengths": wavelengths,
-        "distance_weights": _weights(lens, distance_weights, len(distances), "--distance-weights"),
-        "field_weights": _weights(lens, field_weights, fields.shape[1], "--field-weights"),
-        "wavelength_weights": _weights(lens, wavelength_weights, len(wavelengths), "--wavelength-weights"),
+        "distance_weights": _weights(lens, distance_weights, len(distances), "`distance_weights`"),
+        "field_weights": _weights(lens, field_weights, fields.shape[1], "`field_weights`"),
+        "wavelength_weights": _weights(lens, wavelength_weights, len(wavelengths), "`wavelength_weights`"),
     }
     if not bool(torch.isfinite(paraxial).all()):
         raise NoFocus("the lens is afocal for this object distance; there is no focus to find")
     rms = focus_of_rms(lens, at, weights, **looked_at)
     _tell_losses(lens, at, distances, fields, wavelengths)
     if not bool(torch.isfinite(rms)):
-        raise NoFocus("one ray, or parallel rays, have no focus; give more --rings or --points")
+        raise NoFocus("one ray, or parallel rays, have no focus; give more `rings` or `points`")
     best = rms
     if criterion == "mean":
         best = focus_of_mean_radius(lens, at, weights, **looked_at)

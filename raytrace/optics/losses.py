@@ -129,7 +129,7 @@ def warn_of_losses(
         for words, colours in said.items():
             _warn(f"{at}field {_named(lens, field)}, {', '.join(colours)} µm: {words}")
     if hint := beam_hint(lens):
-        _warn(f"{hint}; see --f-number and --entrance-pupil-diameter")
+        _warn(f"{hint}; see `f_number` and `entrance_pupil_diameter`")
 
 
 def check_reach(lens: Lens, fields: Tensor | None = None, *, every: bool) -> None:
@@ -160,11 +160,11 @@ def check_reach(lens: Lens, fields: Tensor | None = None, *, every: bool) -> Non
 def _help(lens: Lens, fields: Tensor | None) -> str:
     """What to do about a field out of reach."""
     if hint := beam_hint(lens):
-        return f"{hint}; see --f-number and --entrance-pupil-diameter"
+        return f"{hint}; see `f_number` and `entrance_pupil_diameter`"
     if fields is not None:
         largest = float(torch.hypot(lens.fields.x, lens.fields.y).amax())
-        return f"the lens's own fields go to {largest:g} {FIELD_UNITS[lens.fields.kind]}, give --field within"
-    return "give other fields by --field, a smaller beam by --f-number or --entrance-pupil-diameter"
+        return f"the lens's own fields go to {largest:g} {FIELD_UNITS[lens.fields.kind]}, give `fields` within"
+    return "give other fields by `fields`, a smaller beam by `f_number` or `entrance_pupil_diameter`"
 
 
 def beam_hint(lens: Lens) -> str:

@@ -104,16 +104,16 @@ class Spots(Result):
 
     def plot(self, path=None, **options):
         """The spot diagram; also saved under `path` if one is given. Raises ValueError where no rays were kept."""
-        self._kept("--plot")
+        self._kept("`plot`")
         return Result.plot(self, path, **options)
 
     def save(self, path) -> None:
         """Write the rays as .csv: field, wavelength, pupil point, x, y, weight, status."""
-        self._kept("-o").save(path)
+        self._kept("`output`").save(path)
 
     def _kept(self, what: str) -> Arrivals:
         if self.arrivals is None:
-            raise ValueError(f"{what} needs the rays, and --rays keeps none: leave one out")
+            raise ValueError(f"{what} needs the rays, and `rays` keeps none: leave one out")
         return self.arrivals
 
 
@@ -174,12 +174,12 @@ def spot(
 
 def _refuse_of_many(sampling: str, rings: int | None, points: int | None, reference: str, weights: str) -> None:
     if (reference, weights) != ("centroid", "area"):
-        raise ValueError("--rays gives radii about the centroid by area: leave --reference and --weights out")
+        raise ValueError("`rays` gives radii about the centroid by area: leave `reference` and `weights` out")
     for name, given in (("rings", rings), ("points", points)):
         if given is not None:
-            raise ValueError(f"--rays and --{name} exclude each other: both are a number of rays")
+            raise ValueError(f"`rays` and `{name}` exclude each other: both are a number of rays")
     if sampling in ("hexapolar", "square"):
-        raise ValueError(f"--rays takes --sampling sobol (its default) or random, not {sampling}")
+        raise ValueError(f"`rays` takes `sampling=sobol` (its default) or random, not {sampling}")
 
 
 def _of_many(lens, fields, rays: int, sampling: str, progress, *, seed: int, ray_aiming, max_bytes) -> Spots:

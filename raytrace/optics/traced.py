@@ -153,7 +153,7 @@ def trace(
         begun, labels = _chief_and_marginal(lens, object_distances, fields, wavelengths, ray_aiming)
     else:
         if object_distances is not None or fields is not None:
-            told = "--object-distance and --field change nothing: the rays of a table begin where it says"
+            told = "`object_distances` and `fields` change nothing: the rays of a table begin where it says"
             warnings.warn(told, ChangesNothing, stacklevel=2)
         begun = rays if isinstance(rays, Rays) else called("formats.ray_table.read_rays")(rays, lens)
     if begun.wavelength is None:

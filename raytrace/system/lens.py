@@ -191,7 +191,7 @@ def _below_90_degrees(lens: Lens, fields: Tensor) -> Tensor:
     for angle in fields.T.flatten().tolist() if lens.fields.kind == "angle" else ():
         if abs(angle) >= 90:
             raise ValueError(
-                f"--field {angle:g}: a field angle is below 90 degrees, for rays start from the plane of the entrance "
+                f"`fields={angle:g}`: a field angle is below 90 degrees, for rays start from the plane of the entrance "
                 "pupil"
             )
     return fields

@@ -124,25 +124,25 @@ def elements(
     if name in BASELINES:
         for option, given in of_files.items():
             if given is not None:
-                raise ValueError(f"--{option} belongs to a height map; the element {name} has its own")
+                raise ValueError(f"`{option}` belongs to a height map; the element {name} has its own")
         if levels and name not in STEPPED:
-            raise ValueError(f"--levels: the element {name} is smooth; expected one of {', '.join(STEPPED)}")
+            raise ValueError(f"`levels`: the element {name} is smooth; expected one of {', '.join(STEPPED)}")
         made_for = aim(
             radius=0.5 * aperture, sensor=sensor, focus=focus, wavelength=design_wavelength or _DESIGN, exact=exact
         )
         return baseline(name, made_for, **({"levels": levels} if levels else {}))
     if Path(name).suffix.lower() not in FORMATS:
         raise ValueError(
-            f"--element {name}: neither a named element ({', '.join(BASELINES)}) nor a height map "
+            f"`element={name}`: neither a named element ({', '.join(BASELINES)}) nor a height map "
             f"({', '.join(FORMATS)}){did_you_mean(name, BASELINES)}"
         )
     if index is not None:
         if glass:
-            raise ValueError("--glass and --index both name the material: give one of them")
+            raise ValueError("`glass` and `index` both name the material: give one of them")
         try:
             glass = from_table(wavelengths, index)
         except ValueError as error:
-            raise ValueError(f"--index: {error}") from error
+            raise ValueError(f"`index`: {error}") from error
     made_of = {"glass": glass, "pitch": pitch, "span": span, "catalog": catalog}
     wrap = {"design_wavelength": design_wavelength, "levels": levels or 0}
     return (read_element(element, aperture=aperture, **made_of, **wrap),)
@@ -173,7 +173,7 @@ def _kernels(scene: WaveScene, chosen: Plan, progress: Progress) -> Tensor:
     """All kernels at once, or one after the other where that would take too much memory."""
     D, W = len(scene.depths), len(scene.wavelengths)
     whole = chosen.memory < min(_PIECE, allowed_bytes())
-    helps = "take fewer by --samples or a larger --tol, a smaller window by --size"
+    helps = "take fewer by `samples` or a larger `tol`, a smaller window by `size`"
     needed = chosen.memory if whole else chosen.memory / (D * W)
     afford(needed, f"a kernel needs {chosen.samples:,} samples across", helps=helps)
     forewarn(chosen.flops / _RATE, f"{D * W} kernels of {chosen.samples:,} samples across", helps=helps)

@@ -79,21 +79,21 @@ def read_element(
     if across + 2 * float(profile.pitch) < aperture:
         raise ValueError(
             f"{path}: the heights are {across:.6g} mm across, less than the aperture of {aperture:g} mm; "
-            f"give --aperture {across:.6g}"
+            f"give `aperture={across:.6g}`"
         )
     if isinstance(glass, str):
         glass = find_glass(glass, user=tuple(catalog))
     if glass is None and label is None:
         raise ValueError(
-            f"{path}: does not say its material (there is no {_label_of(path).name} beside it); give --glass NAME, as "
-            "PMMA, or --index N for each --wavelength where the command has it"
+            f"{path}: does not say its material (there is no {_label_of(path).name} beside it); give `glass`, as "
+            "PMMA, or `index` for each of the `wavelengths` where the command has it"
         )
     element = Element(profile, torch.tensor(0.5 * aperture, dtype=torch.float64), glass or label.glass)
     if not (design_wavelength or levels):
         return element
     design = design_wavelength or (label and label.design_wavelength)
     if not design:
-        raise ValueError(f"{path}: does not say what it was made for; give --design-wavelength UM")
+        raise ValueError(f"{path}: does not say what it was made for; give `design_wavelength`")
     return wrapped(element, design, levels=levels)
 
 
