@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from problems import number
 
 import raytrace as rt
+from raytrace.files import shipped
 from raytrace.formats import FORMATS, LensFileError, LensFileWarning, read_lens, read_lens_with_report, write_lens
 from raytrace.formats.frame import lens_from_frame, to_frame
 from raytrace.formats.source import MAX_BYTES, Place, decode
@@ -404,7 +405,7 @@ def test_check_refuses_what_cannot_be_traced(tmp_path):
 
 def test_convert_says_what_it_wrote(tmp_path):
     found = rt.convert("double_gauss", tmp_path / "copy.csv")
-    source, target = ROOT / "lenses" / "double_gauss.zmx", tmp_path / "copy.csv"
+    source, target = shipped("lenses") / "double_gauss.zmx", tmp_path / "copy.csv"
     assert str(found) == f"{target}: 13 surfaces from {source}"
     assert found.document() == {"input": str(source), "output": str(target), "surfaces": 13}
     assert leaves(read_lens(tmp_path / "copy.csv")) == leaves(read_lens("double_gauss"))
