@@ -85,8 +85,8 @@ def read_element(
         glass = find_glass(glass, user=tuple(catalog))
     if glass is None and label is None:
         raise ValueError(
-            f"{path}: does not say its material (there is no {_label_of(path).name} beside it); give `glass`, as "
-            "PMMA, or `index` for each of the `wavelengths` where the command has it"
+            f"{path}: does not say its material (there is no {_label_of(path).name} beside it); give `glass=NAME`, as "
+            "PMMA, or `index=N` for each wavelength where that is taken"
         )
     element = Element(profile, torch.tensor(0.5 * aperture, dtype=torch.float64), glass or label.glass)
     if not (design_wavelength or levels):
