@@ -75,9 +75,9 @@ def _incidence(lens: Lens, fields: Tensor, *, surfaces: bool = False) -> Inciden
     along = _directions(lens, fields)[:, :, None, None]  # (2, F, 1, 1), beside (F, W, P)
     rays = launch(lens, along * fields.new_tensor([-1.0, 0.0, 1.0]), fields=fields)
     angles, valid, reached = [], [], rays.valid
-    for surface, crossing in zip(
-        lens.surfaces[1:], steps(lens.surfaces[1:], rays, indices=media(lens, lens.wavelengths[:, None])), strict=True
-    ):
+    wavelength = lens.wavelengths[:, None]
+    crossings = steps(lens.surfaces[1:], rays, indices=media(lens, wavelength), wavelength=wavelength)
+    for surface, crossing in zip(lens.surfaces[1:], crossings, strict=True):
         reached = reached & ~(crossing.missed | crossing.totally_reflected)
         angles.append(_angle(surface, rays.direction, crossing.rays.position, along))
         rays = crossing.rays

@@ -19,7 +19,7 @@ from raytrace.kernels import psf
 from raytrace.maths.grid import grid
 from raytrace.maths.pupil import sobol
 from raytrace.optics.reuse import Memo, trace_bundle
-from raytrace.optics.trace import media, trace_surfaces
+from raytrace.optics.trace import trace_lens
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.rays import Rays
 
@@ -131,7 +131,7 @@ def _end(lens: Lens, rays: Rays) -> Tensor:
 
 
 def _through(lens: Lens, rays: Rays) -> Rays:
-    return trace_surfaces(lens.surfaces[1:], rays, indices=media(lens, lens.wavelengths[0]))
+    return trace_lens(lens, rays, lens.wavelengths[0])
 
 
 # -- kernels: symmetry, wavelengths, object distances ------------------------------------------------------------------

@@ -44,7 +44,7 @@ from raytrace.maths.value import to
 from raytrace.optics.focus import spot_parabola
 from raytrace.optics.launch import rays_of_field
 from raytrace.optics.reuse import Memo, trace_bundle
-from raytrace.optics.trace import media, trace_surfaces
+from raytrace.optics.trace import trace_lens
 from raytrace.system.build import lens as lens_of
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.rays import Rays
@@ -294,7 +294,7 @@ def _sensor_turn(bundle: tuple, leaf: Tensor, memo: Memo, now: Callable[[], floa
     with torch.no_grad():
         rays = rays_of_field(lens, field, pupil, wavelength=wavelength)
     times = [now()]
-    slope(trace_surfaces(lens.surfaces[1:], rays, indices=media(lens, wavelength)), leaf)
+    slope(trace_lens(lens, rays, wavelength), leaf)
     times.append(now())
     slope(trace_bundle(bundle, memo), leaf)
     times.append(now())

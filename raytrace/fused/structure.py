@@ -14,7 +14,7 @@ from torch import Tensor
 
 from raytrace.system.aperture import SHAPES
 from raytrace.system.shapes import KINDS
-from raytrace.system.surface import Surface
+from raytrace.system.surface import Surface, is_posed
 
 _PLANE, _SPHERE, _CONIC = range(3)  # and the codes of shapes.KINDS
 _NONE, _REFRACT, _REFLECT = range(3)
@@ -51,6 +51,8 @@ class Structure:
 
 def is_expressible(surface: Surface) -> bool:
     """Whether the compiled trace knows the surface: kind and apertures compiled, no departure, not too many terms."""
+    if surface.phase is not None or is_posed(surface):
+        return False
     if surface.departure is not None or any(SHAPES[aperture.shape].code is None for aperture in surface.apertures):
         return False
     kind = KINDS[surface.kind]

@@ -53,7 +53,7 @@ def chief_ray_height(scene: Scene) -> Tensor:
     field, _ = object_field(lens, scene.fields[:, :, None], paraxial)
     distance, pupil = lens.surfaces[0].thickness, paraxial.entrance_pupil_position
     n = signed(lens.surfaces[1:-1], media(lens, wavelengths)[:-1])
-    A, B, C, D = system_matrix(lens.surfaces[1:-1], n)
+    A, B, C, D = system_matrix(lens.surfaces[1:-1], n, wavelengths)
     to_sensor = lens.surfaces[-2].thickness / n[-1]
     finite = ~torch.isinf(distance.detach())
     heights = []

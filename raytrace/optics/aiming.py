@@ -77,7 +77,8 @@ def _crossings(lens: Lens, rays: Rays, wavelength: Tensor, numbers: tuple[int, .
     """Where rays meet the surfaces of those rising numbers, (2, ...) mm each, and whether they reach the last."""
     found, arrives, last = [], rays.valid, numbers[-1]
     indices = media(lens, wavelength)[: last + 1]
-    for number, crossing in enumerate(steps(lens.surfaces[1 : last + 1], rays, indices=indices), 1):
+    surfaces = lens.surfaces[1 : last + 1]
+    for number, crossing in enumerate(steps(surfaces, rays, indices=indices, wavelength=wavelength), 1):
         arrives = arrives & ~(crossing.missed | crossing.totally_reflected)
         found += [crossing.rays.position[:2]] * numbers.count(number)
     return found, arrives

@@ -10,7 +10,6 @@ from raytrace.maths.value import value
 from raytrace.optics.focus import image_rays
 from raytrace.optics.launch import launch
 from raytrace.optics.losses import STATUS, fates
-from raytrace.optics.trace import media
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.rays import Rays
 
@@ -80,7 +79,7 @@ def _field(lens: Lens, pupil: Tensor, field: Tensor, ray_aiming: str | None) -> 
     """Rays (3, 1, W, P) of one field (2, 1) on the sensor, their status, and whether they reach it."""
     rays = launch(lens, pupil, fields=field, ray_aiming=ray_aiming)
     reached = rays.valid
-    for crossing, status in fates(lens.surfaces[1:], rays, media(lens, lens.wavelengths[:, None])):
+    for crossing, status in fates(lens, rays, lens.wavelengths[:, None]):
         reached = reached & ~crossing.missed & ~crossing.totally_reflected
         found = crossing.rays, status, reached
     return found

@@ -44,7 +44,8 @@ def image_rays(lens: Lens, pupil: Tensor, *, fields: Tensor | None = None, wavel
     )
     indices = media(lens, wavelengths[:, None])
     rays = launch(lens, pupil, fields=fields, wavelengths=wavelengths)
-    return trace_surfaces(lens.surfaces[1:], rays, indices=[*indices[:-1], indices[-2]])
+    indices = [*indices[:-1], indices[-2]]
+    return trace_surfaces(lens.surfaces[1:], rays, indices=indices, wavelength=wavelengths[:, None])
 
 
 def focus_moments(rays: Rays, weights: Tensor | None = None, *, empty: str = "nan") -> tuple[Tensor, Tensor]:

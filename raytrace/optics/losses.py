@@ -1,7 +1,7 @@
 """Losses: where the rays of every field and wavelength end, and why; and what is said of those that all are lost."""
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
@@ -14,7 +14,6 @@ from raytrace.optics.paraxial import first_order
 from raytrace.optics.trace import Crossing, media, steps
 from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
 from raytrace.system.rays import Rays
-from raytrace.system.surface import Surface
 
 #: What becomes of a ray, by its number, and how that is said of a surface.
 FATES = {
@@ -68,13 +67,14 @@ class Losses:
         return f"{lost} rays lost: " + (parts[0].split(" ", 1)[1] if len(parts) == 1 else ", ".join(parts))
 
 
-def fates(surfaces: Sequence[Surface], rays: Rays, indices: Sequence[Tensor]) -> Iterator[tuple[Crossing, Tensor]]:
+def fates(lens: Lens, rays: Rays, wavelength: Tensor) -> Iterator[tuple[Crossing, Tensor]]:
     """What happens at each surface in turn, as `trace.steps` tells it, and the status (...) of every ray behind it.
 
-    status: place in STATUS of what befell the ray first.
+    wavelength: (...) µm; status: place in STATUS of what befell the ray first.
     """
     status = torch.where(rays.valid, _OK, STATUS.index("unaimed"))
-    for crossing in steps(surfaces, rays, indices=indices):
+    indices = media(lens, wavelength)
+    for crossing in steps(lens.surfaces[1:], rays, indices=indices, wavelength=wavelength):
         for name, fate in zip(LOST, (crossing.missed, crossing.totally_reflected, crossing.clipped), strict=True):
             status = torch.where((status == _OK) & fate, STATUS.index(name), status)
         yield crossing, status
@@ -95,7 +95,7 @@ def losses(
     codes = [STATUS.index(name) for name in LOST]
     ended = [
         torch.stack([(status == code).expand(rays.shape).sum(-1) for code in codes])
-        for _, status in fates(lens.surfaces[1:], rays, media(lens, wavelengths[:, None]))
+        for _, status in fates(lens, rays, wavelengths[:, None])
     ]
     so_far = torch.stack(ended, 1)
     return Losses(so_far.diff(dim=1, prepend=torch.zeros_like(so_far[:, :1])), (~rays.valid).sum(-1), pupil.shape[-1])

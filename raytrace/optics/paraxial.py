@@ -11,6 +11,7 @@ from torch import Tensor
 from raytrace.maths.value import value
 from raytrace.optics.trace import media
 from raytrace.system.lens import Lens, largest_field
+from raytrace.system.phases import kind_of
 from raytrace.system.surface import Surface, vertex_curvature
 
 
@@ -67,15 +68,21 @@ def signed(surfaces: Sequence[Surface], indices: Sequence[Tensor]) -> list[Tenso
     return result
 
 
-def system_matrix(surfaces: Sequence[Surface], indices: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def system_matrix(
+    surfaces: Sequence[Surface], indices: Sequence[Tensor], wavelength: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """(A, B, C, D) with y′ = A y + B ω, ω′ = C y + D ω from the first vertex, before it, to behind the last surface.
 
-    indices: signed, len(surfaces) + 1, entries (...). C is minus the power; AD - BC = 1.
+    The axis is straightened: tilts, decentres and the mean slope of a grating are left out, and what bends differently
+    along x and y counts by its section along y. indices: signed, len(surfaces) + 1, entries (...); wavelength: (...)
+    µm, which surfaces with a phase need. C is minus the power; AD - BC = 1.
     """
     one = torch.ones_like(indices[0])
     A, B, C, D = one, torch.zeros_like(one), torch.zeros_like(one), one
     for i, surface in enumerate(surfaces):
         power = vertex_curvature(surface) * (indices[i + 1] - indices[i])
+        if surface.phase is not None:
+            power = power + kind_of(surface.phase).power(surface.phase, wavelength)[1]
         C, D = C - power * A, D - power * B
         if i + 1 < len(surfaces):
             gap = surface.thickness / indices[i + 1]
@@ -92,13 +99,13 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
     surfaces = lens.surfaces[1:-1]
     n = signed(surfaces, media(lens, wavelength)[:-1])
     n_object, n_image = n[0], n[-1]
-    A, B, C, D = system_matrix(surfaces, n)
+    A, B, C, D = system_matrix(surfaces, n, wavelength)
     focal_length = -n_image.abs() / C
 
     # The stop seen from the front (transfer to its vertex) and from the back.
     before, behind = surfaces[: lens.stop - 1], surfaces[lens.stop - 1 :]
-    A1, B1 = _to_next_vertex(before, n[: lens.stop])
-    _, B2, _, D2 = system_matrix(behind, n[lens.stop - 1 :])
+    A1, B1 = _to_next_vertex(before, n[: lens.stop], wavelength)
+    _, B2, _, D2 = system_matrix(behind, n[lens.stop - 1 :], wavelength)
     entrance_pupil = n_object * B1 / A1
     exit_pupil = -n_image * B2 / D2 - surfaces[-1].thickness
 
@@ -151,7 +158,7 @@ def paraxial_image_distance(lens: Lens, object_distance: Tensor, wavelength: Ten
     wavelength = lens.wavelengths[lens.primary_wavelength] if wavelength is None else wavelength
     surfaces = lens.surfaces[1:-1]
     n = signed(surfaces, media(lens, wavelength)[:-1])
-    A, B, C, D = system_matrix(surfaces, n)
+    A, B, C, D = system_matrix(surfaces, n, wavelength)
     vergence = n[0] / object_distance
     return -n[-1] * (A + B * vergence) / (C + D * vergence)
 
@@ -182,11 +189,11 @@ def _optical_invariant(lens: Lens, radius, n_object, slope_object, omega_image) 
     return ((n_object * slope_object if lens.fields.kind == "object_height" else omega_image) * largest).abs()
 
 
-def _to_next_vertex(surfaces: Sequence[Surface], indices: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+def _to_next_vertex(surfaces: Sequence[Surface], indices: Sequence[Tensor], wavelength) -> tuple[Tensor, Tensor]:
     """A and B from the first vertex to the vertex that follows the last of the surfaces."""
     if not surfaces:
         return torch.ones_like(indices[0]), torch.zeros_like(indices[0])
-    A, B, C, D = system_matrix(surfaces, indices)
+    A, B, C, D = system_matrix(surfaces, indices, wavelength)
     gap = surfaces[-1].thickness / indices[-1]
     return A + gap * C, B + gap * D
 

@@ -18,11 +18,11 @@ from torch.utils import _pytree as pytree
 
 from raytrace.maths.numerics import broadcast_shape
 from raytrace.optics.launch import rays_of_field
-from raytrace.optics.trace import Crossing, media, steps, trace_surfaces
+from raytrace.optics.trace import Crossing, media, steps, trace_lens, trace_surfaces
 from raytrace.optics.vignetting import vignette
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.rays import Rays
-from raytrace.system.surface import SHAPE
+from raytrace.system.surface import SHAPE, gap_behind
 
 _NODES = 10  # object distances that are traced in place of a range
 _CLOSE = 1e-9  # mm and direction cosines: what interpolated rays may err by
@@ -123,7 +123,7 @@ def trace_bundle(bundle: Bundle, memo: Memo | None = None) -> Rays:
     """The rays of field and pupil points at the image surface; everything broadcasts."""
     lens, _, wavelength, _ = bundle
     if memo is None or torch._C._are_functorch_transforms_active():
-        return trace_surfaces(lens.surfaces[1:], _launched(bundle), indices=media(lens, wavelength))
+        return trace_lens(lens, _launched(bundle), wavelength)
     front = memo.front(bundle, recorded=False)
     return trace_surfaces(**_rest(bundle, front, memo))
 
@@ -132,7 +132,7 @@ def cross_bundle(bundle: Bundle, memo: Memo | None = None) -> list[Crossing]:
     """What happens to the rays at every surface after the object."""
     lens, _, wavelength, _ = bundle
     if memo is None or torch._C._are_functorch_transforms_active():
-        return list(steps(lens.surfaces[1:], _launched(bundle), indices=media(lens, wavelength)))
+        return list(steps(lens.surfaces[1:], _launched(bundle), indices=media(lens, wavelength), wavelength=wavelength))
     front = memo.front(bundle, recorded=True)
     return [*front.crossings, *steps(**_rest(bundle, front, memo))]
 
@@ -158,8 +158,9 @@ def _rest(bundle: Bundle, front: _Front, memo: Memo) -> dict:
         "surfaces": lens.surfaces[1 + done :],
         "rays": rays,
         "indices": indices[done:],
+        "wavelength": wavelength,
         "side": _side(lens, done),
-        "gap": lens.surfaces[done].thickness if done else None,
+        "gap": gap_behind(lens.surfaces[done]) if done else None,
     }
 
 
@@ -177,22 +178,23 @@ def _constant_front(bundle: Bundle, recorded: bool) -> _Front:
     if _varies(rays):
         return _Front(0, None, [], kept_indices)
     surfaces = lens.surfaces[1:]
-    count, crossings = _unvaried(lens, indices), []
+    count, crossings = _unvaried(lens, indices, wavelength), []
     with torch.enable_grad():
         if recorded:
-            crossings = list(steps(surfaces[:count], rays, indices=indices[: count + 1]))
+            crossings = list(steps(surfaces[:count], rays, indices=indices[: count + 1], wavelength=wavelength))
             rays = crossings[-1].rays if crossings else rays
         else:
-            rays = trace_surfaces(surfaces[:count], rays, indices=indices[: count + 1])
+            rays = trace_surfaces(surfaces[:count], rays, indices=indices[: count + 1], wavelength=wavelength)
     return _Front(count, rays, crossings, kept_indices)
 
 
-def _unvaried(lens: Lens, indices: Sequence[Tensor]) -> int:
+def _unvaried(lens: Lens, indices: Sequence[Tensor], wavelength: Tensor) -> int:
     """How many surfaces after the object lie before the first that a variable moves, bends or stands behind."""
     for count, surface in enumerate(lens.surfaces[1:]):
-        gap = lens.surfaces[count].thickness if count else None
-        shape = [getattr(surface, name) for name in SHAPE]
-        numbers = pytree.tree_leaves((gap, shape, *indices[count : count + 2]))
+        gap = gap_behind(lens.surfaces[count]) if count else None
+        shape = [getattr(surface, name) for name in (*SHAPE, "phase", "before")]
+        phased = (wavelength,) if surface.phase is not None else ()
+        numbers = pytree.tree_leaves((gap, shape, *phased, *indices[count : count + 2]))
         if any(isinstance(number, Tensor) and number.requires_grad for number in numbers):
             return count
     return len(lens.surfaces) - 1

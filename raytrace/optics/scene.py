@@ -15,7 +15,7 @@ from raytrace.optics.vignetting import vignette
 from raytrace.system.aperture import SHAPES
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.rays import Rays
-from raytrace.system.surface import is_round
+from raytrace.system.surface import is_posed, is_round
 
 
 def _own(number: Tensor) -> Tensor:
@@ -100,7 +100,7 @@ def symmetry(scene: Scene) -> str:
 
 
 def _symmetry(scene: Scene) -> str:
-    if not all(is_round(surface) for surface in scene.lens.surfaces):
+    if not all(is_round(surface) and not is_posed(surface) for surface in scene.lens.surfaces):
         return "none"
     apertures = [aperture for surface in scene.lens.surfaces for aperture in surface.apertures]
     moving = [scene.fields, scene.lens.fields.vignetting, *(c for aperture in apertures for c in aperture.centre)]

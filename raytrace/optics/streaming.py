@@ -200,7 +200,8 @@ def start(shot: Shot, pupil: Tensor) -> Rays:
 
 def hits(shot: Shot, pupil: Tensor) -> tuple[Tensor, Tensor]:
     """Where rays through pupil points (2, P) meet the image, (2, P) mm, and which of them arrive, (P,)."""
-    arrived = trace_surfaces(shot.lens.surfaces[1:], start(shot, pupil), indices=shot.indices)
+    begun = start(shot, pupil)
+    arrived = trace_surfaces(shot.lens.surfaces[1:], begun, indices=shot.indices, wavelength=shot.wavelength)
     return arrived.position[:2], arrived.valid
 
 

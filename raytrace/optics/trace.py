@@ -18,10 +18,13 @@ from raytrace.fused.structure import is_expressible
 from raytrace.maths.numerics import dot
 from raytrace.maths.value import value
 from raytrace.media import glass
+from raytrace.optics.laws import bend_slopes, diffract, reflect, refract
 from raytrace.system.aperture import inside
 from raytrace.system.lens import Lens
+from raytrace.system.phases import kind_of
+from raytrace.system.pose import Gap, direction_in, point_in
 from raytrace.system.rays import Rays
-from raytrace.system.surface import Surface, in_double, meet, normal
+from raytrace.system.surface import Surface, gap_behind, in_double, is_posed, meet, normal
 
 
 @value
@@ -39,32 +42,6 @@ class Crossing:
     clipped: Tensor
 
 
-def refract(direction, normal, cosine, norm_squared, n1: Tensor, n2: Tensor, b_squared: Tensor | None = None):
-    """Snell's law n1 sin θ1 = n2 sin θ2 as a vector, and whether light passes (False: total internal reflection).
-
-        d' = (n1/n2) d + sign(n·d) D/(a + b)/n2 n,   D = (n2 - n1)(n2 + n1),   a = n1 |n·d|,   b = √(a² + D |n|²)
-
-    direction: unit, by components; normal: by components, of squared length norm_squared; cosine: n·d.
-    b_squared: b² in float64 where it is known better than by these numbers; it then decides.
-    No 1 - cos² anywhere: equal indices return d exactly, and grazing rays keep their digits. The squared length of
-    d' is then brought to 1 within rounding, by a factor that is 1 identically and so is not differentiated.
-    """
-    a = n1 * cosine
-    D = (n2 - n1) * (n2 + n1)
-    exact, b_squared = b_squared, torch.addcmul(D * norm_squared, a, a)
-    passes = (b_squared if exact is None else exact) > 0
-    if exact is not None:
-        smallest = torch.finfo(b_squared.dtype).tiny
-        b_squared = exact.to(b_squared.dtype).clamp_min(smallest) + (b_squared - b_squared.detach())
-    b = torch.sqrt(torch.where(passes, b_squared, 1.0))
-    # An index of 0 is a medium without a real index: nothing passes into it.
-    n2 = torch.where(n2 > 0, n2, 1.0)
-    along_normal = (D / n2) / (a + torch.copysign(b, a))
-    ratio = n1 / n2
-    refracted = [torch.addcmul(ratio * d, along_normal, n) for d, n in zip(direction, normal, strict=True)]
-    return _renormalise(refracted), passes
-
-
 def _snell_discriminant(surface: Surface, hit, direction, n1: Tensor, n2: Tensor) -> Tensor:
     """b² of `refract` in float64, outside the graph."""
     with torch.no_grad():
@@ -72,18 +49,6 @@ def _snell_discriminant(surface: Surface, hit, direction, n1: Tensor, n2: Tensor
         n1, n2 = n1.double(), n2.double()
         a = n1 * dot(n, direction)
         return torch.addcmul((n2 - n1) * (n2 + n1) * torch.as_tensor(norm_squared), a, a).detach()
-
-
-def reflect(direction, normal, cosine, norm_squared):
-    """Law of reflection d' = d - 2 (n·d) n / |n|²; arguments as for `refract`."""
-    twice = 2 * cosine / norm_squared
-    return _renormalise([torch.addcmul(d, twice, n, value=-1) for d, n in zip(direction, normal, strict=True)])
-
-
-def _renormalise(direction):
-    detached = [d.detach() for d in direction]
-    factor = torch.rsub(dot(detached, detached), 1.5, alpha=0.5)
-    return [d * factor for d in direction]
 
 
 class _Ray(NamedTuple):
@@ -103,14 +68,23 @@ class _Ray(NamedTuple):
         return Rays(torch.stack([x, y, z]), torch.stack([L, M, N]), self.valid, self.opl)
 
 
-def cross(surface: Surface, rays: Rays, gap: Tensor | None, side: int, n1: Tensor, n2: Tensor) -> Crossing:
+def cross(
+    surface: Surface,
+    rays: Rays,
+    gap: Tensor | Gap | None,
+    side: int,
+    n1: Tensor,
+    n2: Tensor,
+    wavelength: Tensor | None = None,
+) -> Crossing:
     """Carry rays over the gap before a surface and through the surface.
 
-    rays: in the frame of the surface before, or of this one if gap is None; gap: mm between the two vertices;
-    side: σ = ±1, the axial direction of light in the gap; n1, n2: (...) indices before and behind.
+    rays: in the frame of the surface before, or of this one, before its pose, if gap is None; gap: mm between the two
+    vertices, or what `gap_behind` says; side: σ = ±1, the axial direction of light in the gap; n1, n2: (...) indices
+    before and behind; wavelength: (...) µm, needed by surfaces with a phase.
     If n2 is the same tensor as n1 the surface is a dummy and does not bend.
     """
-    return _crossing(_Ray.of(rays), *_cross(surface, _Ray.of(rays), gap, side, n1, n2))
+    return _crossing(_Ray.of(rays), *_cross(surface, _Ray.of(rays), gap, side, n1, n2, wavelength))
 
 
 def _crossing(before: _Ray, after: _Ray, met: Tensor, passes: Tensor | None, clear: Tensor | None) -> Crossing:
@@ -123,8 +97,12 @@ def _crossing(before: _Ray, after: _Ray, met: Tensor, passes: Tensor | None, cle
     )
 
 
-def _cross(surface: Surface, rays: _Ray, gap: Tensor | None, side: int, n1: Tensor, n2: Tensor):
+def _cross(surface: Surface, rays: _Ray, gap, side: int, n1: Tensor, n2: Tensor, wavelength: Tensor | None):
     """Rays behind the surface, and which of those before met it, were not totally reflected, pass its apertures."""
+    if isinstance(gap, Gap) or is_posed(surface):
+        rays, gap = _approach(surface, rays, gap, side, n1), None
+        if surface.is_break:
+            return rays, torch.ones_like(rays.valid), None, None
     direction = rays.direction
     x, y, z = rays.position
     arrival = rays.position if gap is None else (x, y, z - gap)
@@ -133,7 +111,10 @@ def _cross(surface: Surface, rays: _Ray, gap: Tensor | None, side: int, n1: Tens
     if opl is not None:
         opl = opl + n1 * _reduced_path(rays.position, hit, direction, gap, side)
     passes = None
-    if surface.is_mirror or n2 is not n1:
+    if surface.phase is not None:
+        direction, passes, added = _through_phase(surface, hit, direction, cosine, known, n1, n2, wavelength)
+        opl = opl if opl is None or added is None else opl + added
+    elif surface.is_mirror or n2 is not n1:
         n, norm_squared = normal(surface, hit) if known is None else known
         if surface.is_mirror:
             direction = reflect(direction, n, cosine, norm_squared)
@@ -150,6 +131,36 @@ def _cross(surface: Surface, rays: _Ray, gap: Tensor | None, side: int, n1: Tens
         opl=opl if opl is None else torch.where(survives, opl, 0.0),
     )
     return after, met, passes, clear
+
+
+def _approach(surface: Surface, rays: _Ray, gap: Tensor | Gap | None, side: int, n1: Tensor) -> _Ray:
+    """Rays told in the axes of the surface; their path less that of the gap along the axis, n1 T σ."""
+    position, direction, opl = rays.position, rays.direction, rays.opl
+    thickness = gap
+    if isinstance(gap, Gap):
+        position, direction = point_in(gap.pose, position), direction_in(gap.pose, direction)
+        thickness = gap.thickness
+    if thickness is not None:
+        x, y, z = position
+        position = x, y, z - thickness
+        opl = opl if opl is None else opl - n1 * (thickness * side)
+    if surface.before is not None:
+        position, direction = point_in(surface.before, position), direction_in(surface.before, direction)
+    return _Ray(position, direction, rays.valid, opl)
+
+
+def _through_phase(surface: Surface, hit, direction, cosine, known, n1, n2, wavelength):
+    """Direction behind a surface with a phase, whether light passes (None: all does), and the path that is added."""
+    kind, phase = kind_of(surface.phase), surface.phase
+    if kind.added is not None and wavelength is None:
+        raise ValueError(f"a surface with a phase ({type(phase).__name__}) bends light by its wavelength: give it")
+    added = None if kind.added is None else kind.added(phase, hit[0], hit[1], wavelength.to(hit[0].dtype))
+    if kind.slopes:
+        return bend_slopes(direction, hit, kind.power(phase, wavelength), n1, n2), None, added and added.path
+    n, norm_squared = normal(surface, hit) if known is None else known
+    mirror = surface.is_mirror
+    direction, passes = diffract(direction, n, cosine, norm_squared, n1, n2, added, mirror=mirror)
+    return direction, passes, added.path
 
 
 def _reduced_path(start, hit, direction, gap: Tensor | None, side: int) -> Tensor:
@@ -171,25 +182,27 @@ def steps(
     rays: Rays,
     *,
     indices: Sequence[Tensor],
+    wavelength: Tensor | None = None,
     side: int = 1,
-    gap: Tensor | None = None,
+    gap: Tensor | Gap | None = None,
 ) -> Iterator[Crossing]:
     """Yield what happens at each surface in turn.
 
-    rays: before surfaces[0], in its frame, or with `gap` in that of a vertex `gap` mm before it; indices:
-    len(surfaces) + 1 media (...), the first before surfaces[0]; side: axial direction of light before it (-1 behind
+    rays: before surfaces[0], in its frame before its pose, or with `gap` in that of the surface before it (mm, or what
+    `surface.gap_behind` says of that one); indices: len(surfaces) + 1 media (...), the first before surfaces[0];
+    wavelength: (...) µm, which surfaces with a phase need; side: axial direction of light before surfaces[0] (-1 behind
     an odd number of mirrors).
     """
-    for before, crossed in _walk(surfaces, rays, indices, side, gap):
+    for before, crossed in _walk(surfaces, rays, indices, wavelength, side, gap):
         yield _crossing(before, *crossed)
 
 
-def _walk(surfaces: Sequence[Surface], rays: Rays, indices: Sequence[Tensor], side: int, gap: Tensor | None):
+def _walk(surfaces: Sequence[Surface], rays: Rays, indices: Sequence[Tensor], wavelength: Tensor | None, side, gap):
     before = _Ray.of(rays)
     for surface, n1, n2 in zip(surfaces, indices[:-1], indices[1:], strict=True):
-        crossed = _cross(surface, before, gap, side, n1, n2)
+        crossed = _cross(surface, before, gap, side, n1, n2, wavelength)
         yield before, crossed
-        before, gap = crossed[0], surface.thickness
+        before, gap = crossed[0], gap_behind(surface)
         side = -side if surface.is_mirror else side
 
 
@@ -198,36 +211,38 @@ def trace_surfaces(
     rays: Rays,
     *,
     indices: Sequence[Tensor],
+    wavelength: Tensor | None = None,
     side: int = 1,
-    gap: Tensor | None = None,
+    gap: Tensor | Gap | None = None,
 ) -> Rays:
     """The rays behind the last of the surfaces; arguments as for `steps`.
 
     The compiled trace takes the runs of surfaces that it knows, where it pays: see `fused.tracing`.
     """
     if torch.compiler.is_compiling():
-        return _eager(surfaces, rays, indices=indices, side=side, gap=gap)
+        return _eager(surfaces, rays, indices=indices, wavelength=wavelength, side=side, gap=gap)
     first = 0
     for expressible, run in itertools.groupby(surfaces, is_expressible):
         last = first + len(list(run))
-        how = {"indices": indices[first : last + 1], "side": side, "gap": gap}
+        how = {"indices": indices[first : last + 1], "wavelength": wavelength, "side": side, "gap": gap}
         rays = (_fused if expressible else _eager)(surfaces[first:last], rays, **how)
         side = -side if sum(surface.is_mirror for surface in surfaces[first:last]) % 2 else side
-        gap, first = surfaces[last - 1].thickness, last
+        gap, first = gap_behind(surfaces[last - 1]), last
     return rays
 
 
 def _fused(surfaces: Sequence[Surface], rays: Rays, **how) -> Rays:
-    if is_fused(rays, how["indices"][0], len(surfaces)):
-        end = trace_compiled(surfaces, rays, **how, eager=_eager)
+    if not isinstance(how["gap"], Gap) and is_fused(rays, how["indices"][0], len(surfaces)):
+        known = {name: how[name] for name in ("indices", "side", "gap")}
+        end = trace_compiled(surfaces, rays, **known, eager=_eager)
         if end is not None:
             return end
     return _eager(surfaces, rays, **how)
 
 
-def _eager(surfaces: Sequence[Surface], rays: Rays, *, indices, side: int, gap: Tensor | None) -> Rays:
+def _eager(surfaces: Sequence[Surface], rays: Rays, *, indices, wavelength=None, side: int, gap) -> Rays:
     after = None
-    for _, crossed in _walk(surfaces, rays, indices, side, gap):
+    for _, crossed in _walk(surfaces, rays, indices, wavelength, side, gap):
         after = crossed[0]
     return rays if after is None else after.rays()
 
@@ -240,7 +255,7 @@ def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:
     """
     media: list[glass.Glass] = []
     for surface in lens.surfaces:
-        same = media and (surface.is_mirror or _same_medium(surface.glass, media[-1]))
+        same = media and (surface.is_mirror or surface.is_break or _same_medium(surface.glass, media[-1]))
         media.append(media[-1] if same else surface.glass)
     # Air stands between all elements: each medium is evaluated once, and none for a surface that keeps the one before.
     distinct = {(medium.formula, id(medium.coefficients)): medium for medium in media}
@@ -279,7 +294,7 @@ def trace_lens(lens: Lens, rays: Rays, wavelength: Tensor) -> Rays:
 
     wavelength: µm, broadcast against the batch shape of the rays. Returns the rays in the frame of the image.
     """
-    return trace_surfaces(lens.surfaces[1:], rays, indices=media(lens, wavelength))
+    return trace_surfaces(lens.surfaces[1:], rays, indices=media(lens, wavelength), wavelength=wavelength)
 
 
 def axial_path(surfaces: Sequence[Surface], indices: Sequence[Tensor], side: int = 1) -> Tensor:

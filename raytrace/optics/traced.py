@@ -19,7 +19,7 @@ from raytrace.maths.result import Result, called
 from raytrace.maths.value import value
 from raytrace.optics.launch import rays as launched
 from raytrace.optics.losses import STATUS, LostRays
-from raytrace.optics.trace import axial_path, media, steps, trace_surfaces
+from raytrace.optics.trace import axial_path, media, steps, trace_lens
 from raytrace.system.lens import Lens, field_points, vector, wavelengths_of
 from raytrace.system.rays import COLUMNS, Rays
 
@@ -158,7 +158,7 @@ def trace(
         begun = rays if isinstance(rays, Rays) else called("formats.ray_table.read_rays")(rays, lens)
     if begun.wavelength is None:
         begun = dataclasses.replace(begun, wavelength=_chosen(lens, wavelengths).squeeze())
-    end = trace_surfaces(lens.surfaces[1:], begun, indices=media(lens, begun.wavelength))
+    end = trace_lens(lens, begun, begun.wavelength)
     return Traced(end.position, end.direction, end.valid, end.opl, begun.wavelength, lens, begun, labels)
 
 
@@ -202,7 +202,7 @@ def _way(lens: Lens, rays: Rays, wavelength: Tensor) -> _Way:
     surfaces, indices = lens.surfaces[1:], media(lens, wavelength)
     ended = vignetted = torch.zeros_like(rays.valid)
     shown, status, values = [], [], []
-    for k, crossing in enumerate(steps(surfaces, rays, indices=indices), 1):
+    for k, crossing in enumerate(steps(surfaces, rays, indices=indices, wavelength=wavelength), 1):
         vignetted = vignetted | crossing.clipped
         state = torch.where(vignetted, _VIGNETTED, _OK)
         state = torch.where(crossing.totally_reflected, _TIR, torch.where(crossing.missed, _MISS, state))

@@ -80,7 +80,9 @@ def drawn_radii(lens: Lens, wavelength: Tensor, fields: Tensor) -> list[float]:
         dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
         points = torch.cat([fan(11, axis, dtype=dtype, device=device)[0] for axis in "xy"], dim=1)
         rays = launch(lens, points, fields=fields, wavelengths=wavelength.reshape(1))
-        for k, crossing in enumerate(steps(lens.surfaces[1:], rays, indices=media(lens, wavelength)), start=1):
+        indices = media(lens, wavelength)
+        crossings = steps(lens.surfaces[1:], rays, indices=indices, wavelength=wavelength)
+        for k, crossing in enumerate(crossings, start=1):
             if stored[k] <= 0:
                 x, y, _ = crossing.rays.position
                 reach = torch.where(crossing.rays.valid, torch.hypot(x, y), 0.0).max()
@@ -140,7 +142,8 @@ def ray_paths(lens: Lens, pupil: Tensor, *, fields: Tensor, wavelength: Tensor, 
     alive, gap = rays.valid, None
     fate = [[("miss", 0)] * pupil.shape[1] for _ in range(fields.shape[1])]
     ends: dict[tuple[int, int], np.ndarray] = {}
-    for k, crossing in enumerate(steps(lens.surfaces[1:], rays, indices=indices), start=1):
+    crossings = steps(lens.surfaces[1:], rays, indices=indices, wavelength=wavelength)
+    for k, crossing in enumerate(crossings, start=1):
         arrival = (
             rays.position if gap is None else rays.position - torch.stack([0 * gap, 0 * gap, gap])[:, None, None, None]
         )

@@ -163,6 +163,7 @@ def changed(surface: Surface, numbers: Mapping[str, object], where: str, *, like
             raise ValueError(f"{where}: radius 0; a plane has radius inf")
         given["curvature"] = 1 / radius
     made = {name: _like(v, like) if name in numeric and v is not None else v for name, v in given.items()}
+    made |= {name: _with_tensors(v, like) for name, v in made.items() if name in ("phase", "before", "after")}
     found = dataclasses.replace(surface, **made)
     _check_kinds(found, where)
     return found
@@ -214,6 +215,15 @@ def wavelengths_of(lens: Lens, wavelengths: Tensor | Iterable[float] | float | N
     found = vector(wavelengths, like=lens)
     check_media(lens, found[~torch.isin(found, lens.wavelengths)])
     return found
+
+
+def _with_tensors(part, like: Tensor):
+    """A value whose plain numbers are tensors."""
+    if part is None:
+        return None
+    numeric = {field.name for field in dataclasses.fields(part) if field.type in (Tensor, Tensor | None)}
+    found = {name: getattr(part, name) for name in numeric}
+    return dataclasses.replace(part, **{name: _like(v, like) for name, v in found.items() if v is not None})
 
 
 def _like(number: Tensor | float | Sequence, like: Tensor) -> Tensor:

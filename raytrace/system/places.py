@@ -1,4 +1,4 @@
-"""Places: the numbers of a surface's shape by name, whatever its kind is."""
+"""Places: the numbers of a surface by name, whatever its kind is: of its shape, its phase and its pose."""
 
 import dataclasses
 from typing import NamedTuple
@@ -18,9 +18,10 @@ class Place(NamedTuple):
 
 
 def places(surface: Surface) -> dict[str, Place]:
-    """Every number of the shape by its name: curvature, conic, a4 (of r⁴) …, and the fields of a departure.
+    """Every number by its name: curvature, conic, a4 (of r⁴) …, and the fields of a departure, a phase and the poses.
 
-    Entries of a tensor are counted from 1, coefficients by the power of r that they belong to.
+    Entries of a tensor are counted from 1, coefficients by the power of r that they belong to. The pose behind the
+    surface has its names with "_after", as tilt_x_after.
     """
     found: dict[str, Place] = {}
     for field in dataclasses.fields(Surface):
@@ -29,9 +30,10 @@ def places(surface: Surface) -> dict[str, Place]:
             found |= _entries(("coefficients",), part, "a", KINDS[surface.kind].step)
         elif field.name in SHAPE and field.type == Tensor | None:
             found[field.name] = Place((field.name,))
-        elif field.name in SHAPE and dataclasses.is_dataclass(part):
+        elif field.name in (*SHAPE, "phase", "before", "after") and dataclasses.is_dataclass(part):
+            behind = "_after" if field.name == "after" else ""
             for own in dataclasses.fields(part):
-                found |= _entries((field.name, own.name), getattr(part, own.name), own.name)
+                found |= _entries((field.name, own.name), getattr(part, own.name), own.name + behind)
     return found
 
 

@@ -21,6 +21,8 @@ from raytrace.maths.value import to, value
 from raytrace.media.glass import AIR, Glass
 from raytrace.system.aperture import Aperture
 from raytrace.system.departure import Departure
+from raytrace.system.phases import Phase, kind_of
+from raytrace.system.pose import Gap, Pose
 from raytrace.system.search import first_crossing
 from raytrace.system.shapes import DEPARTURES, EVEN, KINDS, Relief, relief, sag_and_derivatives
 
@@ -36,7 +38,12 @@ class Surface:
         mm^(1-2j); None if not aspheric.
     departure: what the sag has beside, of a kind of `shapes.DEPARTURES`; None if nothing. A height at the vertex
         belongs to the thickness before: paraxial optics takes D(0, 0) and the slopes there for 0.
-    glass: the medium behind the surface; MIRROR reflects and keeps the medium before it.
+    phase: what the surface adds to the path of light, or does in place of Snell's law, of a kind of `phases.PHASES`;
+        None for a surface that refracts or reflects.
+    before, after: the pose of the surface's axes in those of its vertex, and of the axes that the thickness is laid
+        along in those of the surface; None where they are the same.
+    is_break: whether rays only change their axes here, to those of `before`, and meet nothing: a coordinate break.
+    glass: the medium behind the surface; MIRROR reflects and keeps the medium before it, as a coordinate break does.
     semi_diameter: mm, as stored in the file; it never clips a ray (only `apertures` do), but bounds the search for
         the first crossing with an asphere that a ray may cross more than once.
     apertures: what the surface lets through.
@@ -49,6 +56,10 @@ class Surface:
     coefficients: Tensor | None = None
     kind: str = EVEN
     departure: Departure | None = None
+    phase: Phase | None = None
+    before: Pose | None = None
+    after: Pose | None = None
+    is_break: bool = False
     glass: Glass = AIR
     semi_diameter: float | None = None
     apertures: tuple[Aperture, ...] = ()
@@ -64,22 +75,33 @@ class Surface:
         return self.curvature is None and self.coefficients is None and self.departure is None
 
 
-#: The fields of a surface that make its shape: all but what stands behind it and around it.
-SHAPE = tuple(
-    field.name
-    for field in dataclasses.fields(Surface)
-    if field.name not in ("thickness", "glass", "semi_diameter", "apertures", "comment")
-)
+_BESIDE = ("thickness", "phase", "before", "after", "is_break", "glass", "semi_diameter", "apertures", "comment")
+
+#: The fields of a surface that make its shape: all but how it stands, what stands behind it and around it.
+SHAPE = tuple(field.name for field in dataclasses.fields(Surface) if field.name not in _BESIDE)
+
+
+def gap_behind(surface: Surface) -> Tensor | Gap:
+    """What lies between a surface and the next: its thickness, and its pose behind it if it has one."""
+    return surface.thickness if surface.after is None else Gap(surface.after, surface.thickness)
+
+
+def is_posed(surface: Surface) -> bool:
+    """Whether the surface is tilted or decentred, or a coordinate break."""
+    return surface.is_break or surface.before is not None or surface.after is not None
 
 
 def is_round(surface: Surface) -> bool:
-    """Whether the sag is symmetric about the axis, by its kind and whatever its numbers are."""
+    """Whether sag and phase are symmetric about the axis, by their kind and whatever their numbers are."""
+    if surface.phase is not None and not kind_of(surface.phase).is_round:
+        return False
     return surface.departure is None or DEPARTURES[type(surface.departure).__name__].is_round
 
 
 def is_even(surface: Surface) -> bool:
-    """Whether the sag is a conic with the terms of an even asphere at most, which is what other programs know."""
-    return surface.departure is None and (surface.coefficients is None or surface.kind == EVEN)
+    """Whether the surface is a centred conic with the terms of an even asphere at most: what other programs know."""
+    plain = surface.departure is None and surface.phase is None and not is_posed(surface)
+    return plain and (surface.coefficients is None or surface.kind == EVEN)
 
 
 def is_searched(surface: Surface) -> bool:

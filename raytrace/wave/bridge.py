@@ -224,7 +224,8 @@ def _at_stop(scene: Scene, pupil: Tensor) -> Tensor:
     lens = with_object_distance(scene.lens, scene.lens.surfaces[0].thickness[..., None])
     field, wavelength = scene.fields[:, :, None, None], scene.wavelengths[:, None]
     rays = rays_of_field(lens, field, vignette(lens, field, pupil), wavelength=wavelength)
-    hit = trace_surfaces(lens.surfaces[1 : lens.stop + 1], rays, indices=media(lens, wavelength)[: lens.stop + 1])
+    indices = media(lens, wavelength)[: lens.stop + 1]
+    hit = trace_surfaces(lens.surfaces[1 : lens.stop + 1], rays, indices=indices, wavelength=wavelength)
     return hit.position[:2].expand(2, *scene.shape, pupil.shape[-1])
 
 
