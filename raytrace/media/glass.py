@@ -8,7 +8,8 @@ Two ways to an index, on purpose:
 * `check_wavelengths(glass, wavelengths)` is the door: it raises `InvalidIndex` there and warns `OutOfRange` where the
   glass's coefficients were not fitted. `index(glass, wavelength)` is both in one call.
 
-Wavelengths in µm, indices relative to air at the catalog's reference temperature.
+Wavelengths in µm, indices relative to air at the catalog's reference temperature and 1 atm (`environment.py`:
+at others).
 """
 
 import math

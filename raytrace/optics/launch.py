@@ -14,11 +14,10 @@ from torch import Tensor
 
 from raytrace.maths.numerics import broadcast_shape, dot, dot_2, safe_divide, safe_sqrt, unit
 from raytrace.maths.pupil import gauss_rings
-from raytrace.media import glass
 from raytrace.optics.aiming import aim_at_image, aim_at_stop, at_stop
 from raytrace.optics.paraxial import FirstOrder, first_order
 from raytrace.optics.vignetting import vignette
-from raytrace.system.lens import RAY_AIMING, Lens, field_points, wavelengths_of
+from raytrace.system.lens import RAY_AIMING, Lens, field_points, index_behind, wavelengths_of
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import sag
 
@@ -86,7 +85,7 @@ def rays_of_field(
     """
     lens = with_ray_aiming(lens, ray_aiming)
     paraxial = first_order(lens)
-    index = glass.refractive_index(lens.surfaces[0].glass, wavelength).to(pupil.dtype)
+    index = index_behind(lens, 0, wavelength).to(pupil.dtype)
     field, reached = object_field(lens, field, paraxial)
 
     def through(pupil: Tensor, fraction: float = 1.0) -> Rays:
@@ -151,7 +150,7 @@ def paraxial_field(lens: Lens, field: Tensor, paraxial: FirstOrder) -> Tensor:
         if at_infinity:
             raise ValueError("fields are object heights but the object is at infinity: give angles, or a distance")
         return field
-    index = glass.refractive_index(lens.surfaces[0].glass, lens.wavelengths[lens.primary_wavelength])
+    index = index_behind(lens, 0, lens.wavelengths[lens.primary_wavelength])
     scale = paraxial.power / index if at_infinity else 1 / paraxial.magnification
     return _scaled(field, scale)
 
@@ -201,7 +200,7 @@ def _marginal_height(lens: Lens, paraxial: FirstOrder) -> tuple[Tensor, Tensor]:
     """Height in mm at the stop of the real axial ray through the edge of the entrance pupil, and whether it arrives."""
     wavelength = lens.wavelengths[lens.primary_wavelength]
     edge = lens.wavelengths.new_tensor([0.0, 1.0]).to(paraxial.entrance_pupil_diameter.dtype)
-    index = glass.refractive_index(lens.surfaces[0].glass, wavelength).to(edge.dtype)
+    index = index_behind(lens, 0, wavelength).to(edge.dtype)
     position, arrives = at_stop(
         lens, _through_entrance_pupil(lens, torch.zeros_like(edge), edge, paraxial, index), wavelength
     )
@@ -263,7 +262,7 @@ def _telecentric_radius(lens: Lens, paraxial: FirstOrder, index: Tensor) -> Tens
 def _field_of_real_height(lens, height: Tensor, estimate: Tensor, paraxial: FirstOrder) -> tuple[Tensor, Tensor]:
     """The field (2, ...) whose real chief ray meets the image at `height` (2, ...) mm, and whether there is one."""
     wavelength = lens.wavelengths[lens.primary_wavelength]
-    index = glass.refractive_index(lens.surfaces[0].glass, wavelength).to(height.dtype)
+    index = index_behind(lens, 0, wavelength).to(height.dtype)
 
     def through(field: Tensor, pupil: Tensor) -> Rays:
         return _through_entrance_pupil(lens, field, pupil, paraxial, index)

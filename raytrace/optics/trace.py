@@ -20,7 +20,7 @@ from raytrace.maths.value import value
 from raytrace.media import glass
 from raytrace.optics.laws import bend_slopes, diffract, reflect, refract
 from raytrace.system.aperture import inside
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, index_behind
 from raytrace.system.phases import kind_of
 from raytrace.system.pose import Gap, direction_in, point_in
 from raytrace.system.rays import Rays
@@ -253,6 +253,8 @@ def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:
     wavelength: (...) µm; returns one tensor (...) for each surface of the lens, in the lens's dtype. A medium that
     does not change is the same tensor, which tells `cross` that nothing bends.
     """
+    if lens.environment is not None or any(surface.environment is not None for surface in lens.surfaces):
+        return _media_in_environment(lens, wavelength)
     media: list[glass.Glass] = []
     for surface in lens.surfaces:
         same = media and (surface.is_mirror or surface.is_break or _same_medium(surface.glass, media[-1]))
@@ -263,6 +265,21 @@ def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:
     found = _refractive_indices(list(distinct.values()), wavelength)
     by_medium = dict(zip(distinct, (n.to(dtype) for n in found), strict=True))
     return [by_medium[medium.formula, id(medium.coefficients)] for medium in media]
+
+
+def _media_in_environment(lens: Lens, wavelength: Tensor) -> list[Tensor]:
+    """`media` of a lens at a temperature and a pressure."""
+    found: list[Tensor] = []
+    by_medium: dict[tuple, Tensor] = {}
+    for number, surface in enumerate(lens.surfaces):
+        if found and (surface.is_mirror or surface.is_break):
+            found.append(found[-1])
+            continue
+        key = (surface.glass.formula, id(surface.glass.coefficients), surface.glass.records, id(surface.environment))
+        if key not in by_medium:
+            by_medium[key] = index_behind(lens, number, wavelength).to(lens.surfaces[-2].thickness.dtype)
+        found.append(by_medium[key])
+    return found
 
 
 def _refractive_indices(glasses: Sequence[glass.Glass], wavelength: Tensor) -> list[Tensor]:

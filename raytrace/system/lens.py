@@ -1,6 +1,7 @@
 """Lens: surfaces, stop, aperture, fields and wavelengths, as one value."""
 
 import dataclasses
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 
 import torch
@@ -8,6 +9,14 @@ from torch import Tensor
 
 from raytrace.maths.result import lent
 from raytrace.maths.value import value
+from raytrace.media.environment import (
+    REFERENCE,
+    Environment,
+    NoThermalCoefficients,
+    index_in,
+    objection,
+    unknown_change,
+)
 from raytrace.media.glass import check_unit, check_wavelengths, refractive_index
 from raytrace.system.aperture import SHAPES
 from raytrace.system.shapes import KINDS
@@ -77,6 +86,7 @@ class Lens:
     name, notes: title and comment lines of the file.
     catalogs: glass catalogs in the order of the file.
     ray_aiming: a key of RAY_AIMING.
+    environment: temperature and pressure of the lens and the air around it; None: every glass as its catalog has it.
     """
 
     surfaces: tuple[Surface, ...]
@@ -90,6 +100,7 @@ class Lens:
     notes: tuple[str, ...] = ()
     catalogs: tuple[str, ...] = ()
     ray_aiming: str = "off"
+    environment: Environment | None = None
 
     __str__ = lent("optics.views.text")
     _repr_html_ = lent("plot.notebook.page")
@@ -104,12 +115,16 @@ class Lens:
         wavelengths: Tensor | Sequence[float] | None = None,
         fields: Tensor | Sequence | None = None,
         ray_aiming: str | None = None,
+        temperature: Tensor | float | None = None,
+        pressure: Tensor | float | None = None,
     ) -> "Lens":
         """The same lens under other conditions; what is None stays.
 
         object_distance: mm from the object to surface 1, inf allowed; sensor_distance: mm from the last surface before
         the image; f_number: image-space, EFL / entrance_pupil_diameter, which is in mm; wavelengths: (W,) µm, alike in
-        weight, the first one primary; fields: y, or (x, y), in the lens's own kind, without vignetting factors.
+        weight, the first one primary; fields: y, or (x, y), in the lens's own kind, without vignetting factors;
+        temperature: °C, pressure: atm, 0 in vacuum: what is not given of the two stays, or is 20 °C and 1 atm. Warns
+        NoThermalCoefficients.
         Raises ValueError for conditions that no lens has.
         """
         found = self
@@ -130,6 +145,8 @@ class Lens:
             found = dataclasses.replace(found, fields=kept)
         if ray_aiming is not None:
             found = dataclasses.replace(found, ray_aiming=ray_aiming)
+        if temperature is not None or pressure is not None:
+            found = with_environment(found, temperature, pressure)
         check(found)
         return found
 
@@ -258,6 +275,45 @@ def with_wavelengths(
     return dataclasses.replace(lens, wavelengths=wavelengths, wavelength_weights=weights, primary_wavelength=0)
 
 
+def with_environment(lens: Lens, temperature: Tensor | float | None, pressure: Tensor | float | None) -> Lens:
+    """The lens at another temperature in °C and pressure in atm; what is None stays, or is 20 °C and 1 atm.
+
+    A surface with an environment of its own keeps it. Raises ValueError for what no air has; warns
+    NoThermalCoefficients, once for each glass whose change is not known.
+    """
+    before = lens.environment or _reference(lens.wavelengths)
+    temperature = before.temperature if temperature is None else _like(temperature, lens.wavelengths)
+    pressure = before.pressure if pressure is None else _like(pressure, lens.wavelengths)
+    found = dataclasses.replace(lens, environment=Environment(temperature, pressure))
+    _check_environments(found)
+    for message in unknown_changes(found).values():
+        warnings.warn(message, NoThermalCoefficients, stacklevel=3)
+    return found
+
+
+def unknown_changes(lens: Lens) -> dict[int, str]:
+    """What is not known of the glasses of a lens in its environment, by the first surface of each, in words."""
+    found: dict[tuple[str, str], tuple[int, str]] = {}
+    for number, surface in enumerate(lens.surfaces):
+        place = surface.environment or lens.environment
+        if place is not None and (message := unknown_change(surface.glass, place)):
+            found.setdefault((message, surface.glass.catalog), (number, f"surface {number}: {message}"))
+    return dict(found.values())
+
+
+def index_behind(lens: Lens, number: int, wavelength: Tensor) -> Tensor:
+    """n (...) of the medium behind a surface at wavelengths (...) µm, beside the lens's air; none of a mirror."""
+    surface, air = lens.surfaces[number], lens.environment
+    if air is None and surface.environment is None:
+        return refractive_index(surface.glass, wavelength)
+    return index_in(surface.glass, wavelength, air or _reference(wavelength), surface.environment)
+
+
+def _reference(like: Tensor) -> Environment:
+    """The air of catalogs."""
+    return Environment(*(torch.as_tensor(number, dtype=torch.float64, device=like.device) for number in REFERENCE))
+
+
 def with_field_kind(lens: Lens, kind: str) -> Lens:
     """The lens with the same numbers for its fields, told as another kind of FIELD_UNITS."""
     return dataclasses.replace(lens, fields=dataclasses.replace(lens.fields, kind=kind))
@@ -321,11 +377,19 @@ def check(lens: Lens) -> None:
         raise ValueError("object space is telecentric but the object is at infinity: give an object distance")
     if at_infinity and lens.aperture.kind in ("object_na", "object_cone_angle"):
         raise ValueError(f"aperture {lens.aperture.kind} needs an object at a finite distance")
+    _check_environments(lens)
     _check_cone(lens)
     for number, surface in enumerate(lens.surfaces):
         _check_kinds(surface, f"surface {number}")
     if lens.fields.kind == "angle" and bool((torch.hypot(lens.fields.x, lens.fields.y) >= 90).any()):
         raise ValueError("field angles reach 90 degrees: rays start from the plane of the entrance pupil")
+
+
+def _check_environments(lens: Lens) -> None:
+    """Refuse a temperature or a pressure that no air has."""
+    for where, holder in (("", lens), *((f"surface {k}: ", surface) for k, surface in enumerate(lens.surfaces))):
+        if holder.environment is not None and (wrong := objection(holder.environment)):
+            raise ValueError(where + wrong)
 
 
 def _check_kinds(surface: Surface, where: str) -> None:
@@ -346,6 +410,6 @@ def _check_cone(lens: Lens) -> None:
     if kind == "object_cone_angle" and number >= 90:
         raise ValueError(f"aperture object_cone_angle {number:g} degrees: expected less than 90")
     if kind == "object_na":
-        index = float(refractive_index(lens.surfaces[0].glass, lens.wavelengths[lens.primary_wavelength]))
+        index = float(index_behind(lens, 0, lens.wavelengths[lens.primary_wavelength]))
         if number >= index:
             raise ValueError(f"aperture object_na {number:g}: expected less than the index {index:g} before surface 1")

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from raytrace.maths.numerics import differentiating, dot
 from raytrace.maths.value import to, value
+from raytrace.media.environment import Environment
 from raytrace.media.glass import AIR, Glass
 from raytrace.system.aperture import Aperture
 from raytrace.system.departure import Departure
@@ -48,6 +49,7 @@ class Surface:
         the first crossing with an asphere that a ray may cross more than once.
     apertures: what the surface lets through.
     comment: free text of the file.
+    environment: temperature and pressure of the medium behind the surface, where they are not the lens's.
     """
 
     thickness: Tensor
@@ -64,6 +66,7 @@ class Surface:
     semi_diameter: float | None = None
     apertures: tuple[Aperture, ...] = ()
     comment: str = ""
+    environment: Environment | None = None
 
     @property
     def is_mirror(self) -> bool:
@@ -75,7 +78,10 @@ class Surface:
         return self.curvature is None and self.coefficients is None and self.departure is None
 
 
-_BESIDE = ("thickness", "phase", "before", "after", "is_break", "glass", "semi_diameter", "apertures", "comment")
+_BESIDE = (
+    *("thickness", "phase", "before", "after", "is_break", "glass", "environment"),
+    *("semi_diameter", "apertures", "comment"),
+)
 
 #: The fields of a surface that make its shape: all but how it stands, what stands behind it and around it.
 SHAPE = tuple(field.name for field in dataclasses.fields(Surface) if field.name not in _BESIDE)
