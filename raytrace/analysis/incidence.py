@@ -9,7 +9,7 @@ from raytrace.maths.numerics import dot
 from raytrace.maths.result import masked
 from raytrace.maths.value import value
 from raytrace.optics.launch import launch
-from raytrace.optics.trace import media, steps
+from raytrace.optics.trace import lens_steps
 from raytrace.system.lens import Lens
 from raytrace.system.surface import Surface, normal
 
@@ -75,8 +75,7 @@ def _incidence(lens: Lens, fields: Tensor, *, surfaces: bool = False) -> Inciden
     along = _directions(lens, fields)[:, :, None, None]  # (2, F, 1, 1), beside (F, W, P)
     rays = launch(lens, along * fields.new_tensor([-1.0, 0.0, 1.0]), fields=fields)
     angles, valid, reached = [], [], rays.valid
-    wavelength = lens.wavelengths[:, None]
-    crossings = steps(lens.surfaces[1:], rays, indices=media(lens, wavelength), wavelength=wavelength)
+    crossings = lens_steps(lens, rays, lens.wavelengths[:, None])
     for surface, crossing in zip(lens.surfaces[1:], crossings, strict=True):
         reached = reached & ~(crossing.missed | crossing.totally_reflected)
         angles.append(_angle(surface, rays.direction, crossing.rays.position, along))

@@ -15,6 +15,7 @@ from torch import Tensor
 from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.pupil import gauss_rings
+from raytrace.optics.conjugates import sequence_of
 from raytrace.optics.launch import launch
 from raytrace.optics.paraxial import paraxial_image_distance
 from raytrace.optics.spot import EmptySpot, Spot, spot_of, spot_of_points, where_lit
@@ -45,7 +46,7 @@ def image_rays(lens: Lens, pupil: Tensor, *, fields: Tensor | None = None, wavel
     indices = media(lens, wavelengths[:, None])
     rays = launch(lens, pupil, fields=fields, wavelengths=wavelengths)
     indices = [*indices[:-1], indices[-2]]
-    return trace_surfaces(lens.surfaces[1:], rays, indices=indices, wavelength=wavelengths[:, None])
+    return trace_surfaces(sequence_of(lens), rays, indices=indices, wavelength=wavelengths[:, None])
 
 
 def focus_moments(rays: Rays, weights: Tensor | None = None, *, empty: str = "nan") -> tuple[Tensor, Tensor]:

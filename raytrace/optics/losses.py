@@ -11,7 +11,7 @@ from raytrace.maths.pupil import hexapolar
 from raytrace.maths.value import value
 from raytrace.optics.launch import launch
 from raytrace.optics.paraxial import first_order
-from raytrace.optics.trace import Crossing, media, steps
+from raytrace.optics.trace import Crossing, lens_steps
 from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
 from raytrace.system.rays import Rays
 
@@ -73,8 +73,7 @@ def fates(lens: Lens, rays: Rays, wavelength: Tensor) -> Iterator[tuple[Crossing
     wavelength: (...) µm; status: place in STATUS of what befell the ray first.
     """
     status = torch.where(rays.valid, _OK, STATUS.index("unaimed"))
-    indices = media(lens, wavelength)
-    for crossing in steps(lens.surfaces[1:], rays, indices=indices, wavelength=wavelength):
+    for crossing in lens_steps(lens, rays, wavelength):
         for name, fate in zip(LOST, (crossing.missed, crossing.totally_reflected, crossing.clipped), strict=True):
             status = torch.where((status == _OK) & fate, STATUS.index(name), status)
         yield crossing, status

@@ -11,7 +11,7 @@ from torch import Tensor
 from raytrace.maths.value import value
 from raytrace.optics.trace import media
 from raytrace.system.lens import Lens, largest_field
-from raytrace.system.phases import kind_of
+from raytrace.system.phases import power_of
 from raytrace.system.surface import Surface, vertex_curvature
 
 
@@ -82,7 +82,7 @@ def system_matrix(
     for i, surface in enumerate(surfaces):
         power = vertex_curvature(surface) * (indices[i + 1] - indices[i])
         if surface.phase is not None:
-            power = power + kind_of(surface.phase).power(surface.phase, wavelength)[1]
+            power = power + power_of(surface.phase, wavelength)[1]
         C, D = C - power * A, D - power * B
         if i + 1 < len(surfaces):
             gap = surface.thickness / indices[i + 1]

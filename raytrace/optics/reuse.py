@@ -17,8 +17,9 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.maths.numerics import broadcast_shape
+from raytrace.optics.conjugates import sequence_of
 from raytrace.optics.launch import rays_of_field
-from raytrace.optics.trace import Crossing, media, steps, trace_lens, trace_surfaces
+from raytrace.optics.trace import Crossing, lens_steps, media, steps, trace_lens, trace_surfaces
 from raytrace.optics.vignetting import vignette
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.rays import Rays
@@ -132,7 +133,7 @@ def cross_bundle(bundle: Bundle, memo: Memo | None = None) -> list[Crossing]:
     """What happens to the rays at every surface after the object."""
     lens, _, wavelength, _ = bundle
     if memo is None or torch._C._are_functorch_transforms_active():
-        return list(steps(lens.surfaces[1:], _launched(bundle), indices=media(lens, wavelength), wavelength=wavelength))
+        return list(lens_steps(lens, _launched(bundle), wavelength))
     front = memo.front(bundle, recorded=True)
     return [*front.crossings, *steps(**_rest(bundle, front, memo))]
 
@@ -155,7 +156,7 @@ def _rest(bundle: Bundle, front: _Front, memo: Memo) -> dict:
     indices = media(lens, wavelength) if front.indices is None else front.indices
     memo.crossed += len(lens.surfaces) - 1 - done
     return {
-        "surfaces": lens.surfaces[1 + done :],
+        "surfaces": sequence_of(lens)[done:],
         "rays": rays,
         "indices": indices[done:],
         "wavelength": wavelength,
@@ -177,7 +178,7 @@ def _constant_front(bundle: Bundle, recorded: bool) -> _Front:
     kept_indices = indices if len(fixed) == len(indices) else None
     if _varies(rays):
         return _Front(0, None, [], kept_indices)
-    surfaces = lens.surfaces[1:]
+    surfaces = sequence_of(lens)
     count, crossings = _unvaried(lens, indices, wavelength), []
     with torch.enable_grad():
         if recorded:
@@ -190,7 +191,7 @@ def _constant_front(bundle: Bundle, recorded: bool) -> _Front:
 
 def _unvaried(lens: Lens, indices: Sequence[Tensor], wavelength: Tensor) -> int:
     """How many surfaces after the object lie before the first that a variable moves, bends or stands behind."""
-    for count, surface in enumerate(lens.surfaces[1:]):
+    for count, surface in enumerate(sequence_of(lens)):
         gap = gap_behind(lens.surfaces[count]) if count else None
         shape = [getattr(surface, name) for name in (*SHAPE, "phase", "before")]
         phased = (wavelength,) if surface.phase is not None else ()

@@ -16,6 +16,7 @@ from raytrace.fused.choice import WORTH_COMPILING, prepare
 from raytrace.maths import pupil
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.value import to, value
+from raytrace.optics.conjugates import sequence_of
 from raytrace.optics.launch import is_at_infinity, launch, with_ray_aiming
 from raytrace.optics.spot import where_lit
 from raytrace.optics.trace import media, trace_surfaces
@@ -201,7 +202,7 @@ def start(shot: Shot, pupil: Tensor) -> Rays:
 def hits(shot: Shot, pupil: Tensor) -> tuple[Tensor, Tensor]:
     """Where rays through pupil points (2, P) meet the image, (2, P) mm, and which of them arrive, (P,)."""
     begun = start(shot, pupil)
-    arrived = trace_surfaces(shot.lens.surfaces[1:], begun, indices=shot.indices, wavelength=shot.wavelength)
+    arrived = trace_surfaces(sequence_of(shot.lens), begun, indices=shot.indices, wavelength=shot.wavelength)
     return arrived.position[:2], arrived.valid
 
 

@@ -4,7 +4,6 @@ The trace is a generator. To record, draw or find where a ray was lost, consume 
 rays, hand them with the surfaces that are left.
 """
 
-import dataclasses
 import itertools
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -17,11 +16,12 @@ from raytrace.fused.run import trace_compiled
 from raytrace.fused.structure import is_expressible
 from raytrace.maths.numerics import dot
 from raytrace.maths.value import value
-from raytrace.media import glass
+from raytrace.optics.conjugates import sequence_of
+from raytrace.optics.indices import media
 from raytrace.optics.laws import bend_slopes, diffract, reflect, refract
 from raytrace.system.aperture import inside
-from raytrace.system.lens import Lens, index_behind
-from raytrace.system.phases import kind_of
+from raytrace.system.lens import Lens
+from raytrace.system.phases import added_path, ideal_path, kind_of
 from raytrace.system.pose import Gap, direction_in, point_in
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface, gap_behind, in_double, is_posed, meet, normal
@@ -152,13 +152,13 @@ def _approach(surface: Surface, rays: _Ray, gap: Tensor | Gap | None, side: int,
 def _through_phase(surface: Surface, hit, direction, cosine, known, n1, n2, wavelength):
     """Direction behind a surface with a phase, whether light passes (None: all does), and the path that is added."""
     kind, phase = kind_of(surface.phase), surface.phase
-    if kind.added is not None and wavelength is None:
-        raise ValueError(f"a surface with a phase ({type(phase).__name__}) bends light by its wavelength: give it")
-    added = None if kind.added is None else kind.added(phase, hit[0], hit[1], wavelength.to(hit[0].dtype))
     if kind.slopes:
-        return bend_slopes(direction, hit, kind.power(phase, wavelength), n1, n2), None, added and added.path
+        behind = bend_slopes(direction, hit, kind.power(phase, wavelength), n1, n2)
+        return behind, None, ideal_path(phase, hit, direction, behind, n1, n2)
     n, norm_squared = normal(surface, hit) if known is None else known
-    mirror = surface.is_mirror
+    if kind.flat:
+        return *refract(direction, n, dot(n, direction), norm_squared, n1, n2), None
+    added, mirror = added_path(phase, hit[0], hit[1], wavelength), surface.is_mirror
     direction, passes = diffract(direction, n, cosine, norm_squared, n1, n2, added, mirror=mirror)
     return direction, passes, added.path
 
@@ -247,71 +247,17 @@ def _eager(surfaces: Sequence[Surface], rays: Rays, *, indices, wavelength=None,
     return rays if after is None else after.rays()
 
 
-def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:
-    """Refractive index behind every surface, object first; positive also behind a mirror.
-
-    wavelength: (...) µm; returns one tensor (...) for each surface of the lens, in the lens's dtype. A medium that
-    does not change is the same tensor, which tells `cross` that nothing bends.
-    """
-    if lens.environment is not None or any(surface.environment is not None for surface in lens.surfaces):
-        return _media_in_environment(lens, wavelength)
-    media: list[glass.Glass] = []
-    for surface in lens.surfaces:
-        same = media and (surface.is_mirror or surface.is_break or _same_medium(surface.glass, media[-1]))
-        media.append(media[-1] if same else surface.glass)
-    # Air stands between all elements: each medium is evaluated once, and none for a surface that keeps the one before.
-    distinct = {(medium.formula, id(medium.coefficients)): medium for medium in media}
-    dtype = lens.surfaces[-2].thickness.dtype
-    found = _refractive_indices(list(distinct.values()), wavelength)
-    by_medium = dict(zip(distinct, (n.to(dtype) for n in found), strict=True))
-    return [by_medium[medium.formula, id(medium.coefficients)] for medium in media]
-
-
-def _media_in_environment(lens: Lens, wavelength: Tensor) -> list[Tensor]:
-    """`media` of a lens at a temperature and a pressure."""
-    found: list[Tensor] = []
-    by_medium: dict[tuple, Tensor] = {}
-    for number, surface in enumerate(lens.surfaces):
-        if found and (surface.is_mirror or surface.is_break):
-            found.append(found[-1])
-            continue
-        key = (surface.glass.formula, id(surface.glass.coefficients), surface.glass.records, id(surface.environment))
-        if key not in by_medium:
-            by_medium[key] = index_behind(lens, number, wavelength).to(lens.surfaces[-2].thickness.dtype)
-        found.append(by_medium[key])
-    return found
-
-
-def _refractive_indices(glasses: Sequence[glass.Glass], wavelength: Tensor) -> list[Tensor]:
-    """n of each glass, as `refractive_index` gives it; glasses of one formula are evaluated together."""
-    groups: dict[object, list[int]] = {}
-    for number, medium in enumerate(glasses):
-        together = medium.formula not in ("mirror", "constant") and medium.coefficients.dim() == 1
-        groups.setdefault((medium.formula, len(medium.coefficients)) if together else number, []).append(number)
-    found: dict[int, Tensor] = {}
-    for numbers in groups.values():
-        if len(numbers) == 1:
-            found[numbers[0]] = glass.refractive_index(glasses[numbers[0]], wavelength)
-            continue
-        stacked = torch.stack([glasses[number].coefficients for number in numbers], -1)
-        stacked = stacked.reshape(*stacked.shape, *(1,) * wavelength.dim())
-        indices = glass.refractive_index(
-            dataclasses.replace(glasses[numbers[0]], coefficients=stacked), wavelength[None]
-        )
-        found |= dict(zip(numbers, indices.unbind(0), strict=True))
-    return [found[number] for number in range(len(glasses))]
-
-
-def _same_medium(a: glass.Glass, b: glass.Glass) -> bool:
-    return a is b or (a.formula == b.formula and a.coefficients is b.coefficients)
-
-
 def trace_lens(lens: Lens, rays: Rays, wavelength: Tensor) -> Rays:
     """Trace rays from the frame of surface 1 to the image surface.
 
     wavelength: µm, broadcast against the batch shape of the rays. Returns the rays in the frame of the image.
     """
-    return trace_surfaces(lens.surfaces[1:], rays, indices=media(lens, wavelength), wavelength=wavelength)
+    return trace_surfaces(sequence_of(lens), rays, indices=media(lens, wavelength), wavelength=wavelength)
+
+
+def lens_steps(lens: Lens, rays: Rays, wavelength: Tensor) -> Iterator[Crossing]:
+    """What happens to rays before surface 1 at every surface after the object; wavelength: (...) µm."""
+    return steps(sequence_of(lens), rays, indices=media(lens, wavelength), wavelength=wavelength)
 
 
 def axial_path(surfaces: Sequence[Surface], indices: Sequence[Tensor], side: int = 1) -> Tensor:

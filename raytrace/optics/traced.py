@@ -17,6 +17,7 @@ from torch import Tensor
 from raytrace.files import write_atomically
 from raytrace.maths.result import Result, called
 from raytrace.maths.value import value
+from raytrace.optics.conjugates import sequence_of
 from raytrace.optics.launch import rays as launched
 from raytrace.optics.losses import STATUS, LostRays
 from raytrace.optics.trace import axial_path, media, steps, trace_lens
@@ -199,7 +200,7 @@ class _Way(NamedTuple):
 
 @torch.no_grad()
 def _way(lens: Lens, rays: Rays, wavelength: Tensor) -> _Way:
-    surfaces, indices = lens.surfaces[1:], media(lens, wavelength)
+    surfaces, indices = sequence_of(lens), media(lens, wavelength)
     ended = vignetted = torch.zeros_like(rays.valid)
     shown, status, values = [], [], []
     for k, crossing in enumerate(steps(surfaces, rays, indices=indices, wavelength=wavelength), 1):

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from raytrace.maths.pupil import fan
 from raytrace.optics.launch import launch, stop_radius
-from raytrace.optics.trace import media, steps
+from raytrace.optics.trace import lens_steps, media
 from raytrace.plot.style import array
 from raytrace.system.lens import Lens
 from raytrace.system.surface import Surface, intersect, sag_at
@@ -80,9 +80,7 @@ def drawn_radii(lens: Lens, wavelength: Tensor, fields: Tensor) -> list[float]:
         dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
         points = torch.cat([fan(11, axis, dtype=dtype, device=device)[0] for axis in "xy"], dim=1)
         rays = launch(lens, points, fields=fields, wavelengths=wavelength.reshape(1))
-        indices = media(lens, wavelength)
-        crossings = steps(lens.surfaces[1:], rays, indices=indices, wavelength=wavelength)
-        for k, crossing in enumerate(crossings, start=1):
+        for k, crossing in enumerate(lens_steps(lens, rays, wavelength), start=1):
             if stored[k] <= 0:
                 x, y, _ = crossing.rays.position
                 reach = torch.where(crossing.rays.valid, torch.hypot(x, y), 0.0).max()
@@ -142,8 +140,7 @@ def ray_paths(lens: Lens, pupil: Tensor, *, fields: Tensor, wavelength: Tensor, 
     alive, gap = rays.valid, None
     fate = [[("miss", 0)] * pupil.shape[1] for _ in range(fields.shape[1])]
     ends: dict[tuple[int, int], np.ndarray] = {}
-    crossings = steps(lens.surfaces[1:], rays, indices=indices, wavelength=wavelength)
-    for k, crossing in enumerate(crossings, start=1):
+    for k, crossing in enumerate(lens_steps(lens, rays, wavelength), start=1):
         arrival = (
             rays.position if gap is None else rays.position - torch.stack([0 * gap, 0 * gap, gap])[:, None, None, None]
         )

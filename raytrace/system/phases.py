@@ -1,20 +1,24 @@
 """Phases: what a thin structure on a surface does to light beside Snell's law; one row for every kind.
 
 A grating, a hologram or a diffractive lens adds a path p(x, y), in mm, and its gradient to what light carries along
-the surface: [n2 d2] = [n1 d1] + ∇p, tangentially (`optics.laws`). An ideal lens bends slopes instead. A new kind is a
-new value and a new row of PHASES: rays, derivatives, first order, variables and files read it.
+the surface: [n2 d2] = [n1 d1] + ∇p, tangentially (`optics.laws`). An ideal lens bends slopes instead, and the facets
+of a Fresnel lens stand on a plane. A new kind is a new value and a new row of PHASES: rays, derivatives, first order,
+variables and files read it.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from raytrace.maths.bivariate import fringe_to_powers, polynomial_xy
+from raytrace.maths.numerics import dot, polynomial
 from raytrace.maths.value import value
 
-MICROMETRES = 1e-3  # mm
+_MICROMETRE = 1e-3  # mm
 
 
 class Added(NamedTuple):
@@ -26,10 +30,24 @@ class Added(NamedTuple):
 
 
 @value
-class Grating:
-    """Straight grooves along x, equally spaced in the projection on the x-y plane.
+class PolynomialPath:
+    """The path itself, p = Σ c_k x^i y^j in the order x, y, x², xy, y², …; coefficients: (K, ...) mm^(1-i-j)."""
 
-    frequency: lines per µm along y; order: of diffraction; p = order · frequency · λ y.
+    coefficients: Tensor
+
+
+@value
+class RadialPath:
+    """The path itself, p = Σ a_j r^2j; coefficients: (J, ...) mm^(1-2j)."""
+
+    coefficients: Tensor
+
+
+@value
+class Grating:
+    """Straight grooves along x, equally spaced in the projection on the x-y plane: p = order · frequency · λ y.
+
+    frequency: lines per µm along y; order: of diffraction.
     """
 
     frequency: Tensor
@@ -37,48 +55,223 @@ class Grating:
 
 
 @value
+class RadialPhase:
+    """p = order λ/2π Σ A_j ρ^2j, ρ = r/radius: "binary 2". coefficients: (J,) A_j in radians; radius: mm."""
+
+    coefficients: Tensor
+    radius: Tensor
+    order: Tensor
+
+
+@value
+class PolynomialPhase:
+    """p = order λ/2π Σ A_k (x/radius)^i (y/radius)^j: "binary 1". coefficients: (K,) radians of x, y, x², xy, y², …"""
+
+    coefficients: Tensor
+    radius: Tensor
+    order: Tensor
+
+
+@value
+class FringePhase:
+    """p = order λ Σ A_k Z_k(ρ, φ), Zernike's fringe terms, not normalised. coefficients: (K,) waves; radius: mm."""
+
+    coefficients: Tensor
+    radius: Tensor
+    order: Tensor
+
+
+@value
+class Hologram:
+    """The interference of waves from one point and towards another, recorded on the plane of the vertex.
+
+        p = -order λ/λ0 (|P - first| + |P - second|), less its value at the vertex
+
+    first, second: (3,) mm, where light comes from and goes to if it is the recording one; wavelength: λ0, µm.
+    """
+
+    first: Tensor
+    second: Tensor
+    wavelength: Tensor
+    order: Tensor
+
+
+@value
 class IdealLens:
     """A thin lens without aberrations: n2 tan θ2 = n1 tan θ1 - power · height, in x and in y.
 
-    power_x, power_y: 1/mm. opd_mode: how OpticStudio counts the path through it, 0 to 3; kept for the file.
+    power_x, power_y: 1/mm. vergence: 1/s, s mm from the point that is imaged sharply, in the direction of light, to the
+    lens: light from there has the same path along every ray (of unequal powers only near the axis); None, or 0, for a
+    point at infinity. A lens that is traced as a whole finds it out itself: see `optics.conjugates`.
+    opd_mode: how OpticStudio counts the path, 0 to 3; kept for the file.
     """
 
     power_x: Tensor
     power_y: Tensor
+    vergence: Tensor | None = None
     opd_mode: int = 0
 
 
-Phase = Grating | IdealLens
+@value
+class Facets:
+    """A Fresnel lens: rays meet the plane of the vertex, and are bent as by the curved surface above that point."""
+
+
+Phase = (
+    Grating | RadialPhase | PolynomialPhase | FringePhase | Hologram | IdealLens | Facets | PolynomialPath | RadialPath
+)
 
 
 @dataclasses.dataclass(frozen=True)
 class PhaseKind:
-    """A kind of phase.
+    """A kind of phase; λ is (...) µm, and any of the first three is None for a kind that does not have it.
 
-    added: phase, x, y (...) mm, wavelength (...) µm -> what is added; None for a kind that adds no path.
-    power: phase, wavelength -> (x, y), -∂²p/∂x² and -∂²p/∂y² at the vertex in 1/mm: its paraxial power.
-    slopes: whether it bends slopes by that power, in place of adding a gradient to Snell's law.
-    zemax: TYPE of a .zmx file; is_round: about the axis.
+    path: phase, λ -> the path as a polynomial; added: phase, x, y (...) mm, λ -> what is added, of a path that is none.
+    power: phase, λ -> -∂²p/∂x² and -∂²p/∂y² at the vertex in 1/mm: its paraxial power.
+    slopes: whether it bends slopes by that power, in place of Snell's law; flat: whether rays meet the plane of the
+    vertex, whatever the shape of the surface is; is_round: about the axis; chromatic: whether λ makes a difference.
     """
 
-    power: Callable[[Phase, Tensor], tuple[Tensor, Tensor]]
-    added: Callable[[Phase, Tensor, Tensor, Tensor], Added] | None = None
+    path: Callable | None = None
+    added: Callable | None = None
+    power: Callable | None = None
     slopes: bool = False
-    zemax: str | None = None
+    flat: bool = False
     is_round: bool = False
+    chromatic: bool = True
 
 
-def _grating(phase: Grating, x: Tensor, y: Tensor, wavelength: Tensor) -> Added:
+def _grating(phase: Grating, wavelength: Tensor) -> PolynomialPath:
     slope = phase.order * phase.frequency * wavelength
-    return Added(slope * y, torch.zeros_like(slope), slope)
+    return PolynomialPath(torch.stack([torch.zeros_like(slope), slope]))
 
 
+def _radial(phase: RadialPhase, wavelength: Tensor) -> RadialPath:
+    scale = phase.order * wavelength * (_MICROMETRE / (2 * math.pi))
+    orders = [2 * j for j in range(1, len(phase.coefficients) + 1)]
+    return RadialPath(_scaled(phase.coefficients, phase.radius, orders, scale))
+
+
+def _polynomial(phase: PolynomialPhase, wavelength: Tensor) -> PolynomialPath:
+    scale = phase.order * wavelength * (_MICROMETRE / (2 * math.pi))
+    return PolynomialPath(_scaled(phase.coefficients, phase.radius, _degrees(len(phase.coefficients)), scale))
+
+
+def _fringe(phase: FringePhase, wavelength: Tensor) -> PolynomialPath:
+    matrix = phase.coefficients.new_tensor(fringe_to_powers(phase.coefficients.shape[0]))
+    terms = torch.tensordot(matrix, phase.coefficients, dims=1)
+    scale = phase.order * wavelength * _MICROMETRE
+    return PolynomialPath(_scaled(terms, phase.radius, _degrees(len(terms)), scale))
+
+
+def _degrees(count: int) -> list[int]:
+    return [n for n in range(1, count + 1) for _ in range(n + 1)][:count]
+
+
+def _scaled(terms: Tensor, radius: Tensor, orders: list[int], scale: Tensor) -> Tensor:
+    """c_k s/R^n (K, ...) of terms (K, ...) of orders n."""
+    if not orders:
+        return scale.new_zeros(0, *scale.shape)
+    return torch.stack([c * scale / radius**n for c, n in zip(terms.unbind(0), orders, strict=True)])
+
+
+def _hologram(phase: Hologram, x: Tensor, y: Tensor, wavelength: Tensor) -> Added:
+    scale = -phase.order * wavelength / phase.wavelength
+    path = slope_x = slope_y = torch.zeros_like(x)
+    for point in (phase.first, phase.second):
+        a, b, c = point.unbind(0)
+        from_vertex, from_point = torch.sqrt(dot(point, point)), torch.sqrt((x - a) ** 2 + (y - b) ** 2 + c * c)
+        path = path + (x * (x - 2 * a) + y * (y - 2 * b)) / (from_point + from_vertex)
+        slope_x, slope_y = slope_x + (x - a) / from_point, slope_y + (y - b) / from_point
+    return Added(scale * path, scale * slope_x, scale * slope_y)
+
+
+def _hologram_power(phase: Hologram, wavelength: Tensor) -> tuple[Tensor, Tensor]:
+    powers = []
+    for axis in (0, 1):
+        total = torch.zeros_like(phase.order)
+        for point in (phase.first, phase.second):
+            squared = dot(point, point)
+            total = total + (squared - point[axis] ** 2) / squared**1.5
+        powers.append(phase.order * wavelength / phase.wavelength * total)
+    return powers[0], powers[1]
+
+
+#: Kinds of phase, by the name of their class.
 PHASES = {
-    "Grating": PhaseKind(power=lambda p, _: (torch.zeros_like(p.order),) * 2, added=_grating, zemax="DGRATING"),
-    "IdealLens": PhaseKind(power=lambda p, _: (p.power_x, p.power_y), slopes=True, zemax="PARAXIAL"),
+    "Grating": PhaseKind(path=_grating),
+    "RadialPhase": PhaseKind(path=_radial, is_round=True),
+    "PolynomialPhase": PhaseKind(path=_polynomial),
+    "FringePhase": PhaseKind(path=_fringe),
+    "Hologram": PhaseKind(added=_hologram, power=_hologram_power),
+    "IdealLens": PhaseKind(power=lambda lens, _: (lens.power_x, lens.power_y), slopes=True, chromatic=False),
+    "Facets": PhaseKind(flat=True, is_round=True, chromatic=False),
+    "PolynomialPath": PhaseKind(path=lambda path, _: path, chromatic=False),
+    "RadialPath": PhaseKind(path=lambda path, _: path, is_round=True, chromatic=False),
 }
 
 
 def kind_of(phase: Phase) -> PhaseKind:
     """The row of a phase."""
     return PHASES[type(phase).__name__]
+
+
+def added_path(phase: Phase, x: Tensor, y: Tensor, wavelength: Tensor | None) -> Added:
+    """The path that is added at points (...) mm, of any kind that adds one; wavelength: (...) µm."""
+    kind = kind_of(phase)
+    if kind.chromatic and wavelength is None:
+        raise ValueError(f"a surface with a phase ({type(phase).__name__}) bends light by its wavelength: give it")
+    wavelength = None if wavelength is None else wavelength.to(x.dtype)
+    if kind.path is None:
+        return kind.added(phase, x, y, wavelength)
+    path = kind.path(phase, wavelength)
+    if isinstance(path, RadialPath):
+        return _radial_added(path.coefficients, x, y)
+    z, slope_x, slope_y, *_ = polynomial_xy(path.coefficients, x, y, highest=1)
+    return Added(z, slope_x, slope_y)
+
+
+def _radial_added(a: Tensor, x: Tensor, y: Tensor) -> Added:
+    u = x * x + y * y
+    order = torch.arange(1, len(a) + 1, dtype=a.dtype, device=a.device).reshape(-1, *(1,) * (a.dim() - 1))
+    twice = 2 * polynomial(order * a, u)
+    return Added(u * polynomial(a, u), twice * x, twice * y)
+
+
+def power_of(phase: Phase, wavelength: Tensor) -> tuple[Tensor, Tensor]:
+    """The paraxial power (...) 1/mm in x and y, -∂²p/∂x² and -∂²p/∂y² at the vertex."""
+    kind = kind_of(phase)
+    if kind.power is not None:
+        return kind.power(phase, wavelength)
+    zero = torch.zeros_like(wavelength)
+    if kind.path is None:
+        return zero, zero
+    c = kind.path(phase, wavelength).coefficients
+    if kind.is_round:
+        return (-2 * c[0], -2 * c[0]) if len(c) else (zero, zero)
+    return tuple(-2 * c[k] if len(c) > k else zero for k in (2, 4))
+
+
+def ideal_path(lens: IdealLens, point, before, behind, n1: Tensor, n2: Tensor) -> Tensor:
+    """The path (...) mm through an ideal lens that makes it alike along all rays of a point, O, to its image, I.
+
+        Δ = n1 (|O| - |OP|) + n2 (|I| - |PI|),  n1/s + n2/s′ = power
+        |O| - |OP| = (v |P|² - 2 d·P)/(|v P - d| + 1),  v = |N|/s the inverse distance along the ray d, and so for I
+
+    point: P = (x, y, ...) mm on the lens; before, behind: directions by components. A point at infinity is v = 0. Of
+    unequal powers no point has a sharp image, and Δ = -(φx x² + φy y²)/2.
+    """
+    x, y = point[0], point[1]
+    vergence = torch.zeros_like(lens.power_x) if lens.vergence is None else lens.vergence
+    onward = (lens.power_x - n1 * vergence) / n2
+    found = n1 * _longer(x, y, before, vergence, -1.0) + n2 * _longer(x, y, behind, onward, 1.0)
+    return torch.where(lens.power_x == lens.power_y, found, -0.5 * (lens.power_x * x * x + lens.power_y * y * y))
+
+
+def _longer(x: Tensor, y: Tensor, direction, vergence: Tensor, sign: float) -> Tensor:
+    """How much longer the way from the vertex to a point on the ray is than the ray's own."""
+    L, M, N = direction
+    v = N.abs() * vergence
+    along = sign * (L * x + M * y)
+    reach = torch.sqrt((v * x + sign * L) ** 2 + (v * y + sign * M) ** 2 + N * N)
+    return (v * (x * x + y * y) + 2 * along) / (reach + 1)

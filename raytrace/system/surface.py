@@ -186,7 +186,7 @@ class Meeting(NamedTuple):
 
 def meet(surface: Surface, position: Sequence[Tensor], direction: Sequence[Tensor]) -> Meeting:
     """`intersect` by components, with the cosine that comes with it; arguments are triples of (...)."""
-    if surface.is_plane:
+    if surface.is_plane or (surface.phase is not None and kind_of(surface.phase).flat):
         return _meet_plane(position, direction)
     if is_searched(surface):
         return _meet_searched(surface, position, direction)
@@ -199,6 +199,8 @@ def normal(surface: Surface, hit: Sequence[Tensor]) -> tuple[tuple[Tensor, Tenso
     Conic: (-c x, -c y, 1 - (1+k) c z), squared length 1 - k c² r² on the surface (1 for a sphere): no square root.
     """
     x, y, z = hit
+    if surface.phase is not None and kind_of(surface.phase).flat:
+        return _sloped_normal(surface, x, y, None)
     if surface.is_plane:
         return (torch.zeros_like(x), torch.zeros_like(x), torch.ones_like(x)), 1.0
     if is_searched(surface):

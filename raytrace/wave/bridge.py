@@ -37,6 +37,7 @@ from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to
 from raytrace.maths.zernike import noll
 from raytrace.media.glass import index
+from raytrace.optics.conjugates import sequence_of
 from raytrace.optics.launch import rays_of_field
 from raytrace.optics.scene import Scene, scene, symmetry, trace_scene
 from raytrace.optics.trace import media, trace_surfaces
@@ -225,7 +226,7 @@ def _at_stop(scene: Scene, pupil: Tensor) -> Tensor:
     field, wavelength = scene.fields[:, :, None, None], scene.wavelengths[:, None]
     rays = rays_of_field(lens, field, vignette(lens, field, pupil), wavelength=wavelength)
     indices = media(lens, wavelength)[: lens.stop + 1]
-    hit = trace_surfaces(lens.surfaces[1 : lens.stop + 1], rays, indices=indices, wavelength=wavelength)
+    hit = trace_surfaces(sequence_of(lens)[: lens.stop], rays, indices=indices, wavelength=wavelength)
     return hit.position[:2].expand(2, *scene.shape, pupil.shape[-1])
 
 

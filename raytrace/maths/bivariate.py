@@ -1,0 +1,121 @@
+"""Polynomials in x and y: Σ c_k x^i y^j in the order x, y, x², xy, y², x³, …, and Zernike's fringe terms as such."""
+
+import functools
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+class Bivariate(NamedTuple):
+    """A function (...) of x and y with its slopes and second derivatives; those above the highest asked for are 0."""
+
+    z: Tensor
+    x: Tensor
+    y: Tensor
+    xx: Tensor
+    xy: Tensor
+    yy: Tensor
+
+
+def powers(count: int) -> list[tuple[int, int]]:
+    """(i, j) of the first `count` terms x^i y^j, without the constant."""
+    degrees = range(1, degree(count) + 1)
+    return [(n - j, j) for n in degrees for j in range(n + 1)][:count]
+
+
+def degree(count: int) -> int:
+    """The least degree n whose n(n + 3)/2 terms are `count` or more."""
+    return math.ceil((math.sqrt(9 + 8 * count) - 3) / 2)
+
+
+def polynomial_xy(coefficients: Tensor, x: Tensor, y: Tensor, highest: int = 2) -> Bivariate:
+    """Σ c_k x^i y^j and its derivatives at points (...); coefficients: (K, ...) in the order of `powers`."""
+    x, y = torch.broadcast_tensors(x, y)
+    rows = _rows_by_power_of_y(coefficients)
+    flat = [_univariate(row, x, highest) for row in rows]  # of each power of y, its polynomial in x
+    zero = torch.zeros_like(x)
+    z, zx, zxx = ([part[order] for part in flat] for order in range(3))
+    value, slope, bend = _horner(z, y, highest)
+    across = _horner(zx, y, highest - 1) if highest > 0 else (zero,) * 3
+    along = _horner(zxx, y, highest - 2)[0] if highest > 1 else zero
+    return Bivariate(value, across[0], slope, along, across[1], bend)
+
+
+def _rows_by_power_of_y(coefficients: Tensor) -> list[list[Tensor | None]]:
+    """c_ij by j, then by i; None where there is no such term."""
+    n = degree(len(coefficients))
+    rows: list[list[Tensor | None]] = [[None] * (n - j + 1) for j in range(n + 1)]
+    for (i, j), c in zip(powers(len(coefficients)), coefficients.unbind(0), strict=True):
+        rows[j][i] = c
+    return rows
+
+
+def _univariate(row: list[Tensor | None], x: Tensor, highest: int) -> tuple[Tensor, Tensor, Tensor]:
+    zero = torch.zeros_like(x)
+    return _horner([zero if c is None else c + zero for c in row], x, highest)
+
+
+def _horner(coefficients: list[Tensor], x: Tensor, highest: int) -> tuple[Tensor, Tensor, Tensor]:
+    """p(x), p'(x), p''(x) of coefficients (...) from the constant up; derivatives above the highest are 0."""
+    zero = torch.zeros_like(x)
+    p, dp, half = coefficients[-1], zero, zero
+    for c in reversed(coefficients[:-1]):
+        if highest > 1:
+            half = torch.addcmul(dp, half, x)
+        if highest > 0:
+            dp = torch.addcmul(p, dp, x)
+        p = torch.addcmul(c, p, x)
+    return p, dp, 2 * half
+
+
+def fringe(number: int) -> tuple[int, int]:
+    """(n, m) of Zernike's fringe term 1, 2, …, 37: m > 0 goes with cos mφ, m < 0 with sin |m|φ, φ from the x axis.
+
+    Terms follow by n + |m|, then by falling |m|, cosine first; term 37 is the pure 12th order. Source: the numbering
+    of the University of Arizona, as optical design programs print it.
+    """
+    if number == 37:
+        return 12, 0
+    half = math.isqrt(number - 1)  # (n + |m|)/2
+    place = number - 1 - half * half
+    m = half - place // 2
+    return 2 * half - m, m if place % 2 == 0 else -m
+
+
+@functools.lru_cache(maxsize=4)
+def fringe_to_powers(count: int) -> np.ndarray:
+    """Matrix (K, count) from coefficients of the first fringe terms, not normalised, to those of x^i y^j; no constant.
+
+    R_n^m(ρ) cos mφ = Σ_s (-1)^s (n-s)!/(s! ((n+m)/2 - s)! ((n-m)/2 - s)!) ρ^(n-2s-m) · Re (x + iy)^m
+    """
+    top = max((fringe(number)[0] for number in range(1, count + 1)), default=0)
+    order = powers(top * (top + 3) // 2)
+    place = {power: k for k, power in enumerate(order)}
+    matrix = np.zeros((len(order), count))
+    for column in range(count):
+        for power, c in _fringe_terms(*fringe(column + 1)).items():
+            if power != (0, 0):
+                matrix[place[power], column] += c
+    return matrix
+
+
+def _fringe_terms(n: int, m: int) -> dict[tuple[int, int], float]:
+    size, found = abs(m), {}
+    for s in range((n - size) // 2 + 1):
+        plus, minus = (n + size) // 2 - s, (n - size) // 2 - s
+        c = (-1) ** s * math.factorial(n - s) // (math.factorial(s) * math.factorial(plus) * math.factorial(minus))
+        for power, weight in _harmonic_terms(m).items():
+            for k in range(minus + 1):  # (x² + y²)^minus
+                key = power[0] + 2 * k, power[1] + 2 * (minus - k)
+                found[key] = found.get(key, 0) + c * weight * math.comb(minus, k)
+    return found
+
+
+def _harmonic_terms(m: int) -> dict[tuple[int, int], int]:
+    """Re (x + iy)^m, or Im (x + iy)^|m| of m < 0."""
+    size = abs(m)
+    parts = range(0 if m >= 0 else 1, size + 1, 2)
+    return {(size - j, j): (-1) ** (j // 2) * math.comb(size, j) for j in parts}
