@@ -21,11 +21,13 @@ from raytrace.formats.source import MAX_BYTES, Place, decode
 from raytrace.media.catalog import UnknownGlass
 from raytrace.media.glass import constant, model_glass
 from raytrace.system.lens import Lens, SystemAperture
-from raytrace.system.surface import Aperture
+from raytrace.system.surface import Aperture, is_posed
 
 ROOT = Path(__file__).parents[1]
 OWN = sorted(path for path in (ROOT / "lenses").iterdir() if path.suffix in FORMATS)
-CORPUS = sorted((ROOT.parent / "shared" / "corpus" / "zmx").glob("*.[zZ][mM][xX]"))
+CORPUS = sorted(
+    path for folder in ("corpus/zmx", "tier2/dev") for path in (ROOT.parent / "shared" / folder).glob("*.[zZ][mM][xX]")
+)
 SUFFIXES = tuple(FORMATS)
 
 
@@ -86,7 +88,8 @@ def test_real_files_come_back_bit_for_bit(path, tmp_path):
     lens = readable(path)
     if lens is None:
         pytest.skip("refused by name")
-    for suffix in SUFFIXES:
+    plain = not any(is_posed(surface) or surface.phase or surface.departure for surface in lens.surfaces)
+    for suffix in SUFFIXES if plain else [".zmx"]:
         write_lens(lens, tmp_path / f"lens{suffix}")
         assert leaves(read_lens(tmp_path / f"lens{suffix}")) == leaves(lens)
 
@@ -152,7 +155,7 @@ def test_texts_of_any_language_come_back(suffix, tmp_path):
         ({"thickness": number(float("inf"))}, ".csv", "thickness is inf"),
         ({"curvature": number([0.1, 0.2])}, ".zmx", "a file holds one lens"),
         ({"coefficients": number([[0.1, 0.2]])}, ".csv", "a file holds one lens"),
-        ({"coefficients": number([1e-9] * 9)}, ".zmx", "EVENASPH has 8"),
+        ({"coefficients": number([1e-9] * 9), "kind": "odd asphere"}, ".zmx", "ODDASPHE has 8"),
         ({"comment": "two\nlines"}, ".zmx", "line break"),
         ({"glass": constant(1.5, "two words")}, ".zmx", "one word"),
         ({"apertures": (Aperture("circular", (0.0, 1.0)),) * 2}, ".zmx", "has one"),

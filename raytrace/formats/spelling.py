@@ -66,6 +66,7 @@ def refuse_overflow(lens: Lens, file: str) -> None:
     """
     for k, surface in enumerate(lens.surfaces):
         numbers = [getattr(surface, name) for name in SHAPE if name != "kind"]
+        numbers += [surface.phase, surface.before, surface.after]
         numbers += [surface.semi_diameter, *([surface.thickness] if k else [])]
         numbers += [(*aperture.extent, *aperture.centre) for aperture in surface.apertures]
         if not _finite(numbers):

@@ -7,7 +7,6 @@ from raytrace.formats.report import IGNORED, READ, UNKNOWN, Draft
 from raytrace.formats.source import MAX_SURFACES, LensFileError, Place, shown
 from raytrace.formats.spelling import integer, number
 from raytrace.system.aperture import SHAPES
-from raytrace.system.shapes import KINDS
 
 
 def _words(text: str) -> frozenset[str]:
@@ -19,7 +18,7 @@ SYSTEM_READ = _words(
     "VERS MODE NAME NOTE UNIT GCAT ENVD GFAC RAIM FTYP PWAV MNUM ENPD FNUM OBNA FLOA XFLN YFLN FWGN XFLD YFLD FWGT"
     " VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN VDX VDY VCX VCY VAN WAVM WAVL WAVN WWGT WWGN"
 )
-_SURFACE_READ = _words("SURF TYPE CURV CONI DISZ GLAS DIAM STOP PARM COMM FLAP OBDC USAP USOB UDAD SCBD IGNR")
+_SURFACE_READ = _words("SURF TYPE CURV CONI DISZ GLAS DIAM STOP PARM COMM FLAP OBDC USAP USOB UDAD SCBD IGNR XDAT")
 
 #: Keywords that may stand more than once in the system or in one surface.
 REPEATED = ("NOTE", "WAVM", "PARM", "UDAD", "XDAT", "PPAR", "VPAR", "SCBD")
@@ -60,7 +59,6 @@ SURFACE_IGNORED = _left_out(
         "coatings do not bend rays": "COAT",
         "coefficient of thermal expansion": "TCED",
         "tolerance": "TOLE",
-        "extra data, which this type of surface does not use": "XDAT",
         "solve or variable: the file stores the solved value, which is read": "VCON VDSZ VPAR PZUP PPAR MAZH",
     }
 )
@@ -68,11 +66,10 @@ SURFACE_IGNORED = _left_out(
 #: What follows the last surface belongs to these, and not to the lens.
 TAIL_REASON = "merit function, tolerances or configurations: not part of the lens"
 
-#: Types of surface by what OpticStudio calls them; modelled are STANDARD and those of the rows of `shapes.KINDS`.
+#: Types of surface that are not modelled, by what OpticStudio calls them; those that are, are rows of `TYPES`.
 _TYPES = (
-    "COORDBRK coordinate break, PARAXIAL paraxial lens, PARAX_XY paraxial XY, TOROIDAL toroidal, "
-    "DGRATING diffraction grating, EGRATING elliptical grating, TILTSURF tilted, ODDASPHE odd asphere, "
-    "XASPHERE extended asphere, XOSPHERE extended odd asphere, BICONICX biconic, IRREGULA irregular, "
+    "TOROIDAL toroidal, EGRATING elliptical grating, TILTSURF tilted, "
+    "XOSPHERE extended odd asphere, BICONICX biconic, IRREGULA irregular, "
     "ZERNSAG Zernike sag, SZERNSAG Zernike standard sag, FZERNSAG Zernike fringe sag, "
     "SZERNPHA Zernike standard phase, FZERNPHA Zernike fringe phase, XPOLYNOM extended polynomial, "
     "POLYNOMI polynomial, BINARY_1 binary 1, BINARY_2 binary 2, BINARY_3 binary 3, FRESNELS Fresnel, "
@@ -119,11 +116,6 @@ FIELD_LISTS = {
 
 #: OpticStudio cuts a long note into pieces of this many characters.
 NOTE_PIECE = 200
-
-
-def modelled_types() -> dict[str, str]:
-    """Kind of sag by the TYPE that has its terms in PARM; STANDARD has none."""
-    return {"STANDARD": "", **{kind.zemax: name for name, kind in KINDS.items() if kind.zemax}}
 
 
 def aperture_keywords() -> dict[str, tuple[str, bool]]:

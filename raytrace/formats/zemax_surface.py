@@ -9,16 +9,18 @@ from raytrace.formats.media import by_figures, is_code, listed_glass
 from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, UnsupportedSurface, shown
 from raytrace.formats.spelling import double, is_infinite
-from raytrace.formats.zemax_keywords import TYPE_NAMES, Block, Record, aperture_keywords, modelled_types
+from raytrace.formats.zemax_keywords import TYPE_NAMES, Block, Record, aperture_keywords
+from raytrace.formats.zemax_parameters import numbers, poses, report_unused
+from raytrace.formats.zemax_types import TYPES, SurfaceType
 from raytrace.media.glass import AIR, MIRROR, Glass, mil_glass
 from raytrace.system.aperture import SHAPES, Aperture
-from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface
 
 
 def refuse_unsupported(blocks: Sequence[Block]) -> None:
     """Raise UnsupportedSurface for the first surface that is not modelled, and name the others."""
-    found = [(block, reason) for block in blocks if (reason := _unsupported(block))]
+    last = len(blocks) - 1
+    found = [(block, reason) for k, block in enumerate(blocks) if (reason := _unsupported(block, k in (0, last)))]
     if not found:
         return
     block, reason = found[0]
@@ -30,18 +32,24 @@ def refuse_unsupported(blocks: Sequence[Block]) -> None:
     raise UnsupportedSurface(f"{reason} is not modelled{also}; modelled are {_modelled()}", place)
 
 
-def _unsupported(block: Block) -> str:
+def _unsupported(block: Block, at_end: bool) -> str:
+    """Why a surface is not modelled; at_end: whether it is the object or the image."""
     kind = _type(block)
-    if kind not in modelled_types():
+    row = TYPES.get(kind)
+    if row is None:
         name = TYPE_NAMES.get(kind)
         return f"type {kind[:40]}" + (f" ({name})" if name else "")
-    for record in block.all("SCBD"):
-        if any(record.number(position, "tilt or decentre") for position in range(3, len(record.words))):
-            return f"type {kind} with a tilt or decentre of the surface (SCBD)"
     ignored = block.last("IGNR")
     if ignored and ignored.words[:1] not in ((), ("0",)):
         return f"type {kind} marked as to be ignored (IGNR)"
-    return ""
+    if at_end and (kind == "COORDBRK" or "phase" in row.holds):
+        return f"type {kind} ({row.name}) of the object or the image"
+    if block.place.surface == 0 and any(poses(block, 1.0).values()):
+        return f"type {kind} of the object with a tilt or decentre of the surface (SCBD)"
+    if kind == "COORDBRK" and any(poses(block, 1.0).values()):
+        return f"type {kind} ({row.name}) with a tilt or decentre of the surface (SCBD)"
+    beyond = row.beyond(numbers(block, row, 1.0))
+    return f"type {kind} ({row.name}) {beyond}" if beyond else ""
 
 
 def _type(block: Block) -> str:
@@ -54,7 +62,7 @@ def _type(block: Block) -> str:
 
 
 def _modelled() -> str:
-    *first, last = modelled_types()
+    *first, last = TYPES
     return f"{', '.join(first)} and {last}"
 
 
@@ -70,17 +78,44 @@ def build(
         message = "has no DISZ (thickness): file cut off? A plane image has DISZ 0"
         raise LensFileError(f"surface {message}", block.place)
     comment = block.last("COMM")
+    kind = _type(block)
+    row = TYPES[kind]
+    shape = {}
+    if "curvature" in row.holds:
+        shape["curvature"] = _nonzero(block, "CURV", "curvature", millimetres)
+        shape["conic"] = _nonzero(block, "CONI", "conic constant", 1.0)
+    if kind == "COORDBRK":
+        _report_bare(block, report)
+    else:
+        shape["glass"] = _medium(block, catalogs, user, report)
+        shape["apertures"] = _apertures(block, millimetres, report)
+    shape |= poses(block, millimetres) | _fields(block, row, millimetres)
+    report_unused(block, kind, row, report)
     return Surface(
         thickness=_thickness(thickness, millimetres),
-        curvature=_nonzero(block, "CURV", "curvature", millimetres),
-        conic=_nonzero(block, "CONI", "conic constant", 1.0),
-        coefficients=_coefficients(block, millimetres, report),
-        kind=modelled_types()[_type(block)] or EVEN,
-        glass=_medium(block, catalogs, user, report),
         semi_diameter=semi_diameter(block, millimetres),
-        apertures=_apertures(block, millimetres, report),
         comment=comment.text.strip() if comment else "",
+        **shape,
     )
+
+
+def _report_bare(block: Block, report: Draft) -> None:
+    """Say what a coordinate break carries that meets no ray: a medium, an aperture."""
+    for keyword in ("GLAS", *aperture_keywords()):
+        record = block.last(keyword)
+        if record and (keyword != "GLAS" or record.words[:1] != ("AIR",)):
+            message = f"{keyword} on a coordinate break is not used: the medium goes on, and nothing clips"
+            report.warn(message, record.place)
+
+
+def _fields(block: Block, row: SurfaceType, millimetres: float) -> dict:
+    """The fields of a surface that its type tells. Raises LensFileError for numbers that are out of range."""
+    told = numbers(block, row, millimetres)._replace(size=semi_diameter(block, millimetres))
+    try:
+        return row.fields(told)
+    except ValueError as error:
+        record = block.last("TYPE", "SURF")
+        raise LensFileError(str(error), record.place if record else block.place) from error
 
 
 def _thickness(record: Record, millimetres: float) -> Tensor:
@@ -96,27 +131,6 @@ def _nonzero(block: Block, keyword: str, what: str, divisor: float) -> Tensor | 
     record = block.last(keyword)
     found = record.number(0, what) / divisor if record else 0.0
     return double(found) if found else None
-
-
-def _coefficients(block: Block, millimetres: float, report: Draft) -> Tensor | None:
-    """a_j of the kind from PARM j, j = 1…8; an asphere without PARM has eight zeros."""
-    parameters, kind = block.all("PARM"), KINDS.get(modelled_types()[_type(block)])
-    if kind is None:
-        for record in parameters:
-            if record.number(1, "value", 0.0):
-                report.note(f"{record.place}: PARM {record.words[0]} is not used by a STANDARD surface")
-        return None
-    terms: dict[int, float] = {}
-    for record in parameters:
-        j = record.integer(0, "number of the parameter")
-        found = record.number(1, "value")
-        if 1 <= j <= kind.parameters:
-            terms[j] = found / millimetres ** (kind.step * j - 1)
-        elif found:
-            message = f"PARM {j}: an {kind.zemax} has parameters 1 to {kind.parameters}{kind.powers}; left out"
-            report.warn(message, record.place)
-    count = max(terms, default=kind.parameters)
-    return double([terms.get(j, 0.0) for j in range(1, count + 1)])
 
 
 def semi_diameter(block: Block, millimetres: float) -> float | None:

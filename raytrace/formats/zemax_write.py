@@ -5,11 +5,13 @@ from pathlib import Path
 
 from raytrace.formats.media import catalogs_needed, is_code, is_left_out, listed_name
 from raytrace.formats.source import LensFileError, Place
-from raytrace.formats.spelling import exact, exact_list, one_line, refuse_departure, thickness
+from raytrace.formats.spelling import exact, exact_list, one_line, thickness
 from raytrace.formats.zemax_keywords import FIELD_KINDS, FIELD_LISTS, NOTE_PIECE, SYSTEM_APERTURES
+from raytrace.formats.zemax_types import INVERSE, TYPES, SurfaceType, numbers_of, spelled_inverse, type_of
 from raytrace.media.glass import Glass, mil_glass
 from raytrace.system.aperture import SHAPES, Aperture
 from raytrace.system.lens import RAY_AIMING, Lens
+from raytrace.system.pose import Pose
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface
 
@@ -91,7 +93,7 @@ def _notes(notes: Sequence[str], place: Place) -> list[str]:
 
 
 def _surface(lens: Lens, number: int, surface: Surface, place: Place) -> list[str]:
-    refuse_departure(surface, place)
+    kind = _type(surface, place)
     curvature = "0.0" if surface.curvature is None else exact(surface.curvature, "curvature", place)
     semi_diameter = surface.semi_diameter
     if number == lens.stop and lens.aperture.kind == "float_by_stop":
@@ -100,9 +102,10 @@ def _surface(lens: Lens, number: int, surface: Surface, place: Place) -> list[st
     lines = [
         f"SURF {number}",
         *(["  STOP"] if number == lens.stop else []),
-        f"  TYPE {'STANDARD' if surface.coefficients is None else KINDS[surface.kind].zemax}",
+        f"  TYPE {kind}",
+        *_poses(surface, kind, place),
         f'  CURV {curvature} 0 0 0 0 ""',
-        *_coefficients(surface, place),
+        *_numbers(surface, TYPES[kind], place),
         f"  DISZ {thickness(surface.thickness, 'INFINITY', place)}",
         *_glass(surface.glass, place),
         *([] if surface.conic is None else [f"  CONI {exact(surface.conic, 'conic constant', place)}"]),
@@ -113,16 +116,81 @@ def _surface(lens: Lens, number: int, surface: Surface, place: Place) -> list[st
     return [*lines, f"  COMM {comment}"] if comment else lines
 
 
-def _coefficients(surface: Surface, place: Place) -> list[str]:
-    if surface.coefficients is None:
+#: Fields of a surface's shape, by what an error calls them.
+_SHAPE = {
+    "curvature": "curvature",
+    "conic": "conic constant",
+    "coefficients": "aspheric terms",
+    "departure": "departure from a conic",
+    "phase": "phase",
+}
+
+
+def _type(surface: Surface, place: Place) -> str:
+    """The TYPE of a surface. Raises LensFileError for what none holds."""
+    found = type_of(surface)
+    if found is None:
+        message = f"a .zmx file has no type for a surface of {_own(surface)}; write a table (.csv)"
+        raise LensFileError(message, place)
+    row = TYPES[found]
+    for name, what in _SHAPE.items():
+        if getattr(surface, name) is not None and name not in row.holds:
+            raise LensFileError(f"{_own(surface)} with a {what}: a {found} surface has none", place)
+    if found == "COORDBRK" and (not is_left_out(surface.glass) or surface.apertures or surface.after is not None):
+        message = "a coordinate break with a medium, an aperture or a pose behind it"
+        raise LensFileError(f"{message}; a .zmx file holds none of them: put it on a surface of its own", place)
+    terms = surface.coefficients
+    if found in (KINDS[surface.kind].zemax, "XASPHERE") and terms is not None and terms.dim() == 1:
+        _check_terms(surface, found, place)
+    return found
+
+
+def _own(surface: Surface) -> str:
+    """What is special of a surface, as an error calls it."""
+    if surface.is_break:
+        return "a coordinate break"
+    return type(surface.phase or surface.departure).__name__ if surface.phase or surface.departure else surface.kind
+
+
+def _check_terms(surface: Surface, found: str, place: Place) -> None:
+    kind, terms = KINDS[surface.kind], surface.coefficients
+    most, powers = (TYPES[found].most, "") if found == "XASPHERE" else (kind.parameters, kind.powers)
+    if bool((terms[most:] != 0).any()):
+        message = f"{len(terms)} terms (to r^{kind.step * len(terms)}), an {found} has {most}{powers}"
+        raise LensFileError(f"{message}; write a table (.csv)", place)
+
+
+def _numbers(surface: Surface, row: SurfaceType, place: Place) -> list[str]:
+    """PARM and XDAT lines."""
+    try:
+        told = row.numbers(surface)
+    except ValueError as error:
+        raise LensFileError(f"{error}; a .zmx file cannot hold it", place) from error
+    lines = []
+    for j, number in told.parameters.items():
+        text = exact(number, f"parameter {j} of a surface that is {row.name}", place)
+        lines.append(f"  PARM {j} {spelled_inverse(float(text)) if row.parameters[j] is INVERSE else text}")
+    if told.terms is None:
+        return lines
+    terms = exact_list(told.terms, f"terms of a surface that is {row.name}", place)
+    data = [repr(float(len(terms))), exact(told.radius, "radius of normalisation", place), *terms]
+    return lines + [f'  XDAT {i} {text} 0 0 1.0 0.0 0 ""' for i, text in enumerate(data, 1)]
+
+
+def _poses(surface: Surface, kind: str, place: Place) -> list[str]:
+    """SCBD lines of the poses before and behind a surface; those of a coordinate break are its PARM."""
+    if kind == "COORDBRK":
         return []
-    kind, terms = KINDS[surface.kind], exact_list(surface.coefficients, "aspheric terms", place)
-    if kind.zemax is None:
-        raise LensFileError(f"a .zmx file has no type for an {kind.name}; write a table (.csv)", place)
-    if any(float(term) for term in terms[kind.parameters :]):
-        message = f"{len(terms)} terms (to r^{kind.step * len(terms)}), an {kind.zemax} has {kind.parameters}"
-        raise LensFileError(f"{message}{kind.powers}; write a table (.csv)", place)
-    return [f"  PARM {j} {term}" for j, term in enumerate(terms[: kind.parameters], 1)]
+    found = ((1, surface.before), (2, surface.after))
+    return [f"  SCBD {where} {_pose(pose, place)}" for where, pose in found if pose is not None]
+
+
+def _pose(pose: Pose, place: Place) -> str:
+    try:
+        told = numbers_of(pose)
+    except ValueError as error:
+        raise LensFileError(f"{error}; a .zmx file cannot hold it", place) from error
+    return " ".join([str(int(pose.tilts_first)), "0", *(exact(number, "tilt or decentre", place) for number in told)])
 
 
 def _glass(glass: Glass, place: Place) -> list[str]:
