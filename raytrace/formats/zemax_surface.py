@@ -48,6 +48,8 @@ def _unsupported(block: Block, at_end: bool) -> str:
         return f"type {kind} of the object with a tilt or decentre of the surface (SCBD)"
     if kind == "COORDBRK" and any(poses(block, 1.0).values()):
         return f"type {kind} ({row.name}) with a tilt or decentre of the surface (SCBD)"
+    if row.flat and any(_nonzero(block, keyword, keyword, 1.0) is not None for keyword in ("CURV", "CONI")):
+        return f"type {kind} ({row.name}) on a curved surface (CURV)"
     beyond = row.beyond(numbers(block, row, 1.0))
     return f"type {kind} ({row.name}) {beyond}" if beyond else ""
 

@@ -5,15 +5,17 @@ them. Every length is a power of the file's unit, which the row knows. What a ro
 """
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Mapping
 from decimal import Context, Decimal
 from fractions import Fraction
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from raytrace.formats.spelling import double
-from raytrace.system.phases import Grating, IdealLens
+from raytrace.system.phases import Facets, FringePhase, Grating, Hologram, IdealLens, PolynomialPhase, RadialPhase
 from raytrace.system.pose import Pose
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface
@@ -48,7 +50,8 @@ class SurfaceType:
     terms: power of the unit of the terms in XDAT, None if it has none; most: how many.
     fields: numbers -> fields of `Surface`, None for one whose shape is all; ValueError for numbers out of range.
     numbers: surface -> numbers, `fields` undone.
-    beyond: numbers -> what is not modelled of them, "" if all is.
+    beyond: numbers -> what is not modelled of them, "" if all is; flat: whether a curvature is not.
+    powers: what the parameters stand for, in words.
     """
 
     name: str
@@ -60,6 +63,7 @@ class SurfaceType:
     fields: Callable[[Numbers], dict] = lambda numbers: {}
     numbers: Callable[[Surface], Numbers] = lambda surface: Numbers({})
     beyond: Callable[[Numbers], str] = lambda numbers: ""
+    flat: bool = False
     powers: str = ""
 
 
@@ -162,6 +166,67 @@ def _ideal_xy_numbers(surface: Surface) -> Numbers:
     return Numbers({1: phase.power_x, 2: phase.power_y, 3: float(phase.opd_mode)})
 
 
+def _diffractive(phase: type) -> Callable[[Numbers], dict]:
+    """The fields of a surface with a phase of coefficients, radius and order (PARM 0), and even terms beside."""
+
+    def fields(numbers: Numbers) -> dict:
+        terms = numbers.terms if len(numbers.terms) else double([0.0])
+        if 0 not in numbers.parameters and bool(terms.any()):
+            raise ValueError("no order of diffraction (PARM 0); lines lost?")
+        return {"phase": phase(terms, double(numbers.radius), double(numbers.at(0))), **_beside(numbers)}
+
+    return fields
+
+
+def _diffractive_numbers(surface: Surface) -> Numbers:
+    phase = surface.phase
+    return Numbers({0: phase.order, **_even_numbers(surface)}, phase.coefficients, phase.radius)
+
+
+def _beside(numbers: Numbers) -> dict:
+    """The even terms of a surface that mostly has none: up to the last that is not 0."""
+    terms = [numbers.at(j) for j in range(1, 9)]
+    while terms and not terms[-1]:
+        terms.pop()
+    return {"kind": EVEN, "coefficients": double(terms)} if terms else {}
+
+
+def _even_numbers(surface: Surface) -> dict[int, Tensor]:
+    terms = surface.coefficients
+    return {} if terms is None else dict(enumerate(terms[: KINDS[EVEN].parameters].unbind(0), 1))
+
+
+def _hologram(numbers: Numbers) -> dict:
+    first, second = ([numbers.at(j + k) for k in range(3)] for j in (1, 4))
+    if not any(first) or not any(second):
+        raise ValueError("a construction point at the vertex (PARM 1 to 3, or 4 to 6), expected one away from it")
+    if numbers.at(7) <= 0:
+        raise ValueError(f"a construction wavelength of {numbers.at(7):g} µm (PARM 7), expected a positive one")
+    return {"phase": Hologram(double(first), double(second), double(numbers.at(7)), double(numbers.at(8)))}
+
+
+def _hologram_numbers(surface: Surface) -> Numbers:
+    phase = surface.phase
+    points = itertools.chain(*(torch.unbind(point) for point in (phase.first, phase.second)))
+    return Numbers(dict(enumerate([*points, phase.wavelength, phase.order], 1)))
+
+
+_WITH_EVEN = ("curvature", "conic", "coefficients", "phase")
+_EVEN_POWERS = {j: 1 - 2 * j for j in range(1, 9)}
+
+
+def _diffractive_type(name: str, phase: type, most: int) -> SurfaceType:
+    return SurfaceType(
+        name,
+        _WITH_EVEN,
+        {0: 0, **_EVEN_POWERS},
+        terms=0,
+        most=most,
+        fields=_diffractive(phase),
+        numbers=_diffractive_numbers,
+    )
+
+
 _POLARISATION = dict.fromkeys(range(1, 9), "polarisation; its plane refracts as any other")
 
 TYPES = {
@@ -195,11 +260,37 @@ TYPES = {
     "PARAX_XY": SurfaceType(
         "paraxial XY", ("phase",), {1: -1, 2: -1, 3: 0}, fields=_ideal_xy, numbers=_ideal_xy_numbers
     ),
+    "BINARY_1": _diffractive_type("binary 1", PolynomialPhase, 230),
+    "BINARY_2": _diffractive_type("binary 2", RadialPhase, 240),
+    "FZERNPHA": _diffractive_type("Zernike fringe phase", FringePhase, 37),
+    "HOLOGRM2": SurfaceType(
+        "hologram 2",
+        ("phase",),
+        {**dict.fromkeys(range(1, 7), 1), 7: 0, 8: 0},
+        fields=_hologram,
+        numbers=_hologram_numbers,
+        flat=True,
+    ),
+    "FRESNELS": SurfaceType(
+        "Fresnel",
+        _WITH_EVEN,
+        _EVEN_POWERS,
+        fields=lambda numbers: {"phase": Facets(), **_beside(numbers)},
+        numbers=lambda surface: Numbers(_even_numbers(surface)),
+    ),
     "JONESMAT": SurfaceType("Jones matrix", (), unused=_POLARISATION),
 }
 
 #: TYPE by the phase of a surface.
-_OF_PHASES = {"Grating": "DGRATING", "IdealLens": "PARAX_XY"}
+_OF_PHASES = {
+    "Grating": "DGRATING",
+    "IdealLens": "PARAX_XY",
+    "PolynomialPhase": "BINARY_1",
+    "RadialPhase": "BINARY_2",
+    "FringePhase": "FZERNPHA",
+    "Hologram": "HOLOGRM2",
+    "Facets": "FRESNELS",
+}
 
 
 def type_of(surface: Surface) -> str | None:

@@ -12,7 +12,7 @@ from raytrace.media.glass import Glass, mil_glass
 from raytrace.system.aperture import SHAPES, Aperture
 from raytrace.system.lens import RAY_AIMING, Lens
 from raytrace.system.pose import Pose
-from raytrace.system.shapes import KINDS
+from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface
 
 #: OpticStudio has this many wavelengths.
@@ -139,8 +139,7 @@ def _type(surface: Surface, place: Place) -> str:
     if found == "COORDBRK" and (not is_left_out(surface.glass) or surface.apertures or surface.after is not None):
         message = "a coordinate break with a medium, an aperture or a pose behind it"
         raise LensFileError(f"{message}; a .zmx file holds none of them: put it on a surface of its own", place)
-    terms = surface.coefficients
-    if found in (KINDS[surface.kind].zemax, "XASPHERE") and terms is not None and terms.dim() == 1:
+    if surface.coefficients is not None and surface.coefficients.dim() == 1:
         _check_terms(surface, found, place)
     return found
 
@@ -154,6 +153,9 @@ def _own(surface: Surface) -> str:
 
 def _check_terms(surface: Surface, found: str, place: Place) -> None:
     kind, terms = KINDS[surface.kind], surface.coefficients
+    if surface.phase is not None and surface.kind != EVEN:
+        message = f"{type(surface.phase).__name__} on an {surface.kind}, expected one on an {EVEN} at most"
+        raise LensFileError(f"{message}; a .zmx file holds no such surface", place)
     most, powers = (TYPES[found].most, "") if found == "XASPHERE" else (kind.parameters, kind.powers)
     if bool((terms[most:] != 0).any()):
         message = f"{len(terms)} terms (to r^{kind.step * len(terms)}), an {found} has {most}{powers}"
