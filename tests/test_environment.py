@@ -1,6 +1,7 @@
 """Environment: indices at a temperature and a pressure against figures of makers and of OpticStudio; derivatives."""
 
 import dataclasses
+import json
 import warnings
 from functools import partial
 
@@ -12,9 +13,10 @@ import raytrace as rt
 from raytrace.media.catalog import SHIPPED, find_glass, shipped_catalog
 from raytrace.media.environment import Environment, NoThermalCoefficients, air_index, dn_dt, index_in, thermal
 from raytrace.media.glass import AIR, constant, from_table, model_glass, refractive_index
+from raytrace.optics.indices import media
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.spot import spot_of
-from raytrace.optics.trace import media, trace_lens
+from raytrace.optics.trace import trace_lens
 from raytrace.system.lens import index_behind
 
 float64 = partial(torch.tensor, dtype=torch.float64)
@@ -183,7 +185,7 @@ def test_without_an_environment_nothing_is_computed_for_it(monkeypatch):
     lens = rt.read_lens("double_gauss")
     before = media(lens, lens.wavelengths)
     monkeypatch.setattr("raytrace.system.lens.index_in", None)
-    monkeypatch.setattr("raytrace.optics.trace._media_in_environment", None)
+    monkeypatch.setattr("raytrace.optics.indices._media_in_environment", None)
     assert all(torch.equal(a, b) for a, b in zip(before, media(lens, lens.wavelengths), strict=True))
     assert lens.environment is None
     assert lens.at(f_number=4).environment is None
@@ -282,3 +284,37 @@ def test_a_glass_whose_change_is_not_known_is_told_once_with_its_surface():
         warnings.simplefilter("error")
         lens.at(temperature=20, pressure=1)
         doublet_at_100_degrees().at(temperature=-40, pressure=0)
+
+
+# -- the command ------------------------------------------------------------------------------------------------------
+
+
+def test_temperature_and_pressure_are_conditions_of_a_command(command):
+    words = ("info", "double_gauss", "--json")
+    plain = json.loads(command(*words)[1])
+    found = json.loads(command(*words, "--temperature", 40, "--pressure", 0)[1])
+    lens = rt.read_lens("double_gauss").at(temperature=40, pressure=0)
+    assert found["effective_focal_length"] == first_order(lens).effective_focal_length.item()
+    assert found["environment"] == {"temperature": 40.0, "pressure": 0.0}
+    assert [*plain] == [key for key in found if key != "environment"]
+    assert (
+        "environment              40 °C and 0 atm"
+        in command("info", "double_gauss", "--temperature", 40, "--pressure", 0)[1]
+    )
+    assert "in 20 °C and 0 atm" in str(rt.info(vacuum_cell()))
+    assert rt.info(vacuum_cell()).document()["surfaces"][3]["environment"] == {"temperature": 20.0, "pressure": 0.0}
+
+
+def test_the_command_tells_a_glass_at_a_temperature(command):
+    code, out, err = command("glass", "N-BK7", "--temperature", 30, "--wavelength", *LINES)
+    assert code == 0, err
+    slopes = [line.split()[4:6] for line in out.splitlines() if line.startswith("  n(")]
+    assert [tuple(round(float(number), 1) for number in column) for column in zip(*slopes, strict=True)] == [
+        *DATA_SHEET[20, 40]
+    ]
+    found = json.loads(command("glass", "N-BK7", "--pressure", 0, "--json")[1])
+    assert found["dn_dt"] == pytest.approx(found["dn_dt_absolute"])
+    assert [*json.loads(command("glass", "N-BK7", "--json")[1])][-1] == "indices"
+    code, out, err = command("glass", "LZ_K8", "--temperature", -300)
+    assert (code, err.strip()) == (1, "raytrace: error: LZ_K8: --temperature -300: expected degrees Celsius above -272")
+    assert "no thermal coefficients" in command("glass", "LZ_K8", "--temperature", 30)[2]

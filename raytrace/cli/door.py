@@ -11,7 +11,7 @@ from raytrace.system.lens import Lens, check_media
 from raytrace.words import did_you_mean
 
 #: Options that set the lens, by the keywords of `Lens.at`.
-CONDITIONS = ("sensor_distance", "f_number", "entrance_pupil_diameter", "wavelengths")
+CONDITIONS = ("sensor_distance", "f_number", "entrance_pupil_diameter", "wavelengths", "temperature", "pressure")
 
 
 class CommandError(ValueError):

@@ -3,13 +3,17 @@
 import argparse
 
 import raytrace
-from raytrace.cli.options import catalog, json, positive_finite
+from raytrace.cli.options import catalog, environment, json, positive_finite
 
 SUMMARY = "look up a glass"
-DESCRIPTION = "Print index, nd, Vd, formula, range and catalog of a glass; a name that is not found gets suggestions."
+DESCRIPTION = (
+    "Print index, nd, Vd, formula, range and catalog of a glass; a name that is not found gets suggestions. With a "
+    "temperature or a pressure also its indices there, beside the air of that place, and how they change with it."
+)
 EXAMPLES = """examples:
   raytrace glass N-BK7
   raytrace glass SK16 --wavelength 0.53 --json
+  raytrace glass N-BK7 --temperature 40 --pressure 0
   raytrace glass MYGLASS --catalog my_glasses.agf"""
 
 
@@ -25,9 +29,11 @@ def options(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         help="wavelengths in µm (default: F d C)",
     )
+    environment(parser)
 
 
 def run(arguments: argparse.Namespace):
     from raytrace.cli.door import catalogs
 
-    return raytrace.glass(arguments.name, wavelengths=arguments.wavelengths, catalogs=catalogs(arguments))
+    given = {name: getattr(arguments, name) for name in ("wavelengths", "temperature", "pressure")}
+    return raytrace.glass(arguments.name, catalogs=catalogs(arguments), **given)

@@ -45,6 +45,14 @@ def positive_finite(text: str) -> float:
     return positive(text)
 
 
+def not_negative(text: str) -> float:
+    """A finite number, 0 or more."""
+    number = finite(text)
+    if number < 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is below 0")
+    return number
+
+
 def count(text: str) -> int:
     """A whole number above 0."""
     number = _whole(text)
@@ -155,7 +163,7 @@ def json(parser: argparse.ArgumentParser) -> None:
 
 
 def conditions(parser: argparse.ArgumentParser, *, several: str = "") -> None:
-    """What may be set other than in the file: distances, aperture, wavelength.
+    """What may be set other than in the file: distances, aperture, wavelength, temperature and pressure.
 
     several: what a command does with several object distances together; it is run for one after the other if empty.
     """
@@ -167,6 +175,7 @@ def conditions(parser: argparse.ArgumentParser, *, several: str = "") -> None:
     )
     aperture(group)
     wavelength(group)
+    environment(group)
 
 
 def max_bytes(parser: argparse.ArgumentParser) -> None:
@@ -212,6 +221,16 @@ def wavelength(group) -> None:
         nargs="+",
         help="wavelengths in µm; the first is primary",
     )
+
+
+def environment(group) -> None:
+    group.add_argument(
+        "--temperature",
+        metavar="C",
+        type=finite,
+        help="of the glasses and the air, °C; with one of the two the other is the file's, or 20 °C, 1 atm",
+    )
+    group.add_argument("--pressure", metavar="ATM", type=not_negative, help="of the air, atm; 0 in vacuum")
 
 
 def fields(parser: argparse.ArgumentParser, *, default: str = "") -> None:

@@ -8,12 +8,13 @@ from torch import Tensor
 
 from raytrace.maths.result import Result, number, numbers
 from raytrace.maths.value import detached, value
+from raytrace.media.environment import told
 from raytrace.optics.f_number import real_working_f_number
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.trace import media
 from raytrace.system.lens import FIELD_UNITS, Lens, field_points, name_of_field
 from raytrace.system.shapes import EVEN
-from raytrace.system.surface import vertex_curvature
+from raytrace.system.surface import Surface, vertex_curvature
 
 #: Lines of `raytrace info`: words, entry of FirstOrder (and the real working F/#), unit.
 FIRST_ORDER_LINES = (
@@ -81,6 +82,7 @@ class Info(Result):
                 for x, y, weight in zip(lens.fields.x, lens.fields.y, lens.fields.weight, strict=True)
             ],
             "aperture": {"kind": lens.aperture.kind, "value": number(lens.aperture.value)},
+            **_environment(lens),
             "stop_surface": lens.stop,
             "surfaces": [
                 {
@@ -94,6 +96,7 @@ class Info(Result):
                     "indices": numbers(indices[k].expand_as(lens.wavelengths)),
                     "semi_diameter": number(surface.semi_diameter),
                     "comment": surface.comment,
+                    **_environment(surface),
                 }
                 for k, surface in enumerate(lens.surfaces)
             ],
@@ -113,6 +116,7 @@ class Info(Result):
         lines += [
             f"  {'wavelengths':<24} {', '.join(shown)} µm" + ("  (* primary)" if several else ""),
             f"  {'fields':<24} {points} {FIELD_UNITS[lens.fields.kind]}, {lens.fields.kind.replace('_', ' ')}",
+            *([f"  {'environment':<24} {told(lens.environment)}"] if lens.environment else []),
             "",
             f"  {'surface':>7} {'radius':>13} {'thickness':>12} {'glass':<12} {'index':>9} {'semi-dia.':>10}  note",
         ]
@@ -172,6 +176,14 @@ def _radius(surface) -> float:
     return math.inf if curvature == 0 else 1 / curvature
 
 
+def _environment(holder: Lens | Surface) -> dict:
+    """The entry of a document for an environment, where there is one."""
+    place = holder.environment
+    return (
+        {"environment": {"temperature": number(place.temperature), "pressure": number(place.pressure)}} if place else {}
+    )
+
+
 def _indices(lens: Lens) -> list[float]:
     return [float(index) for index in media(lens, lens.wavelengths[lens.primary_wavelength])]
 
@@ -196,5 +208,7 @@ def _remarks(lens: Lens, k: int) -> str:
         parts.append(f"conic {float(surface.conic):g}")
     if surface.coefficients is not None:
         parts.append(surface.kind)
+    if surface.environment is not None:
+        parts.append(f"in {told(surface.environment)}")
     parts += [f"{a.shape} {'obscuration' if a.obscures else 'aperture'}" for a in surface.apertures]
     return ", ".join(dict.fromkeys(filter(None, [*parts, surface.comment])))
