@@ -15,7 +15,15 @@ from problems import number
 
 import raytrace as rt
 from raytrace.files import shipped
-from raytrace.formats import FORMATS, LensFileError, LensFileWarning, read_lens, read_lens_with_report, write_lens
+from raytrace.formats import (
+    FORMATS,
+    WRITTEN,
+    LensFileError,
+    LensFileWarning,
+    read_lens,
+    read_lens_with_report,
+    write_lens,
+)
 from raytrace.formats.frame import lens_from_frame, to_frame
 from raytrace.formats.source import MAX_BYTES, Place, decode
 from raytrace.media.catalog import UnknownGlass
@@ -28,7 +36,7 @@ OWN = sorted(path for path in (ROOT / "lenses").iterdir() if path.suffix in FORM
 CORPUS = sorted(
     path for folder in ("corpus/zmx", "tier2/dev") for path in (ROOT.parent / "shared" / folder).glob("*.[zZ][mM][xX]")
 )
-SUFFIXES = tuple(FORMATS)
+SUFFIXES = WRITTEN
 
 
 def leaves(value, path=""):

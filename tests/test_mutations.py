@@ -12,6 +12,7 @@ from mutations import Reader, survive
 from PIL import Image
 from problems import number
 from test_prescriptions import LOWENTHAL, NOCTILUX, summilux
+from test_zemax_archive import archive
 
 from raytrace.camera.training import DamagedRun, OtherSettings, Run, load_state, read_state
 from raytrace.formats import LensFileError, read_lens, read_lens_with_report
@@ -103,6 +104,14 @@ def lenses(suffix: str, folder: Path) -> Reader:
     )
 
 
+def archives(folder: Path) -> Reader:
+    """The lens and a catalog it names, of both layouts, packed and stored."""
+    lens = (ROOT / "lenses" / "singlet.zmx").read_bytes()
+    files = {"LENS.CFG": b"1", "LENS.ZMX": lens, "SCHOTT.AGF": catalogs(folder).originals[0]}
+    originals = tuple(archive(files, version, packed) for version in (0xEA, 0xEC) for packed in (True, False))
+    return Reader(originals, from_file(read_lens_with_report, folder / "lens.zar"), (LensFileError, UnknownGlass))
+
+
 def checkpoints(folder: Path) -> Reader:
     module = torch.nn.Sequential(torch.nn.Linear(3, 2), torch.nn.Linear(2, 1))
     optimizer = torch.optim.Adam(module.parameters())
@@ -150,6 +159,7 @@ def arrays(folder: Path) -> Reader:
 
 READERS = {
     "agf": catalogs,
+    "zar": archives,
     "pictures": pictures,
     "npz": arrays,
     "rays": rays,

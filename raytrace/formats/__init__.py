@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from raytrace.files import shipped, write_atomically
-from raytrace.formats import table_read, table_write, zemax_read, zemax_write
+from raytrace.formats import table_read, table_write, zemax_archive, zemax_read, zemax_write
 from raytrace.formats.report import ImportReport as ImportReport
 from raytrace.formats.source import LensFileError as LensFileError
 from raytrace.formats.source import LensFileWarning as LensFileWarning
@@ -24,26 +24,35 @@ from raytrace.system.lens import check as check_lens
 
 
 class Format(NamedTuple):
-    """read(text, file, catalogs, strict) -> (Lens, ImportReport); write(lens, file, catalogs) -> content."""
+    """read(text, file, catalogs, strict) -> (Lens, ImportReport); write(lens, file, catalogs) -> content.
+
+    write: None for a format that is only read. load: what of a file's content is read, its text.
+    """
 
     read: Callable[..., tuple[Lens, ImportReport]]
-    write: Callable[..., bytes]
+    write: Callable[..., bytes] | None = None
+    load: Callable[[Path], str | bytes] = read_text
 
 
 #: The formats by suffix, in lower case.
 FORMATS = {
     ".zmx": Format(zemax_read.read, zemax_write.write),
+    ".zar": Format(zemax_archive.read, load=zemax_archive.load),
     ".csv": Format(table_read.read, table_write.write),
     ".tsv": Format(table_read.read, partial(table_write.write, separator="\t")),
     ".txt": Format(table_read.read, partial(table_write.write, separator="\t")),
 }
 
+#: The suffixes of those that are written too.
+WRITTEN = tuple(suffix for suffix, form in FORMATS.items() if form.write)
+
 
 def read_lens(path: str | os.PathLike, *, catalogs: Sequence[str | Path] = (), strict: bool = False) -> Lens:
-    """The lens of a file, in mm and µm: .zmx (Zemax OpticStudio), or a prescription table .csv, .tsv, .txt.
+    """The lens of a file, in mm and µm: .zmx or .zar (OpticStudio), or a prescription table .csv, .tsv, .txt.
 
     path: of a file, or the name of a shipped lens, as "double_gauss". catalogs: further glass catalogs (.agf), searched
-    as `raytrace.media.catalog.find_glass` does. strict: raise where the file holds something unknown or something has
+    as `raytrace.media.catalog.find_glass` does; a catalog that the file names and that lies beside it, or in it, is
+    found by itself. strict: raise where the file holds something unknown or something has
     to be assumed; otherwise that is one LensFileWarning.
     Raises LensFileError, its subclass UnsupportedSurface, and UnknownGlass, each naming file, line and surface.
     """
@@ -61,7 +70,7 @@ def read_lens_with_report(
     if not path.exists():
         path = shipped_lens(path) or path
     form = _format(path)
-    lens, report = form.read(read_text(path), str(path), catalogs=tuple(catalogs), strict=strict)
+    lens, report = form.read(form.load(path), str(path), catalogs=tuple(catalogs), strict=strict)
     _refuse_other_units(lens, path)
     return lens, dataclasses.replace(report, surfaces=len(lens.surfaces), stop_surface=lens.stop)
 
@@ -128,7 +137,7 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
     """
     path = Path(path)
     _refuse_other_units(lens, path)
-    form = _format(path)
+    form = _format(path, WRITTEN)
     content = form.write(lens, str(path), catalogs=tuple(catalogs))
     changed = _changed_texts(lens, content, form, path, tuple(catalogs))
     if changed:
@@ -165,10 +174,10 @@ def _changed_texts(lens: Lens, content: bytes, form: Format, path: Path, catalog
     return [f"{what} ({shown(str(before))})" for what, before, after in pairs if before != after]
 
 
-def _format(path: Path) -> Format:
-    form = FORMATS.get(path.suffix.lower())
-    if form is None:
-        known = ", ".join(FORMATS)
-        found = f"the suffix {path.suffix!r} names no format" if path.suffix else "has no suffix to name its format"
-        raise LensFileError(f"{found} of lens files; expected one of {known}", Place(str(path)))
-    return form
+def _format(path: Path, known: Sequence[str] = tuple(FORMATS)) -> Format:
+    suffix = path.suffix.lower()
+    if suffix not in known:
+        found = f"the suffix {path.suffix!r} names no format" if suffix else "has no suffix to name its format"
+        found = f"a {suffix} file is read, but not written" if suffix in FORMATS else f"{found} of lens files"
+        raise LensFileError(f"{found}; expected one of {', '.join(known)}", Place(str(path)))
+    return FORMATS[suffix]

@@ -66,7 +66,7 @@ def lens_from_frame(
     header(table, [str(column) for column in frame.columns], _PLACE)
     for cells in frame.itertuples(index=False, name=None):
         add_row(table, [_text(cell) for cell in cells], _PLACE)
-    lens = build(table, catalogs=catalogs)
+    lens = build(table, catalogs=catalogs, packed={})
     report.finished(strict=strict)
     return lens
 

@@ -1,14 +1,26 @@
 """Glasses by their names, found for a reader and named by a writer."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
 
 from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, Place, shown
-from raytrace.media.catalog import AmbiguousGlass, UnknownGlass, find_glass, missing_catalogs
+from raytrace.media.catalog import (
+    SAME_INDEX,
+    AmbiguousGlass,
+    Catalog,
+    CatalogError,
+    UnknownGlass,
+    find_glass,
+    load,
+    missing_catalogs,
+    shipped_difference,
+    user_catalogs,
+)
 from raytrace.media.glass import Glass, constant, model_glass
 from raytrace.system.lens import Lens
 
@@ -16,8 +28,14 @@ from raytrace.system.lens import Lens
 _LONGEST = 80
 
 
-def listed_glass(name: str, *, catalogs: Sequence[str], user: Sequence[Path], place: Place, report: Draft) -> Glass:
-    """The glass of a name, as `find_glass` finds it, its warnings in the report. Raises UnknownGlass."""
+def listed_glass(
+    name: str, *, catalogs: Sequence[str | Catalog], user: Sequence[Path], place: Place, report: Draft
+) -> Glass:
+    """The glass of a name, as `find_glass` finds it, its warnings in the report. Raises UnknownGlass.
+
+    Where it comes from a catalog that came with the lens, and the shipped one of that name has other figures, the
+    report says so.
+    """
     if len(name) > _LONGEST:
         raise LensFileError(f"the glass {shown(name)} has {len(name)} characters; no glass has such a name", place)
     with warnings.catch_warnings(record=True) as caught:
@@ -28,16 +46,66 @@ def listed_glass(name: str, *, catalogs: Sequence[str], user: Sequence[Path], pl
             report.warn(str(warning.message).removeprefix(f"{place}: "), place)
         else:
             report.note(str(warning.message))
+    came = any(isinstance(catalog, Catalog) and catalog.name == glass.catalog for catalog in catalogs)
+    gap = shipped_difference(glass) if came else 0.0
+    if gap > SAME_INDEX:
+        message = (
+            f"{name} is the one of the {glass.catalog} that came with the lens; its index differs from that of the"
+        )
+        report.warn(f"{message} shipped {glass.catalog} by up to {gap:.1e}", place)
     alias = f" as {glass.listed_name}" if glass.listed_name and glass.listed_name.upper() != name.upper() else ""
     report.glass(place.surface, name, f"{glass.catalog or 'user catalog'}{alias}")
     return glass
 
 
-def report_missing_catalogs(catalogs: Sequence[str], user: Sequence[Path], report: Draft) -> None:
-    """Note the catalogs that a file names and that are not at hand."""
-    missing = missing_catalogs(catalogs, user=user)
-    if missing:
-        report.note(f"catalogs that are not shipped: {', '.join(missing)}; their glasses are sought in the others")
+#: Catalogs at hand by their names in capitals: where each stands, and what reads it.
+AtHand = Mapping[str, tuple[str, Callable[[], Catalog]]]
+
+
+def beside(file: str) -> AtHand:
+    """The glass catalogs (.agf) in the folder of a lens file."""
+    try:
+        found = sorted(path for path in Path(file).parent.iterdir() if path.suffix.lower() == ".agf" and path.is_file())
+    except (OSError, ValueError):
+        return {}
+    return {path.stem.upper(): (f"{path.name} beside the lens", partial(load, path)) for path in found}
+
+
+def catalogs_at_hand(
+    names: Sequence[str], user: Sequence[Path], report: Draft, packed: AtHand | None = None
+) -> tuple[str | Catalog, ...]:
+    """The catalogs that a lens file names, in its order: one that came with the lens itself, any other by its name.
+
+    A catalog comes with the lens if it lies beside it as NAME.agf, in upper or lower case, or, of an archive, is
+    `packed` with it. It goes before a shipped one of its name, and is passed over where `user` has one. The report says
+    which were found, and which are nowhere.
+    """
+    came, stated = beside(report.file) if packed is None else packed, {p.stem.upper() for p in user_catalogs(user)}
+    found, nowhere = [], []
+    for name in dict.fromkeys(names):
+        where, read = came.get(name.upper(), ("", None))
+        catalog = _came(name, where, read, report) if read and name.upper() not in stated else None
+        found.append(catalog or name)
+        nowhere += [] if catalog else missing_catalogs([name], user=user)
+    if nowhere:
+        report.note(f"catalogs that are not shipped: {', '.join(nowhere)}; their glasses are sought in the others")
+    return tuple(found)
+
+
+def _came(name: str, where: str, read: Callable[[], Catalog], report: Draft) -> Catalog | None:
+    """A catalog that came with the lens; None, with a warning, where it cannot be read."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            catalog = read()
+        except CatalogError as error:
+            report.warn(f"the catalog {name} that came with the lens is left out: {error}", Place(report.file))
+            return None
+    for warning in caught:
+        report.note(str(warning.message))
+    shipped = "" if missing_catalogs([name]) else ", which goes before the shipped one"
+    report.note(f"catalog {name}: {where}{shipped}")
+    return catalog
 
 
 def is_left_out(glass: Glass) -> bool:
@@ -67,12 +135,14 @@ def catalogs_needed(lens: Lens, user: Sequence[Path], file: str) -> tuple[str, .
             names = (*names, glass.catalog)
             continue
         message = f"the figures of {glass.name!r} are not those of its catalog; a file holds its name only"
-        raise LensFileError(f"{message}: use the listed glass or a model glass", place)
+        hint = "use the listed glass or a model glass, or put its catalog beside the file"
+        raise LensFileError(f"{message}: {hint}", place)
     return names
 
 
-def _found(glass: Glass, catalogs: tuple[str, ...], user: Sequence[Path], place: Place) -> bool:
+def _found(glass: Glass, names: tuple[str, ...], user: Sequence[Path], place: Place) -> bool:
     """True if the name finds the same figures, or is of a catalog that is not at hand."""
+    catalogs = catalogs_at_hand(names, user, Draft(place.file, ""))
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", AmbiguousGlass)

@@ -37,7 +37,8 @@ class Keyword:
             return f"{self.name} x{self.count}"
         where, times = ("line", "") if self.count == 1 else ("lines", f" x{self.count}")
         listed = ", ".join(map(str, self.lines)) + (", …" if self.count > len(self.lines) else "")
-        return f"{self.name}{times} ({where} {listed})" + (f": {self.reason}" if self.reason else "")
+        place = f" ({where} {listed})" if self.lines else ""
+        return f"{self.name}{times}{place}" + (f": {self.reason}" if self.reason else "")
 
 
 @dataclass(frozen=True)
@@ -137,7 +138,8 @@ class Draft:
             if one.status == UNKNOWN:
                 times = "" if one.count == 1 else f" ({one.count} times)"
                 place = Place(self.file, one.lines[0] if one.lines else None)
-                self.warn(f"unknown keyword {one.name}{times}: left out", place)
+                what = one.name if " " in one.name else f"keyword {one.name}"
+                self.warn(f"unknown {what}{times}: left out", place)
         if strict and self.warnings:
             text, place = self.warnings[0]
             more = len(self.warnings) - 1

@@ -57,23 +57,28 @@ def read_text(path: Path) -> str:
 
     Raises LensFileError for a file that is missing, not a regular file, larger than MAX_BYTES, or not text.
     """
+    return decode(read_content(path, MAX_BYTES), Place(str(path)))
+
+
+def read_content(path: Path, most: int) -> bytes:
+    """The bytes of a lens file. Raises LensFileError for one that is missing, no regular file or larger than `most`."""
     place = Place(str(path))
     try:
         status = os.stat(path)
         if not stat.S_ISREG(status.st_mode):
             raise LensFileError("is not a regular file; give the path of a lens file", place)
-        if status.st_size > MAX_BYTES:
+        if status.st_size > most:
             size = f"{status.st_size / 1e6:.0f} MB"
-            raise LensFileError(f"is {size} long, more than any lens file ({MAX_BYTES / 1e6:.0f} MB); not read", place)
+            raise LensFileError(f"is {size} long, more than any lens file ({most / 1e6:.0f} MB); not read", place)
         with open(path, "rb") as file:
-            content = file.read(MAX_BYTES + 1)
+            content = file.read(most + 1)
     except OSError as error:
         raise LensFileError(f"cannot be read: {error.strerror or error}", place) from error
     except ValueError as error:
         if isinstance(error, LensFileError):
             raise
         raise LensFileError(f"cannot be opened: {error}", place) from error
-    return decode(content, place)
+    return content
 
 
 def decode(content: bytes, place: Place) -> str:

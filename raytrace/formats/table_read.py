@@ -28,7 +28,7 @@ from pathlib import Path
 import torch
 
 from raytrace.formats import table_surface, table_system
-from raytrace.formats.media import report_missing_catalogs
+from raytrace.formats.media import AtHand, catalogs_at_hand
 from raytrace.formats.report import Draft, ImportReport
 from raytrace.formats.source import LensFileError, shown
 from raytrace.formats.spelling import (
@@ -71,12 +71,12 @@ def read(text: str, file: str, *, catalogs: Sequence[Path] = (), strict: bool = 
     return build(parse(text, file, report), catalogs=catalogs), report.finished(strict=strict)
 
 
-def build(table: Table, *, catalogs: Sequence[Path] = ()) -> Lens:
-    """The lens of a table taken apart."""
+def build(table: Table, *, catalogs: Sequence[Path] = (), packed: AtHand | None = None) -> Lens:
+    """The lens of a table taken apart. packed: glass catalogs that come with it, instead of those beside its file."""
     unit, rows = _unit(table), _numbered(table)
     names = tuple(words(table.value("catalogs")))
-    report_missing_catalogs(names, catalogs, table.report)
-    surfaces = [table_surface.build(row, unit, names, catalogs, table.report) for row in rows]
+    at_hand = catalogs_at_hand(names, catalogs, table.report, packed)
+    surfaces = [table_surface.build(row, unit, at_hand, catalogs, table.report) for row in rows]
     _refuse_all_air(table, surfaces)
     surfaces = _with_object(surfaces, rows, table, unit)
     surfaces += _missing_image(rows, surfaces, table.report)

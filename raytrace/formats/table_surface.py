@@ -14,6 +14,7 @@ from raytrace.formats.table_columns import order
 from raytrace.formats.table_media import figures as figures_of
 from raytrace.formats.table_media import medium
 from raytrace.formats.table_text import Row
+from raytrace.media.catalog import Catalog
 from raytrace.media.glass import AIR, LINES, MIRROR, Glass, mil_glass, refractive_index
 from raytrace.system.aperture import SHAPES, Aperture
 from raytrace.system.shapes import KINDS
@@ -52,7 +53,7 @@ def _words(text: str) -> list[str]:
     return re.findall(r"[^\W\d_]+", text.lower())
 
 
-def build(row: Row, unit: float, catalogs: tuple[str, ...], user: Sequence[Path], report: Draft) -> Surface:
+def build(row: Row, unit: float, catalogs: Sequence[str | Catalog], user: Sequence[Path], report: Draft) -> Surface:
     """The surface of a row, its lengths in units of `unit` mm."""
     cells, place = row.cells, row.place
     conic = _cell(row, "conic")
@@ -117,7 +118,7 @@ def _semi_diameter(row: Row, unit: float) -> float | None:
     return found * unit or None
 
 
-def _glass(row: Row, catalogs: tuple[str, ...], user: Sequence[Path], report: Draft) -> Glass:
+def _glass(row: Row, catalogs: Sequence[str | Catalog], user: Sequence[Path], report: Draft) -> Glass:
     text, place = row.cells.get("glass", ""), row.place
     given = figures_of(row.cells)
     if text.lower() in _AIR or (given and text.lower() == "unknown"):

@@ -19,7 +19,7 @@ from pathlib import Path
 from torch import Tensor
 
 from raytrace.formats import zemax_surface
-from raytrace.formats.media import report_missing_catalogs
+from raytrace.formats.media import AtHand, catalogs_at_hand
 from raytrace.formats.report import Draft, ImportReport
 from raytrace.formats.source import LensFileError, UnsupportedSurface, shown
 from raytrace.formats.spelling import MILLIMETRES, double, is_number, refuse_overflow
@@ -40,10 +40,13 @@ from raytrace.system.lens import RAY_AIMING, Fields, Lens, SystemAperture
 _MOST = 1000
 
 
-def read(text: str, file: str, *, catalogs: Sequence[Path] = (), strict: bool = False) -> tuple[Lens, ImportReport]:
+def read(
+    text: str, file: str, *, catalogs: Sequence[Path] = (), strict: bool = False, packed: AtHand | None = None
+) -> tuple[Lens, ImportReport]:
     """The lens of a .zmx text and the report of its import.
 
-    file: its name, for messages. catalogs: further glass catalogs (.agf). strict: every warning is an error.
+    file: its name, for messages and for the catalogs beside it. catalogs: further glass catalogs (.agf). strict: every
+    warning is an error. packed: the catalogs of an archive, instead of those beside the file.
     Raises LensFileError, UnsupportedSurface (a type that is not modelled) and UnknownGlass.
     """
     report = Draft(file, "zmx")
@@ -54,9 +57,9 @@ def read(text: str, file: str, *, catalogs: Sequence[Path] = (), strict: bool = 
     unit = _millimetres(system, report)
     stop = _stop(found.surfaces)
     names = tuple(name for record in system.all("GCAT") for name in record.words)
-    report_missing_catalogs(names, catalogs, report)
+    at_hand = catalogs_at_hand(names, catalogs, report, packed)
     surfaces = [
-        zemax_surface.build(block, unit, catalogs=names, user=catalogs, report=report) for block in found.surfaces
+        zemax_surface.build(block, unit, catalogs=at_hand, user=catalogs, report=report) for block in found.surfaces
     ]
     wavelengths, weights = _wavelengths(system, report)
     primary = _primary(system, len(wavelengths), report)

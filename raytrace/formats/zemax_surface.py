@@ -12,6 +12,7 @@ from raytrace.formats.spelling import double, is_infinite
 from raytrace.formats.zemax_keywords import TYPE_NAMES, Block, Record, aperture_keywords
 from raytrace.formats.zemax_parameters import numbers, poses, report_unused
 from raytrace.formats.zemax_types import TYPES, SurfaceType
+from raytrace.media.catalog import Catalog
 from raytrace.media.glass import AIR, MIRROR, Glass, mil_glass
 from raytrace.system.aperture import SHAPES, Aperture
 from raytrace.system.surface import Surface
@@ -69,7 +70,7 @@ def _modelled() -> str:
 
 
 def build(
-    block: Block, millimetres: float, *, catalogs: tuple[str, ...], user: Sequence[Path], report: Draft
+    block: Block, millimetres: float, *, catalogs: Sequence[str | Catalog], user: Sequence[Path], report: Draft
 ) -> Surface:
     """The surface of a block, its lengths in units of `millimetres`.
 
@@ -144,7 +145,7 @@ def semi_diameter(block: Block, millimetres: float) -> float | None:
     return found or None
 
 
-def _medium(block: Block, catalogs: tuple[str, ...], user: Sequence[Path], report: Draft) -> Glass:
+def _medium(block: Block, catalogs: Sequence[str | Catalog], user: Sequence[Path], report: Draft) -> Glass:
     """The medium of a GLAS record: name, flag (0 catalog, 1 model, 2 pickup, 3 substitute), -, nd, Vd, ΔPgF.
 
     The columns after the name are placeholders unless the flag says model glass or the name is ___BLANK.

@@ -63,7 +63,12 @@ def read_text(path: str | Path) -> str:
         content = read_bytes(path, _LARGEST_FILE)
     except OSError as error:
         raise CatalogError(f"{path}: cannot be read ({error.strerror or error}); expected a glass catalog") from error
-    found = encoding(content)
+    return decode(content, path)
+
+
+def decode(content: bytes, path: str | Path) -> str:
+    """The text of a catalog's bytes; `path` is its place in messages. Raises CatalogError."""
+    path, found = Path(path), encoding(content)
     try:
         text = content.decode(found).removeprefix("\ufeff").rstrip("\x1a\0")  # end-of-file marks of old programs
     except UnicodeDecodeError as error:

@@ -3,7 +3,7 @@
 A name is never replaced by a similar one. `find_glass` looks, in this order and nowhere else, in
 
 1. the catalogs of the user: files given by the caller, then those in the environment variable RAYTRACE_CATALOGS;
-2. the catalogs the lens file names, in its order;
+2. the catalogs the lens file names, in its order: those that came with it, else the shipped ones of these names;
 3. the other shipped catalogs, in the order of SHIPPED (a warning tells where two of them disagree on the name);
 4. the alias table glass_catalogs/ALIASES.csv: other spellings of the same glass, each with its reason;
 
@@ -75,12 +75,15 @@ class UnknownGlass(LookupError):
         )
 
 
-def find_glass(name: str, *, catalogs: Sequence[str] = (), user: Sequence[str | Path] = (), where: str = "") -> Glass:
+def find_glass(
+    name: str, *, catalogs: Sequence[str | Catalog] = (), user: Sequence[str | Path] = (), where: str = ""
+) -> Glass:
     """The glass of a name, by the rule at the head of this file.
 
-    catalogs: names of the lens file's catalogs in its order; one that is not shipped is passed over (report it with
-    `missing_catalogs`). user: AGF files that go before all others. where: the place to name in messages, as
-    "lens.zmx:31, surface 2". Raises UnknownGlass; CatalogError for a bad user catalog; warns AmbiguousGlass.
+    catalogs: those of the lens file in its order: names, one of which that is not shipped is passed over (report it
+    with `missing_catalogs`), and catalogs that came with it. user: AGF files that go before all others. where: the
+    place to name in messages, as "lens.zmx:31, surface 2". Raises UnknownGlass; CatalogError for a bad user catalog;
+    warns AmbiguousGlass.
     """
     wanted = name.strip()
     own = [load(path) for path in user_catalogs(user)]
@@ -88,10 +91,10 @@ def find_glass(name: str, *, catalogs: Sequence[str] = (), user: Sequence[str | 
         glass = catalog.find(wanted)
         if glass:
             return replace(glass, name=name)
-    named = list(dict.fromkeys(filter(None, map(_shipped_name, catalogs))))
-    for catalog in named:
-        if wanted.upper() in _shipped_names(catalog):
-            return replace(_shipped_glass(wanted, catalog), name=name)
+    for catalog in catalogs:
+        glass = catalog.find(wanted) if isinstance(catalog, Catalog) else _of_shipped(wanted, catalog)
+        if glass:
+            return replace(glass, name=name)
     others = [_shipped_glass(wanted, catalog) for catalog in SHIPPED if wanted.upper() in _shipped_names(catalog)]
     if others:
         _warn_if_ambiguous(others, where)
@@ -99,8 +102,8 @@ def find_glass(name: str, *, catalogs: Sequence[str] = (), user: Sequence[str | 
     alias = aliases().get(wanted.upper())
     if alias:
         return replace(_shipped_glass(alias.glass, alias.catalog), name=name)
-    searched = [*(catalog.name for catalog in own), *SHIPPED]
-    raise UnknownGlass(name, where, nearest_names(wanted, user=user), searched)
+    own += [catalog for catalog in catalogs if isinstance(catalog, Catalog)]
+    raise UnknownGlass(name, where, _nearest(wanted, own), [*(catalog.name for catalog in own), *SHIPPED])
 
 
 def edition(glass: Glass) -> tuple[str, ...]:
@@ -129,10 +132,14 @@ def missing_catalogs(catalogs: Sequence[str], *, user: Sequence[str | Path] = ()
 
 def nearest_names(name: str, *, user: Sequence[str | Path] = (), count: int = 5) -> tuple[tuple[str, str], ...]:
     """Up to `count` (glass, catalog) whose names look like `name`, the nearest first; hyphens do not count."""
+    return _nearest(name, [load(path) for path in user_catalogs(user)], count)
+
+
+def _nearest(name: str, own: Sequence[Catalog], count: int = 5) -> tuple[tuple[str, str], ...]:
     spellings: dict[str, list[tuple[str, str]]] = {}
-    own = [(glass, load(path).name) for path in user_catalogs(user) for glass in load(path).glasses]
+    listed = [(glass, catalog.name) for catalog in own for glass in catalog.glasses]
     shipped = [(glass, catalog) for catalog in SHIPPED for glass in _shipped_names(catalog).values()]
-    for glass, catalog in own + shipped:
+    for glass, catalog in listed + shipped:
         spellings.setdefault(_bare(glass), []).append((glass, catalog))
     near = difflib.get_close_matches(_bare(name), spellings, n=count, cutoff=0.6)
     return tuple(hit for spelling in near for hit in spellings[spelling])[:count]
@@ -206,6 +213,17 @@ def _shipped_names(catalog: str) -> dict[str, str]:
 def _shipped_name(catalog: str) -> str | None:
     name = CATALOG_NAMES.get(catalog.upper(), catalog.upper())
     return name if name in SHIPPED else None
+
+
+def _of_shipped(name: str, catalog: str) -> Glass | None:
+    shipped = _shipped_name(catalog)
+    return _shipped_glass(name, shipped) if shipped and name.upper() in _shipped_names(shipped) else None
+
+
+def shipped_difference(glass: Glass) -> float:
+    """How far the indices of a glass lie from those of the shipped catalog of the same name; 0 where it has none."""
+    shipped = _of_shipped(glass.listed_name, glass.catalog)
+    return _difference(glass, shipped) if shipped else 0.0
 
 
 def _shipped_glass(name: str, catalog: str) -> Glass:

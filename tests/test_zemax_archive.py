@@ -1,0 +1,340 @@
+"""Archives of OpticStudio (.zar), and glass catalogs that come with a lens: packed with it, or beside it."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from test_catalog import SMALL
+from test_zemax import file as singlet
+
+from raytrace.cli import main
+from raytrace.formats import LensFileError, check, convert, read_lens, read_lens_with_report
+from raytrace.formats.source import MAX_BYTES, Place
+from raytrace.formats.zemax_archive import Member, members, unpacked
+from raytrace.media.agf import format_agf
+from raytrace.media.catalog import ENVIRONMENT, UnknownGlass, find_glass, shipped_catalog
+from raytrace.media.glass import index
+
+PLACE = Place("lens.zar")
+#: A catalog of one glass, N-BK7 by name, with other figures: those of SF6.
+OWN = next(part for part in format_agf(shipped_catalog("SCHOTT")).split("\nNM ") if part.startswith("N-SF6 "))
+OWN = f"CC other figures\nNM {OWN.replace('N-SF6', 'N-BK7', 1)}\n"
+
+
+@pytest.fixture(autouse=True)
+def no_catalogs_from_the_environment(monkeypatch):
+    monkeypatch.delenv(ENVIRONMENT, raising=False)
+
+
+# -- a packer of our own ----------------------------------------------------------------------------------------------
+
+
+def lzw(content: bytes) -> bytes:
+    """The codes of LZW, of 9 bits and more, the highest bit first, padded with zeros to whole bytes."""
+    words, codes, before = {bytes([k]): k for k in range(256)}, [], b""
+    for k in range(len(content)):
+        longer = before + content[k : k + 1]
+        if longer not in words:
+            codes.append(words[before])
+            words[longer] = len(words)
+            longer = content[k : k + 1]
+        before = longer
+    return bits([*codes, *([words[before]] if before else [])])
+
+
+def bits(codes: list[int]) -> bytes:
+    """Codes as bits: code k, from 0, has as many as the dictionary of its reader then needs."""
+    text = "".join(f"{code:0{(255 + max(k, 1)).bit_length()}b}" for k, code in enumerate(codes))
+    return int(text.ljust(-(-len(text) // 8) * 8, "0") or "0", 2).to_bytes(-(-len(text) // 8), "big")
+
+
+def header(name: str, size: int, version: int) -> bytes:
+    if version == 0xEA:
+        head = bytearray(0x14C)
+        head[0x0C:0x10], head[0x20 : 0x20 + len(name)] = size.to_bytes(4, "little"), name.encode("latin-1")
+    else:
+        head = bytearray(0x288)
+        head[0x10:0x18], head[0x30 : 0x30 + 2 * len(name)] = size.to_bytes(8, "little"), name.encode("utf-16-le")
+    head[0] = version
+    return bytes(head)
+
+
+def archive(files: dict[str, str | bytes], version: int = 0xEC, packed: bool = True) -> bytes:
+    parts = []
+    for name, content in files.items():
+        content = content if isinstance(content, bytes) else content.encode("utf-16")
+        content, name = (lzw(content), f"{name}.LZW") if packed else (content, name)
+        parts += [header(name, len(content), version), content]
+    return b"".join(parts)
+
+
+def written(folder: Path, files: dict, name: str = "lens.zar", **kind) -> Path:
+    path = folder / name
+    path.write_bytes(archive(files, **kind))
+    return path
+
+
+# -- members ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_codes_of_the_literature_are_unpacked():
+    """The example of LZW that every text book of it has, of 16 codes (Rosetta Code, LZW compression)."""
+    codes = [84, 79, 66, 69, 79, 82, 78, 79, 84, 256, 258, 260, 265, 259, 261, 263]
+    member = Member("text", True, memoryview(bits(codes)))
+    assert unpacked(member, 100, PLACE) == b"TOBEORNOTTOBEORTOBEORNOT"
+
+
+@pytest.mark.parametrize("size", [0, 1, 2, 255, 3_000, 200_000])
+def test_bytes_come_back(size):
+    """Beyond 512, 1024, … words, where codes grow by a bit."""
+    for content in (
+        bytes(torch.randint(0, 256, (size,), generator=torch.Generator().manual_seed(1)).tolist()),
+        bytes(size),
+        (b"abcab" * size)[:size],
+    ):
+        assert unpacked(Member("text", True, memoryview(lzw(content))), size, PLACE) == content
+
+
+@pytest.mark.parametrize("version", [0xEA, 0xEC])
+@pytest.mark.parametrize("packed", [True, False])
+def test_members_stand_in_their_order_with_their_names(version, packed):
+    files = {"LENS.ZMX": b"one", "Prüf glas.agf": b"two two two", "empty.cfg": b""}
+    found = members(archive(files, version, packed), PLACE)
+    assert [member.name for member in found] == list(files)
+    assert [unpacked(member, 99, PLACE) for member in found] == list(files.values())
+
+
+@pytest.mark.parametrize("name", ["../../etc/LENS.ZMX", "C:\\Zemax\\LENS.ZMX", "/LENS.ZMX"])
+def test_a_name_is_no_path(name, tmp_path):
+    lens, report = read_lens_with_report(written(tmp_path, {name: singlet()}))
+    assert lens.name == "A singlet"
+    assert report.keywords[0].name == "member LENS.ZMX"
+    assert [path.name for path in tmp_path.iterdir()] == ["lens.zar"]
+
+
+def test_a_name_that_cannot_be_printed_is_shown_marked(tmp_path):
+    _, report = read_lens_with_report(written(tmp_path, {"LENS.ZMX": singlet(), "a\n\x1b[31m.cfg": b""}))
+    assert report.keywords[1].name == "member a??[31m.cfg"
+
+
+# -- the lens ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("version", [0xEA, 0xEC])
+@pytest.mark.parametrize("packed", [True, False])
+def test_the_lens_of_an_archive_is_the_lens_of_its_file(version, packed, tmp_path):
+    path = written(tmp_path, {"A.CFG": b"1", "LENS.ZMX": singlet(), "A.STP": b"2"}, version=version, packed=packed)
+    (tmp_path / "lens.zmx").write_text(singlet())
+    assert str(read_lens(path)) == str(read_lens(tmp_path / "lens.zmx"))
+
+
+def test_every_member_is_listed(tmp_path, capsys):
+    files = {
+        "LENS.ZMX": singlet(GCAT="GCAT ACME SCHOTT"),
+        "OTHER.ZMX": singlet(),
+        "ACME.AGF": SMALL,
+        "EXTRA.AGF": SMALL,
+    }
+    files |= {"LENS.CFG": b"", "NOTES.XYZ": b""}
+    path = written(tmp_path, files)
+    report = check(path)
+    statuses = {one.name.removeprefix("member "): one.status for one in report.keywords if one.name.startswith("mem")}
+    ignored = dict.fromkeys(("OTHER.ZMX", "EXTRA.AGF", "LENS.CFG"), "ignored")
+    assert statuses == {"LENS.ZMX": "read", "ACME.AGF": "read", **ignored, "NOTES.XYZ": "unknown"}
+    assert all(one.reason for one in report.keywords if one.status == "ignored")
+    assert report.format == "zar"
+    assert [warning for warning in report.warnings if "member" in warning] == [
+        f"{path}: unknown member NOTES.XYZ: left out"
+    ]
+    assert main(["check", str(path)]) == 0
+    printed = capsys.readouterr().out
+    assert "member LENS.CFG: settings of the program" in printed
+    with pytest.raises(LensFileError, match="unknown member NOTES"):
+        check(path, strict=True)
+
+
+def test_info_of_an_archive_is_that_of_its_lens(tmp_path, capsys):
+    path, beside = written(tmp_path, {"LENS.ZMX": singlet()}), tmp_path / "lens.zmx"
+    beside.write_text(singlet())
+    found = []
+    for one in (path, beside):
+        assert main(["info", str(one), "--json"]) == 0
+        found.append({**json.loads(capsys.readouterr().out), "lens": ""})
+    assert found[0] == found[1]
+
+
+def test_an_archive_is_not_written(tmp_path):
+    with pytest.raises(LensFileError, match=r"a \.zar file is read, but not written; expected one of \.zmx"):
+        convert("double_gauss", tmp_path / "lens.zar")
+
+
+def test_errors_of_the_lens_name_archive_member_and_line(tmp_path):
+    path = written(tmp_path, {"A.ZMX": singlet(surface="CONI x")})
+    with pytest.raises(LensFileError, match=r"lens\.zar \(A\.ZMX\):23, surface 1: CONI: conic constant is 'x'"):
+        read_lens(path)
+
+
+# -- damaged and hostile ----------------------------------------------------------------------------------------------
+
+
+def test_an_archive_without_a_lens_says_what_it_holds(tmp_path):
+    with pytest.raises(LensFileError, match=r"no lens \(\.zmx\) among its 2 members \(A\.CFG, B\.AGF\)"):
+        read_lens(written(tmp_path, {"A.CFG": b"", "B.AGF": SMALL}))
+    with pytest.raises(LensFileError, match=r"2 lenses \(A\.ZMX, B\.ZMX\), none with its own name"):
+        read_lens(written(tmp_path, {"A.ZMX": singlet(), "B.ZMX": singlet()}))
+
+
+def test_a_bomb_is_refused_before_it_is_large(tmp_path):
+    """A word longer than all before it with every code: 8 kB would unpack to a gigabyte."""
+    bomb = bits([0, *range(256, 256 + 46_000)])
+    assert len(bomb) < 100_000
+    path = tmp_path / "lens.zar"
+    path.write_bytes(header("LENS.ZMX.LZW", len(bomb), 0xEC) + bomb)
+    with pytest.raises(LensFileError, match=f"'LENS.ZMX' holds more than {MAX_BYTES / 1e6:.0f} MB"):
+        read_lens(path)
+    stored = bytes(MAX_BYTES + 1)
+    path.write_bytes(header("LENS.ZMX", len(stored), 0xEC) + stored)
+    with pytest.raises(LensFileError, match="holds more than"):
+        read_lens(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "no lens"),
+        (b"PK\x03\x04 a zip", "member 0 begins with 50 4b at byte 0, expected ea or ec"),
+        (header("LENS.ZMX", 10, 0xEC)[:200], "cut off"),
+        (header("LENS.ZMX", 10, 0xEC) + b"123", "has 10 bytes, but 3 follow"),
+        (header("LENS.ZMX", 2**63, 0xEC) + b"123", "has 9223372036854775808 bytes, but 3 follow"),
+        (header("LENS.ZMX.LZW", 4, 0xEC) + b"\xff\xff\xff\xff", "code 511 of a dictionary of 256 words"),
+        (header("A", 0, 0xEA) * 1001, "more than 1000 members"),
+    ],
+)
+def test_a_damaged_archive_is_refused(content, message, tmp_path):
+    path = tmp_path / "lens.zar"
+    path.write_bytes(content)
+    with pytest.raises(LensFileError, match=message):
+        read_lens(path)
+
+
+# -- catalogs that come with the lens ---------------------------------------------------------------------------------
+
+ACME = SMALL.replace("NM ONE ", "NM ACME-1 ")
+
+
+def lens_file(folder: Path, suffix: str, glass: str = "ACME-1", catalogs: str = "ACME") -> Path:
+    """The singlet as a lens file of a format that names its catalogs."""
+    if suffix == ".zar":
+        return written(folder, {"LENS.ZMX": singlet(GCAT=f"GCAT {catalogs}").replace("N-BK7", glass)})
+    path = folder / f"lens{suffix}"
+    if suffix == ".csv":
+        path.write_text(f"# catalogs: {catalogs}\n# stop: 1\nradius,thickness,glass\n50,4,{glass}\n-50,47.5,\n")
+    else:
+        path.write_text(singlet(GCAT=f"GCAT {catalogs}").replace("N-BK7", glass))
+    return path
+
+
+def first(lens) -> object:
+    return next(surface.glass for surface in lens.surfaces if surface.glass.name)
+
+
+@pytest.mark.parametrize("name", ["ACME.AGF", "acme.agf", "Acme.Agf"])
+@pytest.mark.parametrize("suffix", [".zmx", ".csv"])
+def test_a_catalog_beside_the_lens_is_found_by_itself(suffix, name, tmp_path):
+    path = lens_file(tmp_path, suffix)
+    with pytest.raises(UnknownGlass, match="ACME-1"):
+        read_lens(path)
+    (tmp_path / name).write_text(ACME)
+    lens, report = read_lens_with_report(path)
+    assert first(lens).catalog == "ACME"
+    assert f"catalog ACME: {name} beside the lens" in report.notes
+    assert not any("not shipped" in note for note in report.notes)
+
+
+def test_a_catalog_of_the_archive_is_found_by_itself(tmp_path):
+    text = singlet(GCAT="GCAT ACME").replace("N-BK7", "ACME-1")
+    lens, report = read_lens_with_report(written(tmp_path, {"ACME.AGF": ACME, "LENS.ZMX": text}))
+    assert first(lens).catalog == "ACME"
+    assert "catalog ACME: ACME.AGF of the archive" in report.notes
+    (tmp_path / "ACME.AGF").write_text(ACME)  # what lies beside an archive is not what it was made with
+    with pytest.raises(UnknownGlass):
+        read_lens(written(tmp_path, {"LENS.ZMX": text}))
+
+
+@pytest.mark.parametrize("suffix", [".zmx", ".csv"])
+def test_a_catalog_that_the_lens_does_not_name_is_not_used(suffix, tmp_path):
+    (tmp_path / "ACME.AGF").write_text(ACME)
+    with pytest.raises(UnknownGlass):
+        read_lens(lens_file(tmp_path, suffix, catalogs="SCHOTT"))
+
+
+def test_the_catalog_of_the_lens_goes_before_the_shipped_one_of_its_name_and_it_is_said(tmp_path):
+    path = lens_file(tmp_path, ".zmx", "N-BK7", "SCHOTT")
+    (tmp_path / "schott.agf").write_text(OWN)
+    lens, report = read_lens_with_report(path)
+    assert float(index(first(lens), 0.5875618)) == float(index(find_glass("N-SF6"), 0.5875618))
+    assert "catalog SCHOTT: schott.agf beside the lens, which goes before the shipped one" in report.notes
+    (warning,) = report.warnings
+    assert "surface 1: N-BK7 is the one of the SCHOTT that came with the lens; its index differs" in warning
+    with pytest.raises(LensFileError, match="its index differs"):
+        read_lens(path, strict=True)
+    (tmp_path / "schott.agf").write_text(format_agf(shipped_catalog("SCHOTT")))
+    assert read_lens_with_report(path)[1].warnings == ()  # the same figures: nothing to warn of
+
+
+def test_the_order_of_the_lens_file_holds_for_catalogs_that_came_with_it(tmp_path):
+    (tmp_path / "ACME.AGF").write_text(OWN)
+    assert first(read_lens(lens_file(tmp_path, ".zmx", "N-BK7", "SCHOTT ACME"))).catalog == "SCHOTT"
+    assert first(read_lens(lens_file(tmp_path, ".zmx", "N-BK7", "ACME SCHOTT"))).catalog == "ACME"
+
+
+def test_a_catalog_that_is_given_goes_before_the_one_beside_the_lens(tmp_path, monkeypatch):
+    given = tmp_path / "given"
+    given.mkdir()
+    (given / "ACME.AGF").write_text(ACME.replace("CD 1.03961212", "CD 1.05961212"))
+    (tmp_path / "ACME.AGF").write_text(OWN.replace("N-BK7", "ACME-1"))
+    path = lens_file(tmp_path, ".zmx")
+    beside = float(index(first(read_lens(path)), 0.55))
+    stated = float(index(first(read_lens(path, catalogs=[given / "ACME.AGF"])), 0.55))
+    assert beside != stated
+    assert not any("beside" in note for note in read_lens_with_report(path, catalogs=[given / "ACME.AGF"])[1].notes)
+    monkeypatch.setenv(ENVIRONMENT, str(given / "ACME.AGF"))
+    assert float(index(first(read_lens(path)), 0.55)) == stated
+
+
+def test_a_damaged_catalog_beside_the_lens_is_said(tmp_path):
+    (tmp_path / "SCHOTT.AGF").write_text("NM N-BK7 2\n")
+    path = lens_file(tmp_path, ".zmx", "N-BK7", "SCHOTT")
+    lens, report = read_lens_with_report(path)
+    assert first(lens).catalog == "SCHOTT"
+    assert "the catalog SCHOTT that came with the lens is left out" in report.warnings[0]
+    with pytest.raises(LensFileError, match="is left out"):
+        read_lens(path, strict=True)
+
+
+@pytest.mark.parametrize("name", ["..", "../ACME", "/ACME", ".", "a\\..\\ACME"])
+def test_the_name_of_a_catalog_is_no_path(name, tmp_path):
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (tmp_path / "ACME.AGF").write_text(ACME)
+    with pytest.raises(UnknownGlass):
+        read_lens(lens_file(folder, ".zmx", catalogs=name))
+
+
+def test_a_lens_is_written_beside_its_catalog_and_read_again(tmp_path):
+    (tmp_path / "SCHOTT.AGF").write_text(OWN)
+    path = lens_file(tmp_path, ".zmx", "N-BK7", "SCHOTT")
+    with pytest.warns(UserWarning, match="its index differs"):
+        convert(path, tmp_path / "again.csv")
+    with pytest.warns(UserWarning, match="its index differs"):
+        again = read_lens(tmp_path / "again.csv")
+    assert torch.equal(first(again).coefficients, first(read_lens_with_report(path)[0]).coefficients)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    with (
+        pytest.warns(UserWarning, match="its index differs"),
+        pytest.raises(LensFileError, match="put its catalog beside the file"),
+    ):
+        convert(path, elsewhere / "again.zmx")
+    assert not any(elsewhere.iterdir())
