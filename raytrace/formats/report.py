@@ -138,7 +138,7 @@ class Draft:
             if one.status == UNKNOWN:
                 times = "" if one.count == 1 else f" ({one.count} times)"
                 place = Place(self.file, one.lines[0] if one.lines else None)
-                what = one.name if " " in one.name else f"keyword {one.name}"
+                what = one.name if one.name.startswith("member ") else f"keyword {one.name}"
                 self.warn(f"unknown {what}{times}: left out", place)
         if strict and self.warnings:
             text, place = self.warnings[0]
