@@ -3,16 +3,22 @@
 from raytrace.cli import options as words
 
 SUMMARY = "draw the lens with rays"
-DESCRIPTION = "Draw the cross section of a lens with the rays of its fields."
+DESCRIPTION = "Draw the cross section of a lens with the rays of its fields; folded systems as they stand."
 EXAMPLES = """examples:
   raytrace layout double_gauss --plot layout.png
-  raytrace layout lens.zmx --field 0 14 -14,0 --plot layout.pdf"""
+  raytrace layout lens.zmx --field 0 14 -14,0 --plot layout.pdf
+  raytrace layout relay.zmx --view 3d --plot relay.png
+  raytrace layout spectrometer.zmx --wavelength 0.45 0.55 0.65      rays coloured by wavelength"""
 
 
 def options(parser):
     words.lens(parser)
     words.conditions(parser)
     words.fields(parser)
+    parser.add_argument(
+        "--view", default="yz", choices=("yz", "xz", "3d"), help="from the side (default), from above, or in space"
+    )
+    parser.add_argument("--rays", metavar="N", type=words.count, default=7, help="rays of each fan (default 7)")
     words.plot(parser, "the cross section (default LENS_layout.png in this folder)")
 
 

@@ -12,7 +12,7 @@ from raytrace.media.environment import told
 from raytrace.optics.f_number import real_working_f_number
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.trace import media
-from raytrace.system.lens import FIELD_UNITS, Lens, field_points, name_of_field
+from raytrace.system.lens import FIELD_UNITS, Lens, field_points, name_of_field, wavelengths_of
 from raytrace.system.shapes import EVEN
 from raytrace.system.surface import Surface, vertex_curvature
 
@@ -130,13 +130,22 @@ class Info(Result):
         return "\n".join(lines)
 
 
+#: From where a lens is looked at.
+VIEWS = {"yz": "from the side, y upward", "xz": "from above, x upward", "3d": "in space"}
+
+
 @value
 class Layout(Result):
-    """The cross section of a lens with rays of fields (2, F), so many of each."""
+    """The cross section of a lens with rays of fields (2, F), so many of each; wavelengths: (W,) µm, or the primary.
+
+    view: a key of VIEWS.
+    """
 
     lens: Lens
     fields: Tensor
     rays: int = 7
+    view: str = "yz"
+    wavelengths: Tensor | None = None
 
     FIGURE = "plot.layout.layout"
 
@@ -153,13 +162,24 @@ def info(lens: Lens) -> Info:
     return Info(lens)
 
 
-def layout(lens: Lens, *, fields: Tensor | Sequence | None = None, rays: int = 7) -> Layout:
+def layout(
+    lens: Lens,
+    *,
+    fields: Tensor | Sequence | None = None,
+    rays: int = 7,
+    view: str = "yz",
+    wavelengths: Tensor | Sequence[float] | None = None,
+) -> Layout:
     """The cross section, to be drawn by `plot`: glass filled by index, the stop marked, rays coloured by field.
 
-    fields: y, (x, y) or (2, F), in the lens's own kind of field, by default its own; rays: how many of the meridional
-    fan of each.
+    fields: y, (x, y) or (2, F), in the lens's own kind of field, by default its own; rays: how many of the fan of each,
+    in the plane that is shown; view: a key of VIEWS; wavelengths: µm, by default the primary one; rays of several are
+    coloured by wavelength. Raises ValueError for a view that there is not.
     """
-    return Layout(lens, field_points(fields, like=lens), rays)
+    if view not in VIEWS:
+        raise ValueError(f"`view={view}`: expected one of {', '.join(VIEWS)}")
+    chosen = None if wavelengths is None else wavelengths_of(lens, wavelengths)
+    return Layout(lens, field_points(fields, like=lens), rays, view, chosen)
 
 
 def text(lens: Lens) -> str:

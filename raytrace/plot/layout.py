@@ -1,11 +1,10 @@
-"""Layout: the cross section of a lens in the y-z plane with the rays of its fields."""
+"""Layout: the cross section of a lens, from the side or from above, with the rays of its fields."""
 
 import math
 
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from torch import Tensor
@@ -15,115 +14,177 @@ from raytrace.optics.launch import stop_radius
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.trace import media
 from raytrace.optics.views import Layout
-from raytrace.plot import outline, style
+from raytrace.plot import outline, space, style
 from raytrace.system.aperture import reach
 from raytrace.system.lens import Lens
+from raytrace.system.phases import IdealLens
+from raytrace.system.surface import Surface
 
 _LEAD = 0.14  # of the length of the lens: how far in front of it rays of a far object start
 _NEAR = 1.5  # an object nearer than this many lengths of the lens is drawn
-_GLASS = ("#e9f2f8", "#86b3d1")  # tints at n = 1.4 and n = 2.0
 
 
 @style.styled
 def layout(found: Layout) -> Figure:
-    """The lens in cross section: glass filled by index, mirrors hatched, the stop marked, rays coloured by field.
+    """The lens in cross section, or in space: glass filled by index, mirrors hatched, the stop marked, rays by field.
 
-    Rays are those of the primary wavelength. Lost ones are drawn faint and dashed up to where they are lost, with a
-    cross where a surface is missed or reflects totally. Raises ValueError for a lens with an infinite thickness inside.
+    Rays are those of the primary wavelength, or coloured by wavelength where several are asked for. Lost ones are drawn
+    faint and dashed up to where they are lost, with a cross where a surface is missed or reflects totally. A folded
+    system is drawn as it stands. Raises ValueError for a lens with an infinite thickness inside.
     """
     lens, fields = style.detached(found.lens), found.fields.detach()
+    wavelengths = lens.wavelengths[lens.primary_wavelength][None] if found.wavelengths is None else found.wavelengths
+    if found.view == "3d":
+        return _finished(space.draw(lens, fields, wavelengths.detach(), found.rays), lens, fields, wavelengths, 7.5)
     figure = style.new_figure(8.0, 4.0)
     axes = figure.add_subplot()
-    draw_layout(axes, lens, fields=fields, rays=found.rays)
+    draw_layout(axes, lens, fields=fields, wavelengths=wavelengths.detach(), rays=found.rays, view=found.view)
     (z0, z1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
     shape = (y1 - y0) / (z1 - z0)
     width = min(max(6.0 / shape, 5.5), 8.0)
     figure.set_size_inches(width, min(max(0.98 * width * shape, 1.2), 6.0) + 1.1)
-    figure.suptitle(style.fill(lens.name, width, 11, bold=True) or "Lens", fontsize=11, fontweight="bold")
     axes.set_title(style.first_order_text(lens, first_order(lens)), fontsize=8.5, color=style.GREY, pad=4)
-    labels = [style.field_label(lens, field) for field in style.array(fields).T]
-    colours = style.field_colours(len(labels))
+    return _finished(figure, lens, fields, wavelengths, width)
+
+
+def _finished(figure: Figure, lens: Lens, fields: Tensor, wavelengths: Tensor, width: float) -> Figure:
+    """The figure with its title and its legend: fields, or wavelengths where there are several."""
+    figure.suptitle(style.fill(lens.name, width, 11, bold=True) or "Lens", fontsize=11, fontweight="bold")
+    if len(wavelengths) > 1:
+        title, labels = "Wavelength", [f"{float(wavelength):g} µm" for wavelength in wavelengths]
+    else:
+        title, labels = style.field_title(lens), [style.field_label(lens, field) for field in style.array(fields).T]
+    colours = style.ray_colours(fields.shape[1], wavelengths.tolist())
+    colours = [row[0] for row in colours] if len(wavelengths) > 1 else colours[0]
     handles = [Line2D([], [], color=colour, label=label) for colour, label in zip(colours, labels, strict=True)]
     figure.legend(
-        handles=[Line2D([], [], linestyle="", label=style.field_title(lens)), *handles],
+        handles=[Line2D([], [], linestyle="", label=title), *handles],
         loc="outside lower center", ncols=min(len(handles) + 1, int(1.5 * width)), handlelength=1.4, columnspacing=1.6,
     )  # fmt: skip
     return figure
 
 
-def draw_layout(axes: Axes, lens: Lens, *, fields: Tensor, wavelength: Tensor | None = None, rays: int = 7) -> None:
-    """Draw the cross section into axes, equal in both directions and without ticks; wavelength: () µm, or primary."""
-    wavelength = lens.wavelengths[lens.primary_wavelength] if wavelength is None else wavelength
+def draw_layout(
+    axes: Axes,
+    lens: Lens,
+    *,
+    fields: Tensor,
+    wavelengths: Tensor | None = None,
+    rays: int = 7,
+    view: str = "yz",
+) -> None:
+    """Draw the cross section into axes, equal in both directions and without ticks; wavelengths: (W,) µm, or primary."""
+    wavelengths = lens.wavelengths[lens.primary_wavelength][None] if wavelengths is None else wavelengths
     with torch.no_grad():
-        z, radii = outline.vertices(lens), outline.drawn_radii(lens, wavelength, fields)
-        indices = [float(index) for index in media(lens, wavelength)]
-        reach = [z[k] + outline.depth(lens.surfaces[k], np.array([0.0, radii[k]])) for k in range(1, len(z) - 1)]
-        first, last = min(np.min(reach), z[-1]), max(np.max(reach), z[-1])
+        places, radii = outline.sections(lens, view), outline.drawn_radii(lens, wavelengths, fields)
+        indices = [float(index) for index in media(lens, wavelengths[0])]
+        right, up = _extent(lens, places, radii)
+        first, last = right
         distance = float(lens.surfaces[0].thickness)
-        near = math.isfinite(distance) and 0 < distance <= _NEAR * (last - first)
-        start = -distance if near else first - _LEAD * (last - first)
-        points = fan(rays, dtype=lens.surfaces[-2].thickness.dtype, device=lens.wavelengths.device)[0]
-        paths = outline.ray_paths(lens, points, fields=fields, wavelength=wavelength, z_start=start)
+        size = max(last - first, up[1] - up[0]) if outline.is_bent(lens) else last - first
+        near = math.isfinite(distance) and 0 < distance <= _NEAR * size
+        start = -distance if near else _front(places, radii, lens) - _LEAD * size
+        dtype, device = lens.surfaces[-2].thickness.dtype, lens.wavelengths.device
+        points = fan(rays, view[0], dtype=dtype, device=device)[0]
+        how = {"fields": fields, "z_start": start, "view": view}
+        coloured = [outline.ray_paths(lens, points, wavelength=wavelength, **how) for wavelength in wavelengths]
+        paths = [field for fields in coloured for field in fields]
 
-        _draw_glass(axes, lens, z, radii, indices)
-        _draw_mirrors(axes, lens, z, radii, paths)
-        _draw_apertures(axes, lens, z, radii)
-        _draw_stop(axes, lens, z, radii)
-        _draw_rays(axes, paths, style.field_colours(len(paths)))
-        half = _draw_sensor(axes, lens, z, radii, paths)
+        _draw_glass(axes, lens, places, radii, indices)
+        _draw_mirrors(axes, lens, places, radii, paths)
+        _draw_apertures(axes, lens, places, radii)
+        _draw_stop(axes, lens, places, radii)
+        _draw_rays(
+            axes, paths, [colour for row in style.ray_colours(fields.shape[1], wavelengths.tolist()) for colour in row]
+        )
+        half = _draw_sensor(axes, lens, places[-1], radii, paths)
         if near:
-            _draw_object(axes, lens, z, paths)
+            _draw_object(axes, lens, places[0], paths)
+    if outline.is_bent(lens):
+        _frame_bent(axes, places)
+        return
     largest = max(radii[1:-1])
     low, high = _ray_heights(paths)
     stop = radii[lens.stop] + 0.18 * largest
     _frame(axes, (min(first, start), last), (min(low, -largest, -half, -stop), max(high, largest, half, stop)))
 
 
-def _draw_glass(axes: Axes, lens: Lens, z: np.ndarray, radii: list[float], indices: list[float]) -> None:
-    glass = [index > 1.01 for index in indices]
-    for k in range(1, len(z) - 1):
-        if not glass[k] or z[k + 1] == z[k]:
+def _extent(lens: Lens, places: list[outline.Section], radii: list[float]) -> tuple[tuple, tuple]:
+    """How far surfaces reach, ((left, right), (low, high)) mm; the image by its vertex."""
+    right, up = [places[-1].origin[0]], [places[-1].origin[1]]
+    for k in range(1, len(places) - 1):
+        height = np.array([-radii[k], 0.0, radii[k]])
+        z, y = places[k].at(outline.depth(lens.surfaces[k], height, places[k].direction), height)
+        right, up = [*right, *z], [*up, *y]
+    return (min(right), max(right)), (min(up), max(up))
+
+
+def _front(places: list[outline.Section], radii: list[float], lens: Lens) -> float:
+    """Where the first surface begins, mm, or what stands before it if nothing is folded."""
+    if not outline.is_bent(lens):
+        return _extent(lens, places, radii)[0][0]
+    height = np.array([-radii[1], radii[1]])
+    return float(min(0.0, *places[1].at(outline.depth(lens.surfaces[1], height, places[1].direction), height)[0]))
+
+
+def _draw_glass(
+    axes: Axes, lens: Lens, places: list[outline.Section], radii: list[float], indices: list[float]
+) -> None:
+    for k in range(1, len(places) - 1):
+        if indices[k] <= outline.GLASSY or lens.surfaces[k].is_break:
             continue
-        cemented = glass[k - 1] and not lens.surfaces[k].is_mirror, k + 2 < len(z) and glass[k + 1]
-        pair = lens.surfaces[k], lens.surfaces[k + 1]
-        if k + 2 == len(z):  # glass up to the image, which has no rim of its own
-            shape = outline.element(*pair, z[k], z[k + 1], (radii[k], radii[k]), (False, False))
-        else:
-            shape = outline.element(*pair, z[k], z[k + 1], (radii[k], radii[k + 1]), cemented)
-        axes.fill(*shape, facecolor=_tint(indices[k]), edgecolor=style.INK, linewidth=0.7, zorder=2, gid=f"glass {k}")
+        shape = outline.glass(lens, k, places, radii, indices)
+        if shape is not None:
+            look = {"facecolor": style.tint(indices[k]), "edgecolor": style.INK, "linewidth": 0.7}
+            axes.fill(*shape, **look, zorder=2, gid=f"glass {k}")
+    for k in range(1, len(places) - 1):  # what stands in air and bends light: ideal lenses, gratings
+        if lens.surfaces[k].phase is not None and not lens.surfaces[k].is_mirror:
+            _draw_thin(axes, lens.surfaces[k], places[k], radii[k])
 
 
-def _tint(index: float) -> tuple[float, ...]:
-    light, dark = (np.array(to_rgb(colour)) for colour in _GLASS)
-    share = min(max((index - 1.4) / 0.6, 0.0), 1.0)
-    return tuple(light + share * (dark - light))
+def _draw_thin(axes: Axes, surface: Surface, place: outline.Section, radius: float) -> None:
+    """A thin structure: a line along the surface, with arrows at the ends of an ideal lens."""
+    height = np.linspace(-radius, radius, 81)
+    line = place.at(outline.depth(surface, height, place.direction), height)
+    axes.plot(*line, color=style.INK, linewidth=1.2, zorder=3, gid="thin")
+    if isinstance(surface.phase, IdealLens):
+        pointed = 1 if float(surface.phase.power_y) >= 0 else -1
+        for end in (1, -1):
+            tip = end * (radius + (0.0 if pointed > 0 else 0.07 * radius))
+            back = tip - end * pointed * 0.07 * radius
+            depth = 0.05 * radius
+            corners = place.at(np.array([-depth, 0.0, depth]), np.array([back, tip, back]))
+            axes.plot(*corners, color=style.INK, linewidth=1.0, zorder=3)
 
 
-def _draw_mirrors(axes: Axes, lens: Lens, z: np.ndarray, radii: list[float], paths) -> None:
+def _draw_mirrors(axes: Axes, lens: Lens, places: list[outline.Section], radii: list[float], paths) -> None:
+    bent = outline.is_bent(lens)
     for k, side in enumerate(outline.sides(lens)):
         surface = lens.surfaces[k]
         if not surface.is_mirror:
             continue
         hole = max([reach(a)[0] for a in surface.apertures if not a.obscures] or [0.0])
-        hole = min(max(hole, outline.hole_radius(k, z, radii[k], paths)), 0.95 * radii[k])
-        y = np.linspace(hole, radii[k], 121)
-        face = z[k] + outline.depth(surface, y)
-        back = face + side * max(0.07 * radii[k], 0.025 * max(radii[1:-1]))
+        seen = 0.0 if bent else outline.hole_radius(k, outline.vertices(lens), radii[k], paths)
+        hole = min(max(hole, seen), 0.95 * radii[k])
+        height = np.linspace(hole, radii[k], 121)
+        thick = side * max(0.07 * radii[k], 0.025 * max(radii[1:-1]))
         if hole == 0.0:
-            y, face, back = (np.concatenate([part[:0:-1], part]) for part in (y, face, back))
-            y[: len(y) // 2] *= -1
+            height = np.concatenate([-height[:0:-1], height])
         for sign in (1,) if hole == 0.0 else (1, -1):
-            corners = np.concatenate([face, back[::-1]]), sign * np.concatenate([y, y[::-1]])
+            face = outline.depth(surface, sign * height, places[k].direction)
+            front, back = places[k].at(face, sign * height), places[k].at(face + thick, sign * height)
+            corners = (np.concatenate([a, b[::-1]]) for a, b in zip(front, back, strict=True))
             axes.fill(*corners, facecolor="#f1f1f1", edgecolor="#9a9a9a", hatch="/////", linewidth=0.4, zorder=2)
-            axes.plot(face, sign * y, color=style.INK, linewidth=1.5, zorder=3, gid=f"mirror {k}")
+            axes.plot(*front, color=style.INK, linewidth=1.5, zorder=3, gid=f"mirror {k}")
 
 
-def _draw_apertures(axes: Axes, lens: Lens, z: np.ndarray, radii: list[float]) -> None:
+def _draw_apertures(axes: Axes, lens: Lens, places: list[outline.Section], radii: list[float]) -> None:
     """Obscurations as grey bars along their surface, apertures as bars from their rim outwards."""
     outward = 0.12 * max(radii[1:])
     for k, surface in enumerate(lens.surfaces[1:-1], start=1):
         for aperture in surface.apertures:
-            centre, (inner, rim) = aperture.centre[1], reach(aperture)
+            place, (inner, rim) = places[k], reach(aperture)
+            centre = aperture.centre[0] * place.direction[0] + aperture.centre[1] * place.direction[1]
             if not math.isfinite(rim):
                 continue
             if aperture.obscures:
@@ -134,22 +195,24 @@ def _draw_apertures(axes: Axes, lens: Lens, z: np.ndarray, radii: list[float]) -
                 bars = [(-rim - outward, -rim), (rim, rim + outward)]
                 bars += [(-inner, inner)] if inner > 0 else []
             for low, high in bars:
-                y = centre + np.linspace(low, high, 41)
-                depth = outline.depth(surface, np.minimum(np.abs(y), 0.9999 * outline.edge_radius(surface)))
-                axes.plot(z[k] + depth, y, color="#8c8c8c", linewidth=2.4, solid_capstyle="butt", zorder=1.5)
+                height = centre + np.linspace(low, high, 41)
+                edge = 0.9999 * outline.edge_radius(surface)
+                depth = outline.depth(surface, np.clip(height, -edge, edge), place.direction)
+                axes.plot(*place.at(depth, height), color="#8c8c8c", linewidth=2.4, solid_capstyle="butt", zorder=1.5)
 
 
-def _draw_stop(axes: Axes, lens: Lens, z: np.ndarray, radii: list[float]) -> None:
+def _draw_stop(axes: Axes, lens: Lens, places: list[outline.Section], radii: list[float]) -> None:
     """The stop: a wedge on either side, its tip at the rim of the stop."""
-    surface, largest = lens.surfaces[lens.stop], max(radii[1:-1])
+    surface, place, largest = lens.surfaces[lens.stop], places[lens.stop], max(radii[1:-1])
     radius = float(stop_radius(lens))
     on_glass = not surface.is_plane or surface.is_mirror
     radius = radii[lens.stop] if on_glass or not math.isfinite(radius) else radius
-    tip = z[lens.stop] + float(outline.depth(surface, np.array([radius]))[0])
     length, half = 0.16 * largest, 0.035 * largest
     for sign in (1, -1):
-        y = sign * np.array([radius, radius + length, radius + length])
-        axes.fill([tip, tip - half, tip + half], y, color=style.INK, linewidth=0.3, zorder=6, gid="stop")
+        tip = float(outline.depth(surface, np.array([sign * radius]), place.direction)[0])
+        height = sign * np.array([radius, radius + length, radius + length])
+        corners = place.at(np.array([tip, tip - half, tip + half]), height)
+        axes.fill(*corners, color=style.INK, linewidth=0.3, zorder=6, gid="stop")
 
 
 def _draw_rays(axes: Axes, paths, colours) -> None:
@@ -165,25 +228,27 @@ def _draw_rays(axes: Axes, paths, colours) -> None:
                 axes.plot(path.z[-1:], path.y[-1:], "x", color=colour, markersize=4, markeredgewidth=0.9, zorder=7)
 
 
-def _draw_sensor(axes: Axes, lens: Lens, z: np.ndarray, radii: list[float], paths) -> float:
+def _draw_sensor(axes: Axes, lens: Lens, place: outline.Section, radii: list[float], paths) -> float:
     """The image surface, as far as the rays need it; returns its half height in mm."""
-    hits = [abs(path.y[-1]) for field in paths for path in field if path.status == "ok"]
-    half = min(
-        max([1.06 * max(hits, default=0.0), 0.05 * max(radii[1:-1])]), 0.9999 * outline.edge_radius(lens.surfaces[-1])
-    )
-    y = np.linspace(-half, half, 81)
-    axes.plot(
-        z[-1] + outline.depth(lens.surfaces[-1], np.abs(y)), y, color=style.INK, linewidth=1.8, zorder=5, gid="sensor"
-    )
+    surface = lens.surfaces[-1]
+    hits = [float(place.height(path.z[-1], path.y[-1])) for field in paths for path in field if path.status == "ok"]
+    low, high = min(hits, default=0.0), max(hits, default=0.0)
+    least, edge = 0.05 * max(radii[1:-1]), 0.9999 * outline.edge_radius(surface)
+    centre = 0.5 * (low + high) if outline.is_bent(lens) else 0.0
+    half = min(max(1.06 * max(high - centre, centre - low), least), edge)
+    height = centre + np.linspace(-half, half, 81)
+    line = place.at(outline.depth(surface, height, place.direction), height)
+    axes.plot(*line, color=style.INK, linewidth=1.8, zorder=5, gid="sensor")
     return half
 
 
-def _draw_object(axes: Axes, lens: Lens, z: np.ndarray, paths) -> None:
+def _draw_object(axes: Axes, lens: Lens, place: outline.Section, paths) -> None:
     heights = [abs(path.y[0]) for field in paths for path in field]
     half = 1.06 * max(heights, default=0.0)
     if half > 0:
         y = np.linspace(-half, half, 81)
-        axes.plot(z[0] + outline.depth(lens.surfaces[0], np.abs(y)), y, color=style.INK, linewidth=1.0, zorder=3)
+        depth = outline.depth(lens.surfaces[0], np.abs(y), place.direction)
+        axes.plot(*place.at(depth, y), color=style.INK, linewidth=1.0, zorder=3)
 
 
 def _ray_heights(paths) -> tuple[float, float]:
@@ -204,4 +269,22 @@ def _frame(axes: Axes, extent: tuple[float, float], heights: tuple[float, float]
     axes.set_aspect("equal")
     axes.set_xlim(low, high)
     axes.set_ylim(bottom - 0.015 * length, heights[1] + 0.01 * length)
+    axes.axis("off")
+
+
+def _frame_bent(axes: Axes, places: list[outline.Section]) -> None:
+    """The mechanical axis from vertex to vertex, limits and scale bar of a system that is folded."""
+    axes.relim()
+    for patch in axes.patches:
+        axes.update_datalim(patch.get_xy())
+    (left, low), (right, high) = axes.dataLim.get_points()
+    way = np.array([place.origin for place in places[1:]]).T
+    axes.plot(*way, color=style.GREY, linewidth=0.6, linestyle=(0, (10, 3, 2, 3)), zorder=1)
+    size = max(right - left, high - low)
+    bar = style.round_length(0.2 * size)
+    bottom = low - 0.05 * size
+    style.scale_bar(axes, right - bar, bottom, bar)
+    axes.set_aspect("equal")
+    axes.set_xlim(left - 0.025 * size, right + 0.025 * size)
+    axes.set_ylim(bottom - 0.03 * size, high + 0.025 * size)
     axes.axis("off")

@@ -50,7 +50,7 @@ def focus_report(found: Focus, by: str | None = None) -> Figure:
 
     axes = top.add_subplot()
     drawn = with_object_distance(lens_after, distances[0])
-    draw_layout(axes, drawn, fields=fields, wavelength=wavelengths[0], rays=11 if fields.shape[1] == 1 else 7)
+    draw_layout(axes, drawn, fields=fields, wavelengths=wavelengths[:1], rays=11 if fields.shape[1] == 1 else 7)
     top.suptitle(style.first_order_text(drawn, first_order(drawn)), fontsize=8.5, color=style.GREY)
 
     _draw_focus(left.add_subplot(), lens_before, lens_after, distances, labels, rule)

@@ -33,6 +33,7 @@ FIELD_COLOURS = ("#0072B2", "#009E73", "#D55E00", "#CC79A7", "#E69F00", "#56B4E9
 
 #: Colours of wavelengths the eye does not see, and markers of all wavelengths, in order.
 INVISIBLE_COLOURS = ("#7a1f1f", "#525252", "#8c6d31", "#5e3c99", "#1b6f6a", "#b0578d")
+GLASS_COLOURS = ("#e9f2f8", "#86b3d1")  # at n = 1.4 and n = 2.0
 WAVELENGTH_MARKERS = ("o", "+", "x", "^", "s", "D", "v", "*")
 
 #: What `save` writes, by suffix, with the metadata that would otherwise make every file differ.
@@ -113,6 +114,13 @@ def array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().to(device="cpu", dtype=torch.float64 if tensor.is_floating_point() else None).numpy()
 
 
+def tint(index: float) -> tuple[float, ...]:
+    """The colour of glass by its index."""
+    light, dark = (np.array(to_rgb(colour)) for colour in GLASS_COLOURS)
+    share = min(max((index - 1.4) / 0.6, 0.0), 1.0)
+    return tuple(light + share * (dark - light))
+
+
 def field_colour(number: int) -> str:
     return FIELD_COLOURS[number % len(FIELD_COLOURS)]
 
@@ -151,6 +159,13 @@ def wavelength_colours(wavelengths: Sequence[float]) -> list[str | tuple[float, 
             colours.append(INVISIBLE_COLOURS[unseen % len(INVISIBLE_COLOURS)])
             unseen += 1
     return colours
+
+
+def ray_colours(fields: int, wavelengths: Sequence[float]) -> list[list]:
+    """A colour for the rays of every wavelength and field: by wavelength where there are several, else by field."""
+    if len(wavelengths) > 1:
+        return [[colour] * fields for colour in wavelength_colours(wavelengths)]
+    return [field_colours(fields)]
 
 
 def _spectral_colour(wavelength: float) -> tuple[float, float, float]:
