@@ -73,7 +73,7 @@ def draw_layout(
     rays: int = 7,
     view: str = "yz",
 ) -> None:
-    """Draw the cross section into axes, equal in both directions and without ticks; wavelengths: (W,) µm, or primary."""
+    """Draw the cross section into axes, equal in both directions, without ticks; wavelengths: (W,) µm, or primary."""
     wavelengths = lens.wavelengths[lens.primary_wavelength][None] if wavelengths is None else wavelengths
     with torch.no_grad():
         places, radii = outline.sections(lens, view), outline.drawn_radii(lens, wavelengths, fields)

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d import proj3d
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from torch import Tensor
 
@@ -131,6 +132,14 @@ def _draw_image(axes, lens: Lens, frame: Frame, arrived: list[np.ndarray]) -> No
     )
 
 
+def _fill(axes, points: np.ndarray) -> float:
+    """How much larger points (3, N) may be seen until they fill the axes."""
+    axes.apply_aspect()
+    x, y, _ = proj3d.proj_transform(*points, axes.get_proj())
+    seen = np.ptp(axes.transData.transform(np.stack([x, y], 1)), axis=0)
+    return float(0.9 * min(axes.bbox.width / seen[0], axes.bbox.height / seen[1]))
+
+
 def _frame(axes, points: np.ndarray) -> None:
     """Equal scales about everything that is drawn, a scale bar, and no box."""
     p = _seen(points)
@@ -139,10 +148,12 @@ def _frame(axes, points: np.ndarray) -> None:
     span = np.maximum(high - low, 0.12 * size)
     for name, middle, width in zip("xyz", 0.5 * (low + high), span, strict=True):
         getattr(axes, f"set_{name}lim")(middle - 0.52 * width, middle + 0.52 * width)
-    axes.set_box_aspect(span, zoom=1.25)
+    axes.set_box_aspect(span)
     axes.set_proj_type("ortho")
     axes.view_init(elev=22, azim=-62)
     axes.set_axis_off()
+    axes.set_position((0.02, 0.1, 0.96, 0.8))
+    axes.set_box_aspect(span, zoom=_fill(axes, p))
     bar = style.round_length(0.25 * size)
     at = low - 0.02 * size
     axes.plot([at[0], at[0] + bar], [at[1]] * 2, [at[2]] * 2, color=style.INK, linewidth=1.5)
