@@ -77,8 +77,8 @@ def test_a_wedge_of_glass_is_bounded_by_its_tilted_faces():
     corners = glass.get_xy()
     near, far = corners[: len(corners) // 2], corners[len(corners) // 2 : -1]
     slope = math.tan(math.radians(20))
-    assert np.abs(near[:, 0] - slope * near[:, 1]).max() < 1e-9
-    assert np.abs(far[:, 0] - (10 - slope * far[:, 1])).max() < 1e-9
+    assert np.abs(near[:, 0] + slope * near[:, 1]).max() < 1e-9
+    assert np.abs(far[:, 0] - (10 + slope * far[:, 1])).max() < 1e-9
     assert np.abs(near[-1] - far[0])[1] < 2  # the outline goes round, and does not cross itself
 
 
