@@ -12,10 +12,11 @@ from mutations import Reader, survive
 from PIL import Image
 from problems import number
 from test_prescriptions import LOWENTHAL, NOCTILUX, summilux
+from test_seq import ACHROMAT, ASPHERE, DOUBLE_GAUSS, EVERYTHING, QUESTAR, THREE_MIRRORS
 from test_zemax_archive import archive
 
 from raytrace.camera.training import DamagedRun, OtherSettings, Run, load_state, read_state
-from raytrace.formats import LensFileError, read_lens, read_lens_with_report
+from raytrace.formats import FORMATS, LensFileError, read_lens, read_lens_with_report
 from raytrace.formats.pictures import PictureError, read_grey
 from raytrace.formats.ray_table import RayTableError, read_rays
 from raytrace.maths.arrays import ArrayError, read_npy, read_npz
@@ -97,7 +98,11 @@ def rays(folder: Path) -> Reader:
 
 def lenses(suffix: str, folder: Path) -> Reader:
     originals = [path.read_bytes() for path in sorted((ROOT / "lenses").glob(f"*{suffix}"))]
-    if suffix != ".zmx":
+    if suffix == ".seq":
+        own = [FORMATS[suffix].write(read_lens(name), "lens") for name in ("cooke_triplet", "phone")]
+        texts = (ACHROMAT, ASPHERE, DOUBLE_GAUSS.format("PIM", -0.4), EVERYTHING, QUESTAR, THREE_MIRRORS)
+        originals += own + [text.encode() for text in texts]
+    elif suffix != ".zmx":
         originals += [text.encode() for text in (summilux("No.,R,Nd,νd,d", "No R n V d"), NOCTILUX, LOWENTHAL)]
     return Reader(
         tuple(originals), from_file(read_lens_with_report, folder / f"lens{suffix}"), (LensFileError, UnknownGlass)
@@ -166,7 +171,7 @@ READERS = {
     "checkpoints": checkpoints,
     "logs": logs,
     "settings": settings,
-    **{f"lenses{suffix}": lambda folder, suffix=suffix: lenses(suffix, folder) for suffix in (".zmx", ".csv")},
+    **{f"lenses{suffix}": lambda folder, suffix=suffix: lenses(suffix, folder) for suffix in (".zmx", ".csv", ".seq")},
     **{f"heights{suffix}": lambda folder, suffix=suffix: heights(suffix, folder) for suffix in HEIGHTS},
 }
 

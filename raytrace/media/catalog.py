@@ -145,6 +145,19 @@ def _nearest(name: str, own: Sequence[Catalog], count: int = 5) -> tuple[tuple[s
     return tuple(hit for spelling in near for hit in spellings[spelling])[:count]
 
 
+def plain_names(name: str, *, user: Sequence[str | Path] = ()) -> tuple[tuple[str, str], ...]:
+    """The (glass, catalog) whose names are `name` but for hyphens, underscores, blanks and points, in search order."""
+    bare = _bare(name)
+    own = [(glass, load(path).name) for path in user_catalogs(user) for glass in load(path).glasses]
+    shipped = [(glass, catalog) for catalog in SHIPPED for glass in _shipped_names(catalog).values()]
+    return tuple((glass, catalog) for glass, catalog in own + shipped if _bare(glass) == bare)
+
+
+def same_catalog(one: str, other: str) -> bool:
+    """Whether two names of a catalog mean the same one, as NIKON and HIKARI do."""
+    return one.upper() == other.upper() or (_shipped_name(one) or one) == (_shipped_name(other) or other)
+
+
 # -- where the catalogs are -------------------------------------------------------------------------------------------
 
 

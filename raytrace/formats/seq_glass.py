@@ -1,0 +1,264 @@
+"""Glasses of a CODE V sequence: of a catalog, by their figures, and private ones; read and written.
+
+NBK7_SCHOTT is the glass of that catalog whose name is the same but for hyphens and the like, which CODE V leaves out.
+517642 and 517.642, with as many digits as one likes on either side of the point, tell n_d - 1 and V_d; so does
+1.517:64.2. PRV … END holds private glasses: indices at the wavelengths PWL, or the coefficients of a formula.
+"""
+
+import dataclasses
+import re
+import warnings
+from collections.abc import Sequence
+from decimal import Decimal
+from pathlib import Path
+
+import torch
+
+from raytrace.formats.media import by_figures, is_code, is_left_out, listed_glass
+from raytrace.formats.report import Draft
+from raytrace.formats.seq_keywords import unquoted
+from raytrace.formats.source import LensFileError, Place, shown
+from raytrace.formats.spelling import double, exact, exact_list, is_number, number
+from raytrace.formats.zemax_keywords import Record
+from raytrace.media.catalog import UnknownGlass, find_glass, plain_names, same_catalog
+from raytrace.media.formulas import FORMULAS
+from raytrace.media.glass import AIR, Glass, constant, from_table, mil_glass, refractive_index
+
+#: Formula of a private glass by its word: n² = C1 + C2 λ² + C3 λ⁻² + C4 λ⁻⁴ + …, λ in µm.
+FORMULA_WORDS = {"LAU": "schott"}
+
+#: Indices of a table that a formula meets exactly.
+_NODES = 6
+
+_CODE = re.compile(r"(\d{3,})\.(\d{2,})", re.ASCII)
+_PAIR = re.compile(r"([^:]+):([^:]+)")
+
+
+# -- reading ----------------------------------------------------------------------------------------------------------
+
+
+def medium(word: str, private: dict[str, Glass], *, user: Sequence[Path], place: Place, report: Draft) -> Glass:
+    """The medium of a word. Raises UnknownGlass, and LensFileError for what is no glass."""
+    name = unquoted(word)
+    if name.upper() in private:
+        report.glass(place.surface, name, "private glass of the file (PRV)")
+        return private[name.upper()]
+    if name.upper() == "AIR" or not name:
+        return AIR
+    figures = _figures(name, place)
+    if figures is not None:
+        report.glass(place.surface, name, "nd and Vd by its digits, partial dispersion of the normal line")
+        return figures
+    return _listed(name, user=user, place=place, report=report)
+
+
+def _figures(name: str, place: Place) -> Glass | None:
+    """The glass whose index and Abbe number are its name; None for a name of letters."""
+    if is_code(name):
+        return mil_glass(name)
+    code, pair = _CODE.fullmatch(name), _PAIR.fullmatch(name)
+    if code:
+        return by_figures(float(f"1.{code[1]}"), float(f"{code[2][:2]}.{code[2][2:] or 0}"), 0.0, name)
+    if pair:
+        nd, vd = number(pair[1], "index", place), number(pair[2], "Abbe number", place)
+        if nd <= 0 or vd < 0:
+            raise LensFileError(f"glass of nd {nd:g}, Vd {vd:g}; expected nd > 0 and Vd ≥ 0", place)
+        return by_figures(nd, vd, 0.0, "")
+    if is_number(name):
+        raise LensFileError(f"the glass is {shown(name)}, expected a name, 517642, 517.642 or 1.517:64.2", place)
+    return None
+
+
+def _listed(name: str, *, user: Sequence[Path], place: Place, report: Draft) -> Glass:
+    """The glass of a catalog, by NAME_CATALOG or NAME."""
+    plain, _, catalog = name.rpartition("_")
+    found = [hit for hit in plain_names(plain, user=user) if same_catalog(hit[1], catalog)] if plain else []
+    found = found or list(plain_names(name, user=user))
+    if not found:
+        return _by_alias(plain, catalog, name, user=user, place=place, report=report)
+    spelling, home = found[0]
+    rivals = [f"{other} ({where})" for other, where in found[1:] if where == home or other != spelling]
+    if any(where == home for _, where in found[1:]):
+        raise LensFileError(f"{shown(name)} may be {spelling} ({home}) or {', '.join(rivals)}; spell it in full", place)
+    if rivals:
+        report.warn(f"{name} is taken for {spelling} ({home}), but may be {', '.join(rivals)}", place)
+    told = [home] if (plain and same_catalog(home, catalog)) or rivals else []
+    return listed_glass(spelling, catalogs=told, user=user, place=place, report=report)
+
+
+def _by_alias(plain: str, catalog: str, name: str, *, user: Sequence[Path], place: Place, report: Draft) -> Glass:
+    """A glass by another spelling of its catalog. Raises UnknownGlass."""
+    if plain:
+        try:
+            with warnings.catch_warnings(action="ignore"):
+                glass = find_glass(plain, catalogs=[catalog], user=user, where=str(place))
+        except UnknownGlass:
+            glass = None
+        if glass is not None and same_catalog(glass.catalog, catalog):
+            return listed_glass(glass.listed_name, catalogs=[catalog], user=user, place=place, report=report)
+    return listed_glass(name, catalogs=[], user=user, place=place, report=report)
+
+
+def private_glasses(
+    rows: dict[str, Record], wavelengths: Sequence[float], unnamed: Sequence[str], report: Draft
+) -> dict[str, Glass]:
+    """The glasses between PRV and END; wavelengths: those of the lens, µm; unnamed: names that stand for none."""
+    found = {}
+    for name, row in rows.items():
+        glass = _private(row, wavelengths, report)
+        is_unnamed = name in (word.upper() for word in unnamed)
+        found[name] = dataclasses.replace(glass, name="") if is_unnamed else glass
+    return found
+
+
+def _private(row: Record, wavelengths: Sequence[float], report: Draft) -> Glass:
+    name, words, place = row.keyword, row.words, row.place
+    waves = [micrometres(word, place) for word in row.text.split()]
+    if not words:
+        raise LensFileError(f"the private glass {shown(name)} has no figures", place)
+    if is_number(words[0]):
+        indices = [number(word, f"index of {name[:40]}", place) for word in words]
+        return _table(name, waves, indices, wavelengths, row, report)
+    formula = FORMULA_WORDS.get(words[0].upper())
+    if formula is None:
+        known = ", ".join(FORMULA_WORDS)
+        message = f"private glass {shown(name)} by the formula {words[0][:40]}, which is not modelled"
+        raise LensFileError(f"{message}; expected indices at the wavelengths PWL, or {known}", place)
+    numbers = [number(word, f"coefficient of {name[:40]}", place) for word in words[1:]]
+    count = FORMULAS[formula].count
+    if any(numbers[count:]) or not numbers:
+        message = f"private glass {shown(name)} with {len(numbers)} coefficients, expected 1 to {count}"
+        raise LensFileError(message, place)
+    coefficients = (numbers + [0.0] * count)[:count]
+    span = (min(waves), max(waves)) if len(set(waves)) > 1 else None
+    return Glass(name, formula, double(coefficients), wavelength_range=span)
+
+
+def micrometres(word: str, place: Place) -> float:
+    """A wavelength in nm as µm, rounded once."""
+    number(word, "wavelength", place)
+    return float(Decimal(re.sub("[dD]", "e", word)).scaleb(-3))
+
+
+def _table(
+    name: str, waves: list[float], indices: list[float], wanted: Sequence[float], row: Record, report: Draft
+) -> Glass:
+    """The glass of a table: its indices at the wavelengths of the lens are met exactly where they are in it."""
+    if len(waves) != len(indices):
+        message = f"private glass {shown(name)} with {len(indices)} indices at {len(waves)} wavelengths (PWL)"
+        raise LensFileError(f"{message}, expected as many", row.place)
+    pairs = dict(zip(waves, indices, strict=True))
+    if len(pairs) < len(waves) or min(waves) <= 0 or min(indices) <= 0:
+        raise LensFileError(f"private glass {shown(name)}: wavelengths and indices differ and are above 0", row.place)
+    if len(set(indices)) == 1:
+        return constant(indices[0], name)
+    missing = [wave for wave in wanted if wave not in pairs]
+    if missing:
+        listed = ", ".join(f"{1e3 * wave:g}" for wave in missing[:5])
+        report.warn(f"private glass {name}: index at {listed} nm is interpolated, by the formula of Schott", row.place)
+    nodes = _nodes(sorted(pairs), [wave for wave in wanted if wave in pairs])
+    glass = from_table(nodes, [pairs[wave] for wave in nodes], name=name)
+    off = float((refractive_index(glass, double(waves)) - double(indices)).abs().max())
+    if len(waves) > _NODES:
+        report.note(f"private glass {name}: a formula for its {len(waves)} indices, which it meets to {off:.1e}")
+    return glass
+
+
+def _nodes(waves: list[float], wanted: list[float]) -> list[float]:
+    """Wavelengths of a table to be met exactly: those wanted, then those furthest from all that are taken."""
+    if len(set(wanted)) > _NODES:
+        return waves
+    taken = sorted(set(wanted)) or [waves[0]]
+    while len(taken) < min(_NODES, len(waves)):
+        taken.append(max(waves, key=lambda wave: min(abs(1 / wave - 1 / other) for other in taken)))
+    return sorted(taken)
+
+
+# -- writing ----------------------------------------------------------------------------------------------------------
+
+
+def word(glass: Glass, private: dict[str, Glass], user: Sequence[Path], place: Place) -> str:
+    """How a surface names its medium; glasses that have to be private are put into `private`.
+
+    Raises LensFileError for a medium that a .seq file cannot hold.
+    """
+    if is_left_out(glass):
+        return ""
+    if glass.formula == "mirror":
+        return "REFL"
+    if glass.formula == "model":
+        return _by_digits(glass, place)
+    if glass.formula == "constant" or (not glass.catalog and glass.formula in FORMULA_WORDS.values()):
+        return f"'{_private_name(glass, private, place)}'"
+    return _catalog_name(glass, user, place)
+
+
+def _by_digits(glass: Glass, place: Place) -> str:
+    nd, vd, dpgf = exact_list(glass.coefficients, "model glass", place)
+    if float(dpgf):
+        raise LensFileError(f"a model glass with ΔPgF = {dpgf}, which a .seq file has no place for", place)
+    named = bool(is_code(glass.name) or _CODE.fullmatch(glass.name))
+    figures = _figures(glass.name, place) if named else None
+    if figures is not None and exact_list(figures.coefficients, "model glass", place) == [nd, vd, dpgf]:
+        return glass.name
+    if glass.name:
+        message = f"a model glass named {glass.name!r}; a .seq file tells model glasses by their figures"
+        raise LensFileError(f"{message}: leave out the name", place)
+    return f"{nd}:{vd}"
+
+
+def _private_name(glass: Glass, private: dict[str, Glass], place: Place) -> str:
+    """The name of a private glass; one without a name gets one that is free."""
+    if not glass.name:
+        same = (key for key, other in private.items() if not other.name and _same(other, glass))
+        found = next(same, None) or next(n for k in range(1, 10**4) if (n := f"MEDIUM{k}") not in private)
+        private[found] = glass
+        return found
+    if not re.fullmatch(r"[^\s'\"!;&^]+", glass.name) or glass.name.upper() in ("AIR", "REFL"):
+        raise LensFileError(f"the name of the glass is {glass.name!r}, expected one word", place)
+    key = glass.name.upper()
+    if key in private and not (_same(private[key], glass) and private[key].name == glass.name):
+        raise LensFileError(f"two glasses are named {glass.name!r}; give one of them another name", place)
+    private[key] = glass
+    return glass.name
+
+
+def _same(one: Glass, other: Glass) -> bool:
+    return one.formula == other.formula and torch.equal(one.coefficients, other.coefficients)
+
+
+def _catalog_name(glass: Glass, user: Sequence[Path], place: Place) -> str:
+    """NAME_CATALOG without hyphens, if that finds the same figures again."""
+    listed = glass.listed_name or glass.name
+    written = f"{re.sub('[^A-Za-z0-9+]', '', listed)}_{glass.catalog}".upper()
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            found = _listed(written, user=user, place=place, report=Draft(place.file, "seq"))
+    except UnknownGlass:
+        if glass.catalog:
+            return written
+        found = AIR
+    if found.formula != glass.formula or not torch.equal(found.coefficients, glass.coefficients.detach().cpu()):
+        message = f"the figures of {glass.name!r} are not those of its catalog; a file holds its name only"
+        raise LensFileError(f"{message}: use the listed glass or a model glass", place)
+    return written
+
+
+def private_lines(private: dict[str, Glass], waves: list[str], place: Place) -> list[str]:
+    """PRV … END for glasses by name; waves: the wavelengths of the lens, nm."""
+    lines = []
+    for key, glass in private.items():
+        name, numbers = glass.name or key, exact_list(glass.coefficients, "glass", place)
+        span = glass.wavelength_range
+        if glass.formula == "constant":
+            lines += [f"PWL {' '.join(waves)}", f"'{name}' {' '.join(numbers * len(waves))}"]
+        else:
+            ends = [nanometres(exact(end, "wavelength", place)) for end in span] if span else waves[:1]
+            formula = next(word for word, formula in FORMULA_WORDS.items() if formula == glass.formula)
+            lines += [f"PWL {' '.join(ends)}", f"'{name}' {formula} {' '.join(numbers)}"]
+    return ["PRV", *lines, "END"] if lines else []
+
+
+def nanometres(micrometres: str) -> str:
+    """A wavelength in µm as nm, digit by digit."""
+    return f"{Decimal(micrometres).scaleb(3).normalize():f}"

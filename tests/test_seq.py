@@ -1,0 +1,609 @@
+"""CODE V sequences: conventions by figures of public files, which other people wrote, and what is refused by name."""
+
+import dataclasses
+import math
+import random
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from problems import NANOMETRE, number
+from test_formats import damaged, leaves, read_damaged
+
+import raytrace as rt
+from raytrace.formats import FORMATS, LensFileError, LensFileWarning, read_lens, read_lens_with_report, write_lens
+from raytrace.formats.seq_keywords import FIELD_KINDS, SURFACE_READ, SYSTEM_READ
+from raytrace.formats.source import Place, UnsupportedSurface, decode
+from raytrace.media.catalog import UnknownGlass
+from raytrace.media.glass import constant, index, model_glass
+from raytrace.optics.trace import trace_lens
+from raytrace.system.aperture import Aperture
+from raytrace.system.lens import Lens, SystemAperture
+from raytrace.system.pose import Pose, undone
+from raytrace.system.rays import Rays
+
+MICROMETRE = 1e-3
+
+
+def of(text: str, file: str = "lens.seq", **options):
+    return FORMATS[".seq"].read(decode(text.encode(), Place(file)), file, **options)
+
+
+def again(lens: Lens) -> Lens:
+    return of(FORMATS[".seq"].write(lens, "lens.seq").decode())[0]
+
+
+def sequence(surfaces: str, system: str = "EPD 10;WL 587.6;YAN 0", mode: str = "RDM") -> str:
+    return f"{mode};LEN\nDIM M\n{system}\nSO 0 1e14\n{surfaces}\nSI 0 0\nGO\n"
+
+
+SINGLET = sequence("S 50 4 NBK7_SCHOTT\nSTO\nS -50 48")
+
+
+#: Every command that is read, once at least.
+EVERYTHING = """RDM;LEN NEW
+TITLE 'a lens'; INI 'xy'
+!raytrace note "of two words"
+!raytrace catalogs SCHOTT OHARA
+!raytrace aiming real
+!raytrace unnamed MEDIUM1
+NAO 0.01; DIM I; TEM 20; PRE 760; CA YES
+WL 656.3 587.6 &
+ 486.1
+REF 2; WTW 1 2 1; WTW W1 0.5
+XOB 0 0; YOB 0 0.1; WTF 1 1
+VUX 0 0.1; VLX 0 0.1; VUY 0 0.2; VLY F2 0.3
+PRV
+PWL 656.3 587.6 486.1
+'E48' 1.5286 1.53116 1.5378
+'MEDIUM1' 1.3 1.3 1.3
+'NOA61' LAU 2.36390625 0 0.025493134 -0.000580235
+END
+SO 0 20
+S1 2 0.3 'E48'; SLB 'first'
+  SPH
+  CIR 0.5; ADX 0.01; ADY 0.01; ARO 0
+  CIR OBS L'A' 0.05; CIR EDG 0.6
+S -2 0.1 MEDIUM1
+  CON; K -1; CUF 0
+  REX 0.4; REY 0.4
+S 0 0.2 517.642
+  STO
+  ELX 0.4; ELY 0.4
+S 3 0.2 NBK7_SCHOTT; RDY S4 3.1
+  ASP; K 0.1; A 1e-3; B 1e-4; C 1e-4; D 1e-5; E 1e-5; F 1e-5; G 1e-5; H 1e-5; J 1e-6
+  XDE 0.001; YDE 0.001; ZDE 0.001; ADE 0.1; BDE 0.1; CDE 0.1; DAR
+S 0 1 NOA61; THI S5 1.1; GLA S5 F5; CUY S5 0.0
+  ADE 1; REV
+S 0 -1 F5 REFL
+  ADE 10; BEN
+S 0 -2; RMD REFR
+SI 0 0
+ZOO 2; ZOO THI S7 -2.1 -2.2; TIT Z2 'b'
+PIM NO
+GO
+"""
+
+# -- figures that CODE V stored: the distance of the paraxial image, to which PIM had put the image --------------------
+
+DOUBLE_GAUSS = """RDM N;LEN
+TITLE 'Double Gauss F/2'
+EPD 50
+DIM M
+WL 656.3 587.6 486.1
+REF 2
+YAN 0 10.0000000023 14.0000000032
+VUY 0 0.2 0.4
+VLY 0 0.25 0.4
+SO 0 993938392063
+S 0.01779284094091543 8.75 NSSK2_SCHOTT
+S 0.006566600536925569 0.5
+S 0.02653743294670983 12.5 NSK2_SCHOTT
+S 0 3.8 F5_SCHOTT
+S 0.04126892878570084 16.36944492653564
+S 0 13.74795696388906
+STO
+S -0.03523942654429074 3.8 F5_SCHOTT
+S 0 11 NSK16_SCHOTT
+S -0.02636750828657709 0.5
+S 0.005636604951748545 7 NSK16_SCHOTT
+S -0.0125926458590576 61.4875364179821
+{}
+SI 0 {}
+"""  # ray-optics, ag_dblgauss.seq: saved by CODE V 10.7
+
+QUESTAR = """RDM N;LEN
+EPD 3.503937007874016
+DIM I
+WL 650 555 450
+REF 2
+YAN 0 0.25
+SO 0 1e11
+S -0.2779672329376499 0.2841750104821051 NBK7_SCHOTT
+S -0.2656588696905559 6.617998801804411
+CIR OBS L'A' 0.3825432833412954
+S -0.06219776663591262 -6.617998801804411 REFL
+STO
+S -0.2656588696905559 10.21528463036717 REFL
+PIM
+SI 0 0
+"""  # ray-optics, questar35.seq: saved by CODE V 10.7, in inches
+
+ACHROMAT = sequence("S 61.47 6 NBK7_SCHOTT\nSTO\nS -44.64 2.5 NSF5_SCHOTT\nS -129.94 95.95194415183156\nPIM")
+SMALL = sequence(
+    "S 0.8 0.5 NPSK53A_SCHOTT\nSTO\nS -0.8 0.5 NLASF9_SCHOTT\nS -4.5 0.9176749924408083\nPIM", "EPD 0.4;WL 587.6"
+)
+ASPHERE = sequence(
+    "S 19.38 9.720976918833829 NBK7_SCHOTT\nSTO\nASP\nK -0.6698934\nCUF 0.0\nA 0.1876737e-5; B 0.8930244e-9; C 0; D 0\n"
+    "S 0 31.09123483490374\nPIM",
+    "EPD 25;WL 587.6;XAN 0;YAN 0",
+)  # Edmund Optics 32327, 65564 and 16998
+
+
+@pytest.mark.parametrize(
+    ("text", "stored"),
+    [
+        (DOUBLE_GAUSS.format("PIM", 0), 61.4875364179821),
+        (QUESTAR, 25.4 * 10.21528463036717),
+        (ACHROMAT, 95.95194415183156),
+        (SMALL, 0.9176749924408083),
+        (ASPHERE, 31.09123483490374),
+    ],
+    ids=["double Gauss", "inches and mirrors", "radii", "lanthanum", "asphere"],
+)
+def test_the_paraxial_image_is_where_code_v_put_it(text, stored):
+    lens, _ = of(text)
+    found = rt.first_order(lens)
+    image = float(lens.surfaces[-2].thickness)
+    assert image == pytest.approx(stored, rel=1e-14)
+    assert float(found.back_focal_distance) == pytest.approx(stored, rel=1e-9)  # an object at 1e12 mm: 1e-8 mm
+
+
+def test_a_stored_distance_that_is_not_the_paraxial_one_is_solved_and_told():
+    wrong = ACHROMAT.replace("95.95194415183156", "0")
+    lens, report = of(wrong)
+    assert float(lens.surfaces[-2].thickness) == pytest.approx(95.95194415183156, rel=1e-12)
+    assert "PIM puts the image to 95.9519442 mm, where 0 mm is stored" in report.warnings[0]
+    with pytest.raises(LensFileError, match="PIM"):
+        of(wrong, strict=True)
+
+
+def test_the_thickness_of_the_image_is_the_defocus_that_sharpens_it():
+    sharp, paraxial = (of(DOUBLE_GAUSS.format("PIM", defocus))[0] for defocus in (-0.4002686453541377, 0))
+    assert float(sharp.surfaces[-2].thickness) == 61.4875364179821 - 0.4002686453541377
+    rms = [float(rt.spot(lens, fields=[0]).rms_radius.mean()) for lens in (sharp, paraxial)]
+    assert rms[0] < 0.5 * rms[1]
+
+
+# -- decentres and tilts ----------------------------------------------------------------------------------------------
+
+THREE_MIRRORS = """tit 'F/4.0, 4x4 deg., 3 Mirror Compact'
+rdm y
+SO 0 1e11
+S 0 300
+S -1058.98937 -276.006853 REFL
+CON; K -1.314566
+DAR; YDE 48.695345; ADE 8.438645
+REX 75.734236; REY 78.538674; ADY 99.602384
+S 0 -0.981318; STO
+DAR; YDE 11.444717; ADE 10.219900
+S -324.06500 319.160560 REFL
+CON; K 0.889123
+DAR; YDE 17.561821; ADE 9.661580
+REX 24.789115; REY 24.791683; ADY -6.213535
+S -453.96516 -321.621031 REFL
+ASP; K 0.226106; A 0.368950E-10
+DAR; YDE 67.500535; ADE 9.514418
+REX 66.581268; REY 65.453521; ADY -112.354230
+SI 0 15.407921
+YDE -47.681342; ADE 8.716957
+EPD 100; DIM MM; WL 500; REF 1
+XAN 0 0 0 2 2
+YAN 2 0 -2 -2 2
+PIM
+"""  # ray-optics, threemir.seq
+
+
+def bundle(x: float, y: float, field: tuple[float, float], radius: float, count: int) -> Rays:
+    """Parallel rays through the plane of surface 1 about a point, in a direction by two angles."""
+    side = torch.linspace(-1, 1, count, dtype=torch.float64) if count > 1 else number([0.0])
+    X, Y = (part.flatten() for part in torch.meshgrid(side, side, indexing="ij"))
+    inside = X * X + Y * Y <= 1
+    X, Y = x + radius * X[inside], y + radius * Y[inside]
+    direction = number([*(math.tan(math.radians(angle)) for angle in field), 1.0])
+    direction = (direction / direction.norm())[:, None].expand(3, len(X))
+    return Rays(torch.stack([X, Y, torch.zeros_like(X)]), direction, torch.ones(len(X), dtype=torch.bool))
+
+
+def at_stop(lens: Lens, rays: Rays) -> torch.Tensor:
+    bare = [dataclasses.replace(surface, apertures=()) for surface in lens.surfaces[: lens.stop + 1]]
+    until = dataclasses.replace(lens, surfaces=tuple(bare))
+    return trace_lens(until, rays, lens.wavelengths[0]).position[:2, 0]
+
+
+def through_stop(lens: Lens, field: tuple[float, float]) -> list[float]:
+    """Where on surface 1 the ray starts that goes through the centre of the stop; by Newton's method."""
+    start = number([0.0, 150.0])
+    for _ in range(8):
+        middle, right, above = (
+            at_stop(lens, bundle(*(start + step).tolist(), field, 0.0, 1))
+            for step in (number([0.0, 0.0]), number([1e-3, 0.0]), number([0.0, 1e-3]))
+        )
+        slopes = torch.stack([right - middle, above - middle], 1) / 1e-3
+        start = start - torch.linalg.solve(slopes, middle)
+    return start.tolist()
+
+
+def images(text: str) -> tuple[torch.Tensor, torch.Tensor, bool]:
+    """Chief rays (2, F) and RMS radii (F,) mm on the image, and whether all the light passes the apertures."""
+    lens, _ = of(text)
+    centres, radii, passes = [], [], True
+    for field in zip(lens.fields.x.tolist(), lens.fields.y.tolist(), strict=True):
+        x, y = through_stop(lens, field)
+        end = trace_lens(lens, bundle(x, y, field, 50.0, 9), lens.wavelengths[0])
+        passes &= bool(end.valid.all())
+        hit = end.position[:2]
+        centres.append(hit.mean(1))
+        radii.append((hit - hit.mean(1, keepdim=True)).square().sum(0).mean().sqrt())
+    return torch.stack(centres, 1), torch.stack(radii), passes
+
+
+def test_an_off_axis_telescope_images_as_its_title_says():
+    """F/4.0 at 100 mm: 400 mm tan 2° from the axis to the edge; sharp, centred, within its mirrors' rims."""
+    centres, radii, passes = images(THREE_MIRRORS)
+    assert passes
+    assert float(radii.max()) < 1.5 * MICROMETRE
+    assert float(centres[:, 1].abs().max()) < 0.3 * MICROMETRE
+    edge = 400 * math.tan(math.radians(2))
+    assert (centres[1, 0] - centres[1, 2]) / 2 == pytest.approx(edge, rel=0.02)
+    assert centres[0, 3] == pytest.approx(edge, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"), [("ADE ", "ADE -"), ("YDE ", "YDE -"), ("DAR; ", ""), ("DAR; ", "REV; "), ("ADY ", "ADY -")]
+)
+def test_the_telescope_images_no_other_way(old, new):
+    try:
+        _, radii, passes = images(THREE_MIRRORS.replace(old, new).replace("--", ""))
+    except (torch.linalg.LinAlgError, RuntimeError):  # no ray comes through
+        return
+    assert not passes or float(radii.max()) > 0.5
+
+
+def test_an_off_axis_paraboloid_is_sharp_on_a_plane_turned_by_90_degrees():
+    """Edmund Optics 35571: the focus of the parabola lies on the image, 88.9 mm from its centre."""
+    lens, report = of(
+        sequence(
+            "S 0 150\nSTO\nS -177.8 -88.90000000000001 REFL\nCON\nK -1.0\nXDE 0.0; YDE -177.8; ZDE 0.0\nCIR 12.7\n"
+            "ADY 177.8\nTHI HMY 0.0\nS 0 -88.90000000000001\nXDE 0.0; YDE 177.8; ZDE 0.0\nS 0 0\n"
+            "XDE 0.0; YDE -177.8; ZDE 0.0\nADE 89.99999999999997; BDE 0.0; CDE 0.0",
+            "EPD 25.4;WL 587.6;XAN 0;YAN 0",
+        )
+    )
+    end = trace_lens(lens, bundle(0, 0, (0, 0), 12.69, 8), lens.wavelengths[0])
+    assert bool(end.valid.all())
+    assert float(end.position[0].abs().max()) < NANOMETRE
+    assert float((end.position[1] - end.position[1].mean()).abs().max()) < NANOMETRE
+    assert float(end.position[1].mean().abs()) == pytest.approx(88.9, abs=NANOMETRE)
+    assert bool((end.direction[2] < -0.9).all())  # behind one mirror light runs against z
+    assert [keyword.status for keyword in report.keywords if keyword.name == "THI"] == ["ignored"]
+
+
+def test_a_bend_turns_the_axis_twice_and_keeps_the_ray_on_it():
+    """ray-optics, folded_lenses.seq: after three folds of 60°, -60° and -45° the ray along the axis is on it."""
+    text = sequence(
+        "S 0 5\nSTO\nS 0 -2.25 REFL\nADE 60; BEN\nS -.67 -.3 NBK7_SCHOTT\nS 0 -0.05\nS 0 -.2 NBK7_SCHOTT\n"
+        "S -.77095 -2.25\nS 0 2.25 REFL\nADE -60; BEN\nS -.67 0.2 NBK7_SCHOTT\nS 0 0.05\nS 0 .3 NBK7_SCHOTT\n"
+        "S -.59225 2.25\nS 0 -5 REFL\nADE -45; BEN",
+        "EPD 1;WL 555;YAN 0",
+        "RDM N",
+    )
+    lens, _ = of(text)
+    end = trace_lens(lens, bundle(0, 0, (0, 0), 0.0, 1), lens.wavelengths[0])
+    assert float(end.position.abs().max()) < 1e-14
+    assert end.direction[:, 0].tolist() == pytest.approx([0, 0, -1], abs=1e-15)
+    straight, _ = of(text.replace("BEN", "DAR"))
+    assert not bool(trace_lens(straight, bundle(0, 0, (0, 0), 0.0, 1), lens.wavelengths[0]).valid.all())
+
+
+def test_a_reverse_decentre_leads_back():
+    """ray-optics, dec_rev_tilt_test.seq: what a surface tilts, REV with the same numbers undoes behind another."""
+    text = sequence(
+        "S 0 3\nSTO\nS 0 2.82842712\nYDE 2; ADE 45\nS 0 0\nREV; ADE 45\nS 0 3\nYDE -4", "EPD 1;WL 550;YAN 0"
+    )
+    lens, _ = of(text)
+    end = trace_lens(lens, bundle(0, 0, (0, 0), 0.5, 4), lens.wavelengths[0])
+    assert torch.allclose(end.position[1].mean(), number(0.0), atol=1e-8)
+    assert torch.allclose(end.direction, number([0.0, 0.0, 1.0])[:, None].expand(end.direction.shape), atol=1e-15)
+
+
+POSES = {
+    "basic": (Pose(x=number(1.0), y=number(-2.0), z=number(0.5), tilt_x=number(3.0), tilt_z=number(7.0)), None),
+    "return": (one := Pose(y=number(0.1), tilt_x=number(-8.4), tilt_y=number(0.3)), undone(one)),
+    "reverse": (None, undone(Pose(x=number(0.7), tilt_y=number(1 / 3)))),
+    "break": (Pose(y=number(0.1), tilt_x=number(45.0)), None),
+    "break, tilts first": (undone(Pose(y=number(0.1), tilt_x=number(45.0))), None),
+}
+
+
+@pytest.mark.parametrize("kind", POSES)
+def test_poses_come_back_bit_for_bit(kind):
+    before, after = POSES[kind]
+    lens = read_lens("double_gauss").replace(6, before=before, after=after, is_break=kind.startswith("break"))
+    assert leaves(again(dataclasses.replace(lens, stop=5))) == leaves(dataclasses.replace(lens, stop=5))
+
+
+def test_a_bend_comes_back_and_what_no_command_tells_is_refused():
+    lens, tilt = read_lens("hubble"), Pose(y=number(2.0), tilt_x=number(30.0))
+    mirror = next(k for k, surface in enumerate(lens.surfaces) if surface.is_mirror)
+    bent = lens.replace(mirror, before=tilt, after=Pose(tilt_x=number(30.0)))
+    assert leaves(again(bent)) == leaves(bent)
+    with pytest.raises(LensFileError, match="no command for"):
+        again(lens.replace(mirror, before=tilt, after=tilt))
+
+
+# -- apertures, fields, glasses ---------------------------------------------------------------------------------------
+
+
+def test_vignetting_is_converted_as_code_v_does_for_a_lens_of_opticstudio():
+    """A patent's lens read into CODE V 2026: VDY -0.1670, VCY 0.4315 became VUY 0.5985, VLY 0.2645."""
+    lens, _ = of(SINGLET.replace("YAN 0", "YAN 0 10;VUY 0 0.5985;VLY 0 0.2645"))
+    assert lens.fields.vignetting[:, 1].tolist() == [0.0, -0.167, 0.0, 0.4315, 0.0]
+    lens, _ = of(DOUBLE_GAUSS.format("", 0))
+    assert lens.fields.vignetting[3].tolist() == [0.0, 0.225, 0.4]
+    assert lens.fields.vignetting[1].tolist() == [0.0, 0.025, 0.0]
+
+
+@pytest.mark.parametrize("factors", [(0.1, 0.3), (1 / 3, 0.7), (-0.167, 0.4315), (1e-9, 0.9), (1e-30, 1.0)])
+def test_vignetting_comes_back_bit_for_bit(factors):
+    lens = read_lens("double_gauss")
+    given = number([[0.0, a, 0.0] for a in (0.0, factors[0], -factors[0] / 7, factors[1], 0.0)])
+    lens = dataclasses.replace(lens, fields=dataclasses.replace(lens.fields, vignetting=given))
+    assert leaves(again(lens)) == leaves(lens)
+
+
+def test_glasses_by_their_figures():
+    """Optiland takes 569.631 for 1.569 and 63.1, 517642 for 1.517 and 64.2; files of Edmund Optics have more digits."""
+    found = {}
+    for word in ("569.631", "517642", "517000.520000", "516800.641700", "1.5168:64.17"):
+        glass = of(SINGLET.replace("NBK7_SCHOTT", word))[0].surfaces[1].glass
+        found[word] = tuple(glass.coefficients.tolist()[:2])
+    assert found["569.631"] == (1.569, 63.1)
+    assert found["517642"] == (1.517, 64.2)
+    assert found["517000.520000"] == (1.517, 52.0)
+    assert found["516800.641700"] == found["1.5168:64.17"] == (1.5168, 64.17)
+    with pytest.raises(LensFileError, match=r"the glass is '1\.5'"):
+        of(SINGLET.replace("NBK7_SCHOTT", "1.5"))
+
+
+def test_glasses_by_their_names():
+    for word, name, catalog in (
+        ("SLAL8_OHARA", "S-LAL8", "OHARA"),
+        ("nbk7", "N-BK7", "SCHOTT"),
+        ("'F5'", "F5", "SCHOTT"),
+    ):
+        glass = of(SINGLET.replace("NBK7_SCHOTT", word))[0].surfaces[1].glass
+        assert (glass.name, glass.catalog) == (name, catalog)
+    with pytest.raises(UnknownGlass, match="NBK8_SCHOTT"):
+        of(SINGLET.replace("NBK7_SCHOTT", "NBK8_SCHOTT"))
+
+
+def private(rows: str, word: str) -> str:
+    return SINGLET.replace("SO 0", f"PRV\n{rows}\nEND\nSO 0").replace("NBK7_SCHOTT", word)
+
+
+def test_private_glasses():
+    """Norland gives n_D = 1.56 for NOA61, whose formula stands in files of Edmund Optics, as does the table of E48."""
+    formula = "PWL 550\n'NOA61' LAU 2.36390625 0.0 0.025493134 -0.000580235 -0.349933e-5 0.445404e-7"
+    glass = of(private(formula, "'NOA61'"))[0].surfaces[1].glass
+    assert float(index(glass, 0.5893)) == pytest.approx(1.56, abs=0.005)
+    waves, indices = "1000 800 700 650 600 587.6 546.1 486.1 440 404.7", "1.5211 1.5238 1.527 1.5286 1.5306 1.53116"
+    table = f"PWL {waves}\n'E48' {indices}&\n 1.5334 1.5378 1.5428 1.5476"
+    lens, report = of(private(table, "E48"))
+    assert float(index(lens.surfaces[1].glass, 0.5876)) == pytest.approx(1.53116, abs=1e-14)
+    assert "its 10 indices" in report.notes[0]
+    with pytest.raises(LensFileError, match="formula GMS, which is not modelled"):
+        of(private("PWL 500\n'X' GMS 1 2 3", "X"))
+    assert "interpolated" in of(private("PWL 500 600\n'X' 1.51 1.50", "X"))[1].warnings[0]
+
+
+def test_what_is_in_no_catalog_comes_back():
+    lens = of(private("PWL 587.6 500 600\n'X' 1.502 1.51 1.50", "X"))[0]
+    for glass in (lens.surfaces[1].glass, constant(1.333), constant(1.333, "WATER"), model_glass(1.6, 40.0)):
+        changed = lens.replace(2, glass=glass)
+        assert leaves(again(changed)) == leaves(changed)
+    for glass, message in (
+        (model_glass(1.6, 40.0, 0.01), "ΔPgF"),
+        (model_glass(1.5, 60, name="X1"), "leave out the name"),
+    ):
+        with pytest.raises(LensFileError, match=message):
+            again(lens.replace(2, glass=glass))
+
+
+def test_apertures_clip_and_obscure():
+    text = SINGLET.replace("S -50", "CIR 4; ADY 1; CIR OBS L'A' 0.5\nCIR EDG 6\nS -50")
+    first = of(text)[0].surfaces[1]
+    assert leaves(first.apertures) == leaves(
+        (
+            Aperture("circular", (0.0, 4.0), False, (0.0, 1.0)),
+            Aperture("circular", (0.0, 0.5), True, (0.0, 0.0)),
+        )
+    )
+    assert first.semi_diameter == 6.0
+    with pytest.raises(LensFileError, match="2 clear apertures"):
+        of(SINGLET.replace("S -50", "CIR 4; CIR L'B' 3\nS -50"))
+    with pytest.raises(LensFileError, match="without REY"):
+        of(SINGLET.replace("S -50", "REX 4\nS -50"))
+
+
+# -- the language -----------------------------------------------------------------------------------------------------
+
+
+def test_commands_are_joined_parted_cut_short_and_commented():
+    lens, _ = of(
+        "RDM;LEN NEW\ntitle 'a; b ! c & d' ! not this\nwl 486.1 &\n 587.6 ; ref 2; epd 1&\n0\n"
+        "dim c\nyan 0 &\n  5\nso 0 1e10\ns 5 .4 'nbk7_schott'; stop\ns2 -5 4.8\nk s1 0; CUY S1 0.1\nsi 0 0\n"
+    )
+    assert lens.name == "a; b ! c & d"
+    assert lens.wavelengths.tolist() == [0.4861, 0.5876]
+    assert (lens.primary_wavelength, lens.fields.y.tolist(), lens.stop) == (1, [0.0, 5.0], 1)
+    assert float(lens.aperture.value) == 100.0
+    assert float(lens.surfaces[1].curvature) == 0.1 / 10
+    assert float(lens.surfaces[2].curvature) == 1 / -50
+
+
+def test_of_zoom_positions_the_first_is_read_and_told():
+    text = SINGLET.replace("GO", "ZOO 3\nZOO THI S2 47 30 20\nZOO THC S2 100 100 100\nTIT Z2 'two'\nTHI Z1 S1 5\nGO")
+    lens, report = of(text)
+    assert [float(surface.thickness) for surface in lens.surfaces[1:3]] == [5.0, 47.0]
+    assert "3 zoom positions (ZOO): the first is read" in report.warnings[0]
+
+
+def test_a_lens_module_of_what_is_known_is_told():
+    lens, report = of(SINGLET.replace("STO", "STO\nCCY 0; THC 0\nXYZ 4\nXDE 0.0"))
+    status = {keyword.name: keyword.status for keyword in report.keywords}
+    assert (status["CCY"], status["XYZ"], status["RDM"]) == ("ignored", "unknown", "read")
+    assert "unknown keyword XYZ" in report.warnings[0]
+    assert lens.surfaces[1].before is None
+
+
+REFUSED = {
+    "DIF DOE\nHOR 1": "DIF (diffractive surface)",
+    "YTO\nRDX 5": "YTO (toroid or cylinder)",
+    "CYL": "CYL (toroid or cylinder)",
+    "SPS XYP": "SPS (special surface)",
+    "GRT\nGRS 0.001": "GRT (diffractive surface)",
+    "RET S1": "RET (return to an earlier surface)",
+    "GLB S1": "GLB (global coordinates)",
+    "NSS": "NSS (non-sequential surfaces)",
+    "XOD 1": "XOD (centre of a tilt beside the vertex)",
+    "IN other.seq": "IN (another file)",
+    "AUT": "AUT (optimisation)",
+    "NA 0.25": "NA (numerical aperture in image space)",
+    "LCL NUM X": "LCL (macro)",
+}
+
+
+@pytest.mark.parametrize("command", REFUSED)
+def test_what_is_not_modelled_is_refused_by_name_line_and_surface(command):
+    with pytest.raises(UnsupportedSurface) as caught:
+        of(SINGLET.replace("STO", f"STO\n{command}"))
+    assert f"{REFUSED[command]} is not modelled" in str(caught.value)
+    assert (caught.value.line, caught.value.surface) == (7, 1)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("RDM;", "", "radius (RDM) or a curvature (RDM N)"),
+        ("SI 0 0", "", "no SI, the image"),
+        ("WL 587.6", "WL 587.6 486.1", "no REF"),
+        ("WL 587.6", "WL 587.6;REF 2", "REF is 2, expected 1 to 1"),
+        ("YAN 0", "YAN 0;YOB 1", "several kinds"),
+        ("YAN 0", "YAN 0;VUX 0.1", "without its other side"),
+        ("EPD 10", "FNO 5", "FNO of an object at a finite distance"),
+        ("EPD 10", "", "no system aperture"),
+        ("STO", "STO\nA 1e-5", "put ASP before it"),
+        ("STO", "STO\nK -1", "put CON or ASP before it"),
+        ("STO", "STO\nCON; CUF 0.5", "CUF 0.5"),
+        ("STO", "STO\nTHI S1 (2*3)x'", "does not end"),
+        ("S -50 48", "S -50 ^f", "variables of macros"),
+        ("S -50 48", "S9 -50 48", "S9 where S2 should follow"),
+        ("S -50 48", "S -50 48 REFL\nADE 3; BDE 4; BEN", "tilts about several axes"),
+        ("S -50 48", "S -50 48 REFL\nRMD TIR", "RMD TIR"),
+        ("S -50 48", "S -50 48 &", "S with 5 words"),
+        ("GO", "LEN", "several lenses"),
+        ("GO", "S 0 0", "after SI"),
+    ],
+)
+def test_what_is_not_settled_or_wrong_is_refused_with_its_reason(old, new, message):
+    text = SINGLET.replace("1e14", "500") if "finite" in message else SINGLET
+    with pytest.raises(LensFileError) as caught:
+        of(text.replace(old, new, 1))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_every_command_that_is_read_is_met_in_one_file_which_comes_back():
+    lens, report = of(EVERYTHING)
+    met = {keyword.name for keyword in report.keywords if keyword.status == "read"}
+    wanted = SYSTEM_READ | SURFACE_READ | {f"!raytrace {word}" for word in ("aiming", "catalogs", "note", "unnamed")}
+    elsewhere = {"EPD", "FNO", "SO", "SI", *(word for pair in FIELD_KINDS.values() for word in pair)}
+    assert wanted - elsewhere <= met
+    assert leaves(again(lens)) == leaves(lens)
+
+
+# -- writing ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_written_lens_is_one_that_code_v_reads():
+    """Lines of at most 80 characters, a word of four letters at most for a command, wavelengths in nm."""
+    lens = dataclasses.replace(read_lens("cooke_triplet"), notes=("a note",))
+    text = FORMATS[".seq"].write(lens, "lens.seq").decode()
+    assert max(map(len, text.splitlines())) <= 80
+    assert text.startswith('RDM N;LEN "raytrace"\n!raytrace note a note\n')
+    assert "SO 0.0 0.1e14\n" in text
+    assert f"WL {' '.join(f'{1e3 * w:.10g}' for w in lens.wavelengths.tolist())}" in text
+    assert text.endswith("GO\n")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"coefficients": number([1e-3, 1e-9])}, "a term of r²"),
+        ({"coefficients": number([0.0] + [1e-9] * 10)}, r"terms to r\^22"),
+        ({"coefficients": number([0.0, 1e-9]), "kind": "odd asphere"}, "no type for an odd asphere"),
+        ({"apertures": (Aperture("circular", (1.0, 2.0)),)}, "a ring"),
+        ({"apertures": (Aperture("polygon", (0.0, 1.0, 1.0, 0.0, 2.0, 2.0)),)}, "a polygon"),
+        ({"apertures": (Aperture("circular", (0.0, 2.0)),) * 2}, "several clear apertures"),
+        ({"comment": "both ' and \""}, "both kinds of quotes"),
+        ({"glass": constant(1.5, "two words")}, "one word"),
+    ],
+)
+def test_what_a_sequence_cannot_hold_is_refused(changes, message, tmp_path):
+    with pytest.raises(LensFileError, match=message) as caught:
+        write_lens(read_lens("double_gauss").replace(3, **changes), tmp_path / "lens.seq")
+    assert caught.value.surface == 3
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_apertures_of_a_lens_that_a_sequence_cannot_hold_are_refused():
+    lens = read_lens("double_gauss")
+    for aperture in (SystemAperture("float_by_stop", number(9.0)), SystemAperture("working_f_number", number(3.0))):
+        with pytest.raises(LensFileError, match="set `entrance_pupil_diameter`"):
+            again(dataclasses.replace(lens, aperture=aperture))
+    far = lens.at(object_distance=2e10)
+    with pytest.raises(LensFileError, match="which CODE V takes for infinity"):
+        again(far)
+
+
+def test_a_file_cut_off_anywhere_is_no_shorter_lens():
+    text = FORMATS[".seq"].write(read_lens("cooke_triplet"), "lens.seq").decode()
+    lens = of(text)[0]
+    for end in range(0, len(text), 7):
+        try:
+            cut = of(text[:end] or "!")[0]
+        except (LensFileError, UnknownGlass):
+            continue
+        assert len(cut.surfaces) == len(lens.surfaces)
+
+
+@settings(max_examples=400, deadline=None)
+@given(seed=st.integers(0, 2**63), which=st.integers(0, 4))
+def test_damaged_files_give_a_lens_that_comes_back_or_a_clear_error(seed, which):
+    text = (ASPHERE, DOUBLE_GAUSS.format("PIM", -0.4), EVERYTHING, QUESTAR, THREE_MIRRORS)[which]
+    read_damaged(Path("lens.seq"), damaged(text.encode(), random.Random(seed)))
+
+
+def test_convert_and_check_know_the_suffix(tmp_path: Path):
+    found = rt.convert("double_gauss", tmp_path / "lens.seq")
+    assert found.document()["surfaces"] == 13
+    rt.convert(tmp_path / "lens.seq", tmp_path / "back.zmx")
+    assert leaves(read_lens(tmp_path / "back.zmx")) == leaves(read_lens("double_gauss"))
+    report = read_lens_with_report(tmp_path / "lens.seq", strict=True)[1]
+    assert (report.format, report.stop_surface) == ("seq", 6)
+    (tmp_path / "no.seq").write_text(SINGLET.replace("STO\n", ""))
+    with pytest.warns(LensFileWarning, match="no STO"):
+        read_lens(tmp_path / "no.seq")
