@@ -97,8 +97,12 @@ def test_real_files_come_back_bit_for_bit(path, tmp_path):
     if lens is None:
         pytest.skip("refused by name")
     plain = not any(is_posed(surface) or surface.phase or surface.departure for surface in lens.surfaces)
-    for suffix in SUFFIXES if plain else [".zmx"]:
-        write_lens(lens, tmp_path / f"lens{suffix}")
+    for suffix in SUFFIXES if plain else [".zmx", ".seq"]:
+        try:
+            write_lens(lens, tmp_path / f"lens{suffix}")
+        except LensFileError as error:  # which .seq does, where CODE V has no command for it
+            assert suffix == ".seq", error
+            continue
         assert leaves(read_lens(tmp_path / f"lens{suffix}")) == leaves(lens)
 
 

@@ -432,6 +432,8 @@ def test_apertures_clip_and_obscure():
         )
     )
     assert first.semi_diameter == 6.0
+    ring = read_lens("double_gauss").replace(3, apertures=(Aperture("circular", (1.0, 9.0), False, (0.1, 0.0)),))
+    assert leaves(again(ring)) == leaves(ring)
     with pytest.raises(LensFileError, match="2 clear apertures"):
         of(SINGLET.replace("S -50", "CIR 4; CIR L'B' 3\nS -50"))
     with pytest.raises(LensFileError, match="without REY"):
@@ -555,7 +557,7 @@ def test_a_written_lens_is_one_that_code_v_reads():
         ({"coefficients": number([1e-3, 1e-9])}, "a term of r²"),
         ({"coefficients": number([0.0] + [1e-9] * 10)}, r"terms to r\^22"),
         ({"coefficients": number([0.0, 1e-9]), "kind": "odd asphere"}, "no type for an odd asphere"),
-        ({"apertures": (Aperture("circular", (1.0, 2.0)),)}, "a ring"),
+        ({"apertures": (Aperture("circular", (1.0, 2.0), True),)}, "a ring that obscures"),
         ({"apertures": (Aperture("polygon", (0.0, 1.0, 1.0, 0.0, 2.0, 2.0)),)}, "a polygon"),
         ({"apertures": (Aperture("circular", (0.0, 2.0)),) * 2}, "several clear apertures"),
         ({"comment": "both ' and \""}, "both kinds of quotes"),

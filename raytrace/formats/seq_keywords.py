@@ -29,6 +29,9 @@ LETTERS = "ABCDEFGHJ"
 APERTURES = {"circular": ("CIR",), "rectangular": ("REX", "REY"), "elliptic": ("ELX", "ELY")}
 APERTURE_WORDS = (*(word for words in APERTURES.values() for word in words), "ADX", "ADY", "ARO")
 
+#: Label of an obscuration that makes a ring of the clear circle beside it.
+RING = "RING"
+
 #: What CODE V has no command for stands in comments, `!raytrace catalogs SCHOTT OHARA`.
 OWN = "!RAYTRACE"
 _OWN_WORDS = ("AIMING", "BREAK", "CATALOGS", "NOTE", "UNNAMED")

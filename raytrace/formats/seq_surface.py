@@ -7,7 +7,7 @@ from torch import Tensor
 
 from raytrace.formats.report import Draft
 from raytrace.formats.seq_glass import medium
-from raytrace.formats.seq_keywords import APERTURES, LEFT_HANDED, LETTERS, POSE_WORDS, unquoted
+from raytrace.formats.seq_keywords import APERTURES, LEFT_HANDED, LETTERS, POSE_WORDS, RING, unquoted
 from raytrace.formats.source import LensFileError, UnsupportedSurface, shown
 from raytrace.formats.spelling import double, is_infinite, number
 from raytrace.formats.zemax_keywords import Block, Record
@@ -174,7 +174,7 @@ def _apertures(block: Block, unit: float, report: Draft) -> tuple[tuple[Aperture
             kind, label = (word.upper(), label) if word.upper() in _KINDS else (kind, word[1:].upper())
         groups.setdefault((kind, label), {})[record.keyword] = record._replace(words=tuple(words))
     found, semi_diameter = [], None
-    for (kind, _), sizes in groups.items():
+    for (kind, label), sizes in groups.items():
         if kind == "EDG":
             semi_diameter = sizes["CIR"].number(0, "edge of the part") * unit if "CIR" in sizes else semi_diameter
         elif kind == "HOL":
@@ -182,6 +182,8 @@ def _apertures(block: Block, unit: float, report: Draft) -> tuple[tuple[Aperture
             report.warn("a hole in the part (HOL) is left out: no ray is clipped by it", first.place)
         else:
             found.append(_aperture(sizes, kind == "OBS", unit))
+            if label.strip("'\"") == RING and len(found) > 1:
+                found[-2:] = _ring(*found[-2:])
     clear = [aperture for aperture in found if not aperture.obscures]
     if len(clear) > 1:
         message = f"{len(clear)} clear apertures on one surface; whether light passes any or all of them is not settled"
@@ -189,6 +191,13 @@ def _apertures(block: Block, unit: float, report: Draft) -> tuple[tuple[Aperture
     if semi_diameter is not None and semi_diameter < 0:
         raise LensFileError("CIR EDG is negative, expected a semi-diameter of 0 or more", block.place)
     return tuple(found), semi_diameter
+
+
+def _ring(outer: Aperture, inner: Aperture) -> list[Aperture]:
+    """A clear circle and what is obscured within it as one aperture, if they are about the same centre."""
+    if outer.shape != inner.shape or outer.shape != "circular" or outer.obscures or outer.centre != inner.centre:
+        return [outer, inner]
+    return [Aperture("circular", (inner.extent[1], outer.extent[1]), False, outer.centre)]
 
 
 def _aperture(sizes: dict[str, Record], obscures: bool, unit: float) -> Aperture:

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 
 from raytrace.formats import seq_glass
-from raytrace.formats.seq_keywords import APERTURES, FIELD_KINDS, LEFT_HANDED, LETTERS, OWN, POSE_WORDS
+from raytrace.formats.seq_keywords import APERTURES, FIELD_KINDS, LEFT_HANDED, LETTERS, OWN, POSE_WORDS, RING
 from raytrace.formats.seq_surface import INFINITY
 from raytrace.formats.source import LensFileError, Place
 from raytrace.formats.spelling import exact, exact_list, one_line, quoted, refuse_departure, word
@@ -33,7 +33,7 @@ def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
 
     file: its name, for messages. catalogs: the user's glass catalogs that the lens was read with.
     Raises LensFileError for what a .seq file cannot hold: a batch of lenses, nan, terms of r² and beyond r²⁰, apertures
-    other than EPD, FNO and NAO, rings, polygons, names and partial dispersion of model glasses.
+    other than EPD, FNO and NAO, polygons, names and partial dispersion of model glasses.
     """
     place, private = Place(file), {}
     surfaces = []
@@ -247,16 +247,20 @@ def _apertures(apertures: tuple[Aperture, ...], place: Place) -> list[str]:
         )
         raise LensFileError(message, place)
     for k, aperture in enumerate(apertures, 1):
-        of = (" OBS" if aperture.obscures else "") + (f" L'{k}'" if len(apertures) > 1 else "")
-        sizes = [exact(size, "size of the aperture", place) for size in aperture.extent]
-        if aperture.shape == "circular" and float(sizes.pop(0)):
-            message = "a ring as aperture, which a .seq file does not hold"
-            raise LensFileError(f"{message}; put its inner circle beside it as an obscuration", place)
         if aperture.shape not in APERTURES:
             raise LensFileError(f"a {aperture.shape} as aperture, which a .seq file does not hold", place)
-        centre = [exact(number, "decentre of the aperture", place) for number in aperture.centre]
-        lines += [f"  {word}{of} {size}" for word, size in zip(APERTURES[aperture.shape], sizes, strict=True)]
-        lines += [
-            f"  {word}{of} {number}" for word, number in zip(("ADX", "ADY"), centre, strict=True) if float(number)
-        ]
+        if aperture.shape == "circular" and aperture.extent[0] and (aperture.obscures or len(apertures) > 1):
+            message = "a ring that obscures, or beside another aperture, which a .seq file does not hold"
+            raise LensFileError(message, place)
+        of = (" OBS" if aperture.obscures else "") + (f" L'{k}'" if len(apertures) > 1 else "")
+        sizes, circle = aperture.extent, aperture.shape == "circular"
+        lines += _one_aperture(aperture, sizes[1:] if circle else sizes, of, place)
+        lines += _one_aperture(aperture, sizes[:1], f" OBS L'{RING}'", place) if circle and sizes[0] else []
     return lines
+
+
+def _one_aperture(aperture: Aperture, sizes: Sequence[float], of: str, place: Place) -> list[str]:
+    numbers = [exact(size, "size of the aperture", place) for size in sizes]
+    centre = [exact(number, "decentre of the aperture", place) for number in aperture.centre]
+    lines = [f"  {word}{of} {size}" for word, size in zip(APERTURES[aperture.shape], numbers, strict=True)]
+    return lines + [f"  AD{axis}{of} {number}" for axis, number in zip("XY", centre, strict=True) if float(number)]
