@@ -1,5 +1,6 @@
 """Round trips, damaged files, and the doors of reading and writing."""
 
+import contextlib
 import dataclasses
 import os
 import random
@@ -98,12 +99,10 @@ def test_real_files_come_back_bit_for_bit(path, tmp_path):
         pytest.skip("refused by name")
     plain = not any(is_posed(surface) or surface.phase or surface.departure for surface in lens.surfaces)
     for suffix in SUFFIXES if plain else [".zmx", ".seq"]:
-        try:
+        refused = [LensFileError] if suffix == ".seq" else []  # where CODE V has no command for it
+        with contextlib.suppress(*refused):
             write_lens(lens, tmp_path / f"lens{suffix}")
-        except LensFileError as error:  # which .seq does, where CODE V has no command for it
-            assert suffix == ".seq", error
-            continue
-        assert leaves(read_lens(tmp_path / f"lens{suffix}")) == leaves(lens)
+            assert leaves(read_lens(tmp_path / f"lens{suffix}")) == leaves(lens)
 
 
 @pytest.mark.parametrize("path", OWN, ids=lambda path: path.name)
