@@ -318,3 +318,57 @@ def test_the_command_tells_a_glass_at_a_temperature(command):
     code, out, err = command("glass", "LZ_K8", "--temperature", -300)
     assert (code, err.strip()) == (1, "raytrace: error: LZ_K8: --temperature -300: expected degrees Celsius above -272")
     assert "no thermal coefficients" in command("glass", "LZ_K8", "--temperature", 30)[2]
+
+
+# -- tables -----------------------------------------------------------------------------------------------------------
+
+
+def same_environments(one, other):
+    pairs = zip((one, *one.surfaces), (other, *other.surfaces), strict=True)
+    for a, b in ((a.environment, b.environment) for a, b in pairs):
+        assert (a is None) == (b is None)
+        if a is not None:
+            assert torch.equal(a.temperature, b.temperature)
+            assert torch.equal(a.pressure, b.pressure)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".txt"])
+def test_a_table_brings_environments_back_bit_for_bit(tmp_path, suffix):
+    path = tmp_path / f"lens{suffix}"
+    for lens in (vacuum_cell(), vacuum_cell().at(temperature=-40.1, pressure=1 / 3)):
+        rt.write_lens(lens, path)
+        same_environments(lens, rt.read_lens(path))
+    rt.write_lens(rt.read_lens("double_gauss"), path)
+    assert "temperature" not in path.read_text()
+
+
+TABLE = "# temperature: {}\n# wavelengths: 0.55\n# fields: 0\n# aperture: EPD 5\n# stop: 1\nradius,thickness,glass{}\n"
+
+
+@pytest.mark.parametrize(
+    ("temperature", "rest", "said"),
+    [
+        ("40 °C", "\n50,5,N-BK7\ninf,90,\ninf,0,", ""),
+        ("40 C", "\n50,5,N-BK7\ninf,90,\ninf,0,", ""),
+        ("104 F", "\n50,5,N-BK7\ninf,90,\ninf,0,", r"lens.csv:1: temperature is '104 F', expected a finite number"),
+        ("-300", "\n50,5,N-BK7\ninf,90,\ninf,0,", r"lens.csv:1: temperature=-300: expected degrees Celsius above -272"),
+        (
+            "40",
+            ",pressure\n50,5,N-BK7,\ninf,90,,0\ninf,0,,",
+            r"lens.csv:8, surface 2: a pressure alone; give temperature and",
+        ),
+        (
+            "40",
+            "\n50,5,LZ_K8\ninf,90,\ninf,0,",
+            r"lens.csv:7, surface 1: LZ_K8 \(LZOS\) has no thermal coefficients: at 40 °C",
+        ),
+    ],
+)
+def test_a_table_says_what_it_cannot_read(tmp_path, temperature, rest, said):
+    path = tmp_path / "lens.csv"
+    path.write_text(TABLE.format(temperature, rest), encoding="utf-8")
+    if said:
+        with pytest.raises(rt.LensFileError, match=said):
+            rt.read_lens(path, strict=True)
+    else:
+        assert rt.read_lens(path, strict=True).environment.temperature.item() == 40

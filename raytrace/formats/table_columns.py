@@ -55,6 +55,8 @@ _SPELLINGS = {
     ", durchmesser, freier durchmesser, diametre, diametre utile",
     "stop": "stop, is stop, aperture stop, 絞り, 光阑, blende",
     "apertures": "aperture, apertures",
+    "temperature": "temperature",
+    "pressure": "pressure",
 }
 
 #: Columns that are known and tell nothing that a surface needs, with the reason.

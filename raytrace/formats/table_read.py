@@ -17,6 +17,7 @@ with what is stated in warnings: on axis, the d line, F/10 unless the stop row h
   the last row has a thickness, the image is added behind it.
 - Apertures: `circular 0 12.5` (inner, outer radius), `rectangular 3 4`, `elliptic 3 4` (half-widths), with
   `obscuration` before and `at 1 2` (centre) after; several are joined by ` + `.
+- Columns `temperature` and `pressure` are of a medium that has others than the lens ('# temperature:', '# pressure:').
 - A row of a type that is not modelled (coordinate break, toroid, grating …) raises UnsupportedSurface.
 """
 
@@ -44,7 +45,7 @@ from raytrace.formats.spelling import (
 )
 from raytrace.formats.table_text import Row, Table, cleaned, parse
 from raytrace.media.glass import AIR
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, unknown_changes
 from raytrace.system.surface import Surface
 
 _STOP = re.compile(r"\b(stop|sto|aperture|diaphragm|iris|blende|diaphragme)\b|絞り|光阑|光圈", re.IGNORECASE)
@@ -95,9 +96,17 @@ def build(table: Table, *, catalogs: Sequence[Path] = (), packed: AtHand | None 
         notes=tuple(table.notes),
         catalogs=names,
         ray_aiming=table_system.ray_aiming(table),
+        environment=table_system.environment(table),
     )
     refuse_overflow(lens, table.place.file)
+    _warn_of_environment(lens, rows, table)
     return lens
+
+
+def _warn_of_environment(lens: Lens, rows: list[Row], table: Table) -> None:
+    places = {row.place.surface: row.place for row in rows}
+    for surface, message in unknown_changes(lens).items():
+        table.report.warn(message, places.get(surface, table.place))
 
 
 def _unit(table: Table) -> float:

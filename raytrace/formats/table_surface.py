@@ -1,7 +1,7 @@
 """A row of a prescription table as a `Surface`: shape, medium and apertures."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from torch import Tensor
@@ -13,8 +13,10 @@ from raytrace.formats.spelling import double, is_infinite, is_number, number
 from raytrace.formats.table_columns import order
 from raytrace.formats.table_media import figures as figures_of
 from raytrace.formats.table_media import medium
+from raytrace.formats.table_system import ENVIRONMENT, environment_of
 from raytrace.formats.table_text import Row
 from raytrace.media.catalog import Catalog
+from raytrace.media.environment import Environment
 from raytrace.media.glass import AIR, LINES, MIRROR, Glass, mil_glass, refractive_index
 from raytrace.system.aperture import SHAPES, Aperture
 from raytrace.system.shapes import KINDS
@@ -67,8 +69,16 @@ def build(row: Row, unit: float, catalogs: Sequence[str | Catalog], user: Sequen
         glass=_glass(row, catalogs, user, report),
         semi_diameter=_semi_diameter(row, unit),
         apertures=tuple(_aperture(text, unit, place) for text in _several(cells.get("apertures", ""))),
+        environment=_environment(cells, place),
         comment=cells.get("comment") or ("" if is_number(cells.get("label", "0")) else cells["label"]),
     )
+
+
+def _environment(cells: Mapping[str, str], place: Place) -> Environment | None:
+    told = [key for key in ENVIRONMENT if key in cells]
+    if len(told) == 1:
+        raise LensFileError(f"a {told[0]} alone; give {' and '.join(ENVIRONMENT)}, or neither", place)
+    return environment_of(cells, place) if told else None
 
 
 def _cell(row: Row, column: str) -> float | None:

@@ -16,10 +16,12 @@
 # primary wavelength: 2          counted from 1
 # catalogs: SCHOTT OHARA
 # ray aiming: paraxial
+# temperature: 40                °C, of the glasses and the air
+# pressure: 1                    atm, of the air; 0 is vacuum
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
 
@@ -29,6 +31,7 @@ from raytrace.formats.media import catalogs_needed
 from raytrace.formats.source import LensFileError, Place, shown
 from raytrace.formats.spelling import double, exact, exact_list, integer, is_number, number, quoted, word
 from raytrace.formats.table_text import Table
+from raytrace.media.environment import REFERENCE, Environment, objection
 from raytrace.media.glass import LINES
 from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, RAY_AIMING, Fields, Lens, SystemAperture
 
@@ -47,6 +50,8 @@ DEFAULT_F_NUMBER = 10.0
 
 _NUMBERS = re.compile(r"[\s,;]+")
 _NO, _YES = ("no", "off", "false", "0", ""), ("yes", "on", "true", "1")
+#: What tells an environment, and the unit that may stand behind it.
+ENVIRONMENT = {"temperature": "C", "pressure": "atm"}
 _VIGNETTING = ("vdx", "vdy", "vcx", "vcy", "van")
 
 
@@ -69,6 +74,25 @@ def _choice(table: Table, key: str, choices: Sequence[str], expected: str) -> st
 def ray_aiming(table: Table) -> str:
     """off, paraxial or real."""
     return _choice(table, "ray aiming", [*RAY_AIMING], f"one of {', '.join(RAY_AIMING)}")
+
+
+def environment(table: Table) -> Environment | None:
+    """Temperature in °C and pressure in atm; None where the header tells neither."""
+    told = {key: table.metadata[key] for key in ENVIRONMENT if key in table.metadata}
+    return environment_of({key: value for key, (value, _) in told.items()}, [*told.values()][-1][1]) if told else None
+
+
+def environment_of(cells: Mapping[str, str], place: Place) -> Environment:
+    """Of texts for the temperature and the pressure; what is missing is that of catalogs."""
+    numbers = [double(normal) for normal in REFERENCE]
+    for k, (key, unit) in enumerate(ENVIRONMENT.items()):
+        if key in cells:
+            bare = cells[key].strip()
+            numbers[k] = double(number(bare.removesuffix(unit).rstrip("° ") if bare != unit else bare, key, place))
+    found = Environment(*numbers)
+    if wrong := objection(found):
+        raise LensFileError(wrong.replace("`", ""), place)
+    return found
 
 
 def aperture(table: Table, stop_semi_diameter: float | None, unit: float) -> SystemAperture:
@@ -196,6 +220,11 @@ def _decimal(word: str, power: int, place: Place) -> float:
     return float(Decimal(repr(found)).scaleb(power))
 
 
+def written_environment(found: Environment | None, place: Place) -> dict[str, str]:
+    """The texts of an environment by their keys; none where there is none."""
+    return {} if found is None else {key: exact(getattr(found, key), key, place) for key in ENVIRONMENT}
+
+
 def written(lens: Lens, place: Place, catalogs: Sequence[Path] = ()) -> list[tuple[str, str]]:
     """The system of a lens as keys and values of header lines."""
 
@@ -220,5 +249,6 @@ def written(lens: Lens, place: Place, catalogs: Sequence[Path] = ()) -> list[tup
         ("primary wavelength", str(lens.primary_wavelength + 1)),
         ("catalogs", " ".join(map(word, catalogs_needed(lens, catalogs, place.file)))),
         ("ray aiming", "" if lens.ray_aiming == "off" else lens.ray_aiming),
+        *written_environment(lens.environment, place).items(),
     ]
     return [(key, value) for key, value in lines if value]

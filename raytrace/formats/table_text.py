@@ -18,6 +18,7 @@ _KEYS = (
     "title, name; note, notes; units, unit; ignore; object distance; stop, stop surface; aperture, system aperture"
     "; fields, field; field weights; vdx; vdy; vcx; vcy; van; telecentric; wavelengths, wavelength"
     "; wavelength weights, weights; primary wavelength, primary; catalogs, catalog, glass catalogs; ray aiming"
+    "; temperature; pressure"
 )
 KEYS = {spelling: row.split(", ")[0] for row in _KEYS.split("; ") for spelling in row.split(", ")}
 
@@ -246,6 +247,7 @@ _EITHER = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}(?:[eE][+-]?\d+)?")
 def is_figure(column: str) -> bool:
     """True for a column of numbers."""
     named = ("radius", "thickness", "curvature", "conic", "semi_diameter", "diameter", "pgf", "dpgf")
+    named += ("temperature", "pressure")
     return column in named or column.startswith(("index ", "abbe ")) or order(column) is not None
 
 

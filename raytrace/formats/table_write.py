@@ -9,7 +9,7 @@ from raytrace.formats.media import is_code, is_left_out, is_listed, listed_name
 from raytrace.formats.source import LensFileError, Place
 from raytrace.formats.spelling import exact, exact_list, quoted, refuse_departure, thickness
 from raytrace.formats.table_columns import order
-from raytrace.formats.table_system import written
+from raytrace.formats.table_system import ENVIRONMENT, written, written_environment
 from raytrace.media.glass import Glass, mil_glass
 from raytrace.system.aperture import Aperture
 from raytrace.system.lens import Lens
@@ -38,7 +38,7 @@ def rows(lens: Lens, file: str) -> dict[str, list[str]]:
     """The columns of the table by heading; columns that would be empty are left out."""
     listed = [_row(lens, k, surface, Place(file, None, k)) for k, surface in enumerate(lens.surfaces)]
     powers = sorted({n for row in listed for name in row if (n := order(name)) is not None})
-    names = ["conic", "semi_diameter", *(f"a{n}" for n in powers), "apertures", "comment"]
+    names = ["conic", "semi_diameter", *(f"a{n}" for n in powers), "apertures", *ENVIRONMENT, "comment"]
     used = [name for name in names if any(name in row for row in listed)]
     always = ["surface", "type", "curvature", "thickness", "glass"]
     return {name: [row.get(name, "") for row in listed] for name in always + used}
@@ -65,6 +65,7 @@ def _row(lens: Lens, number: int, surface: Surface, place: Place) -> dict[str, s
         row |= {f"a{kind.step * j}": term for j, term in enumerate(found, 1)}
     if surface.apertures:
         row["apertures"] = " + ".join(_aperture(aperture, place) for aperture in surface.apertures)
+    row |= written_environment(surface.environment, place)
     return row | {"comment": quoted(surface.comment)} if surface.comment else row
 
 

@@ -286,8 +286,8 @@ def with_environment(lens: Lens, temperature: Tensor | float | None, pressure: T
     pressure = before.pressure if pressure is None else _like(pressure, lens.wavelengths)
     found = dataclasses.replace(lens, environment=Environment(temperature, pressure))
     _check_environments(found)
-    for message in unknown_changes(found).values():
-        warnings.warn(message, NoThermalCoefficients, stacklevel=3)
+    for number, message in unknown_changes(found).items():
+        warnings.warn(f"surface {number}: {message}", NoThermalCoefficients, stacklevel=3)
     return found
 
 
@@ -297,7 +297,7 @@ def unknown_changes(lens: Lens) -> dict[int, str]:
     for number, surface in enumerate(lens.surfaces):
         place = surface.environment or lens.environment
         if place is not None and (message := unknown_change(surface.glass, place)):
-            found.setdefault((message, surface.glass.catalog), (number, f"surface {number}: {message}"))
+            found.setdefault((message, surface.glass.catalog), (number, message))
     return dict(found.values())
 
 
