@@ -81,6 +81,7 @@ PUBLIC = {
     "field_curvature": "analysis.chief",
     "incidence": "analysis.incidence",
     "lateral_colour": "analysis.chief",
+    "chromatic_focal_shift": "analysis.chromatic",
     "longitudinal_aberration": "analysis.longitudinal",
     "mtf": "analysis.mtf",
     "opd_fan": "analysis.fans",

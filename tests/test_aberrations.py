@@ -7,7 +7,8 @@ import pytest
 import torch
 from problems import MICROMETRE, NANOMETRE, double_gauss, fields, lens, scalar, surface, vector
 
-from raytrace import distortion, distortion_grid, incidence, longitudinal_aberration
+import raytrace as rt
+from raytrace import chromatic_focal_shift, distortion, distortion_grid, incidence, longitudinal_aberration
 from raytrace.cli import main
 from raytrace.media.glass import MIRROR
 from raytrace.optics.paraxial import first_order, paraxial_image_distance
@@ -110,9 +111,29 @@ def test_a_micrometre_of_the_sensor_moves_every_crossing_by_one():
     torch.testing.assert_close(there, here - MICROMETRE, rtol=0, atol=NANOMETRE * 1e-3)
 
 
+def test_a_diffractive_lens_shifts_its_focus_against_the_wavelength():
+    """f = f0 λ0/λ of a flat diffractive lens, and the same lens beside air has no other colour."""
+    plane = dict(thickness=100.0, phase=rt.RadialPhase([-math.pi * 25 / (0.55e-3 * 100)], 5.0, 1.0))
+    system = rt.lens([plane], stop=1, entrance_pupil_diameter=10, wavelengths=[0.5, 0.55, 0.6])
+    found = chromatic_focal_shift(system, samples=11)
+    expected = 100 * (0.55 / found.wavelength - 1)
+    torch.testing.assert_close(found.shift, expected, rtol=0, atol=1e-9)
+    assert float(found.depth_of_focus) == pytest.approx(0.55e-3 / 2 / math.sin(math.atan(0.05)) ** 2)
+
+
+def test_the_focal_shift_is_that_of_the_paraxial_image():
+    system = double_gauss()
+    found = chromatic_focal_shift(system, wavelengths=[0.45, 0.65], samples=3)
+    foci = rt.first_order(system, found.wavelength).paraxial_image_distance
+    torch.testing.assert_close(found.shift, foci - foci[0], rtol=0, atol=1e-12)
+    with pytest.raises(ValueError, match="single one"):
+        chromatic_focal_shift(system, wavelengths=[0.5])
+
+
 COMMANDS = {
     "seidel": (["--kind", "waves", "--field", "10", "14"], "W040"),
     "longitudinal-aberration": (["--points", "5"], "crossing"),
+    "chromatic-focal-shift": (["--samples", "21"], "shift"),
     "distortion-grid": (["--points", "3", "--exaggerate", "5"], "largest"),
     "incidence": (["--samples", "3", "--surfaces"], "chief"),
 }

@@ -407,6 +407,13 @@ ANALYSES = (
     ("relative_illumination", {"fields": [3, 9]}, "--field 3 9", "illumination", "sr"),
     ("seidel", {"fields": [9], "kind": "waves"}, "--field 9 --kind waves", "W040", "optical invariant"),
     ("longitudinal_aberration", {"points": 5, "wavelengths": [0.55]}, "--points 5 --wavelength 0.55", "crossing", "mm"),
+    (
+        "chromatic_focal_shift",
+        {"samples": 5, "wavelengths": [0.5, 0.6]},
+        "--samples 5 --wavelength 0.5 0.6",
+        "shift",
+        "mm",
+    ),
     ("distortion_grid", {"points": 3}, "--points 3", "distortion", "largest"),
     ("incidence", {"samples": 3, "surfaces": True}, "--samples 3 --surfaces", "chief", "upper"),
     ("rms_over_field", {"samples": 3, "spot": True}, "--samples 3 --spot", "rms", "all, weighted"),

@@ -10,6 +10,7 @@
 | relative_illumination                       | light of a field against the axis                              |
 | rms_over_field                              | RMS wavefront or spot, each wavelength and all together        |
 | seidel                                      | third-order aberrations and colours by surface, their sums     |
+| chromatic_focal_shift                       | where each wavelength has its paraxial focus                   |
 | longitudinal_aberration                     | where rays cross the axis, over the pupil                      |
 | distortion_grid                             | a square grid of object points as the sensor sees it           |
 | incidence                                   | angles at which beams meet every surface and the sensor        |

@@ -6,8 +6,8 @@ from raytrace.cli.studies import command
 #: The analyses, each a file of this folder.
 ANALYSES = (
     *("mtf", "ray_fan", "opd_fan", "wavefront", "distortion", "field_curvature", "lateral_colour"),
-    *("relative_illumination", "seidel", "longitudinal_aberration", "distortion_grid", "incidence", "rms_over_field"),
-    "encircled_energy",
+    *("relative_illumination", "seidel", "longitudinal_aberration", "chromatic_focal_shift", "distortion_grid"),
+    *("incidence", "rms_over_field", "encircled_energy"),
 )
 
 #: All commands, in the order of the help page.

@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 from scipy.interpolate import CubicSpline
 
 from raytrace.analysis.chief import Distortion, FieldCurvature, LateralColour
+from raytrace.analysis.chromatic import ChromaticFocalShift
 from raytrace.analysis.encircled import EncircledEnergy
 from raytrace.analysis.fans import Fan
 from raytrace.analysis.grid import GridDistortion
@@ -37,7 +38,18 @@ from raytrace.plot.panels import (
     seen,
     wavelength_label,
 )
-from raytrace.plot.style import FAINT, GREY, INK, array, field_colour, field_label, new_figure, number_text, styled
+from raytrace.plot.style import (
+    FAINT,
+    GREY,
+    INK,
+    array,
+    field_colour,
+    field_label,
+    new_figure,
+    number_text,
+    styled,
+    wavelength_colours,
+)
 
 _SEIDEL = {
     "S1": "spherical", "S2": "coma", "S3": "astigmatism", "S4": "Petzval", "S5": "distortion", "C1": "axial colour",
@@ -261,6 +273,22 @@ def longitudinal_curves(found: LongitudinalAberration) -> Figure:
     panel.set_ylim(0, 1)
     drawn_at_least([panel], 1e-6, "x")
     return finished(panel, found, "longitudinal aberration", 3)
+
+
+@styled
+def chromatic_curve(found: ChromaticFocalShift) -> Figure:
+    """The focus over wavelength, drawn sideways, between the limits of a quarter wave."""
+    _, panel = chart(4.2, 4.4, "paraxial focus, from that of the primary wavelength (mm)", "wavelength (µm)")
+    places, shift, depth = array(found.wavelength), array(found.shift), float(found.depth_of_focus)
+    panel.axvspan(-depth, depth, color=FAINT, alpha=0.45, linewidth=0, label=f"±{1e3 * depth:.3g} µm: λ/4 of wavefront")
+    for low, high, a, b in zip(places, places[1:], shift, shift[1:], strict=False):
+        panel.plot([a, b], [low, high], color=wavelength_colours([0.5 * (low + high)])[0], linewidth=2.0)
+    panel.plot(shift, places, color=INK, linewidth=0.4, zorder=1, label="paraxial focus")
+    panel.axvline(0, color=GREY, linewidth=0.6)
+    panel.set_ylim(places[0], places[-1])
+    drawn_at_least([panel], 1e-6, "x")
+    total = number_text(1e3 * float(shift.max() - shift.min()), 3)
+    return finished(panel, found, f"chromatic focal shift, {total} µm in all", 1)
 
 
 @styled

@@ -1,0 +1,57 @@
+"""Chromatic focal shift: where each wavelength has its paraxial focus."""
+
+import torch
+from torch import Tensor
+
+from raytrace.analysis.result import Analysis
+from raytrace.analysis.setting import NothingToShow, Numbers, like, primary_wavelength
+from raytrace.maths.value import value
+from raytrace.optics.paraxial import first_order
+from raytrace.system.lens import Lens, check_media, with_wavelengths
+
+
+@value
+class ChromaticFocalShift(Analysis):
+    """Paraxial foci of wavelengths (W,) µm: shift (W,) mm from that of the lens's primary one.
+
+    depth_of_focus: () mm, ±λ/(2 n sin²θ) of the primary wavelength, within which the wavefront errs by a quarter wave.
+    """
+
+    lens: Lens
+    wavelength: Tensor
+    shift: Tensor
+    depth_of_focus: Tensor
+
+    COMMAND = "chromatic-focal-shift"
+    FIGURE = "plot.analysis.chromatic_curve"
+    EVERY = 10
+
+    def columns(self) -> dict[str, Tensor]:
+        return {"wavelength": self.wavelength, "shift": self.shift}
+
+    def about(self) -> dict[str, float]:
+        extent = self.shift.max() - self.shift.min()
+        return {"largest_shift": float(extent), "depth_of_focus": float(self.depth_of_focus)}
+
+
+def chromatic_focal_shift(lens: Lens, *, wavelengths: Numbers = None, samples: int = 101) -> ChromaticFocalShift:
+    """The paraxial focus over wavelength, as -n y/ω of the axial marginal ray, along the light.
+
+    wavelengths: µm, of which the first is primary; `samples` go over their range, by default that of the lens's own.
+    Raises NothingToShow for a lens of a single
+    wavelength, and for one without an image.
+    """
+    lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
+    low, high = lens.wavelengths.min(), lens.wavelengths.max()
+    if not bool(high > low):
+        raise NothingToShow("nothing to show over wavelength: the lens has a single one; give a range by `wavelengths`")
+    places = low + (high - low) * torch.linspace(0.0, 1.0, samples, **like(lens))
+    check_media(lens, places)
+    primary = primary_wavelength(lens)
+    data = first_order(lens, torch.cat([primary[None], places]))
+    focus = data.paraxial_image_distance
+    if not bool(torch.isfinite(focus).all()):
+        raise NothingToShow("nothing to show over wavelength: the lens has no image at a finite distance")
+    forward = 1 if sum(surface.is_mirror for surface in lens.surfaces) % 2 == 0 else -1
+    depth = 0.5e-3 * primary / data.image_na[0] ** 2
+    return ChromaticFocalShift(lens, places, forward * (focus[1:] - focus[0]), depth)
