@@ -243,7 +243,7 @@ def dome(u, coefficients, highest, along):
 def made_up(monkeypatch):
     kind = shapes.Kind("dome", dome, zemax="USERDOME", words=("dome",))
     monkeypatch.setitem(shapes.KINDS, "dome", kind)
-    ripple = shapes.DepartureKind(ripple_sag, lambda numbers: numbers[0].abs().sum())
+    ripple = shapes.DepartureKind(ripple_sag, lambda numbers, radius: numbers[0].abs().sum())
     monkeypatch.setitem(shapes.DEPARTURES, "Ripple", ripple)
 
 
@@ -344,7 +344,10 @@ class TestWhatHasToKnow:
         for found in (made, plain.replace(1, **row).surfaces[1]):
             x = vector(0.0, 3.0, 4.0)
             assert torch.equal(sag_at(found, x, x), sag_at(face, x, x))
-        with pytest.raises(ValueError, match="surface 1: kind 'cone'; expected one of even asphere, odd asphere, dome"):
+        with pytest.raises(
+            ValueError,
+            match="surface 1: kind 'cone'; expected one of even asphere, odd asphere, toroidal, biconic, dome",
+        ):
             plain.replace(1, kind="cone")
 
     def test_files_hold_it_or_say_that_they_do_not(self, name, tmp_path):

@@ -9,7 +9,7 @@ from torch.utils import _pytree as pytree
 
 from raytrace.formats.source import LensFileError, Place, shown
 from raytrace.system.lens import Lens
-from raytrace.system.surface import SHAPE, Surface, is_posed
+from raytrace.system.surface import SHAPE, Surface, is_freeform, is_posed
 
 #: More characters than any number needs.
 _DIGITS = 400
@@ -114,6 +114,8 @@ def refuse_departure(surface: Surface, place: Place) -> None:
     if surface.departure is not None:
         kind = type(surface.departure).__name__
         raise LensFileError(f"the surface departs from a conic and even terms ({kind}), which no file holds", place)
+    if is_freeform(surface):
+        raise LensFileError(f"the surface is {surface.kind}, which this format does not hold", place)
     if surface.phase is not None:
         kind = type(surface.phase).__name__
         raise LensFileError(f"the surface has a phase ({kind}), which this format does not hold", place)

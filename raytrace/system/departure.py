@@ -3,9 +3,11 @@
     GridSag      D = Σ_ij c_ij B(x/p - i) B(y/p - j), the cubic spline through heights at points p apart
     SplineSag    the same by its coefficients c, found once
     ZernikeSag   D = Σ_j c_j Z_j(x/R, y/R), Noll's polynomials
+    FringeSag    the same by the fringe polynomials, which are 1 at the rim, about a centre of their own
 
 Slopes and second derivatives are written out, and autograd may differentiate them further. What rays need of a
-departure are its numbers, its tensors in float64: the functions of each kind are its row in `shapes`.
+departure are its numbers, its tensors in float64: the functions of each kind are its row in `shapes`, where the
+polynomials in x and y of `polynomials` have theirs too.
 """
 
 import functools
@@ -17,7 +19,7 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.value import value
-from raytrace.maths.zernike import noll, norm
+from raytrace.maths.zernike import Order, fringe, noll, norm
 
 _LEAST = 4  # points along a side of a grid: a cubic
 _FELT = 32  # points: influence falls by 2 - √3 from one to the next, to 1e-18
@@ -54,7 +56,17 @@ class ZernikeSag:
     radius: Tensor
 
 
-Departure = GridSag | SplineSag | ZernikeSag
+@value
+class FringeSag:
+    """The fringe polynomials from j = 1 on: coefficients (J,) mm at the rim of the disc of `radius` mm; it goes on.
+
+    centre_x, centre_y: mm, the centre of the disc.
+    """
+
+    coefficients: Tensor
+    radius: Tensor
+    centre_x: Tensor
+    centre_y: Tensor
 
 
 class Sag(NamedTuple):
@@ -87,16 +99,21 @@ def spline_covers(numbers: Sequence[Tensor], x: Tensor, y: Tensor) -> Tensor:
     return (x.abs() <= half_x) & (y.abs() <= half_y)
 
 
-def spline_size(numbers: Sequence[Tensor]) -> Tensor:
+def spline_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
     """A bound on |D| over the grid: the weights of a spline are positive and sum to 1."""
     return numbers[0].abs().max()
 
 
-def zernike_size(numbers: Sequence[Tensor]) -> Tensor:
+def zernike_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
     """A bound on |D| over the disc."""
     c = numbers[0]
     norms = c.new_tensor([norm(*noll(j)) for j in range(1, len(c) + 1)])
     return (norms * c.abs()).sum()
+
+
+def fringe_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
+    """A bound on |D| over the disc."""
+    return numbers[0].abs().sum()
 
 
 def _spline_coefficients(heights: Tensor) -> Tensor:
@@ -171,11 +188,25 @@ def _combined(weights: Sequence[Tensor], values: Sequence[Tensor]) -> Tensor:
 
 
 def zernike_sag(numbers: Sequence[Tensor], x: Tensor, y: Tensor, highest: int) -> Sag:
-    """Σ_m (Σ_k c_mk N P_k(t)) H_m, t = 2 r² - 1, with the harmonics H_m of `zernike.polynomials`; ∇²H = 0."""
+    """Σ_j c_j Z_j of Noll's terms at points (...) mm."""
     c, radius = (number.to(x.dtype) for number in numbers)
+    orders = [noll(j) for j in range(1, len(c) + 1)]
+    terms = [(order, a * norm(*order)) for order, a in zip(orders, c.unbind(0), strict=True)]
+    return _summed(terms, radius, x, y, highest)
+
+
+def fringe_sag(numbers: Sequence[Tensor], x: Tensor, y: Tensor, highest: int) -> Sag:
+    """The same of the fringe terms, which are 1 at the rim."""
+    c, radius, centre_x, centre_y = (number.to(x.dtype) for number in numbers)
+    terms = [(fringe(j), a) for j, a in enumerate(c.unbind(0), 1)]
+    return _summed(terms, radius, x - centre_x, y - centre_y, highest)
+
+
+def _summed(terms: Sequence[tuple[Order, Tensor]], radius: Tensor, x: Tensor, y: Tensor, highest: int) -> Sag:
+    """Σ_m (Σ_k c_mk P_k(t)) H_m, t = 2 r² - 1, with the harmonics H_m of `zernike.polynomials`; ∇²H = 0."""
     x, y = torch.broadcast_tensors(x / radius, y / radius)
     zero, one = torch.zeros_like(x), torch.ones_like(x)
-    harmonics, radial = _harmonics(c, x, y), _radial(c, 2 * (x * x + y * y) - 1)
+    harmonics, radial = _harmonics([order for order, _ in terms], x, y), _radial(terms, 2 * (x * x + y * y) - 1)
     z, zx, zy, zxx, zxy, zyy = (zero,) * 6
     for m, (p, dp, d2p) in radial.items():
         h, hx, hy, hxx, hxy = (one, zero, zero, zero, zero) if m == 0 else harmonics[m]
@@ -191,12 +222,12 @@ def zernike_sag(numbers: Sequence[Tensor], x: Tensor, y: Tensor, highest: int) -
     return Sag(z, zx / radius, zy / radius, *(s / radius**2 for s in (zxx, zxy, zyy)))
 
 
-def _harmonics(c: Tensor, x: Tensor, y: Tensor) -> dict[int, tuple[Tensor, ...]]:
+def _harmonics(orders: Sequence[Order], x: Tensor, y: Tensor) -> dict[int, tuple[Tensor, ...]]:
     """H, H_x, H_y, H_xx, H_xy of m > 0, Re (x + iy)^m, and of -m, Im (x + iy)^m."""
     zero, one = torch.zeros_like(x), torch.ones_like(x)
     powers = [(one, zero)]
     found = {}
-    for m in range(1, noll(max(len(c), 1))[0] + 1):
+    for m in range(1, max((abs(m) for _, m in orders), default=0) + 1):
         re, im = powers[-1]
         powers.append((re * x - im * y, re * y + im * x))
         below = powers[m - 2] if m > 1 else (zero, zero)
@@ -206,19 +237,18 @@ def _harmonics(c: Tensor, x: Tensor, y: Tensor) -> dict[int, tuple[Tensor, ...]]
     return found
 
 
-def _radial(c: Tensor, t: Tensor) -> dict[int, list[Tensor]]:
+def _radial(terms: Sequence[tuple[Order, Tensor]], t: Tensor) -> dict[int, list[Tensor]]:
     """Σ_k c N P_k^(0,|m|)(t) with two derivatives by t, for every signed m of the Noll terms 1 … J.
 
     P_i = (α t + β) P_{i-1} - γ P_{i-2} (DLMF 18.9.2), and the same derived once and twice.
     """
     known: dict[int, list[tuple[Tensor, Tensor, Tensor]]] = {}
     sums: dict[int, list[Tensor]] = {}
-    for j, coefficient in enumerate(c.unbind(0), 1):
-        n, m = noll(j)
+    for (n, m), coefficient in terms:
         size, k = abs(m), (n - abs(m)) // 2
         _extend(known.setdefault(size, []), size, k, t)
         total = sums.setdefault(m, [torch.zeros_like(t)] * 3)
-        sums[m] = [torch.add(s, coefficient * norm(n, m) * p) for s, p in zip(total, known[size][k], strict=True)]
+        sums[m] = [torch.add(s, coefficient * p) for s, p in zip(total, known[size][k], strict=True)]
     return sums
 
 

@@ -396,6 +396,11 @@ def _check_kinds(surface: Surface, where: str) -> None:
     """Refuse a kind of sag or a shape of aperture that there is not, and sizes that a shape does not have."""
     if surface.kind not in KINDS:
         raise ValueError(f"{where}: kind {surface.kind!r}; expected one of {', '.join(KINDS)}")
+    kind, count = KINDS[surface.kind], 0 if surface.coefficients is None else len(surface.coefficients)
+    if not kind.least <= count <= (kind.most or count):
+        named = ", ".join(kind.name_of(entry) for entry in range(kind.most or count))
+        expected = kind.least if kind.most == kind.least else f"{kind.least} to {kind.most}"
+        raise ValueError(f"{where}: a {kind.name} of {count} coefficients; expected {expected}: {named}")
     for aperture in surface.apertures:
         if aperture.shape not in SHAPES:
             known = ", ".join(SHAPES)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from raytrace.system.shapes import KINDS
+from raytrace.system.shapes import KINDS, Kind
 from raytrace.system.surface import SHAPE, Surface
 
 
@@ -20,14 +20,14 @@ class Place(NamedTuple):
 def places(surface: Surface) -> dict[str, Place]:
     """Every number by its name: curvature, conic, a4 (of r⁴) …, and the fields of a departure, a phase and the poses.
 
-    Entries of a tensor are counted from 1, coefficients by the power of r that they belong to. The pose behind the
-    surface has its names with "_after", as tilt_x_after.
+    Entries of a tensor are counted from 1, coefficients by the power of r, or of y, that they belong to. The pose
+    behind the surface has its names with "_after", as tilt_x_after.
     """
     found: dict[str, Place] = {}
     for field in dataclasses.fields(Surface):
         part = getattr(surface, field.name)
         if field.name == "coefficients":
-            found |= _entries(("coefficients",), part, "a", KINDS[surface.kind].step)
+            found |= _coefficients(part, KINDS[surface.kind])
         elif field.name in SHAPE and field.type == Tensor | None:
             found[field.name] = Place((field.name,))
         elif field.name in (*SHAPE, "phase", "before", "after") and dataclasses.is_dataclass(part):
@@ -37,12 +37,18 @@ def places(surface: Surface) -> dict[str, Place]:
     return found
 
 
-def _entries(path: tuple[str, ...], part: Tensor | None, name: str, step: int = 1) -> dict[str, Place]:
+def _coefficients(part: Tensor | None, kind: Kind) -> dict[str, Place]:
+    if part is None:
+        return {}
+    return {kind.name_of(entry): Place(("coefficients",), entry) for entry in range(part.numel())}
+
+
+def _entries(path: tuple[str, ...], part: Tensor | None, name: str) -> dict[str, Place]:
     if not isinstance(part, Tensor):
         return {}
     if part.dim() == 0:
         return {name: Place(path)}
-    return {f"{name}{step * (entry + 1)}": Place(path, entry) for entry in range(part.numel())}
+    return {f"{name}{entry + 1}": Place(path, entry) for entry in range(part.numel())}
 
 
 def number_at(part, place: Place) -> Tensor | None:

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.numerics import broadcast_shape, with_batch_axes
-from raytrace.system.shapes import EVEN, Relief, sag_and_derivatives, size_of_terms
+from raytrace.system.freeform import Form
+from raytrace.system.shapes import EVEN, KINDS, Relief, sag_and_derivatives, size_of_terms
 
 _NEWTON_STEPS = 24
 _BISECTIONS = 64
@@ -94,7 +95,7 @@ def search(
     # A coefficient axis without batch is kept short: `polynomial` broadcasts it.
     a = coefficients[:, None] if coefficients.dim() == 1 else _expand(coefficients, batch).flatten(1)
 
-    rays = _Rays(p, d, c, k, a, rim, kind, relief, None if relief is None else relief.size())
+    rays = _Rays(p, d, c, k, a, rim, kind, relief)
     t, residual_small, forward, radius = _newton(rays, _start(rays))
     converged = residual_small & forward
     good = converged & (radius <= rim)
@@ -110,6 +111,8 @@ def search(
         good[few] = found | converged[few]
     if relief is not None:
         good = good & relief.covers(p[0] + t * d[0], p[1] + t * d[1])
+    if rays.form is not None:
+        good = good & rays.form.covers(c, k, a, p[0] + t * d[0], p[1] + t * d[1])
     t = torch.where(good, t, 0.0)
     return t.reshape(batch).to(foot.dtype), good.reshape(batch).clone()
 
@@ -146,8 +149,7 @@ def _aligned(tensors: Sequence[Tensor], in_dims: Sequence[int | None]) -> list[T
 
 
 class _Rays(NamedTuple):
-    """Rays (n,) in float64 and the surface they look for: foot, direction, c, k, coefficients (m, n or 1), rim, kind, D
-    and a bound on |D|."""
+    """Rays (n,) in float64 and the surface they look for: foot, direction, c, k, a (m, n or 1), rim, kind, D."""
 
     p: Tensor
     d: Tensor
@@ -157,7 +159,11 @@ class _Rays(NamedTuple):
     rim: float
     kind: str
     relief: Relief | None
-    size: Tensor | None
+
+    @property
+    def form(self) -> Form | None:
+        """The sag of a kind that is not round."""
+        return KINDS[self.kind].form
 
     def of(self, few: Tensor) -> "_Rays":
         """Some of them."""
@@ -170,15 +176,18 @@ class _Rays(NamedTuple):
 
 
 def _start(rays: _Rays) -> Tensor:
-    """The base conic's crossing if it lies inside the rim, else the vertex plane's, else the foot."""
+    """The base quadric's crossing if it lies inside the rim, else the vertex plane's, else the foot."""
     p, d, c, k, _, rim, *_ = rays
     N = d[2]
     flat = N.abs() > 1e-6
     plane = torch.where(flat, -p[2] / torch.where(flat, N, 1.0), 0.0)
-    shape = 1 + k
-    A = c * (d[0] ** 2 + d[1] ** 2 + shape * N * N)
-    G = N - c * (p[0] * d[0] + p[1] * d[1] + shape * p[2] * N)
-    F = c * (p[0] ** 2 + p[1] ** 2 + shape * p[2] ** 2) - 2 * p[2]
+    if rays.form is None:
+        shape = 1 + k
+        A = c * (d[0] ** 2 + d[1] ** 2 + shape * N * N)
+        G = N - c * (p[0] * d[0] + p[1] * d[1] + shape * p[2] * N)
+        F = c * (p[0] ** 2 + p[1] ** 2 + shape * p[2] ** 2) - 2 * p[2]
+    else:
+        A, G, F = _quadric(rays)
     discriminant = G * G - A * F
     s = torch.where(N < 0, -1.0, 1.0).to(N.dtype)
     denominator = G + s * torch.sqrt(discriminant.clamp_min(0.0))
@@ -188,21 +197,43 @@ def _start(rays: _Rays) -> Tensor:
     return torch.where(usable & (radius <= rim), t, plane)
 
 
+def _quadric(rays: _Rays) -> tuple[Tensor, Tensor, Tensor]:
+    """A, G, F of A t² - 2 G t + F = 0 for c_x x² + c_y y² + c_z z² = 2 z, which osculates at the vertex.
+
+    c_z is whichever of the two does more at the foot: a toroid is exactly that in either of its sections.
+    """
+    (x, y, z), (L, M, N) = rays.p, rays.d
+    zero = torch.zeros_like(x)
+    bend = rays.form.sag(rays.c, rays.k, rays.a, zero, zero, 2)
+    c_x, c_y = bend.xx, bend.yy
+    c_z = torch.where((c_x * x * x).abs() > (c_y * y * y).abs(), c_x, c_y)
+    A = c_x * L * L + c_y * M * M + c_z * N * N
+    G = N - (c_x * x * L + c_y * y * M + c_z * z * N)
+    return A, G, c_x * x * x + c_y * y * y + c_z * z * z - 2 * z
+
+
 def _residual(rays: _Rays, t: Tensor):
-    """F = z - S(r²), F' = dF/dt, the rounding scale of F, and r² at t."""
-    p, d, c, k, a, _, kind, relief, size = rays
+    """F = z - S, F' = dF/dt, the rounding scale of F, r² at t, and whether the surface reaches there."""
+    p, d, c, k, a, _, kind, relief = rays
     x, y, z = p[0] + t * d[0], p[1] + t * d[1], p[2] + t * d[2]
     u = x * x + y * y
-    S, dS, _ = rays.sag(u, 1)
-    radial = x * d[0] + y * d[1]
-    scale = z.abs() + (c * u).abs() + size_of_terms(u, a, kind) + p[2].abs() + (t * d[2]).abs()
-    scale = scale + 2 * dS.abs() * (u + radial.abs() * t.abs())
-    inside_domain = 1 - (1 + k) * (c * (c * u)) > 0
-    F, dF = z - S, d[2] - 2 * dS * radial
+    if rays.form is None:
+        S, dS, _ = rays.sag(u, 1)
+        radial = x * d[0] + y * d[1]
+        F, dF = z - S, d[2] - 2 * dS * radial
+        scale = z.abs() + (c * u).abs() + size_of_terms(u, a, kind) + p[2].abs() + (t * d[2]).abs()
+        scale = scale + 2 * dS.abs() * (u + radial.abs() * t.abs())
+        inside_domain = 1 - (1 + k) * (c * (c * u)) > 0
+    else:
+        S, S_x, S_y, *_ = rays.form.sag(c, k, a, x, y, 1)
+        F, dF = z - S, d[2] - (S_x * d[0] + S_y * d[1])
+        scale = z.abs() + rays.form.size(c, a, x, y) + p[2].abs() + (t * d[2]).abs()
+        scale = scale + (S_x.abs() + S_y.abs()) * (x.abs() + y.abs() + t.abs())
+        inside_domain = rays.form.covers(c, k, a, x, y)
     if relief is not None:
         D, D_x, D_y, *_ = relief.sag(x, y, highest=1)
         F, dF = F - D, dF - (D_x * d[0] + D_y * d[1])
-        scale = scale + size + (D_x.abs() + D_y.abs()) * (x.abs() + y.abs() + t.abs())
+        scale = scale + relief.size(torch.sqrt(u)) + (D_x.abs() + D_y.abs()) * (x.abs() + y.abs() + t.abs())
     return F, dF, scale, u, inside_domain
 
 
@@ -226,13 +257,44 @@ def _newton(rays: _Rays, t: Tensor):
 
 def _bracketed(rays: _Rays):
     """First crossing in the direction of propagation on the stretch of ray inside rim and sag range (1-D batch)."""
-    p, (L, M, N), c, k, a, rim, *_ = rays
+    first, last, possible = (_stretch_round if rays.form is None else _stretch_freeform)(rays)
+    N = rays.d[2]
+    s = torch.where(N < 0, -1.0, 1.0).to(N.dtype)
+    width = (last - first) / _SAMPLES
+    before, was_inside = _side(rays, s, first)
+    left, found = first, torch.zeros_like(possible)
+    for i in range(1, _SAMPLES + 1):
+        t = first + i * width
+        after, is_inside = _side(rays, s, t)
+        crossing = (before <= 0) & (after > 0) & ~found & (was_inside | is_inside)
+        left = torch.where(crossing, t - width, left)
+        found = found | crossing
+        before, was_inside = after, is_inside
+    right = left + width
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (left + right)
+        below = _side(rays, s, middle)[0] <= 0
+        left, right = torch.where(below, middle, left), torch.where(below, right, middle)
+    t = 0.5 * (left + right)
+    t_polished, small, forward, _ = _newton(rays, t)
+    stayed = small & forward & ((t_polished - t).abs() <= width.abs())
+    return torch.where(stayed, t_polished, t), found & possible
+
+
+def _side(rays: _Rays, s: Tensor, t: Tensor) -> tuple[Tensor, Tensor | bool]:
+    """F as light sees it, and whether there is a surface: a round one is looked for only where there is."""
+    F, _, _, _, inside = _residual(rays, t)
+    return s * F, True if rays.form is None else inside
+
+
+def _stretch_round(rays: _Rays):
+    """Where on the rays a crossing may lie, from … to …, and whether it may at all."""
+    p, (L, M, _), c, k, a, rim, *_ = rays
     big = torch.finfo(p.dtype).max ** 0.48  # its square is a number
     closed = (1 + k) * c * c
     edge = torch.where(closed > 0, torch.rsqrt(torch.where(closed > 0, closed, 1.0)), big)
-    reach = 4 * (torch.sqrt(p[0] ** 2 + p[1] ** 2) + p[2].abs())  # with neither rim nor edge: about the foot
     radius = torch.where(edge < big, edge.clamp_max(rim), torch.full_like(edge, rim))
-    radius = torch.where(torch.isfinite(radius) & (radius < big), radius, reach)
+    radius = torch.where(torch.isfinite(radius) & (radius < big), radius, _reach(rays))
 
     # Stretch inside the cylinder r = radius …
     A = L * L + M * M
@@ -249,33 +311,44 @@ def _bracketed(rays: _Rays):
     # … and between the lowest and the highest sag.
     fraction = torch.linspace(0, 1, 65, dtype=p.dtype, device=p.device)[:, None]
     heights = rays._replace(a=a[:, None]).sag((fraction * radius) ** 2 * (1 - 1e-7), 0)[0]
-    margin = (heights.amax(0) - heights.amin(0)) * 0.05 + torch.finfo(p.dtype).tiny
-    margin = margin if rays.size is None else margin + rays.size
+    return _between(rays, heights, 0.05, radius, first, last, possible)
+
+
+def _stretch_freeform(rays: _Rays):
+    """The same inside the box that the sheet of the vertex fills."""
+    p, d, c, k, a, rim, *_ = rays
+    big = torch.finfo(p.dtype).max ** 0.48
+    limit = torch.full_like(p[0], rim) if rim < big else _reach(rays)
+    sides = rays.form.extent(c, k, a, torch.full_like(p[0], min(rim, big)))
+    sides = [torch.where(side < big, side, limit) for side in sides]
+    first, last = torch.full_like(limit, -big), torch.full_like(limit, big)
+    possible = torch.ones_like(limit, dtype=torch.bool)
+    for at, slope, side in zip(p, d, sides, strict=False):
+        oblique = slope != 0
+        ends = [(sign * side - at) / torch.where(oblique, slope, 1.0) for sign in (-1, 1)]
+        first = torch.where(oblique, torch.maximum(first, torch.minimum(*ends)), first)
+        last = torch.where(oblique, torch.minimum(last, torch.maximum(*ends)), last)
+        possible = possible & (oblique | (at.abs() <= side))
+    fraction = torch.linspace(0, 1 - 1e-8, 9, dtype=p.dtype, device=p.device)
+    x, y = (fraction[:, None, None] * sides[0]), fraction[None, :, None] * sides[1]
+    heights = rays.form.sag(c, k, a[:, None, None], x, y, 0).z.flatten(0, 1)
+    return _between(rays, heights, 0.25, torch.hypot(*sides), first, last, possible)
+
+
+def _reach(rays: _Rays) -> Tensor:
+    """Where a surface has neither rim nor edge: about the foot."""
+    return 4 * (torch.sqrt(rays.p[0] ** 2 + rays.p[1] ** 2) + rays.p[2].abs())
+
+
+def _between(rays: _Rays, heights: Tensor, share: float, radius: Tensor, first, last, possible):
+    """A stretch cut to where the ray is between the heights (k, n) mm, widened by a share of their range."""
+    margin = (heights.amax(0) - heights.amin(0)) * share + torch.finfo(heights.dtype).tiny
+    margin = margin if rays.relief is None else margin + rays.relief.size(radius)
     low, high = heights.amin(0) - margin, heights.amax(0) + margin
+    z, N = rays.p[2], rays.d[2]
     steep = N.abs() > 1e-9
     safe_N = torch.where(steep, N, 1.0)
-    t_low, t_high = (low - p[2]) / safe_N, (high - p[2]) / safe_N
+    t_low, t_high = (low - z) / safe_N, (high - z) / safe_N
     first = torch.where(steep, torch.maximum(first, torch.minimum(t_low, t_high)), first)
     last = torch.where(steep, torch.minimum(last, torch.maximum(t_low, t_high)), last)
-    possible = possible & (last >= first)
-
-    s = torch.where(N < 0, -1.0, 1.0).to(N.dtype)
-    width = (last - first) / _SAMPLES
-    before = s * _residual(rays, first)[0]
-    left, found = first, torch.zeros_like(possible)
-    for i in range(1, _SAMPLES + 1):
-        t = first + i * width
-        after = s * _residual(rays, t)[0]
-        crossing = (before <= 0) & (after > 0) & ~found
-        left = torch.where(crossing, t - width, left)
-        found = found | crossing
-        before = after
-    right = left + width
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (left + right)
-        below = s * _residual(rays, middle)[0] <= 0
-        left, right = torch.where(below, middle, left), torch.where(below, right, middle)
-    t = 0.5 * (left + right)
-    t_polished, small, forward, _ = _newton(rays, t)
-    stayed = small & forward & ((t_polished - t).abs() <= width.abs())
-    return torch.where(stayed, t_polished, t), found & possible
+    return first, last, possible & (last >= first)

@@ -2,9 +2,9 @@
 
     z = c r²/(1 + √(1 - (1+k) c² r²)) + Σ_j a_j b_j(r²) + D(x, y)
 
-KINDS tells the b_j, by `Surface.kind`; DEPARTURES tells D, by the class of `Surface.departure`. A new kind is a new
-row: rays, derivatives, first order, variables, figures, files and, with its terms in fused/sags.h, the compiled trace
-read it.
+KINDS tells the b_j, by `Surface.kind`, or the form that a kind has in place of them and the conic; DEPARTURES tells D,
+by the class of `Surface.departure`. A new kind is a new row: rays, derivatives, first order, variables, figures, files
+and, with its terms in fused/sags.h, the compiled trace read it.
 """
 
 import dataclasses
@@ -14,60 +14,30 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
-from raytrace.maths.numerics import polynomial
 from raytrace.system import departure as own
-from raytrace.system.departure import Departure, Sag
+from raytrace.system import freeform
+from raytrace.system.departure import FringeSag, GridSag, Sag, SplineSag, ZernikeSag
+from raytrace.system.polynomials import (
+    IrregularSag,
+    PolynomialSag,
+    TiltSag,
+    as_polynomial,
+    polynomial_sag,
+    polynomial_size,
+)
+from raytrace.system.terms import Terms, conic_terms, even_terms, odd_terms
 
 EVEN = "even asphere"
-
-_TIP = 1e-24  # mm²: r² up to which a ray goes through the vertex
-
-
-#: What terms add to a sag: u (...), coefficients (m, ...), highest derivative, a factor f -> Σ_j a_j b_j(u), its slope
-#: and f² times its second derivative; None for those above the highest. The b_j are at least 0.
-Terms = Callable[[Tensor, Tensor, int, Tensor | float], tuple[Tensor, Tensor | None, Tensor | None]]
-
-
-def even_terms(u: Tensor, coefficients: Tensor, highest: int, along: Tensor | float):
-    """b_j = u^j, as `Terms`."""
-    P = u * polynomial(coefficients, u)
-    if highest == 0:
-        return P, None, None
-    order = torch.arange(1, len(coefficients) + 1, dtype=coefficients.dtype, device=coefficients.device)
-    first = order.reshape(-1, *(1,) * (coefficients.dim() - 1)) * coefficients
-    dP = polynomial(first, u)
-    if highest == 1:
-        return P, dP, None
-    second = (order - 1).reshape(-1, *(1,) * (coefficients.dim() - 1)) * first
-    return P, dP, polynomial(second[1:], u) * along * along
-
-
-def odd_terms(u: Tensor, coefficients: Tensor, highest: int, along: Tensor | float):
-    """b_j = r^j, as `Terms`: those of even j, and r q(u) with q = a_1 + a_3 u + …
-
-    The cone a_1 r has no slope at its tip: a ray through the vertex sees the mean of all directions, 0.
-    """
-    S, dS, d2S = even_terms(u, coefficients[1::2], highest, along)
-    q, dq, d2q = even_terms(u, coefficients[2::2], highest, along)
-    q = coefficients[0] + q
-    apart = u > _TIP
-    r = torch.sqrt(torch.where(apart, u, 1.0))
-    dr, r = torch.where(apart, 0.5 / r, 0.0), torch.where(apart, r, 0.0)
-    S = S + r * q
-    if highest == 0:
-        return S, None, None
-    dS = dS + dr * q + r * dq
-    if highest == 1:
-        return S, dS, None
-    turn = dr * along
-    return S, dS, d2S + r * d2q + 2 * turn * (dq * along) - 2 * dr * turn * turn * q
 
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """A kind of rotationally symmetric terms Σ_j a_j b_j(u), u = r², j = 1, 2, …
+    """A kind of sag: of rotationally symmetric terms Σ_j a_j b_j(u), u = r², j = 1, 2, …, or of a form of its own.
 
     terms: the sum and its derivatives.
+    form: the whole sag of a kind that is not round; curvature and conic are those of its section along y.
+    heads: names of the first coefficients of such a kind; only then come the a_j, of y² … or none.
+    least, most: how many coefficients it has.
     step: b_j is r^(step j), so that a_j is named for it and in mm^(1 - step j).
     zemax: TYPE of a .zmx file, where PARM j is a_j up to `parameters`; None: no such file holds it.
     words: what the column "type" of a table may say for it; where that says nothing the powers of the terms tell.
@@ -76,12 +46,26 @@ class Kind:
 
     name: str
     terms: Terms = even_terms
+    form: freeform.Form | None = None
+    heads: tuple[str, ...] = ()
+    least: int = 0
+    most: int | None = None
     step: int = 2
     zemax: str | None = None
     parameters: int = 8
     words: tuple[str, ...] = ()
     code: int | None = None
     compiled: int = 16
+
+    @property
+    def is_round(self) -> bool:
+        """Whether the sag depends on r alone."""
+        return self.form is None
+
+    def name_of(self, entry: int) -> str:
+        """What a coefficient is called, counted from 0: a4 is that of r⁴, or of y⁴."""
+        heads = len(self.heads)
+        return self.heads[entry] if entry < heads else f"a{self.step * (entry - heads + 1)}"
 
     @property
     def powers(self) -> str:
@@ -95,6 +79,8 @@ KINDS = {
     for kind in (
         Kind(EVEN, even_terms, zemax="EVENASPH", words=("even", "evenasph"), code=3),
         Kind("odd asphere", odd_terms, step=1, zemax="ODDASPHE", words=("odd", "oddasphe"), code=4, compiled=8),
+        Kind("toroidal", form=freeform.TOROIDAL, heads=("curvature_x",), least=1, most=8),
+        Kind("biconic", form=freeform.BICONIC, heads=("curvature_x", "conic_x"), least=2, most=2),
     )
 }
 
@@ -103,13 +89,13 @@ KINDS = {
 class DepartureKind:
     """A kind of D(x, y), by functions of its `numbers`: float64 tensors, found once for every meeting with rays.
 
-    sag: numbers, x, y (...) mm, highest derivative -> `Sag`; size: numbers -> bound on |D| mm, by which a crossing is
-    bracketed; covers: numbers, x, y -> where there is a surface; prepare: to the departure whose tensors are the
-    numbers; is_round: about the axis.
+    sag: numbers, x, y (...) mm, highest derivative -> `Sag`; size: numbers, radius (...) mm -> bound on |D| mm within
+    it, by which a crossing is bracketed and rounding is judged; covers: numbers, x, y -> where there is a surface;
+    prepare: to the departure whose tensors are the numbers; is_round: about the axis.
     """
 
     sag: Callable[[Sequence[Tensor], Tensor, Tensor, int], Sag]
-    size: Callable[[Sequence[Tensor]], Tensor]
+    size: Callable[[Sequence[Tensor], Tensor], Tensor]
     covers: Callable[[Sequence[Tensor], Tensor, Tensor], Tensor] = lambda numbers, x, y: torch.ones_like(
         x, dtype=torch.bool
     )
@@ -121,7 +107,13 @@ DEPARTURES = {
     "GridSag": DepartureKind(own.spline_sag, own.spline_size, own.spline_covers, prepare=own.spline),
     "SplineSag": DepartureKind(own.spline_sag, own.spline_size, own.spline_covers),
     "ZernikeSag": DepartureKind(own.zernike_sag, own.zernike_size),
+    "FringeSag": DepartureKind(own.fringe_sag, own.fringe_size),
+    "PolynomialSag": DepartureKind(polynomial_sag, polynomial_size),
+    "IrregularSag": DepartureKind(polynomial_sag, polynomial_size, prepare=as_polynomial),
+    "TiltSag": DepartureKind(polynomial_sag, polynomial_size, prepare=as_polynomial),
 }
+
+Departure = GridSag | SplineSag | ZernikeSag | FringeSag | PolynomialSag | IrregularSag | TiltSag
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,9 +131,9 @@ class Relief:
         """Whether there is a surface at points (...) mm."""
         return DEPARTURES[self.kind].covers(self.numbers, x, y)
 
-    def size(self) -> Tensor:
-        """A bound on |D| in mm."""
-        return DEPARTURES[self.kind].size(self.numbers)
+    def size(self, radius: Tensor) -> Tensor:
+        """A bound on |D| in mm up to a radius (...) mm; of grids and Zernike polynomials over all that they cover."""
+        return DEPARTURES[self.kind].size(self.numbers, radius)
 
 
 def relief(departure: Departure) -> Relief:
@@ -169,16 +161,7 @@ def sag_and_derivatives(
     """
     S = dS = d2S = torch.zeros_like(u)
     if curvature is not None:
-        c = curvature
-        shape = 1.0 if conic is None else 1 + conic
-        radicand = 1 - shape * (c * (c * u))  # also its derivatives stay in range: neither c² nor r² c̄
-        w = torch.sqrt(torch.where(radicand > 0, radicand, torch.finfo(u.dtype).tiny))
-        S = c * u / (1 + w)
-        if highest > 0:
-            dS = 0.5 * c / w
-        if highest > 1:
-            tilt = c * along / w
-            d2S = 0.25 * shape * c / w * tilt * tilt
+        S, dS, d2S = conic_terms(u, curvature, conic, highest, along)
     if coefficients is not None:
         P, dP, d2P = KINDS[kind].terms(u, coefficients, highest, along)
         S = S + P

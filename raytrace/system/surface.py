@@ -2,7 +2,8 @@
 
     z = c r² / (1 + √(1 - (1+k) c² r²)) + Σ_j a_j b_j(r²) + D(x, y),  j = 1, 2, …
 
-b_j = r^(2j) of an even asphere; other kinds, and the departures D that few surfaces have, are rows of `shapes`.
+b_j = r^(2j) of an even asphere; other kinds, some of which are not round, and the departures D that few surfaces have,
+are rows of `shapes`.
 
 Every function works in the frame of the surface's vertex, components first, for any batch shape. Roots are found
 outside the graph and in float64, also of float32 rays: within 1e-7 of the edge of a surface rounding would decide
@@ -21,11 +22,12 @@ from raytrace.maths.value import to, value
 from raytrace.media.environment import Environment
 from raytrace.media.glass import AIR, Glass
 from raytrace.system.aperture import Aperture
-from raytrace.system.departure import Departure
+from raytrace.system.departure import Sag
 from raytrace.system.phases import Phase, kind_of
 from raytrace.system.pose import Gap, Pose
+from raytrace.system.roots import conic_root, double, doubles, foot_of, way_of
 from raytrace.system.search import first_crossing
-from raytrace.system.shapes import DEPARTURES, EVEN, KINDS, Relief, relief, sag_and_derivatives
+from raytrace.system.shapes import DEPARTURES, EVEN, KINDS, Departure, Relief, relief, sag_and_derivatives
 
 
 @value
@@ -36,7 +38,7 @@ class Surface:
     curvature: c, 1/mm; None is a plane for good (put a tensor of 0 to differentiate a plane's curvature).
     conic: k; None is a sphere.
     coefficients: (m, ...) a_1, a_2, … of the `kind`, a key of `shapes.KINDS`: of an even asphere of r², r⁴, … in
-        mm^(1-2j); None if not aspheric.
+        mm^(1-2j), of a toroid its curvature along x and terms of y², y⁴, …; None if not aspheric.
     departure: what the sag has beside, of a kind of `shapes.DEPARTURES`; None if nothing. A height at the vertex
         belongs to the thickness before: paraxial optics takes D(0, 0) and the slopes there for 0.
     phase: what the surface adds to the path of light, or does in place of Snell's law, of a kind of `phases.PHASES`;
@@ -101,7 +103,14 @@ def is_round(surface: Surface) -> bool:
     """Whether sag and phase are symmetric about the axis, by their kind and whatever their numbers are."""
     if surface.phase is not None and not kind_of(surface.phase).is_round:
         return False
+    if is_freeform(surface):
+        return False
     return surface.departure is None or DEPARTURES[type(surface.departure).__name__].is_round
+
+
+def is_freeform(surface: Surface) -> bool:
+    """Whether the sag is of a kind that is not round, whatever departs from it: a toroid, a biconic."""
+    return surface.coefficients is not None and not KINDS[surface.kind].is_round
 
 
 def is_even(surface: Surface) -> bool:
@@ -118,32 +127,53 @@ def is_searched(surface: Surface) -> bool:
 def vertex_curvature(surface: Surface) -> Tensor:
     """c + 2 P'(0) + (D_xx + D_yy)/2 in 1/mm: a term a r² bends the vertex like a curvature.
 
-    A departure D may bend it differently along x and y: this is the mean. Its tilt at the vertex, and that of an odd
-    asphere, are left out.
+    Of a toroid or a biconic it is that of the section along y, as other programs straighten an axis. A departure D may
+    bend the vertex differently along x and y: this is the mean. Its tilt at the vertex, and that of an odd asphere, are
+    left out.
     """
-    total = torch.zeros_like(surface.thickness) if surface.curvature is None else surface.curvature
+    total, bend = _vertex(surface)[1], _bend(surface)
+    return total if bend is None else total + 0.5 * (bend.xx + bend.yy)
+
+
+def vertex_curvatures(surface: Surface) -> tuple[Tensor, Tensor]:
+    """The curvatures in 1/mm of the sections along x and along y at the vertex, departures included."""
+    (along_x, along_y), bend = _vertex(surface), _bend(surface)
+    return (along_x, along_y) if bend is None else (along_x + bend.xx, along_y + bend.yy)
+
+
+def _vertex(surface: Surface) -> tuple[Tensor, Tensor]:
+    """The curvatures at the vertex without a departure, along x and along y."""
     centre = torch.zeros_like(surface.thickness)
+    if is_freeform(surface):
+        bend = _freeform(surface, centre, centre, 2)
+        return bend.xx, bend.yy
+    total = centre if surface.curvature is None else surface.curvature
     if surface.coefficients is not None:
         total = total + 2 * KINDS[surface.kind].terms(centre, surface.coefficients, 1, 1.0)[1]
+    return total, total
+
+
+def _bend(surface: Surface) -> Sag | None:
+    """The departure at the vertex."""
     if surface.departure is None:
-        return total
-    bend = relief(surface.departure).sag(centre, centre)
-    return total + 0.5 * (bend.xx + bend.yy)
+        return None
+    centre = torch.zeros_like(surface.thickness)
+    return relief(surface.departure).sag(centre, centre)
 
 
 def sag(surface: Surface, radius_squared: Tensor) -> Tensor:
     """Sag z in mm at r² (...) in mm²; the radicand is clamped at 0 beyond the edge of a closed conic.
 
-    Raises ValueError for a surface with a departure, whose sag the radius does not tell: see `sag_at`.
+    Raises ValueError for a surface that is not round, whose sag the radius does not tell: see `sag_at`.
     """
-    if surface.departure is not None:
-        raise ValueError("the sag of a surface with a departure depends on x and y: use sag_at(surface, x, y)")
+    if surface.departure is not None or is_freeform(surface):
+        raise ValueError("the sag of a surface that is not round depends on x and y: use sag_at(surface, x, y)")
     return _round(surface, radius_squared, 0)[0]
 
 
 def sag_at(surface: Surface, x: Tensor, y: Tensor) -> Tensor:
-    """Sag z in mm at points (...) mm of any surface."""
-    z = _round(surface, x * x + y * y, 0)[0]
+    """Sag z in mm at points (...) mm of any surface; beyond its edge that of the edge."""
+    z = _freeform(surface, x, y, 0).z if is_freeform(surface) else _round(surface, x * x + y * y, 0)[0]
     return z if surface.departure is None else z + relief(surface.departure).sag(x, y, highest=0).z
 
 
@@ -151,6 +181,13 @@ def _round(surface: Surface, u: Tensor, highest: int, along: Tensor | float = 1.
     """`sag_and_derivatives` of all but the departure."""
     c, k, a = surface.curvature, surface.conic, surface.coefficients
     return sag_and_derivatives(u, c, k, a, highest, along=along, kind=surface.kind)
+
+
+def _freeform(surface: Surface, x: Tensor, y: Tensor, highest: int) -> Sag:
+    """The sag of a kind that is not round, without the departure."""
+    a = surface.coefficients
+    c, k = (a.new_zeros(()) if number is None else number for number in (surface.curvature, surface.conic))
+    return KINDS[surface.kind].form.sag(c, k, a, x, y, highest)
 
 
 def intersect(surface: Surface, position: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
@@ -279,23 +316,34 @@ def _meet_searched(surface: Surface, position, direction) -> Meeting:
     t, exact = way.back(root, met)
     L, M, N = (torch.where(met, d, at) for d, at in zip(direction, (0.0, 0.0, 1.0), strict=True))
     x, y, z = (torch.addcmul(torch.where(met, p, 0.0), t, d) for p, d in zip(foot, (L, M, N), strict=True))
-    radial = x * L + y * M
-    S, dS, d2S = _round(surface, x * x + y * y, 2, radial)
-    F, dF, d2F = z - S, N - 2 * dS * radial, -(4 * d2S + 2 * dS * (L * L + M * M))
+    if is_freeform(surface):
+        F, dF, d2F = _less((z, N, torch.zeros_like(N)), _freeform(surface, x, y, 2), L, M)
+    else:
+        radial = x * L + y * M
+        S, dS, d2S = _round(surface, x * x + y * y, 2, radial)
+        F, dF, d2F = z - S, N - 2 * dS * radial, -(4 * d2S + 2 * dS * (L * L + M * M))
     if bumps is not None:
-        D = bumps.sag(x, y)
-        F, dF = F - D.z, dF - (D.x * L + D.y * M)
-        d2F = d2F - (D.xx * L * L + 2 * D.xy * L * M + D.yy * M * M)
+        F, dF, d2F = _less((F, dF, d2F), bumps.sag(x, y), L, M)
     step = _step(F, dF, d2F, t.dtype == torch.float64)
     hit = tuple(torch.addcmul(a, step, d, value=-1) for a, d in zip((x, y, z), (L, M, N), strict=True))
     n, norm_squared = _sloped_normal(surface, *hit[:2], bumps)
     return Meeting(hit, dot(n, (L, M, N)), met, (n, norm_squared), exact)
 
 
+def _less(F: Sequence[Tensor], D: Sag, L: Tensor, M: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """F, F', F'' along a ray, less those of a sag."""
+    turn = D.xx * L * L + 2 * D.xy * L * M + D.yy * M * M
+    return F[0] - D.z, F[1] - (D.x * L + D.y * M), F[2] - turn
+
+
 def _sloped_normal(surface: Surface, x: Tensor, y: Tensor, bumps: Relief | None):
     """`normal` by the slopes of the sag: (-z_x, -z_y, 1)."""
-    slope = 2 * _round(surface, x * x + y * y, 1)[1]
-    n_x, n_y = -slope * x, -slope * y
+    if is_freeform(surface):
+        base = _freeform(surface, x, y, 1)
+        n_x, n_y = -base.x, -base.y
+    else:
+        slope = 2 * _round(surface, x * x + y * y, 1)[1]
+        n_x, n_y = -slope * x, -slope * y
     if bumps is not None:
         D = bumps.sag(x, y, highest=1)
         n_x, n_y = n_x - D.x, n_y - D.y
@@ -315,81 +363,3 @@ def _step(F: Tensor, dF: Tensor, d2F: Tensor, polish: bool) -> Tensor:
     step = (F - F.detach()) / dF
     step = torch.addcmul(step, (0.5 * d2F / dF).detach() * step, step)
     return step + (F / dF).detach() if polish else step
-
-
-def foot_of(position, direction) -> tuple[list[Tensor], Tensor]:
-    """Foot of the perpendicular from the vertex to the ray, and the path to it.
-
-    From there a far origin costs no digits (Feder 1951, Spencer & Murty 1962); the slide stays in the graph.
-    """
-    slide = -dot(position, direction)
-    return [torch.addcmul(p, slide, d) for p, d in zip(position, direction, strict=True)], slide
-
-
-class Way(NamedTuple):
-    """Where a root is looked for, detached and in float64 also for float32 rays.
-
-    foot, direction: triples; lag: of float32 rays how much longer the exact slide is than theirs, else None; dtype:
-    theirs.
-    """
-
-    foot: Sequence[Tensor]
-    direction: Sequence[Tensor]
-    lag: Tensor | None
-    dtype: torch.dtype
-
-    def back(self, root: Tensor, met: Tensor) -> tuple[Tensor, tuple | None]:
-        """The path from the rays' own foot, in their dtype; and of float32 rays `Meeting.exact`."""
-        if self.lag is None:
-            return root, None
-        hit = [torch.addcmul(p, root, d) for p, d in zip(self.foot, self.direction, strict=True)]
-        return torch.where(met, root + self.lag, 0.0).to(self.dtype), (hit, self.direction)
-
-
-def way_of(position, direction, foot, slide) -> Way:
-    """The way of rays whose foot and slide are known already, as `foot_of` gives them."""
-    if slide.dtype == torch.float64:
-        return Way([p.detach() for p in foot], [d.detach() for d in direction], None, slide.dtype)
-    position, direction = doubles(position), doubles(direction)
-    foot, exact = foot_of(position, direction)
-    return Way(foot, direction, exact - slide.detach(), slide.dtype)
-
-
-def doubles(vector: Sequence[Tensor]) -> list[Tensor]:
-    """Components in float64, outside the graph."""
-    return [double(component) for component in vector]
-
-
-def double(x: Tensor | None) -> Tensor | None:
-    """A number in float64, outside the graph; None stays None."""
-    return None if x is None else x.detach().double()
-
-
-def conic_root(foot, direction, c: Tensor, shape: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Path t (...) from the foot of the perpendicular to the conic of shape 1+k, 0 if there is none; and whether met.
-
-        A t² - 2 G t + F = 0,  A = c (L² + M² + (1+k) N²),  G = N - c k p_z N - c (p·d),
-        F = c (p_x² + p_y² + (1+k) p_z²) - 2 p_z
-
-    in the algebraic form that does not cancel (Kahan 2004), regular at c = 0 and at k = -1. For a sphere (shape None)
-    A = c and G = N, and G never cancels against the root. Asked for in float64 also of float32 rays: within 1e-7 of the
-    edge of a surface rounding would decide between a hit and a miss.
-    """
-    L, M, N = direction
-    x, y, z = foot
-    if shape is None:
-        F = torch.sub(c * torch.addcmul(x * x + y * y, z, z), z, alpha=2)
-        discriminant = torch.addcmul(N * N, c, F, value=-1)
-        t = F / (N + torch.copysign(torch.sqrt(discriminant.clamp_min(0.0)), N))
-        met = (discriminant > 0) & ((c * torch.addcmul(z, t, N)).abs() < 1)
-        return torch.where(met, t, 0.0), met
-    shaped = shape * N
-    A = c * torch.addcmul(L * L + M * M, shaped, N)
-    G = torch.addcmul(N, c, torch.addcmul(x * L + y * M, shaped, z), value=-1)
-    F = torch.sub(c * torch.addcmul(x * x + y * y, shape * z, z), z, alpha=2)
-    discriminant = torch.addcmul(G * G, A, F, value=-1)
-    root = torch.copysign(torch.sqrt(discriminant.clamp_min(0.0)), N)
-    same_sign = torch.where(N < 0, -G, G) >= 0
-    t = torch.where(same_sign, F, G - root) / torch.where(same_sign, G + root, A)
-    met = (discriminant > 0) & ((shape * c) * torch.addcmul(z, t, N) < 1) & (t.abs() < float("inf"))
-    return torch.where(met, t, 0.0), met

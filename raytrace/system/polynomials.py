@@ -1,0 +1,79 @@
+"""Polynomials: departures that are sums of powers of x and y, linear in their coefficients.
+
+    PolynomialSag   D = Σ_k c_k E_k(x/R, y/R),  E = x, y, x², xy, y², x³, x²y, …
+    IrregularSag    D = Z_s ρ⁴ + Z_a v² + Z_c ρ² v,  ρ = r/R,  v = (y cos θ - x sin θ)/R
+    TiltSag         D = x tan_x + y tan_y
+
+The other two are made into the first (`as_polynomial`), by linear maps that autograd follows.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from raytrace.maths.bivariate import polynomial_xy, powers
+from raytrace.maths.numerics import polynomial
+from raytrace.maths.value import value
+from raytrace.system.departure import Sag
+from raytrace.system.pose import cos_sin
+
+
+@value
+class PolynomialSag:
+    """Powers of x/R and y/R by coefficients (J,) mm: x, y, x², xy, y², x³, x²y, …; radius: R mm."""
+
+    coefficients: Tensor
+    radius: Tensor
+
+
+@value
+class IrregularSag:
+    """Errors of making by their height in mm at `radius` mm: spherical aberration, astigmatism and coma.
+
+    angle: degrees, by which astigmatism and coma are turned from y.
+    """
+
+    spherical: Tensor
+    astigmatism: Tensor
+    coma: Tensor
+    angle: Tensor
+    radius: Tensor
+
+
+@value
+class TiltSag:
+    """A plane that leans: its slopes along x and y, tangents."""
+
+    tan_x: Tensor
+    tan_y: Tensor
+
+
+def as_polynomial(departure: IrregularSag | TiltSag) -> PolynomialSag:
+    """The same as a sum of powers."""
+    if isinstance(departure, TiltSag):
+        return PolynomialSag(torch.stack([departure.tan_x, departure.tan_y]), torch.ones_like(departure.tan_x))
+    cosine, sine = cos_sin(departure.angle)
+    zero, across = torch.zeros_like(departure.coma), -sine * departure.coma
+    along, s = cosine * departure.coma, departure.spherical
+    bent = [a * departure.astigmatism for a in (sine * sine, -2 * sine * cosine, cosine * cosine)]
+    return PolynomialSag(
+        torch.stack([zero, zero, *bent, across, along, across, along, s, zero, 2 * s, zero, s]), departure.radius
+    )
+
+
+def polynomial_sag(numbers: Sequence[Tensor], x: Tensor, y: Tensor, highest: int) -> Sag:
+    """The sum of powers at points (...) mm."""
+    c, radius = (number.to(x.dtype) for number in numbers)
+    z, *slopes = polynomial_xy(c, x / radius, y / radius, highest)
+    return Sag(z, *(slope / radius for slope in slopes[:2]), *(bend / radius**2 for bend in slopes[2:]))
+
+
+def polynomial_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
+    """A bound on |D| up to a radius (...) mm: Σ |c| (r/R)^degree."""
+    c, unit = numbers
+    degrees = [sum(power) for power in powers(len(c))]
+    sums = [c.new_zeros(())] * (max(degrees, default=0) + 1)
+    for degree, a in zip(degrees, c.abs().unbind(0), strict=True):
+        sums[degree] = sums[degree] + a
+    return polynomial(torch.stack(sums), radius / unit.abs())

@@ -1,0 +1,183 @@
+"""Sags that differ along x and y: toroids, biconics, polynomials, fringe terms, irregularity, a tilted plane."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from problems import scalar, vector
+from torch.autograd import gradcheck, gradgradcheck
+from torch.testing import assert_close
+
+from raytrace.maths import zernike
+from raytrace.maths.bivariate import powers
+from raytrace.system.departure import FringeSag
+from raytrace.system.polynomials import IrregularSag, PolynomialSag, TiltSag, as_polynomial
+from raytrace.system.shapes import KINDS, relief
+from raytrace.system.surface import Surface, intersect, normal, sag_at, vertex_curvature, vertex_curvatures
+
+
+def close(found, true, *, rtol: float = 0.0, atol: float = 0.0):
+    assert_close(found, true, rtol=rtol, atol=atol)
+
+
+def freeform(kind: str, curvature, conic, *coefficients: float, **others) -> Surface:
+    c, k = (None if number is None else scalar(number) for number in (curvature, conic))
+    return Surface(scalar(5.0), c, k, vector(*coefficients), kind=kind, **others)
+
+
+def departing(departure, curvature=1 / 30, conic=-0.6) -> Surface:
+    c, k = (None if number is None else scalar(number) for number in (curvature, conic))
+    return Surface(scalar(5.0), c, k, departure=departure)
+
+
+def fringes(count: int = 37) -> FringeSag:
+    return FringeSag(vector(*(0.01 / j for j in range(1, count + 1))), scalar(8.0), scalar(0.5), scalar(-0.4))
+
+
+def polynomial(count: int = 27) -> PolynomialSag:
+    return PolynomialSag(vector(*(0.01 / j * (-1) ** j for j in range(1, count + 1))), scalar(8.0))
+
+
+IRREGULAR = IrregularSag(scalar(0.01), scalar(0.02), scalar(0.013), scalar(25.0), scalar(8.0))
+
+ALL = {
+    "toroid": freeform("toroidal", 1 / 40, -0.7, -1 / 26, 1e-4, 2e-6, 1e-9),
+    "toroid of one curve": freeform("toroidal", -1 / 30, None, -1 / 60),
+    "cylinder along x": freeform("toroidal", None, None, 1 / 20),
+    "cylinder along y": freeform("toroidal", 1 / 20, None, 0.0),
+    "biconic": freeform("biconic", 1 / 30, -1.0, -1 / 50, 0.5),
+    "biconic of positive curvatures": freeform("biconic", 1 / 30, 0.3, 1 / 50, -2.5),
+    "fringe": departing(fringes()),
+    "polynomial": departing(polynomial()),
+    "irregular": departing(IRREGULAR),
+    "tilted plane": departing(TiltSag(scalar(0.3), scalar(-0.2)), None, None),
+    "polynomial on a toroid": dataclasses.replace(freeform("toroidal", 1 / 40, None, 1 / 60), departure=polynomial(9)),
+}
+each = pytest.mark.parametrize("name", ALL)
+
+
+def points(count: int = 200, reach: float = 5.0, seed: int = 1) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return (2 * torch.rand(2, count, generator=generator, dtype=torch.float64) - 1) * reach
+
+
+def bundle(count: int = 300, reach: float = 5.0, tilt: float = 0.3):
+    direction = torch.cat([points(count, tilt, 2), torch.ones(1, count, dtype=torch.float64)])
+    direction = direction / torch.linalg.vector_norm(direction, dim=0)
+    position = torch.cat([points(count, reach), torch.zeros(1, count, dtype=torch.float64)])
+    return position - 15 * direction, direction
+
+
+@each
+def test_hits_lie_on_the_sag_and_normals_are_its_slopes(name):
+    surface = ALL[name]
+    hit, met = intersect(surface, *bundle())
+    assert met.all()
+    assert (hit[2] - sag_at(surface, hit[0], hit[1])).abs().max() < 4e-15
+    x, y = (part.clone().requires_grad_() for part in hit[:2])
+    slopes = torch.autograd.grad(sag_at(surface, x, y).sum(), (x, y), allow_unused=True)
+    n, squared = normal(surface, hit)
+    for part, slope in zip(n, slopes, strict=False):
+        close(-part / n[2], torch.zeros_like(x) if slope is None else slope, atol=1e-14)
+    close(torch.as_tensor(squared).expand_as(x), n[0] ** 2 + n[1] ** 2 + n[2] ** 2, rtol=1e-14)
+
+
+@each
+def test_derivatives_of_the_sag_are_written_out_right(name):
+    surface = ALL[name]
+    x, y = points().requires_grad_().unbind()
+    a = surface.coefficients
+    if a is None:
+        found = relief(surface.departure).sag(x, y)
+    else:
+        c, k = (scalar(0.0) if number is None else number for number in (surface.curvature, surface.conic))
+        found = KINDS[surface.kind].form.sag(c, k, a, x, y, 2)
+
+    def slopes(of):
+        given = (
+            torch.autograd.grad(of.sum(), (x, y), create_graph=True, allow_unused=True)
+            if of.requires_grad
+            else (None,) * 2
+        )
+        return [torch.zeros_like(x) if slope is None else slope for slope in given]
+
+    z_x, z_y = slopes(found.z)
+    close(found.x, z_x, atol=1e-15)
+    close(found.y, z_y, atol=1e-15)
+    for part, true in zip((found.xx, found.xy), slopes(z_x), strict=True):
+        close(part, true, atol=1e-15)
+    close(found.yy, slopes(z_y)[1], atol=1e-15)
+
+
+def test_a_toroid_of_equal_curvatures_is_a_sphere_and_a_biconic_a_conic():
+    x, y = points()
+    sphere = Surface(scalar(5.0), scalar(1 / 30))
+    close(sag_at(freeform("toroidal", 1 / 30, None, 1 / 30), x, y), sag_at(sphere, x, y), atol=1e-15)
+    conic = dataclasses.replace(sphere, conic=scalar(-1.7))
+    close(sag_at(freeform("biconic", 1 / 30, -1.7, 1 / 30, -1.7), x, y), sag_at(conic, x, y), atol=1e-15)
+
+
+def test_sections_and_curvatures_at_the_vertex():
+    y = torch.linspace(-5, 5, 11, dtype=torch.float64)
+    toroid = ALL["toroid"]
+    curve = dataclasses.replace(toroid, kind="even asphere", coefficients=toroid.coefficients[1:])
+    close(sag_at(toroid, 0 * y, y), sag_at(curve, 0 * y, y), atol=1e-16)
+    close(sag_at(toroid, y, 0 * y), sag_at(Surface(scalar(0.0), scalar(-1 / 26)), y, 0 * y), atol=1e-15)
+    close(vertex_curvature(toroid), vertex_curvature(curve))
+    along_x, along_y = vertex_curvatures(toroid)
+    assert [float(along_x), float(along_y)] == pytest.approx([-1 / 26, 1 / 40 + 2e-4], rel=1e-15)
+    along_x, along_y = vertex_curvatures(departing(polynomial()))
+    assert float(along_x) == pytest.approx(1 / 30 - 2 * 0.01 / 3 / 64, rel=1e-14)
+    assert float(along_y) == pytest.approx(1 / 30 - 2 * 0.01 / 5 / 64, rel=1e-14)
+
+
+def test_fringe_terms_are_the_polynomials_that_are_one_at_the_rim():
+    x, y = points(100, 4.0)
+    departure = fringes()
+    u, v = (x - 0.5) / 8, (y + 0.4) / 8
+    orders = [zernike.fringe(j) for j in range(1, 38)]
+    rim = torch.tensor([zernike.norm(*order) for order in orders], dtype=torch.float64)
+    basis = zernike.polynomials(orders, u, v) / rim[:, None]
+    close(relief(departure).sag(x, y).z, departure.coefficients @ basis, atol=1e-16)
+    assert orders[36] == (12, 0)
+    # A few by their formula: tilt x, tilt y, focus, astigmatism, coma.
+    for j, true in ((2, u), (3, v), (4, 2 * (u * u + v * v) - 1), (6, 2 * u * v), (7, (3 * (u * u + v * v) - 2) * u)):
+        close(basis[j - 1], true, atol=1e-15)
+
+
+def test_polynomial_terms_stand_in_their_order():
+    assert powers(9) == [(1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3)]
+    x, y = points(50)
+    departure = polynomial()
+    direct = sum(c * (x / 8) ** i * (y / 8) ** j for (i, j), c in zip(powers(27), departure.coefficients, strict=True))
+    close(relief(departure).sag(x, y).z, direct, atol=1e-16)
+
+
+def test_irregularity_and_tilt_are_their_formulas():
+    x, y = points(50)
+    turn, rho = math.radians(25), (x * x + y * y).sqrt() / 8
+    v = (y * math.cos(turn) - x * math.sin(turn)) / 8
+    close(relief(IRREGULAR).sag(x, y).z, 0.01 * rho**4 + 0.02 * v**2 + 0.013 * rho**2 * v, atol=1e-17)
+    tilt = TiltSag(scalar(0.3), scalar(-0.2))
+    close(relief(tilt).sag(x, y).z, 0.3 * x - 0.2 * y, atol=1e-15)
+    assert as_polynomial(tilt).coefficients.tolist() == [0.3, -0.2]
+
+
+@each
+def test_derivatives_of_the_hit_by_every_number_with_lost_rays(name):
+    surface = ALL[name]
+    position = vector(0.3, 2.0, -1.5, 900.0, 0.4, -1.0, 2.2, 900.0, -9.0, -8.0, -9.0, -7.0).reshape(3, 4)
+    direction = vector(0.1, -0.2, 0.05, 0.0, -0.1, 0.1, 0.2, 0.0, 1.0, 1.0, 1.0, 1.0).reshape(3, 4)
+    direction = direction / torch.linalg.vector_norm(direction, dim=0)
+    fields = [f for f in ("curvature", "conic", "coefficients", "departure") if getattr(surface, f) is not None]
+    tensors, spec = torch.utils._pytree.tree_flatten([getattr(surface, f) for f in fields])
+
+    def hits(*numbers):
+        parts = dict(zip(fields, torch.utils._pytree.tree_unflatten(numbers, spec), strict=True))
+        hit, met = intersect(dataclasses.replace(surface, **parts), position, direction)
+        return torch.where(met, hit, 0.0)
+
+    given = tuple(number.clone().requires_grad_() for number in tensors)
+    assert gradcheck(hits, given, atol=1e-6)
+    assert gradgradcheck(hits, given, atol=1e-6, fast_mode=True)
