@@ -12,7 +12,8 @@ import torch
 from hypothesis import settings
 
 from raytrace.cli import main
-from raytrace.fused import prepare, tracing
+from raytrace.fused import NoCompiler, prepare, tracing
+from raytrace.fused.library import library
 
 settings.register_profile("reproducible", derandomize=True, deadline=None)
 settings.load_profile("reproducible")
@@ -22,6 +23,15 @@ settings.load_profile("reproducible")
 def _compiled_trace():
     """Tests trace as a user does who has compiled the trace before, whichever of them comes first."""
     prepare()
+
+
+@pytest.fixture
+def compiler():
+    """Skips what needs the compiled trace where it cannot be had."""
+    try:
+        library()
+    except NoCompiler as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from fused_rays import CLOSE, assert_same_rays, both, leaves_of_rays, some_rays, with_leaves
 from problems import both_engines, double_gauss, lens, scalar, surface, vector, vignetting_aperture
 from torch.autograd import gradcheck, gradgradcheck
 from torch.testing import assert_close
 
 from raytrace.files import shipped
 from raytrace.formats import read_lens
-from raytrace.fused import NoCompiler, engine, prepare, tracing
+from raytrace.fused import engine, prepare, tracing
 from raytrace.fused.choice import is_fused
-from raytrace.fused.library import library
 from raytrace.fused.run import trace_compiled
 from raytrace.maths.pupil import sobol
 from raytrace.maths.value import to
@@ -28,17 +28,9 @@ from raytrace.system.departure import ZernikeSag
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import Aperture
 
+pytestmark = pytest.mark.usefixtures("compiler")
+
 LENSES = sorted(path for path in shipped("lenses").iterdir() if path.suffix == ".zmx")
-#: What both traces may differ by, in direction cosines and as a share of the size of a system.
-CLOSE = {torch.float64: 1e-14, torch.float32: 2e-6}
-
-
-@pytest.fixture(autouse=True)
-def _compiler():
-    try:
-        library()
-    except NoCompiler as error:
-        pytest.skip(str(error))
 
 
 #: Every kind of surface, a mirror, apertures of every shape, a dummy, and rays lost in every way.
@@ -56,34 +48,6 @@ EVERYTHING = lens(
     ],
     object_distance=50.0,
 )
-
-
-def some_rays(count: int = 700, dtype=torch.float64, seed: int = 4) -> Rays:
-    """Rays in a wide cone: most arrive, the others are lost in all ways."""
-    generator = torch.Generator().manual_seed(seed)
-    spread = torch.randn(4, count, generator=generator, dtype=torch.float64)
-    ones = torch.ones(count, dtype=torch.float64)
-    position = torch.stack([3 * spread[0], 3 * spread[1], -ones])
-    direction = torch.stack([0.08 * spread[2], 0.08 * spread[3], ones])
-    direction[:, ::50] = torch.stack([ones, ones, 0.1 * ones])[:, ::50]
-    return to(start(position, direction, torch.zeros(count, dtype=torch.float64)), dtype=dtype)
-
-
-def both(call):
-    found = []
-    for name in ("fused", "eager"):
-        with tracing(name):
-            found.append(call())
-    return found
-
-
-def assert_same_rays(fused: Rays, eager: Rays, close: float, size: float = 100.0) -> None:
-    """To a share `close` of the size (mm) of the system."""
-    assert torch.equal(fused.valid, eager.valid)
-    assert_close(fused.position, eager.position, rtol=0, atol=close * size)
-    assert_close(fused.direction, eager.direction, rtol=0, atol=close)
-    if eager.opl is not None:
-        assert_close(fused.opl, eager.opl, rtol=close, atol=close * size)
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
@@ -117,7 +81,7 @@ def test_the_adjoint_is_what_autograd_finds(dtype, close, with_path):
     weights = torch.randn(7, 700, generator=generator, dtype=torch.float64).to(dtype)
 
     def gradients():
-        surfaces, leaves, indices = with_leaves(system)
+        surfaces, indices, leaves = with_leaves(system.surfaces[1:], media(system, system.wavelengths[0]))
         given = [rays.position.clone().requires_grad_(), rays.direction.clone().requires_grad_()]
         opl = rays.opl.clone().requires_grad_() if with_path else None
         end = trace_surfaces(surfaces, Rays(*given, rays.valid, opl), indices=indices)
@@ -136,29 +100,11 @@ def test_the_adjoint_is_what_autograd_finds(dtype, close, with_path):
         assert float((f - e).abs().max()) <= close * (float(e.abs().max()) + 1.0)
 
 
-def with_leaves(system):
-    """Surfaces whose numbers are leaves, the leaves, and indices that are leaves too."""
-    leaves = []
-
-    def leaf(number):
-        leaves.append(number.detach().clone().requires_grad_())
-        return leaves[-1]
-
-    names = ("thickness", "curvature", "conic", "coefficients")
-    surfaces = [
-        dataclasses.replace(s, **{n: leaf(getattr(s, n)) for n in names if getattr(s, n) is not None})
-        for s in system.surfaces[1:]
-    ]
-    found = media(system, system.wavelengths[0])
-    distinct = {id(index): leaf(index) for index in found}
-    return surfaces, leaves, [distinct[id(index)] for index in found]
-
-
 @pytest.mark.parametrize(("dtype", "close"), [(torch.float64, 1e-11), (torch.float32, 2e-3)])
 def test_the_forward_derivatives_of_every_number_are_those_of_torch(dtype, close):
     """∂hit/∂v by every number of the lens, through the compiled tangents and through jvp."""
     system, rays = to(EVERYTHING, dtype=dtype), some_rays(200, dtype=dtype)
-    surfaces, leaves, indices = with_leaves(system)
+    surfaces, indices, leaves = with_leaves(system.surfaces[1:], media(system, system.wavelengths[0]))
     fused, eager = both(lambda: hit_jacobian(surfaces, rays, leaves, indices=indices))
     assert fused.shape == (sum(x.numel() for x in leaves), 2, 200)
     for f, e in zip(fused, eager, strict=True):
@@ -218,7 +164,7 @@ def test_a_ray_does_not_depend_on_its_neighbours_nor_gradients_on_threads():
         before = torch.get_num_threads()
         torch.set_num_threads(threads)
         try:
-            surfaces, leaves, indices = with_leaves(EVERYTHING)
+            surfaces, indices, leaves = with_leaves(EVERYTHING.surfaces[1:], media(EVERYTHING, wavelength))
             end = trace_surfaces(surfaces, rays, indices=indices)
             return torch.autograd.grad((end.position**2).sum(), leaves, allow_unused=True)
         finally:
@@ -232,10 +178,6 @@ def test_a_ray_does_not_depend_on_its_neighbours_nor_gradients_on_threads():
             assert torch.equal(part, whole[..., chosen])
         for one, two in zip(gradient(1), gradient(2), strict=True):
             assert one is two is None or torch.equal(one, two)
-
-
-def leaves_of_rays(rays: Rays):
-    return rays.position, rays.direction, rays.valid, rays.opl
 
 
 @pytest.mark.parametrize("axes", [(3, 1, 1), (3, 1), (1, 4, 1)])

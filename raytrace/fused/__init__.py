@@ -7,10 +7,13 @@ structure   a run of surfaces as that code reads it
 run         the code called on tensors, forward and backward
 block.h     what it works on: blocks of rays that stay in the cache
 sags.h      the kinds of sag, as rows of shapes.py
+paths.h     the paths that phases add, as polynomials
 apertures.h the shapes of apertures, as rows of aperture.py
 loops.h     the surfaces as loops over a block, where nothing can go wrong
 careful.h   one ray at one surface, with every case that surface.py and search.py know
-adjoint.h   the adjoint of a surface, with its derivation
+phases.h    what gratings, diffractive and ideal lenses do to rays; phase_slopes.h: differentiated
+turns.h     axes that turn between two surfaces
+adjoint.h   the adjoint of a surface, with its derivation; tangent.h: its derivative in a direction
 trace.cpp   rays through all surfaces and back, block by block
 """
 

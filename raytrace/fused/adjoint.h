@@ -71,6 +71,8 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
       gnx = -tau * gl - back * L, gny = -tau * gm - back * M, gnz = -tau * gn - back * N;
       gL = gl - back * nx, gM = gm - back * ny, gN = gn - back * nz;
       gw = along_n * tau / w;
+    } else if (bend == kPhase) {  // see phase_slopes.h
+      gnx = notes.turn.x[i], gny = notes.turn.y[i], gnz = notes.turn.z[i], gw = notes.turn.w[i];
     }
     if (bend != kRefract) over_cosine = T(1) / cosine;
 

@@ -13,17 +13,18 @@ namespace raytrace {
 constexpr int kBlock = 256;   // rays
 constexpr int kVector = 16;   // rays: whole vectors of either type
 constexpr int kTerms = 16;    // of an asphere, at most
-constexpr int kFields = 13;   // integers that tell of a surface, see structure.py
+constexpr int kFields = 16;   // integers that tell of a surface, see structure.py
 
-enum Bend { kNone, kRefract, kReflect };
+enum Bend { kNone, kRefract, kReflect, kPhase };
 
 // One surface as structure.py lays it out. Offsets count numbers of a row; -1 stands for a number that is not modelled.
 struct Layout {
   int32_t kind, bend, side, terms, apertures, first_aperture;
   int32_t gap, curvature, conic, coefficients, before, behind;
   int32_t rim;  // place in the constants
+  int32_t phase, phase_terms, phase_numbers;  // form of phases.h, 0 for none; how many numbers, and the first of them
 };
-static_assert(sizeof(Layout) == kFields * sizeof(int32_t), "structure.py writes 13 integers");
+static_assert(sizeof(Layout) == kFields * sizeof(int32_t), "structure.py writes 16 integers");
 
 // The same surface with the numbers of one row.
 template <typename T>
@@ -31,6 +32,7 @@ struct Surface {
   const Layout* at;
   T gap, c, k, n1, n2;  // 0 where not modelled; n1, n2 before and behind
   T a[kTerms];
+  const T* phase;  // numbers of the phase
   double rim;
 };
 
@@ -45,6 +47,7 @@ Surface<T> surface_of(const Layout& at, const T* row, const double* constants) {
   s.n1 = number(at.before);
   s.n2 = number(at.behind);
   for (int j = 0; j < at.terms; j++) s.a[j] = row[at.coefficients + j];
+  s.phase = row + at.phase_numbers;
   s.rim = constants[at.rim];
   return s;
 }
@@ -55,12 +58,26 @@ struct alignas(64) Rays {
   T x[kBlock], y[kBlock], z[kBlock], L[kBlock], M[kBlock], N[kBlock], path[kBlock];
 };
 
+// A vector at every ray of a block, and a number: normals and their squared lengths, and what moves them.
+template <typename T>
+struct alignas(64) Normals {
+  T x[kBlock], y[kBlock], z[kBlock], w[kBlock];
+};
+
+// A path p(x, y) at `size` points, its slopes and second derivatives; q: a polynomial on the way there.
+template <typename T, int size>
+struct alignas(64) Added {
+  T p[size], x[size], y[size], xx[size], xy[size], yy[size], q[size], dq[size], d2q[size];
+};
+
 // What the loops note of a block beside its rays. valid: neither lost nor vignetted; lost: number of the last surface
 // that a ray missed or was totally reflected at, or -1.
 template <typename T>
 struct alignas(64) Notes {
   T flagged[kBlock];
   T px[kBlock], py[kBlock], pz[kBlock], t[kBlock], active[kBlock];  // of Newton's method: foot, path from it
+  Normals<T> normal, turn;  // at a surface with a phase; turn: the cotangents of the normals, or how they change
+  Added<T, kBlock> added;
   uint8_t valid[kBlock];
   int32_t lost[kBlock], surface;  // surface: the one that the rays are at
   bool any_lost;

@@ -2,6 +2,7 @@
 // also for float32 rays, for what becomes of a ray must not be decided by rounding.
 #pragma once
 #include "loops.h"
+#include "phases.h"
 
 namespace raytrace {
 
@@ -132,8 +133,9 @@ inline bool crossing(const Surface<double>& s, double x, double y, double z, dou
 }
 
 // Carries a ray over a gap and through a surface, in float64 for rays of either type; false if it is lost there.
-// farthest: a path whose square is the largest number of the type.
-inline bool carry(Ray& ray, const Surface<double>& s, double farthest, bool with_path) {
+// farthest: a path whose square is the largest number of the type; phase: the numbers of the phase.
+template <typename C>
+bool carry(Ray& ray, const Surface<double>& s, const C* phase, double farthest, bool with_path) {
   const double x = ray.x, y = ray.y, z = ray.z, L = ray.L, M = ray.M, N = ray.N, ahead = z - s.gap, shape = 1 + s.k;
   double hx, hy, hz, nx = 0, ny = 0, nz = 1, w = 1, cosine = N;
   if (s.at->kind == kPlane) {
@@ -163,8 +165,11 @@ inline bool carry(Ray& ray, const Surface<double>& s, double farthest, bool with
     }
     cosine = nx * L + ny * M + nz * N;
   }
-  double l = L, m = M, o = N;
-  if (s.at->bend == kRefract) {
+  double l = L, m = M, o = N, added = 0;
+  if (s.at->phase != kNoPhase) {
+    const double normal[] = {nx, ny, nz};
+    if (!through_phase(s, phase, hx, hy, l, m, o, normal, w, added)) return false;
+  } else if (s.at->bend == kRefract) {
     // An index of 0 is none: the discriminant, with n2 = 0, says so.
     double D = (s.n2 - s.n1) * (s.n2 + s.n1), a = s.n1 * cosine, b_squared = D * w + a * a, n2 = s.n2 > 0 ? s.n2 : 1;
     if (!(b_squared > 0)) return false;
@@ -174,9 +179,12 @@ inline bool carry(Ray& ray, const Surface<double>& s, double farthest, bool with
     double twice = 2 * cosine / w;
     l = L - twice * nx, m = M - twice * ny, o = N - twice * nz;
   }
-  double factor = s.at->bend == kNone ? 1 : 1.5 - 0.5 * (l * l + m * m + o * o);
-  if (with_path)
+  const bool is_unit = s.at->phase == kSlopes || (s.at->phase == kNoPhase && s.at->bend == kNone);
+  double factor = is_unit ? 1 : 1.5 - 0.5 * (l * l + m * m + o * o);
+  if (with_path) {
     ray.path += s.n1 * reduced_path(hx, hy, hz, x, y, z, L, M, N, s.gap, s.at->gap >= 0, double(s.at->side));
+    ray.path += added;
+  }
   ray.x = hx, ray.y = hy, ray.z = hz, ray.L = l * factor, ray.M = m * factor, ray.N = o * factor;
   return true;
 }
@@ -185,7 +193,7 @@ inline bool carry(Ray& ray, const Surface<double>& s, double farthest, bool with
 template <typename T, bool path>
 void cross_carefully(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int i, const Surface<T>& s) {
   Ray ray{from.x[i], from.y[i], from.z[i], from.L[i], from.M[i], from.N[i], path ? from.path[i] : T(0)};
-  if (!carry(ray, in_double(s), std::sqrt(double(std::numeric_limits<T>::max())), path)) {
+  if (!carry(ray, in_double(s), s.phase, std::sqrt(double(std::numeric_limits<T>::max())), path)) {
     ray = {0, 0, 0, 0, 0, 1, 0};
     notes.valid[i] = 0, notes.lost[i] = notes.surface, notes.any_lost = true;
   }

@@ -23,7 +23,10 @@ import torch
 
 from raytrace.fused.trust import check_file, open_folder, private_folder
 
-SOURCES = ("block.h", "sags.h", "apertures.h", "loops.h", "careful.h", "adjoint.h", "tangent.h", "trace.cpp")
+SOURCES = (
+    *("block.h", "sags.h", "apertures.h", "paths.h", "loops.h", "phases.h", "careful.h"),
+    *("adjoint.h", "tangent.h", "phase_slopes.h", "turns.h", "trace.cpp"),
+)
 FLAGS = ("-O3", "-std=c++17", "-fPIC", "-fopenmp-simd", "-fno-math-errno", "-fno-trapping-math")
 #: Flags that not every compiler, processor or torch knows: tried in this order, the last none. With -fopenmp, which
 #: stands only where it compiles, threads are those of the OpenMP that torch has loaded: two of them would wait for each

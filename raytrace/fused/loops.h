@@ -189,4 +189,23 @@ int cross_asphere(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, cons
   return flagged;
 }
 
+// The normals of a surface where rays stand on it, and their squared lengths.
+template <typename T, int kind, int terms>
+void normals(const Rays<T>& at, Normals<T>& to, int n, const Surface<T>& s) {
+  const T c = s.c, shape = T(1) + s.k;
+#pragma omp simd
+  for (int i = 0; i < n; i++) {
+    T x = at.x[i], y = at.y[i], u = x * x + y * y, nx = 0, ny = 0, nz = 1, w = 1;
+    if (kind == kSphere || kind == kConic) {
+      nx = -c * x, ny = -c * y, nz = T(1) - shape * c * at.z[i];
+      if (kind == kConic) w = T(1) - s.k * c * c * u;
+    } else if (has_terms(kind)) {
+      T S, dS, d2S;
+      sag<kind, false>(s, terms, u, S, dS, d2S);
+      nx = T(-2) * dS * x, ny = T(-2) * dS * y, w = T(1) + T(4) * dS * dS * u;
+    }
+    to.x[i] = nx, to.y[i] = ny, to.z[i] = nz, to.w[i] = w;
+  }
+}
+
 }  // namespace raytrace

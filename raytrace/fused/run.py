@@ -14,6 +14,7 @@ from torch import Tensor
 from raytrace.fused.library import library
 from raytrace.fused.structure import Structure, structure_of, with_numbers
 from raytrace.maths.numerics import broadcast_shape, with_batch_axes
+from raytrace.system.pose import Gap
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface
 
@@ -44,14 +45,15 @@ def trace_compiled(
     *,
     indices: Sequence[Tensor],
     side: int,
-    gap: Tensor | None,
+    gap: Tensor | Gap | None,
+    wavelength: Tensor | None = None,
     eager: Eager,
 ) -> Rays | None:
     """The rays behind the last of the surfaces; None for a batch that the compiled trace has no form for.
 
     Arguments as for `trace.steps`; eager: the same trace by torch alone, for derivatives of derivatives.
     """
-    task = task_of(surfaces, rays, indices=indices, side=side, gap=gap)
+    task = task_of(surfaces, rays, indices=indices, side=side, gap=gap, wavelength=wavelength)
     if task is None:
         return None
     if torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in task.given):
@@ -74,10 +76,17 @@ class Task(NamedTuple):
 
 
 def task_of(
-    surfaces: Sequence[Surface], rays: Rays, *, indices: Sequence[Tensor], side: int = 1, gap: Tensor | None = None
+    surfaces: Sequence[Surface],
+    rays: Rays,
+    *,
+    indices: Sequence[Tensor],
+    side: int = 1,
+    gap: Tensor | Gap | None = None,
+    wavelength: Tensor | None = None,
 ) -> Task | None:
     """A batch as the compiled trace takes it; None if it has no form for it."""
-    structure, numbers = structure_of(surfaces, indices, side, gap)
+    wavelength = None if wavelength is None else wavelength.to(rays.direction.dtype)
+    structure, numbers = structure_of(surfaces, indices, side, gap, wavelength)
     shape = _batch(rays, numbers)
     if shape is None:
         return None

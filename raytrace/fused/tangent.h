@@ -15,21 +15,27 @@ namespace raytrace {
 template <typename T>
 struct Change {
   T gap, c, k, n1, n2, a[kTerms];
+  const T* phase;
   bool any;
 };
 
 template <typename T>
 Change<T> change_of(const Layout& at, const T* row) {
   auto number = [row](int32_t offset) { return offset < 0 ? T(0) : row[offset]; };
-  Change<T> change{number(at.gap), number(at.curvature), number(at.conic), number(at.before), number(at.behind), {}, false};
+  Change<T> change{};
+  change.gap = number(at.gap), change.c = number(at.curvature), change.k = number(at.conic);
+  change.n1 = number(at.before), change.n2 = number(at.behind);
   for (int j = 0; j < at.terms; j++) change.a[j] = row[at.coefficients + j];
   change.any = change.gap != 0 || change.c != 0 || change.k != 0 || change.n1 != 0 || change.n2 != 0;
   for (int j = 0; j < at.terms; j++) change.any |= change.a[j] != 0;
+  change.phase = row + at.phase_numbers;
+  for (int j = 0; j < at.phase_terms; j++) change.any |= change.phase[j] != 0;
   return change;
 }
 
 template <typename T, int kind, int bend, bool path, int terms>
-void push(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, int n, const Surface<T>& s, const Change<T>& change) {
+void push(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, Notes<T>& notes, int n, const Surface<T>& s,
+          const Change<T>& change) {
   const T gap = s.gap, c = s.c, k = s.k, shape = T(1) + k, n1 = s.n1, n2 = s.n2, side = T(s.at->side);
   const T dgap = change.gap, dc = change.c, dk = change.k, dn1 = change.n1, dn2 = change.n2;
   const T mu = n1 / n2, D = (n2 - n1) * (n2 + n1), over_n2 = T(1) / n2;
@@ -94,7 +100,9 @@ void push(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, int n, const Surfa
     }
 
     // Behind the surface.
-    if (bend != kNone) {
+    if (bend == kPhase) {  // see phase_slopes.h
+      notes.turn.x[i] = dnx, notes.turn.y[i] = dny, notes.turn.z[i] = dnz, notes.turn.w[i] = dw;
+    } else if (bend != kNone) {
       T dcosine = dnx * L + dny * M + dnz * N + nx * dL + ny * dM + nz * dN;
       T keep = 1, dkeep = 0, g, dg;
       if (bend == kRefract) {

@@ -9,7 +9,9 @@
 #include "adjoint.h"
 #include "apertures.h"
 #include "careful.h"
+#include "phase_slopes.h"
 #include "tangent.h"
+#include "turns.h"
 
 namespace raytrace {
 
@@ -34,20 +36,33 @@ struct Call {
 template <typename T>
 using Crosses = int (*)(const Rays<T>&, Rays<T>&, Notes<T>&, int, const Surface<T>&);
 template <typename T>
-using Pushes = void (*)(const Rays<T>&, const Rays<T>&, Rays<T>&, int, const Surface<T>&, const Change<T>&);
+using Pushes = void (*)(const Rays<T>&, const Rays<T>&, Rays<T>&, Notes<T>&, int, const Surface<T>&, const Change<T>&);
 template <typename T>
 using Pulls = Sums<T> (*)(const Rays<T>&, const Rays<T>&, Cotangents<T>&, Notes<T>&, int, const Surface<T>&);
+template <typename T>
+using Stands = void (*)(const Rays<T>&, Normals<T>&, int, const Surface<T>&);
 
-// The functions for one kind of surface.
+// The functions for one kind of surface. Where it has a phase, `crosses` carries rays to it, and phases.h does the rest.
 template <typename T, int kind, int bend, bool path, int terms>
 struct Of {
+  static constexpr int law = bend == kPhase ? kNone : bend;
   static Crosses<T> crosses() {
-    if constexpr (kind == kPlane) return cross_plane<T, bend, path>;
-    else if constexpr (has_terms(kind)) return cross_asphere<T, kind, bend, path, terms>;
-    else return cross_conic<T, bend, path, kind == kConic>;
+    if constexpr (kind == kPlane) return cross_plane<T, law, path>;
+    else if constexpr (has_terms(kind)) return cross_asphere<T, kind, law, path, terms>;
+    else return cross_conic<T, law, path, kind == kConic>;
   }
   static Pulls<T> pulls() { return pull<T, kind, bend, path, terms>; }
   static Pushes<T> pushes() { return push<T, kind, bend, path, terms>; }
+  static Stands<T> stands() { return normals<T, kind, terms>; }
+};
+
+// Those of a turn.
+template <typename T, bool path>
+struct OfTurn {
+  static Crosses<T> crosses() { return turn<T, path>; }
+  static Pulls<T> pulls() { return pull_turn<T, path>; }
+  static Pushes<T> pushes() { return push_turn<T, path>; }
+  static Stands<T> stands() { return nullptr; }
 };
 
 // Calls work(Of<…>{}) for the kind of a surface, what it does to light, and whether the path is asked for.
@@ -61,7 +76,9 @@ void by_kind(const Layout& at, Work work) {
 
 template <typename T, bool path, typename Work>
 void by_bend(const Layout& at, Work work) {
-  if (at.bend == kNone) by_kind<T, kNone, path>(at, work);
+  if (at.kind == kTurn) work(OfTurn<T, path>{});
+  else if (at.phase != kNoPhase) by_kind<T, kPhase, path>(at, work);
+  else if (at.bend == kNone) by_kind<T, kNone, path>(at, work);
   else if (at.bend == kRefract) by_kind<T, kRefract, path>(at, work);
   else by_kind<T, kReflect, path>(at, work);
 }
@@ -72,6 +89,7 @@ struct Step {
   Crosses<T> crosses, silently;  // with the path as asked, and without
   Pulls<T> pulls;
   Pushes<T> pushes;
+  Stands<T> stands;
 };
 
 template <typename T>
@@ -103,6 +121,10 @@ class Trace {
       for (size_t k = steps_.size(); k-- > 0;) {
         const Step<T>& step = steps_[k];
         forget(k, *g, rays.get(), *notes, n);
+        if (step.surface.at->phase != kNoPhase) {
+          step.stands(rays[k + 1], notes->normal, n, step.surface);
+          pull_phase(rays[k], rays[k + 1], *g, *notes, n, step.surface, row);
+        }
         add(row, *step.surface.at, step.pulls(rays[k], rays[k + 1], *g, *notes, n, step.surface));
       }
       store(call_.by_rays, *g, at, count);
@@ -129,7 +151,7 @@ class Trace {
 
  private:
   // One change, from the first surface that it touches on. A ray lost at a surface starts anew behind it.
-  void push_all(int64_t number, int64_t row, const Rays<T>* rays, Rays<T>& d, const Notes<T>& notes, int n) {
+  void push_all(int64_t number, int64_t row, const Rays<T>* rays, Rays<T>& d, Notes<T>& notes, int n) {
     const T* changes = static_cast<const T*>(call_.change) + (number * call_.rows + row) * call_.numbers;
     for (int p = 0; p < 7; p++) std::memset(part(d, p), 0, n * sizeof(T));
     bool begun = false;
@@ -137,7 +159,11 @@ class Trace {
       const Surface<T>& s = steps_[k].surface;
       const Change<T> change = change_of(*s.at, changes);
       begun |= change.any;
-      if (begun) steps_[k].pushes(rays[k], rays[k + 1], d, n, s, change);
+      if (begun) steps_[k].pushes(rays[k], rays[k + 1], d, notes, n, s, change);
+      if (begun && s.at->phase != kNoPhase) {
+        steps_[k].stands(rays[k + 1], notes.normal, n, s);
+        push_phase(rays[k], rays[k + 1], d, notes, n, s, change, path_);
+      }
       for (int i = 0; i < n && notes.any_lost; i++)
         if (notes.lost[i] == int32_t(k))
           for (int p = 0; p < 7; p++) part(d, p)[i] = 0;
@@ -164,7 +190,9 @@ class Trace {
       const Layout& at = call_.layout[k];
       Step<T>& step = steps_[k];
       step.surface = surface_of(at, numbers, call_.constants);
-      auto all = [&step](auto of) { step.crosses = of.crosses(), step.pulls = of.pulls(), step.pushes = of.pushes(); };
+      auto all = [&step](auto of) {
+        step.crosses = of.crosses(), step.pulls = of.pulls(), step.pushes = of.pushes(), step.stands = of.stands();
+      };
       by_bend<T, false>(at, [&step](auto of) { step.silently = of.crosses(); });
       path_ ? by_bend<T, true>(at, all) : by_bend<T, false>(at, all);
     }
@@ -198,7 +226,12 @@ class Trace {
     const Step<T>& step = steps_[k];
     const Surface<T>& s = step.surface;
     notes.surface = int32_t(k);
-    if ((path ? step.crosses : step.silently)(from, to, notes, n, s))
+    int flagged = (path ? step.crosses : step.silently)(from, to, notes, n, s);
+    if (s.at->phase != kNoPhase) {
+      step.stands(to, notes.normal, n, s);
+      flagged = through_phase(to, notes, n, s, path);
+    }
+    if (flagged)
       for (int i = 0; i < n; i++) {
         if (notes.flagged[i] == 0) continue;
         if (path) cross_carefully<T, true>(from, to, notes, i, s);

@@ -19,20 +19,27 @@ from raytrace.system.surface import Surface
 
 
 def hit_jacobian(
-    surfaces: Sequence[Surface], rays: Rays, variables: Sequence[Tensor], *, indices: Sequence[Tensor]
+    surfaces: Sequence[Surface],
+    rays: Rays,
+    variables: Sequence[Tensor],
+    *,
+    indices: Sequence[Tensor],
+    wavelength: Tensor | None = None,
 ) -> Tensor:
     """∂(x, y)/∂v (V, 2, ...) of the hits on the last surface by every entry of the variables, in their order.
 
     variables: tensors that require a gradient and that numbers of the surfaces or indices were computed from, or are;
-    V counts all their entries. surfaces, rays, indices: as for `trace.steps`, the rays before surfaces[0] held fixed.
-    Rays that are lost do not move. Raises ValueError for a departure from even aspheres, for more than 16 of their
-    terms, and for numbers of a lens that differ from ray to ray of the last axis.
+    V counts all their entries. surfaces, rays, indices, wavelength: as for `trace.steps`, the rays before surfaces[0]
+    held fixed. Rays that are lost do not move. Raises ValueError for surfaces that the compiled trace does not know
+    (departures, more than 16 terms, holograms, Fresnel lenses), and for numbers of a lens that differ from ray to ray
+    of the last axis.
     """
-    task = task_of(surfaces, rays, indices=indices) if all(map(is_expressible, surfaces)) else None
+    known = all(map(is_expressible, surfaces))
+    task = task_of(surfaces, rays, indices=indices, wavelength=wavelength) if known else None
     if task is None:
         raise ValueError(
-            "no Jacobian for departures, more than 16 terms, numbers of another dtype than the rays, or numbers that "
-            "differ along the last axis of the rays: use torch.func.jacfwd on the trace"
+            "no Jacobian for departures, more than 16 terms, holograms, Fresnel lenses, numbers of another dtype than "
+            "the rays, or numbers that differ along the last axis of the rays: use torch.func.jacfwd on the trace"
         )
     changes = _changes(task.given[3], variables)
     if is_fused(rays, changes, len(surfaces)):

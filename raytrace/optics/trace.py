@@ -22,9 +22,9 @@ from raytrace.optics.laws import bend_slopes, diffract, reflect, refract
 from raytrace.system.aperture import inside
 from raytrace.system.lens import Lens
 from raytrace.system.phases import added_path, ideal_path, kind_of
-from raytrace.system.pose import Gap, direction_in, point_in
+from raytrace.system.pose import Gap, Turn, direction_in, point_in
 from raytrace.system.rays import Rays
-from raytrace.system.surface import Surface, gap_behind, in_double, is_posed, meet, normal
+from raytrace.system.surface import Surface, gap_behind, in_double, meet, normal
 
 
 @value
@@ -99,7 +99,7 @@ def _crossing(before: _Ray, after: _Ray, met: Tensor, passes: Tensor | None, cle
 
 def _cross(surface: Surface, rays: _Ray, gap, side: int, n1: Tensor, n2: Tensor, wavelength: Tensor | None):
     """Rays behind the surface, and which of those before met it, were not totally reflected, pass its apertures."""
-    if isinstance(gap, Gap) or is_posed(surface):
+    if isinstance(gap, Gap) or surface.before is not None or surface.is_break:
         rays, gap = _approach(surface, rays, gap, side, n1), None
         if surface.is_break:
             return rays, torch.ones_like(rays.valid), None, None
@@ -146,6 +146,8 @@ def _approach(surface: Surface, rays: _Ray, gap: Tensor | Gap | None, side: int,
         opl = opl if opl is None else opl - n1 * (thickness * side)
     if surface.before is not None:
         position, direction = point_in(surface.before, position), direction_in(surface.before, direction)
+        if isinstance(surface.before, Turn) and opl is not None:
+            opl = opl - surface.before.path
     return _Ray(position, direction, rays.valid, opl)
 
 
@@ -232,9 +234,8 @@ def trace_surfaces(
 
 
 def _fused(surfaces: Sequence[Surface], rays: Rays, **how) -> Rays:
-    if not isinstance(how["gap"], Gap) and is_fused(rays, how["indices"][0], len(surfaces)):
-        known = {name: how[name] for name in ("indices", "side", "gap")}
-        end = trace_compiled(surfaces, rays, **known, eager=_eager)
+    if is_fused(rays, how["indices"][0], len(surfaces)):
+        end = trace_compiled(surfaces, rays, **how, eager=_eager)
         if end is not None:
             return end
     return _eager(surfaces, rays, **how)

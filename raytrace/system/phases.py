@@ -216,15 +216,20 @@ def kind_of(phase: Phase) -> PhaseKind:
     return PHASES[type(phase).__name__]
 
 
-def added_path(phase: Phase, x: Tensor, y: Tensor, wavelength: Tensor | None) -> Added:
-    """The path that is added at points (...) mm, of any kind that adds one; wavelength: (...) µm."""
+def path_of(phase: Phase, wavelength: Tensor | None) -> PolynomialPath | RadialPath | None:
+    """The path that a phase adds, as a polynomial; None for one that is none. wavelength: (...) µm."""
     kind = kind_of(phase)
     if kind.chromatic and wavelength is None:
         raise ValueError(f"a surface with a phase ({type(phase).__name__}) bends light by its wavelength: give it")
+    return None if kind.path is None else kind.path(phase, wavelength)
+
+
+def added_path(phase: Phase, x: Tensor, y: Tensor, wavelength: Tensor | None) -> Added:
+    """The path that is added at points (...) mm, of any kind that adds one; wavelength: (...) µm."""
     wavelength = None if wavelength is None else wavelength.to(x.dtype)
-    if kind.path is None:
-        return kind.added(phase, x, y, wavelength)
-    path = kind.path(phase, wavelength)
+    path = path_of(phase, wavelength)
+    if path is None:
+        return kind_of(phase).added(phase, x, y, wavelength)
     if isinstance(path, RadialPath):
         return _radial_added(path.coefficients, x, y)
     z, slope_x, slope_y, *_ = polynomial_xy(path.coefficients, x, y, highest=1)

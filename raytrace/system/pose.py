@@ -39,21 +39,37 @@ class Gap:
     thickness: Tensor
 
 
+@value
+class Turn:
+    """A passage by its numbers, as the compiled trace takes it: new = rotation · old + shift.
+
+    rotation: (3, 3, ...); shift: (3, ...) mm; path: (...) mm, that of the axial ray along the way, which drops out.
+    """
+
+    rotation: Tensor
+    shift: Tensor
+    path: Tensor
+
+
 #: About which of the axes a tilt turns, and between which: from the first of the two to the second.
 _TURNS = {"tilt_x": (1, 2), "tilt_y": (2, 0), "tilt_z": (0, 1)}
 
 Vector = Sequence[Tensor]
 
 
-def point_in(pose: Pose, point: Vector) -> Vector:
+def point_in(pose: Pose | Turn, point: Vector) -> Vector:
     """A point (x, y, z) of (...) mm each, told in the new axes."""
+    if isinstance(pose, Turn):
+        return [at + step for at, step in zip(direction_in(pose, point), pose.shift, strict=True)]
     if pose.tilts_first:
         return _moved(pose, direction_in(pose, point))
     return direction_in(pose, _moved(pose, point))
 
 
-def direction_in(pose: Pose, direction: Vector) -> Vector:
+def direction_in(pose: Pose | Turn, direction: Vector) -> Vector:
     """A direction, by components (...), told in the new axes."""
+    if isinstance(pose, Turn):
+        return [sum(r * d for r, d in zip(row, direction, strict=True)) for row in pose.rotation]
     for name in reversed(_TURNS) if pose.tilts_first else _TURNS:
         tilt = getattr(pose, name)
         if tilt is not None:
@@ -100,3 +116,55 @@ def cos_sin(degrees: Tensor) -> tuple[Tensor, Tensor]:
     quarter = torch.remainder(degrees.detach(), 180.0)
     cosine = cosine - torch.where(quarter == 90, cosine, 0.0).detach()
     return cosine, sine - torch.where(quarter == 0, sine, 0.0).detach()
+
+
+#: A number that is known for good, or a tensor.
+Number = float | Tensor
+
+
+def passage(gap: Tensor | Gap | None, before: Pose | None) -> list[list[Number]]:
+    """What `point_in` does along a gap and a pose, as the rows of rotation and shift (3, 4): [x, y, z, 1] -> new.
+
+    Entries that are 0 or 1 whatever the angles are stay such numbers, and no operator is spent on them.
+    """
+    rows: list[list[Number]] = [[1.0 if i == j else 0.0 for j in range(4)] for i in range(3)]
+    if isinstance(gap, Gap):
+        rows = _through(gap.pose, rows)
+    thickness = gap.thickness if isinstance(gap, Gap) else gap
+    if thickness is not None:
+        rows[2] = [*rows[2][:3], _sum(rows[2][3], -thickness)]
+    return rows if before is None else _through(before, rows)
+
+
+def _through(pose: Pose, rows: list[list[Number]]) -> list[list[Number]]:
+    steps = [0.0 if step is None else -step for step in (pose.x, pose.y, pose.z)]
+    if not pose.tilts_first:
+        rows = [[*row[:3], _sum(row[3], step)] for row, step in zip(rows, steps, strict=True)]
+    for name in reversed(_TURNS) if pose.tilts_first else _TURNS:
+        tilt = getattr(pose, name)
+        if tilt is not None:
+            rows = _rows_turned(rows, tilt, _TURNS[name])
+    if pose.tilts_first:
+        rows = [[*row[:3], _sum(row[3], step)] for row, step in zip(rows, steps, strict=True)]
+    return rows
+
+
+def _rows_turned(rows: list[list[Number]], degrees: Tensor, plane: tuple[int, int]) -> list[list[Number]]:
+    cosine, sine = cos_sin(torch.as_tensor(degrees))
+    back, (i, j) = -sine, plane
+    found = list(rows)
+    found[i] = [_sum(_product(cosine, a), _product(sine, b)) for a, b in zip(rows[i], rows[j], strict=True)]
+    found[j] = [_sum(_product(cosine, b), _product(back, a)) for a, b in zip(rows[i], rows[j], strict=True)]
+    return found
+
+
+def _product(factor: Tensor, number: Number) -> Number:
+    if isinstance(number, float):
+        return factor if number == 1.0 else 0.0
+    return factor * number
+
+
+def _sum(a: Number, b: Number) -> Number:
+    if isinstance(a, float) and a == 0.0:
+        return b
+    return a if isinstance(b, float) and b == 0.0 else a + b

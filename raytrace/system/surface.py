@@ -24,7 +24,7 @@ from raytrace.media.glass import AIR, Glass
 from raytrace.system.aperture import Aperture
 from raytrace.system.departure import Sag
 from raytrace.system.phases import Phase, kind_of
-from raytrace.system.pose import Gap, Pose
+from raytrace.system.pose import Gap, Pose, Turn
 from raytrace.system.roots import conic_root, double, doubles, foot_of, way_of
 from raytrace.system.search import first_crossing
 from raytrace.system.shapes import DEPARTURES, EVEN, KINDS, Departure, Relief, relief, sag_and_derivatives
@@ -61,7 +61,7 @@ class Surface:
     kind: str = EVEN
     departure: Departure | None = None
     phase: Phase | None = None
-    before: Pose | None = None
+    before: Pose | Turn | None = None
     after: Pose | None = None
     is_break: bool = False
     glass: Glass = AIR
