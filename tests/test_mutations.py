@@ -14,6 +14,7 @@ from problems import number
 from test_prescriptions import LOWENTHAL, NOCTILUX, summilux
 from test_seq import ACHROMAT, ASPHERE, DOUBLE_GAUSS, EVERYTHING, QUESTAR, THREE_MIRRORS
 from test_zemax_archive import archive
+from test_zemax_types import CASES, text
 
 from raytrace.camera.training import DamagedRun, OtherSettings, Run, load_state, read_state
 from raytrace.formats import FORMATS, LensFileError, read_lens, read_lens_with_report
@@ -102,7 +103,9 @@ def lenses(suffix: str, folder: Path) -> Reader:
         own = [FORMATS[suffix].write(read_lens(name), "lens") for name in ("cooke_triplet", "phone")]
         texts = (ACHROMAT, ASPHERE, DOUBLE_GAUSS.format("PIM", -0.4), EVERYTHING, QUESTAR, THREE_MIRRORS)
         originals += own + [text.encode() for text in texts]
-    elif suffix != ".zmx":
+    elif suffix == ".zmx":
+        originals += [text(name).encode() for name in CASES]
+    else:
         originals += [text.encode() for text in (summilux("No.,R,Nd,νd,d", "No R n V d"), NOCTILUX, LOWENTHAL)]
     return Reader(
         tuple(originals), from_file(read_lens_with_report, folder / f"lens{suffix}"), (LensFileError, UnknownGlass)

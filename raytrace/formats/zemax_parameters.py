@@ -85,7 +85,8 @@ def report_unused(block: Block, kind: str, row: SurfaceType, report: Draft) -> N
             report.note(f"{record.place}: PARM {j} of a {kind} surface is not used: {row.unused[j]}")
         elif row.parameters or row.unused:
             first, *_, last = sorted(row.parameters or row.unused) * 2
-            message = f"PARM {j}: a {kind} has parameters {first} to {last}{row.powers}; left out"
+            article = "an" if kind[0] in "AEIOU" else "a"
+            message = f"PARM {j}: {article} {kind} has parameters {first} to {last}{row.powers}; left out"
             report.warn(message, record.place)
         else:
             report.note(f"{record.place}: PARM {j} is not used by a {kind} surface")

@@ -1,0 +1,309 @@
+"""Every type of surface of a .zmx file: its rays by definition, its units, there and back, and what stays refused."""
+
+import dataclasses
+import math
+import random
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zemax_by_definition
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from problems import number
+from test_formats import damaged, leaves, read_damaged
+
+import raytrace as rt
+from raytrace.formats import LensFileError, UnsupportedSurface, zemax_read, zemax_write
+from raytrace.formats.source import Place, decode
+from raytrace.formats.zemax_types import TYPES, inverse, spelled_inverse
+from raytrace.optics.trace import media, steps
+from raytrace.system.rays import start
+
+MILLIMETRES = {"MM": 1.0, "IN": 25.4, "METER": 1000.0}
+
+
+def xdat(radius: float, *terms: float) -> str:
+    return "\n".join(f'XDAT {i} {value} 0 0 1 0 0 ""' for i, value in enumerate((len(terms), radius, *terms), 1))
+
+
+def parm(first: int = 1, *values: float) -> str:
+    return "\n".join(f"PARM {j} {value}" for j, value in enumerate(values, first))
+
+
+GLASS = "GLAS ___BLANK 1 0 1.6 0 0 0 0 0 0 0"
+SMALL = [((-1) ** k) * 0.4 / (k + 3) ** 2 for k in range(40)]  # terms that fall, of both signs
+
+#: The lines of surface 2, and the type that it is written as.
+CASES = {
+    "standard": ("STANDARD", f"CURV 0.02\nCONI -0.4\n{GLASS}"),
+    "even asphere": ("EVENASPH", f"CURV 0.02\nCONI -0.4\n{parm(1, 1e-3, 2e-5, -3e-7)}\n{GLASS}"),
+    "odd asphere": ("ODDASPHE", f"CURV 0.02\nCONI -0.4\n{parm(1, 2e-3, 1e-3, -2e-5, 2e-6, 1e-8)}\n{GLASS}"),
+    "extended asphere": ("XASPHERE", f"CURV 0.02\nCONI -0.8\n{xdat(8, 0.02, 0.03, -0.006, 0.001)}\n{GLASS}"),
+    "long asphere": ("XASPHERE", f"CURV 0.02\n{xdat(20, *SMALL[:12])}\n{GLASS}"),
+    "break": ("COORDBRK", parm(1, 1.5, -2, 7, -5, 11, 0)),
+    "break of order 1": ("COORDBRK", parm(1, 1.5, -2, 7, -5, 11, 1)),
+    "grating": ("DGRATING", f"{parm(1, 0.3, -1)}\n{GLASS}"),
+    "curved grating": ("DGRATING", f"CURV 0.02\nCONI 1\n{parm(1, 0.2, 2)}"),
+    "reflection grating": ("DGRATING", f"CURV -0.01\nCONI -0.5\n{parm(1, 0.15, -1)}\nGLAS MIRROR"),
+    "ideal lens": ("PARAXIAL", parm(1, 37.3, 1)),
+    "crossed ideal lens": ("PARAX_XY", parm(1, 0.02, -0.013, 0)),
+    "Jones matrix": ("JONESMAT", f"{parm(1, 1, 0, 0.5)}\n{GLASS}"),
+    "binary 1": ("BINARY_1", f"CURV 0.01\n{parm(0, 1, 1e-4, 1e-6)}\n{xdat(10, *(400 * a for a in SMALL[:14]))}"),
+    "binary 2": ("BINARY_2", f"CURV 0.03\n{parm(0, 2)}\n{xdat(10, -1000, 300, -20, 4)}\n{GLASS}"),
+    "fringe phase": ("FZERNPHA", f"CURV 0.01\n{parm(0, 1)}\n{xdat(11, *(30 * a for a in SMALL[:37]))}\n{GLASS}"),
+    "hologram": ("HOLOGRM2", parm(1, 1, -20, -200, 2, 5, 100, 0.55, 1)),
+    "reflection hologram": ("HOLOGRM2", f"{parm(1, 0, 10, -100, 0, -5, -80, 0.5, 1)}\nGLAS MIRROR"),
+    "Fresnel lens": ("FRESNELS", f"CURV 0.03\nCONI -1\n{parm(1, 1e-3, 1e-5)}\n{GLASS}"),
+    "tilted": ("TILTSURF", f"{parm(1, 0.2, -0.35)}\n{GLASS}"),
+    "toroid": ("TOROIDAL", f"CURV 0.028\nCONI -0.3\n{parm(1, -60, 1e-4, -2e-6, 1e-8)}\n{xdat(100)}\n{GLASS}"),
+    "cylinder": ("TOROIDAL", f"CURV -0.04\n{parm(1, 0, 0, 0, 0, 0, 0, 0, 0)}\n{xdat(100)}\n{GLASS}"),
+    "biconic": ("BICONICX", f"CURV 0.025\nCONI -0.5\n{parm(1, 30, 0.4)}\n{GLASS}"),
+    "extended polynomial": ("XPOLYNOM", f"CURV 0.01\nCONI 0.3\n{xdat(12, *SMALL[:20])}\n{GLASS}"),
+    "fringe sag": ("FZERNSAG", f"{parm(1, 1e-4, 1e-6)}\n{parm(9, 0.7, -1.1)}\n{xdat(12, *SMALL[:37])}\n{GLASS}"),
+    "irregular": ("IRREGULA", f"CURV 0.01\nCONI -2\n{parm(1, 0.5, -0.3, 2, -3, 0.04, -0.06, 0.05, 33)}\n{GLASS}"),
+    "tilts": ("STANDARD", f"CURV 0.02\nSCBD 1 0 0 0.3 -0.2 4 -3 25\nSCBD 2 1 0 0.3 0.2 -4 3 -25\n{GLASS}"),
+    "tilts first": ("STANDARD", "CURV 0.02\nSCBD 1 1 0 0.5 0.1 -2 5 10\nSCBD 2 0 1 0 0 30 10 0\nGLAS MIRROR"),
+    "tilted grating": ("DGRATING", f"{parm(1, 0.3, -1)}\nSCBD 1 0 0 0.3 -0.2 4 -3 25\nGLAS MIRROR"),
+}  # fmt: skip
+CASES = {name: case for name, case in CASES.items() if case[0] in TYPES}
+
+
+def text(name: str, unit: str = "MM", *more: str) -> str:
+    """A lens with the surface of a case as its second, behind a mirror if it says so, in lengths of a unit."""
+    kind, lines = CASES[name]
+    return file(f"TYPE {kind}\n{lines}", unit, *more)
+
+
+def file(second: str, unit: str = "MM", *more: str) -> str:
+    lines = [
+        "MODE SEQ", f"UNIT {unit} X W X CM MR CPMM", "ENPD 8", "FTYP 0 0 1 2 0 0 0", "XFLN 0", "YFLN 0",
+        "WAVM 1 0.5 1", "WAVM 2 0.6 1", "PWAV 1", "SURF 0", "  TYPE STANDARD", "  CURV 0.0", "  DISZ INFINITY",
+        "SURF 1", "  STOP", "  TYPE STANDARD", "  CURV 0.0", "  DISZ 6", "  DIAM 5", "SURF 2",
+        *(f"  {line}" for line in second.split("\n") if line), *(["  CURV 0.0"] if "CURV" not in second else []),
+        f"  DISZ {-5 if 'MIRROR' in second else 5}", "  DIAM 9", "  COMM the second", *(f"  {line}" for line in more),
+        "SURF 3", "  TYPE STANDARD", "  CURV -0.03", "  CONI 0.2", f"  DISZ {-20 if 'MIRROR' in second else 20}",
+        "SURF 4", "  TYPE STANDARD", "  CURV 0.0", "  DISZ 0",
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def read(content: str, **options):
+    return zemax_read.read(content, "lens.zmx", **options)
+
+
+def again(lens) -> tuple[rt.Lens, str]:
+    """The lens that comes back, and the file."""
+    written = decode(zemax_write.write(lens, "lens.zmx"), Place("lens.zmx"))
+    return read(written)[0], written
+
+
+def test_every_type_has_a_case():
+    assert {kind for kind, _ in CASES.values()} == set(TYPES)
+
+
+def rays(seed: int) -> list[tuple[list[float], list[float]]]:
+    """Some at the stop, one of them along the axis but beside the vertex."""
+    source = random.Random(seed)
+    found = [([0.1, 0.2, 0.0], [0.0, 0.0, 1.0])]
+    for _ in range(6):
+        slopes = np.array([source.uniform(-0.15, 0.15), source.uniform(-0.15, 0.15), 1.0])
+        found.append(([source.uniform(-4, 4), source.uniform(-4, 4), 0.0], list(slopes / np.linalg.norm(slopes))))
+    return found
+
+
+@pytest.mark.parametrize("unit", MILLIMETRES)
+@pytest.mark.parametrize("name", CASES)
+def test_rays_go_as_the_definitions_say(name, unit):
+    lens, wavelength, mm = read(text(name, unit))[0], 0.6, MILLIMETRES[unit]
+    indices = media(lens, number(wavelength))
+    for P, D in rays(len(name)):
+        expected = zemax_by_definition.trace(text(name, unit), P, D, wavelength)
+        found = start(mm * number(P), number(D))
+        walk = steps(lens.surfaces[1:], found, indices=indices, wavelength=number(wavelength))
+        for crossing, out in zip(walk, expected, strict=True):
+            if out is not None:
+                assert bool(crossing.rays.valid)
+                assert np.abs(crossing.rays.position.numpy() / mm - out[:3]).max() < 2e-12  # of the unit
+                assert np.abs(crossing.rays.direction.numpy() - out[3:]).max() < 1e-12
+
+
+@pytest.mark.parametrize("unit", MILLIMETRES)
+@pytest.mark.parametrize("name", CASES)
+def test_every_type_comes_back_bit_for_bit(name, unit):
+    lens, report = read(text(name, unit, "CLAP 0 6"))
+    if CASES[name][0] != "COORDBRK":
+        assert lens.surfaces[2].apertures
+        assert report.warnings == ()
+    lens_again, written = again(lens)
+    assert leaves(lens_again) == leaves(lens)
+    known = {"XASPHERE": {"EVENASPH", "XASPHERE"}, "JONESMAT": {"STANDARD"}}.get(CASES[name][0], {CASES[name][0]})
+    assert any(f"  TYPE {kind}\n" in written for kind in known)
+    assert leaves(again(lens_again)[0]) == leaves(lens)
+
+
+# -- there and back ---------------------------------------------------------------------------------------------------
+
+amounts = st.floats(1e-5, 1e5).flatmap(lambda x: st.sampled_from([x, -x, 0.0]))
+#: PARM that only some numbers suit.
+_SUITED = {
+    ("COORDBRK", 6): st.sampled_from([0, 1]),
+    ("PARAXIAL", 1): amounts.filter(bool),
+    ("PARAXIAL", 2): st.integers(0, 3),
+    ("PARAX_XY", 3): st.integers(0, 3),
+    ("HOLOGRM2", 3): amounts.filter(bool),
+    ("HOLOGRM2", 6): amounts.filter(bool),
+    ("HOLOGRM2", 7): st.floats(0.1, 10),
+}
+
+
+@st.composite
+def seconds(draw) -> str:
+    """The lines of a surface of any type, with any numbers."""
+    kind = draw(st.sampled_from(sorted(TYPES)))
+    row, lines = TYPES[kind], [f"TYPE {kind}"]
+    if "curvature" in row.holds:
+        lines += [f"CURV {draw(amounts)}", f"CONI {draw(amounts)}"]
+    lines += [f"PARM {j} {draw(_SUITED.get((kind, j), amounts))}" for j in row.parameters]
+    if row.terms is not None:
+        terms = draw(st.lists(amounts, max_size=min(row.most, 20)))
+        lines += xdat(draw(st.floats(1e-3, 1e3)), *terms).split("\n")
+    if kind not in ("COORDBRK", "IRREGULA"):
+        numbers = st.lists(amounts, min_size=5, max_size=5)
+        poses = (f"SCBD {w} {draw(st.integers(0, 1))} 0 {' '.join(map(str, draw(numbers)))}" for w in (1, 2))
+        lines += draw(st.lists(st.sampled_from([*poses]), unique=True))
+        lines.append(draw(st.sampled_from(["", GLASS, "GLAS MIRROR"])))
+    return "\n".join(lines)
+
+
+@settings(max_examples=400, deadline=None)
+@given(second=seconds(), unit=st.sampled_from(["MM", "CM", "IN", "METER"]))
+def test_any_lens_comes_back_bit_for_bit(second, unit):
+    lens = read(file(second, unit))[0]
+    found = again(lens)[0]
+    assert leaves(found) == leaves(lens)
+    assert leaves(again(found)[0]) == leaves(lens)
+
+
+@settings(max_examples=500, deadline=None)
+@given(value=st.floats(1e-300, 1e300), sign=st.sampled_from([1.0, -1.0]))
+def test_every_reciprocal_is_the_one_of_a_text(value, sign):
+    text = spelled_inverse(sign * value)
+    assert inverse(text, 1.0) == sign * value
+    assert math.isfinite(float(text))
+
+
+def test_a_length_is_converted_before_its_reciprocal_is_rounded():
+    assert inverse("1D1", 25.4) == 1 / 254
+    assert inverse("0.0", 25.4) == 0.0
+    assert spelled_inverse(1 / 37.3) == "37.3"
+
+
+@settings(max_examples=600, deadline=None)
+@given(seed=st.integers(0, 2**63), name=st.sampled_from(sorted(CASES)))
+def test_damaged_files_of_every_type_give_a_lens_or_a_clear_error(seed, name):
+    read_damaged(Path("lens.zmx"), damaged(text(name).encode(), random.Random(seed)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"coefficients": number([1e-9] * 9), "kind": "odd asphere"}, "ODDASPHE has 8"),
+        (
+            {"coefficients": number([1e-9]), "phase": rt.Grating(number(0.1), number(1.0))},
+            "a DGRATING surface has none",
+        ),
+        ({"curvature": number(0.1), "phase": rt.IdealLens(number(0.1), number(0.1))}, "a PARAXIAL surface has none"),
+        ({"before": rt.Pose(z=number(1.0))}, "a decentre along z"),
+        ({"is_break": True, "after": rt.Pose(x=number(1.0))}, "holds none of them"),
+        ({"is_break": True, "glass": rt.MIRROR}, "holds none of them"),
+        ({"before": rt.Pose(x=number([1.0, 2.0]))}, "a file holds one lens"),
+        ({"before": rt.Pose(tilt_x=number(math.nan))}, "tilt or decentre is nan"),
+    ],
+)
+def test_what_a_file_cannot_hold_is_refused(changes, message):
+    lens = read(text("standard"))[0]
+    bare = dataclasses.replace(lens.surfaces[2], curvature=None, conic=None, glass=rt.AIR)
+    surface = dataclasses.replace(bare, **changes)
+    with pytest.raises(LensFileError, match=message) as caught:
+        zemax_write.write(
+            dataclasses.replace(lens, surfaces=(*lens.surfaces[:2], surface, *lens.surfaces[3:])), "a.zmx"
+        )
+    assert caught.value.surface == 2
+
+
+# -- what stays refused, and what is said -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("second", "message"),
+    [
+        ("TYPE COORDBRK\nPARM 6 2", r"type COORDBRK \(coordinate break\) of order 2 \(PARM 6"),
+        ("TYPE COORDBRK\nSCBD 1 0 0 0 0 5 0 0", r"type COORDBRK \(coordinate break\) with a tilt"),
+        ("SCBD 1 7 0 0 0 5 0 0", "SCBD 1 of order 7"),
+        ("SCBD 4 0 0 0 0 5 0 0", "SCBD 4 of order 0"),
+        ("TYPE HOLOGRM2\nCURV 0.1\nPARM 3 9\nPARM 6 9\nPARM 7 0.5", "on a curved surface"),
+    ],
+)
+def test_what_is_not_modelled_is_refused_by_name_surface_and_line(second, message):
+    with pytest.raises(UnsupportedSurface, match=message) as caught:
+        read(file(second))
+    assert (caught.value.surface, caught.value.file) == (2, "lens.zmx")
+    assert caught.value.line is not None
+
+
+@pytest.mark.parametrize("kind", ["COORDBRK", "PARAXIAL", "DGRATING"])
+@pytest.mark.parametrize("surface", [0, 4])
+def test_object_and_image_are_no_breaks_and_bend_no_light(kind, surface):
+    content = text("standard").replace(f"SURF {surface}\n  TYPE STANDARD", f"SURF {surface}\n  TYPE {kind}")
+    with pytest.raises(UnsupportedSurface, match=f"surface {surface}: type {kind} .* of the object or the image"):
+        read(content)
+
+
+def test_an_object_stands_straight():
+    with pytest.raises(UnsupportedSurface, match="surface 0: type STANDARD of the object with a tilt"):
+        read(text("standard").replace("SURF 0\n", "SURF 0\n  SCBD 2 0 0 0 0 5 0 0\n"))
+
+
+@pytest.mark.parametrize(
+    ("second", "message"),
+    [
+        ("TYPE PARAXIAL\nPARM 1 0", "a focal length of 0"),
+        ("TYPE PARAXIAL\nPARM 1 1e-320", "too small a length"),
+        ("TYPE PARAXIAL\nPARM 1 10\nPARM 2 7", "an OPD mode of 7"),
+        ("TYPE BINARY_2\nXDAT 1 1\nXDAT 2 10\nXDAT 3 5", "no order of diffraction"),
+        ("TYPE BINARY_2\nPARM 0 1\nXDAT 1 2\nXDAT 3 5", "no XDAT 2"),
+        ("TYPE BINARY_2\nPARM 0 1\nXDAT 1 2\nXDAT 2 -3\nXDAT 3 5", "expected a positive length"),
+        ("TYPE FZERNPHA\nPARM 0 1\nXDAT 1 38\nXDAT 2 3", "expected 0 to 37"),
+        ("TYPE BINARY_2\nPARM 0 1\nXDAT 1 1.5\nXDAT 2 3", "expected a whole number"),
+        ("TYPE HOLOGRM2\nPARM 3 9\nPARM 7 0.5", "a construction point at the vertex"),
+        ("TYPE HOLOGRM2\nPARM 3 9\nPARM 6 9", "construction wavelength of 0 µm"),
+        ("PARM one 1", "number of the parameter is 'one'"),
+        ("SCBD 1 0 0 nan", "finite number"),
+    ],
+)
+def test_numbers_out_of_range_are_one_clear_error(second, message):
+    with pytest.raises(LensFileError, match=message) as caught:
+        read(file(second))
+    assert caught.value.surface == 2
+
+
+@pytest.mark.parametrize(
+    ("second", "where", "said"),
+    [
+        ("TYPE JONESMAT\nPARM 1 1", "notes", "PARM 1 of a JONESMAT surface is not used: polarisation"),
+        ("TYPE DGRATING\nPARM 3 1", "warnings", "PARM 3: a DGRATING has parameters 1 to 2; left out"),
+        ("TYPE EVENASPH\nPARM 9 1", "warnings", r"PARM 9: an EVENASPH has parameters 1 to 8 \(r² to r\^16\)"),
+        ("TYPE STANDARD\nPARM 1 1", "notes", "PARM 1 is not used by a STANDARD surface"),
+        ("TYPE STANDARD\nXDAT 3 1", "notes", "XDAT 3 is not used by a STANDARD surface"),
+        ("TYPE XASPHERE\nXDAT 1 1\nXDAT 2 9\nXDAT 4 1", "warnings", "XDAT 4: XDAT 1 says 1 terms, to XDAT 3"),
+        ("TYPE COORDBRK\nCURV 0.1", "notes", "CURV is not used by a COORDBRK surface"),
+        ("TYPE COORDBRK\nGLAS MIRROR", "warnings", "GLAS on a coordinate break is not used"),
+        ("TYPE COORDBRK\nSCBD 3 3 1", "notes", "coordinate return; its solved values"),
+    ],
+)
+def test_what_is_not_used_is_said(second, where, said):
+    report = read(file(second))[1]
+    assert [one for one in getattr(report, where) if re.search(said, one)]
+    assert all(keyword.status != "unknown" for keyword in report.keywords)
