@@ -304,8 +304,7 @@ def type_of(surface: Surface) -> str | None:
     if surface.coefficients is None:
         return "STANDARD"
     kind = KINDS[surface.kind]
-    longer = surface.coefficients.dim() == 1 and bool((surface.coefficients[kind.parameters :] != 0).any())
-    return "XASPHERE" if longer and surface.kind == EVEN else kind.zemax
+    return "XASPHERE" if surface.kind == EVEN and len(surface.coefficients) > kind.parameters else kind.zemax
 
 
 def _type_of_phase(surface: Surface) -> str | None:
