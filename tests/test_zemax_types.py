@@ -17,7 +17,8 @@ from test_formats import damaged, leaves, read_damaged
 import raytrace as rt
 from raytrace.formats import LensFileError, UnsupportedSurface, zemax_read, zemax_write
 from raytrace.formats.source import Place, decode
-from raytrace.formats.zemax_types import TYPES, inverse, spelled_inverse
+from raytrace.formats.zemax_numbers import inverse, spelled_inverse
+from raytrace.formats.zemax_types import TYPES
 from raytrace.optics.trace import media, steps
 from raytrace.system.rays import start
 
@@ -82,7 +83,7 @@ def file(second: str, unit: str = "MM", *more: str) -> str:
         "WAVM 1 0.5 1", "WAVM 2 0.6 1", "PWAV 1", "SURF 0", "  TYPE STANDARD", "  CURV 0.0", "  DISZ INFINITY",
         "SURF 1", "  STOP", "  TYPE STANDARD", "  CURV 0.0", "  DISZ 6", "  DIAM 5", "SURF 2",
         *(f"  {line}" for line in second.split("\n") if line), *(["  CURV 0.0"] if "CURV" not in second else []),
-        f"  DISZ {-5 if 'MIRROR' in second else 5}", "  DIAM 9", "  COMM the second", *(f"  {line}" for line in more),
+        f"  DISZ {-5 if 'MIRROR' in second else 5}", *(["  DIAM 9"] if "DIAM" not in second else []), "  COMM the second", *(f"  {line}" for line in more),
         "SURF 3", "  TYPE STANDARD", "  CURV -0.03", "  CONI 0.2", f"  DISZ {-20 if 'MIRROR' in second else 20}",
         "SURF 4", "  TYPE STANDARD", "  CURV 0.0", "  DISZ 0",
     ]  # fmt: skip
@@ -166,7 +167,7 @@ def seconds(draw) -> str:
     if "curvature" in row.holds:
         lines += [f"CURV {draw(amounts)}", f"CONI {draw(amounts)}"]
     lines += [f"PARM {j} {draw(_SUITED.get((kind, j), amounts))}" for j in row.parameters]
-    if row.terms is not None:
+    if row.terms is not None and kind != "TOROIDAL":
         terms = draw(st.lists(amounts, max_size=min(row.most, 20)))
         lines += xdat(draw(st.floats(1e-3, 1e3)), *terms).split("\n")
     if kind not in ("COORDBRK", "IRREGULA"):
@@ -243,6 +244,8 @@ def test_what_a_file_cannot_hold_is_refused(changes, message):
         ("TYPE COORDBRK\nSCBD 1 0 0 0 0 5 0 0", r"type COORDBRK \(coordinate break\) with a tilt"),
         ("SCBD 1 7 0 0 0 5 0 0", "SCBD 1 of order 7"),
         ("SCBD 4 0 0 0 0 5 0 0", "SCBD 4 of order 0"),
+        ("TYPE TOROIDAL\nXDAT 1 2\nXDAT 2 9\nXDAT 4 0.1", r"type TOROIDAL \(toroidal\) with Zernike terms"),
+        ("TYPE IRREGULA\nPARM 3 9\nSCBD 1 0 0 1 0 5 0 0", "type IRREGULA .* with tilts of its own .* and of the surface"),
         ("TYPE HOLOGRM2\nCURV 0.1\nPARM 3 9\nPARM 6 9\nPARM 7 0.5", "on a curved surface"),
     ],
 )
@@ -279,6 +282,7 @@ def test_an_object_stands_straight():
         ("TYPE BINARY_2\nPARM 0 1\nXDAT 1 1.5\nXDAT 2 3", "expected a whole number"),
         ("TYPE HOLOGRM2\nPARM 3 9\nPARM 7 0.5", "a construction point at the vertex"),
         ("TYPE HOLOGRM2\nPARM 3 9\nPARM 6 9", "construction wavelength of 0 µm"),
+        ("TYPE IRREGULA\nDIAM 0\nPARM 5 1", "no semi-diameter"),
         ("PARM one 1", "number of the parameter is 'one'"),
         ("SCBD 1 0 0 nan", "finite number"),
     ],

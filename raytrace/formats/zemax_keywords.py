@@ -68,16 +68,14 @@ TAIL_REASON = "merit function, tolerances or configurations: not part of the len
 
 #: Types of surface that are not modelled, by what OpticStudio calls them; those that are, are rows of `TYPES`.
 _TYPES = (
-    "TOROIDAL toroidal, EGRATING elliptical grating, TILTSURF tilted, "
-    "XOSPHERE extended odd asphere, BICONICX biconic, IRREGULA irregular, "
-    "ZERNSAG Zernike sag, SZERNSAG Zernike standard sag, FZERNSAG Zernike fringe sag, "
-    "SZERNPHA Zernike standard phase, XPOLYNOM extended polynomial, POLYNOMI polynomial, BINARY_3 binary 3, "
-    "BINARY_4 binary 4, QED_TYPE Q-type asphere, "
-    "CFRESNEL cylindrical Fresnel, GRINSUR1 gradient index 1, GRINSUR5 gradient index 5, GRADIUM gradient index, "
-    "HOLOGRM1 hologram 1, CONJUGAT conjugate, RETROREF retro-reflector, "
-    "ATMOSPHR atmospheric, GRIDSAG grid sag, GRID_SAG grid sag, ALTERNAT alternate, QTYPE Q-type asphere, "
-    "NONSEQCO non-sequential component, USERSURF user-defined (DLL), BIREFR_I birefringent in, "
-    "BIREFR_O birefringent out, BICONIC biconic, CUBICSPL cubic spline, DATASURF data, BLACKBOX black box"
+    "EGRATING elliptical grating, XOSPHERE extended odd asphere, ZERNSAG Zernike sag, "
+    "SZERNSAG Zernike standard sag, SZERNPHA Zernike standard phase, POLYNOMI polynomial, BINARY_3 binary 3, "
+    "BINARY_4 binary 4, QED_TYPE Q-type asphere, CFRESNEL cylindrical Fresnel, GRINSUR1 gradient index 1, "
+    "GRINSUR5 gradient index 5, GRADIUM gradient index, HOLOGRM1 hologram 1, CONJUGAT conjugate, "
+    "RETROREF retro-reflector, ATMOSPHR atmospheric, GRIDSAG grid sag, GRID_SAG grid sag, ALTERNAT alternate, "
+    "QTYPE Q-type asphere, NONSEQCO non-sequential component, USERSURF user-defined (DLL), "
+    "BIREFR_I birefringent in, BIREFR_O birefringent out, BICONIC biconic, CUBICSPL cubic spline, DATASURF data, "
+    "BLACKBOX black box"
 )
 TYPE_NAMES = dict(name.split(" ", 1) for name in _TYPES.split(", "))
 

@@ -4,7 +4,7 @@ from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, UnsupportedSurface, shown
 from raytrace.formats.spelling import double
 from raytrace.formats.zemax_keywords import Block, Record
-from raytrace.formats.zemax_types import INVERSE, Numbers, SurfaceType, inverse, order_is_known, pose_of
+from raytrace.formats.zemax_numbers import INVERSE, Numbers, SurfaceType, inverse, order_is_known, pose_of
 from raytrace.system.pose import Pose
 
 #: XDAT 1 and 2 are the number of terms and their radius.

@@ -10,8 +10,9 @@ from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, UnsupportedSurface, shown
 from raytrace.formats.spelling import double, is_infinite
 from raytrace.formats.zemax_keywords import TYPE_NAMES, Block, Record, aperture_keywords
+from raytrace.formats.zemax_numbers import SurfaceType
 from raytrace.formats.zemax_parameters import numbers, poses, report_unused
-from raytrace.formats.zemax_types import TYPES, SurfaceType
+from raytrace.formats.zemax_types import TYPES
 from raytrace.media.catalog import Catalog
 from raytrace.media.glass import AIR, MIRROR, Glass, mil_glass
 from raytrace.system.aperture import SHAPES, Aperture
@@ -51,7 +52,10 @@ def _unsupported(block: Block, at_end: bool) -> str:
         return f"type {kind} ({row.name}) with a tilt or decentre of the surface (SCBD)"
     if row.flat and any(_nonzero(block, keyword, keyword, 1.0) is not None for keyword in ("CURV", "CONI")):
         return f"type {kind} ({row.name}) on a curved surface (CURV)"
-    beyond = row.beyond(numbers(block, row, 1.0))
+    told = numbers(block, row, 1.0)
+    if kind == "IRREGULA" and any(told.at(j) for j in range(1, 5)) and any(poses(block, 1.0).values()):
+        return f"type {kind} ({row.name}) with tilts of its own (PARM 1 to 4) and of the surface (SCBD)"
+    beyond = row.beyond(told)
     return f"type {kind} ({row.name}) {beyond}" if beyond else ""
 
 

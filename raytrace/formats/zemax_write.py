@@ -7,7 +7,9 @@ from raytrace.formats.media import catalogs_needed, is_code, is_left_out, listed
 from raytrace.formats.source import LensFileError, Place
 from raytrace.formats.spelling import exact, exact_list, one_line, thickness
 from raytrace.formats.zemax_keywords import FIELD_KINDS, FIELD_LISTS, NOTE_PIECE, SYSTEM_APERTURES
-from raytrace.formats.zemax_types import INVERSE, TYPES, SurfaceType, numbers_of, spelled_inverse, type_of
+from raytrace.formats.zemax_numbers import INVERSE, SurfaceType, numbers_of, spelled_inverse
+from raytrace.formats.zemax_sags import stands_in_parameters
+from raytrace.formats.zemax_types import TYPES, type_of
 from raytrace.media.glass import Glass, mil_glass
 from raytrace.system.aperture import SHAPES, Aperture
 from raytrace.system.lens import RAY_AIMING, Lens
@@ -152,13 +154,13 @@ def _own(surface: Surface) -> str:
 
 
 def _check_terms(surface: Surface, found: str, place: Place) -> None:
-    kind, terms = KINDS[surface.kind], surface.coefficients
-    if surface.phase is not None and surface.kind != EVEN:
-        message = f"{type(surface.phase).__name__} on an {surface.kind}, expected one on an {EVEN} at most"
+    kind, row, terms = KINDS[surface.kind], TYPES[found], surface.coefficients
+    if (surface.phase is not None or surface.departure is not None) and surface.kind != EVEN:
+        message = f"{_own(surface)} on a surface that is {surface.kind}, expected one that is an {EVEN} at most"
         raise LensFileError(f"{message}; a .zmx file holds no such surface", place)
-    most, powers = (TYPES[found].most, "") if found == "XASPHERE" else (kind.parameters, kind.powers)
+    most = row.most if found == "XASPHERE" else kind.most or kind.parameters
     if bool((terms[most:] != 0).any()):
-        message = f"{len(terms)} terms (to r^{kind.step * len(terms)}), an {found} has {most}{powers}"
+        message = f"{len(terms)} terms (to r^{kind.step * len(terms)}), an {found} has {most}{row.powers}"
         raise LensFileError(f"{message}; write a table (.csv)", place)
 
 
@@ -180,8 +182,8 @@ def _numbers(surface: Surface, row: SurfaceType, place: Place) -> list[str]:
 
 
 def _poses(surface: Surface, kind: str, place: Place) -> list[str]:
-    """SCBD lines of the poses before and behind a surface; those of a coordinate break are its PARM."""
-    if kind == "COORDBRK":
+    """SCBD lines of the poses before and behind a surface, but for those that are its PARM."""
+    if kind == "COORDBRK" or stands_in_parameters(surface):
         return []
     found = ((1, surface.before), (2, surface.after))
     return [f"  SCBD {where} {_pose(pose, place)}" for where, pose in found if pose is not None]
