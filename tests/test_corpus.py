@@ -1,13 +1,12 @@
 """Real lens files against an oracle: each is loaded and right, or refused by name; none is wrong.
 
 Oracle: ../shared/corpus/oracle.json, entries marked `oracle: true` (two independent programs, or numbers OpticStudio
-stored in the file, agree). `python tests/test_corpus.py` prints the table of docs/corpus.md.
+stored in the file, agree). `python tests/test_corpus_types.py` prints docs/corpus.md.
 """
 
 import dataclasses
 import functools
 import json
-import sys
 import warnings
 from pathlib import Path
 
@@ -185,7 +184,7 @@ def media_of(lens: Lens, n_primary: list[float]) -> list[float]:
 
 
 def table() -> str:
-    """The table of docs/corpus.md."""
+    """Its table in docs/corpus.md."""
     results = [compare(name) for name in sorted(oracle())]
     lines = [
         "| file | outcome | largest difference: index · first order (relative) · rays (mm) | details |",
@@ -230,7 +229,3 @@ def test_other_editions_are_still_other_and_their_differences_as_listed():
     assert found.keys() == OTHER_EDITIONS.keys()
     for key, difference in found.items():
         assert difference == pytest.approx(OTHER_EDITIONS[key], rel=0.1), key  # the table gives two digits
-
-
-if __name__ == "__main__":
-    sys.stdout.write(table() + "\n")

@@ -83,7 +83,8 @@ def file(second: str, unit: str = "MM", *more: str) -> str:
         "WAVM 1 0.5 1", "WAVM 2 0.6 1", "PWAV 1", "SURF 0", "  TYPE STANDARD", "  CURV 0.0", "  DISZ INFINITY",
         "SURF 1", "  STOP", "  TYPE STANDARD", "  CURV 0.0", "  DISZ 6", "  DIAM 5", "SURF 2",
         *(f"  {line}" for line in second.split("\n") if line), *(["  CURV 0.0"] if "CURV" not in second else []),
-        f"  DISZ {-5 if 'MIRROR' in second else 5}", *(["  DIAM 9"] if "DIAM" not in second else []), "  COMM the second", *(f"  {line}" for line in more),
+        f"  DISZ {-5 if 'MIRROR' in second else 5}", *(["  DIAM 9"] if "DIAM" not in second else []),
+        "  COMM the second", *(f"  {line}" for line in more),
         "SURF 3", "  TYPE STANDARD", "  CURV -0.03", "  CONI 0.2", f"  DISZ {-20 if 'MIRROR' in second else 20}",
         "SURF 4", "  TYPE STANDARD", "  CURV 0.0", "  DISZ 0",
     ]  # fmt: skip
@@ -245,7 +246,10 @@ def test_what_a_file_cannot_hold_is_refused(changes, message):
         ("SCBD 1 7 0 0 0 5 0 0", "SCBD 1 of order 7"),
         ("SCBD 4 0 0 0 0 5 0 0", "SCBD 4 of order 0"),
         ("TYPE TOROIDAL\nXDAT 1 2\nXDAT 2 9\nXDAT 4 0.1", r"type TOROIDAL \(toroidal\) with Zernike terms"),
-        ("TYPE IRREGULA\nPARM 3 9\nSCBD 1 0 0 1 0 5 0 0", "type IRREGULA .* with tilts of its own .* and of the surface"),
+        (
+            "TYPE IRREGULA\nPARM 3 9\nSCBD 1 0 0 1 0 5 0 0",
+            "type IRREGULA .* with tilts of its own .* and of the surface",
+        ),
         ("TYPE HOLOGRM2\nCURV 0.1\nPARM 3 9\nPARM 6 9\nPARM 7 0.5", "on a curved surface"),
     ],
 )

@@ -109,7 +109,7 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
     entrance_pupil = n_object * B1 / A1
     exit_pupil = -n_image * B2 / D2 - surfaces[-1].thickness
 
-    vergence = n_object / lens.surfaces[0].thickness  # 0 for an object at infinity
+    vergence = n_object / _object_distance(lens)  # 0 for an object at infinity
     y, omega = A + B * vergence, C + D * vergence
     image_distance = -n_image * y / omega
 
@@ -143,12 +143,18 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
     )
 
 
+def _object_distance(lens: Lens) -> Tensor:
+    """The distance (...) mm of the object; of one at surface 1 so little that all is what it is in the limit."""
+    distance = lens.surfaces[0].thickness
+    return torch.where(distance == 0, torch.finfo(distance.dtype).tiny ** 0.5, distance)
+
+
 def marginal_ray(lens: Lens) -> tuple[Tensor, Tensor]:
     """(y, ω) in mm and 1 of the marginal ray in front of surface 1, at the primary wavelength."""
     wavelength = lens.wavelengths[lens.primary_wavelength]
     n_object = media(lens, wavelength)[0]
     data = first_order(lens)
-    vergence = n_object / lens.surfaces[0].thickness
+    vergence = n_object / _object_distance(lens)
     y = _marginal_height(lens, data.entrance_pupil_position, data.entrance_pupil_diameter, n_object, vergence)
     return y, y * vergence
 
