@@ -94,3 +94,12 @@ def test_views_and_colours_by_wavelength(tmp_path):
     assert len(rays) == 6
     assert len({line.get_color() for line in rays}) == 2
     assert "0.45 µm" in "".join(text.get_text() for text in figure.legends[0].get_texts())
+
+
+def test_a_decentred_aperture_shows_that_part_of_a_mirror():
+    part = rt.Aperture("circular", (0.0, 54.0), False, (0.0, 100.0))
+    mirror = dict(radius=-1000.0, conic=-1.0, thickness=-500.0, glass="MIRROR", apertures=(part,))
+    tilted = rt.lens([dict(thickness=600.0), mirror], stop=1, entrance_pupil_diameter=300, fields=[0])
+    (face,) = [line for line in rt.layout(tilted).plot().axes[0].lines if line.get_gid() == "mirror 2"]
+    assert (face.get_ydata().min(), face.get_ydata().max()) == (46.0, 154.0)
+    assert np.abs(face.get_xdata() - (600 - face.get_ydata() ** 2 / 2000)).max() < 1e-9

@@ -163,13 +163,15 @@ def _draw_mirrors(axes: Axes, lens: Lens, places: list[outline.Section], radii: 
         surface = lens.surfaces[k]
         if not surface.is_mirror:
             continue
+        x, y, radius = outline.clear_part(surface, radii[k])
         hole = max([reach(a)[0] for a in surface.apertures if not a.obscures] or [0.0])
         seen = 0.0 if bent else outline.hole_radius(k, outline.vertices(lens), radii[k], paths)
-        hole = min(max(hole, seen), 0.95 * radii[k])
-        height = np.linspace(hole, radii[k], 121)
-        thick = side * max(0.07 * radii[k], 0.025 * max(radii[1:-1]))
+        hole = min(max(hole, seen), 0.95 * radius)
+        height = np.linspace(hole, radius, 121)
+        thick = side * max(0.07 * radius, 0.025 * max(radii[1:-1]))
         if hole == 0.0:
-            height = np.concatenate([-height[:0:-1], height])
+            middle = x * places[k].direction[0] + y * places[k].direction[1]
+            height = middle + np.concatenate([-height[:0:-1], height])
         for sign in (1,) if hole == 0.0 else (1, -1):
             face = outline.depth(surface, sign * height, places[k].direction)
             front, back = places[k].at(face, sign * height), places[k].at(face + thick, sign * height)

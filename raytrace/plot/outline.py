@@ -16,6 +16,7 @@ from raytrace.optics.frames import Frame, frames
 from raytrace.optics.launch import launch, stop_radius
 from raytrace.optics.trace import lens_steps, media
 from raytrace.plot.style import array
+from raytrace.system.aperture import reach
 from raytrace.system.lens import Lens
 from raytrace.system.surface import Surface, intersect, sag_at
 
@@ -109,6 +110,15 @@ def depth(surface: Surface, radius: np.ndarray, direction: tuple[float, float] =
     """Sag (...) mm at a radius (...) mm, of either sign, along a direction by its cosines in x and y."""
     radius = torch.as_tensor(radius, dtype=surface.thickness.dtype, device=surface.thickness.device)
     return array(sag_at(surface, direction[0] * radius, direction[1] * radius))
+
+
+def clear_part(surface: Surface, radius: float) -> tuple[float, float, float]:
+    """Centre (x, y) and radius in mm of what is drawn of a surface: a decentred aperture shows that part alone."""
+    for aperture in surface.apertures:
+        rim = reach(aperture)[1]
+        if not aperture.obscures and math.isfinite(rim) and any(aperture.centre):
+            return *aperture.centre, rim
+    return 0.0, 0.0, radius
 
 
 def is_bent(lens: Lens) -> bool:

@@ -45,11 +45,14 @@ def _seen(points: np.ndarray) -> np.ndarray:
     return points[[2, 0, 1]]
 
 
-def _mesh(surface: Surface, frame: Frame, radius: float, hole: float = 0.0) -> np.ndarray:
-    """Points (3, rings, arms) mm of a surface."""
+def _mesh(surface: Surface, frame: Frame, radius: float) -> np.ndarray:
+    """Points (3, rings, arms) mm of what is drawn of a surface."""
+    centre_x, centre_y, radius = outline.clear_part(surface, radius)
+    holes = [reach(aperture)[0] for aperture in surface.apertures if not aperture.obscures and surface.is_mirror]
+    hole = min(max(holes or [0.0]), 0.95 * radius)
     r = np.linspace(hole, radius, _RINGS + 1)[:, None]
     angle = np.linspace(0, 2 * np.pi, _ARMS + 1)[None]
-    x, y = (frame.origin.new_tensor(part) for part in (r * np.cos(angle), r * np.sin(angle)))
+    x, y = (frame.origin.new_tensor(p) for p in (centre_x + r * np.cos(angle), centre_y + r * np.sin(angle)))
     return style.array(frame.outside(torch.stack([x, y, sag_at(surface, x, y)])))
 
 
@@ -61,8 +64,7 @@ def _draw_surfaces(axes, lens: Lens, places: list[Frame], radii: list[float], in
             continue
         glass = max(indices[k - 1], indices[k]) > outline.GLASSY
         if surface.is_mirror or glass or surface.phase is not None or k == lens.stop:
-            hole = max([reach(a)[0] for a in surface.apertures if not a.obscures and surface.is_mirror] or [0.0])
-            meshes[k] = _mesh(surface, places[k], radii[k], min(hole, 0.95 * radii[k]))
+            meshes[k] = _mesh(surface, places[k], radii[k])
     for k, mesh in meshes.items():
         surface = lens.surfaces[k]
         if surface.is_mirror:
