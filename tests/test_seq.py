@@ -21,6 +21,7 @@ from raytrace.media.glass import constant, index, model_glass
 from raytrace.optics.trace import trace_lens
 from raytrace.system.aperture import Aperture
 from raytrace.system.lens import Lens, SystemAperture
+from raytrace.system.phases import RadialPhase
 from raytrace.system.pose import Pose, undone
 from raytrace.system.rays import Rays
 
@@ -74,6 +75,8 @@ S 0 0.2 517.642
   ELX 0.4; ELY 0.4
 S 3 0.2 NBK7_SCHOTT; RDY S4 3.1
   ASP; K 0.1; A 1e-3; B 1e-4; C 1e-4; D 1e-5; E 1e-5; F 1e-5; G 1e-5; H 1e-5; J 1e-6
+  DIF DOE; HOR 1; HWL 587.6; HCT R; HCO C1 -0.0001; HCO C2 1e-6
+  !raytrace radius 0.7
   XDE 0.001; YDE 0.001; ZDE 0.001; ADE 0.1; BDE 0.1; CDE 0.1; DAR
 S 0 1 NOA61; THI S5 1.1; GLA S5 F5; CUY S5 0.0
   ADE 1; REV
@@ -344,6 +347,34 @@ def test_a_bend_comes_back_and_what_no_command_tells_is_refused():
         again(lens.replace(mirror, before=tilt, after=tilt))
 
 
+# -- diffractive surfaces ---------------------------------------------------------------------------------------------
+
+HYBRID = sequence(
+    "S 9.93 3.7 'E48'\nSTO\nASP; K -0.71; A -0.1581980090969e-4; B -0.2770951746068999e-6; C -0.1216086045095e-8\n"
+    "DIF DOE; HOR 1.0; HWL 587.5618; HCT R; HCO C1 -0.001807322521767816; HCC C1 100\nS -48.3 12.94603127272",
+    "EPD 12;WL 656.2725 587.5618 486.1327;REF 2;YAN 0\nPRV\nPWL 800 700 650 600 587.6 546.1 486.1 480 440\n"
+    "'E48' 1.5257 1.527 1.5286 1.5306 1.53116 1.5334 1.5378 1.5384 1.5427\nEND",
+)  # Edmund Optics 65988, an aspheric hybrid of 12.5 mm for 15 mm
+
+
+@pytest.mark.parametrize(("sign", "sharp"), [("-", True), ("", False)])
+def test_a_hybrid_lens_is_sharp_where_its_file_says(sign, sharp):
+    lens, _ = of(HYBRID.replace("C1 -", f"C1 {sign}"))
+    end = trace_lens(lens, bundle(0, 0, (0, 0), 6.0, 15), lens.wavelengths[1])
+    rms = float(end.position[:2].square().sum(0).mean().sqrt())
+    assert rms < 0.6 * MICROMETRE if sharp else rms > 0.4
+    assert leaves(again(lens)) == leaves(lens)
+    focus = rt.first_order(lens)
+    assert (float(focus.effective_focal_length) == pytest.approx(15.0, abs=0.05)) == sharp
+
+
+@pytest.mark.parametrize("radius", [1.0, 7.3, 1 / 3])
+def test_phases_come_back_bit_for_bit(radius):
+    phase = RadialPhase(number([-17.3, 1 / 7, 0.0, 1e-30]), number(radius), number(-2.0))
+    lens = read_lens("cooke_triplet").replace(2, phase=phase)
+    assert leaves(again(lens)) == leaves(lens)
+
+
 # -- apertures, fields, glasses ---------------------------------------------------------------------------------------
 
 
@@ -472,7 +503,7 @@ def test_a_lens_module_of_what_is_known_is_told():
 
 
 REFUSED = {
-    "DIF DOE\nHOR 1": "DIF (diffractive surface)",
+    "HOE": "HOE (diffractive surface)",
     "YTO\nRDX 5": "YTO (toroid or cylinder)",
     "CYL": "CYL (toroid or cylinder)",
     "SPS XYP": "SPS (special surface)",
@@ -515,6 +546,10 @@ def test_what_is_not_modelled_is_refused_by_name_line_and_surface(command):
         ("S -50 48", "S9 -50 48", "S9 where S2 should follow"),
         ("S -50 48", "S -50 48 REFL\nADE 3; BDE 4; BEN", "tilts about several axes"),
         ("S -50 48", "S -50 48 REFL\nRMD TIR", "RMD TIR"),
+        ("STO", "STO\nDIF GRT", "DIF GRT (diffractive surface)"),
+        ("STO", "STO\nDIF DOE; HWL 500; HCT XY", "HCT XY is not modelled"),
+        ("STO", "STO\nDIF DOE; HCT R", "without the wavelength"),
+        ("STO", "STO\nDIF DOE; HWL 500; HCT R; HCO X1 1", "HCO X1"),
         ("S -50 48", "S -50 48 &", "S with 5 words"),
         ("GO", "LEN", "several lenses"),
         ("GO", "S 0 0", "after SI"),
@@ -531,7 +566,11 @@ def test_what_is_not_settled_or_wrong_is_refused_with_its_reason(old, new, messa
 def test_every_command_that_is_read_is_met_in_one_file_which_comes_back():
     lens, report = of(EVERYTHING)
     met = {keyword.name for keyword in report.keywords if keyword.status == "read"}
-    wanted = SYSTEM_READ | SURFACE_READ | {f"!raytrace {word}" for word in ("aiming", "catalogs", "note", "unnamed")}
+    wanted = (
+        SYSTEM_READ
+        | SURFACE_READ
+        | {f"!raytrace {word}" for word in ("aiming", "catalogs", "note", "radius", "unnamed")}
+    )
     elsewhere = {"EPD", "FNO", "SO", "SI", *(word for pair in FIELD_KINDS.values() for word in pair)}
     assert wanted - elsewhere <= met
     assert leaves(again(lens)) == leaves(lens)
@@ -576,6 +615,8 @@ def test_apertures_of_a_lens_that_a_sequence_cannot_hold_are_refused():
     for aperture in (SystemAperture("float_by_stop", number(9.0)), SystemAperture("working_f_number", number(3.0))):
         with pytest.raises(LensFileError, match="set `entrance_pupil_diameter`"):
             again(dataclasses.replace(lens, aperture=aperture))
+    with pytest.raises(LensFileError, match="a temperature or pressure"):
+        again(lens.at(temperature=40))
     far = lens.at(object_distance=2e10)
     with pytest.raises(LensFileError, match="which CODE V takes for infinity"):
         again(far)

@@ -156,7 +156,7 @@ def _table(
     if missing:
         listed = ", ".join(f"{1e3 * wave:g}" for wave in missing[:5])
         report.warn(f"private glass {name}: index at {listed} nm is interpolated, by the formula of Schott", row.place)
-    nodes = _nodes(sorted(pairs), [wave for wave in wanted if wave in pairs])
+    nodes = _nodes(sorted(pairs), [min(pairs, key=lambda wave: abs(wave - one)) for one in wanted])
     glass = from_table(nodes, [pairs[wave] for wave in nodes], name=name)
     off = float((refractive_index(glass, double(waves)) - double(indices)).abs().max())
     if len(waves) > _NODES:

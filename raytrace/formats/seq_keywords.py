@@ -34,7 +34,7 @@ RING = "RING"
 
 #: What CODE V has no command for stands in comments, `!raytrace catalogs SCHOTT OHARA`.
 OWN = "!RAYTRACE"
-_OWN_WORDS = ("AIMING", "BREAK", "CATALOGS", "NOTE", "UNNAMED")
+_OWN_WORDS = ("AIMING", "BREAK", "CATALOGS", "NOTE", "RADIUS", "UNNAMED")
 
 #: Decentres and tilts by the numbers of a pose; those about x and y are left-handed, their sign turns.
 POSE_WORDS = {"x": "XDE", "y": "YDE", "z": "ZDE", "tilt_x": "ADE", "tilt_y": "BDE", "tilt_z": "CDE"}
@@ -51,7 +51,7 @@ def _words(text: str) -> frozenset[str]:
 SYSTEM_READ = _words(
     "RDM LEN TIT EPD FNO NAO DIM WL REF WTW WTF VUX VLX VUY VLY SO S SI GO PRV PWL END ZOO TEM PRE CA PIM"
 ) | {word for pair in FIELD_KINDS.values() for word in pair}
-SURFACE_READ = _words("CUY RDY THI GLA RMD STO SLB SPH CON ASP K CUF") | {
+SURFACE_READ = _words("CUY RDY THI GLA RMD STO SLB SPH CON ASP K CUF DIF HOR HWL HCT HCO") | {
     *LETTERS,
     *APERTURE_WORDS,
     *POSE_WORDS.values(),
@@ -89,7 +89,7 @@ REFUSED = _by_word(
         "global coordinates": "GLB",
         "toroid or cylinder": "CYL YTO XTO AAS CUX RDX KX KY AR BR CR DR AP BP CP DP",
         "special surface": "SPS SCO UDS SPL ZRN",
-        "diffractive surface": "DIF HOE GRT GRO GRS GRX GRY GRZ HOR HWL HCT HCO HV1 HV2 HX1 HX2 HY1 HY2 HZ1 HZ2",
+        "diffractive surface": "HOE GRT GRO GRS GRX GRY GRZ HV1 HV2 HX1 HX2 HY1 HY2 HZ1 HZ2",
         "gradient index": "GRI GRN GRC",
         "thermal gradient": "THG",
         "non-sequential surfaces": "NSS NSC EXI",

@@ -12,6 +12,7 @@ that CODE V stored in public files, or by what the makers of two other programs 
 - CIR, REX and REY, ELX and ELY are radii and half-widths, and clip; with OBS they obscure, EDG tells the part.
 - XDE YDE ZDE decentre, then ADE BDE CDE tilt about x, y, z, the first two left-handed, all the axes that follow; with
   DAR those of this surface alone, with REV those behind it, back. BEN tilts again behind a mirror.
+- DIF DOE with HCT R adds the path HOR λ/HWL Σ C_j r^2j.
 - Rays are aimed at the stop, along paraxial lines.
 - Of zoom positions (ZOO) the first is read.
 """
@@ -33,6 +34,7 @@ from raytrace.formats.spelling import words as split
 from raytrace.formats.zemax_keywords import Block, Record
 from raytrace.media.glass import AIR, refractive_index
 from raytrace.system.lens import RAY_AIMING, Fields, Lens, SystemAperture
+from raytrace.system.phases import power_of
 from raytrace.system.surface import Surface, vertex_curvature
 
 #: Millimetres in a unit of DIM.
@@ -103,11 +105,10 @@ def _unit(system: Block, report: Draft) -> float:
 
 def _surfaces(found: Sections, unit: float, private: dict, user: Sequence[Path], report: Draft) -> tuple[Surface, ...]:
     surfaces, before = [], AIR
-    breaks = {record.place.surface for record in found.own if record.keyword == "BREAK"}
-    for block in found.surfaces:
-        is_break = block.place.surface in breaks
-        surface = seq_surface.build(block, unit, before, is_break=is_break, private=private, user=user, report=report)
-        before = before if surface.is_mirror or is_break else surface.glass
+    for k, block in enumerate(found.surfaces):
+        own = {record.keyword: record for record in found.own if record.place.surface == k}
+        surface = seq_surface.build(block, unit, before, own=own, private=private, user=user, report=report)
+        before = before if surface.is_mirror or surface.is_break else surface.glass
         surfaces.append(surface)
     return tuple(surfaces)
 
@@ -136,7 +137,8 @@ def _at_paraxial_image(
             behind = -index
         else:
             behind = index.sign() * refractive_index(surface.glass, wavelength)
-        slope, index = slope - y * vertex_curvature(surface) * (behind - index), behind
+        power = 0.0 if surface.phase is None else power_of(surface.phase, wavelength)[1]
+        slope, index = slope - y * (vertex_curvature(surface) * (behind - index) + power), behind
         before, y = y, y + surface.thickness * slope / index
     solved, stored = -before * index / slope, others[-1].thickness
     if bool((solved - stored).abs() <= _SOLVED * stored.abs()):

@@ -8,6 +8,7 @@ from torch import Tensor
 from raytrace.formats.report import Draft
 from raytrace.formats.seq_glass import medium
 from raytrace.formats.seq_keywords import APERTURES, LEFT_HANDED, LETTERS, POSE_WORDS, RING, unquoted
+from raytrace.formats.seq_phase import phase
 from raytrace.formats.source import LensFileError, UnsupportedSurface, shown
 from raytrace.formats.spelling import double, is_infinite, number
 from raytrace.formats.zemax_keywords import Block, Record
@@ -28,19 +29,21 @@ def build(
     unit: float,
     before: Glass,
     *,
-    is_break: bool,
+    own: dict[str, Record],
     private: dict[str, Glass],
     user: Sequence[Path],
     report: Draft,
 ) -> Surface:
     """The surface of a block, its lengths in units of `unit` mm; before: the medium before it.
 
-    is_break: whether it is a dummy surface that stands for a coordinate break. private: private glasses by name, user:
+    own: what our comments say of it: BREAK makes a coordinate break of a dummy surface, RADIUS tells that of its phase;
+    private: private glasses by name, user:
     further catalogs. Raises UnknownGlass as `find_glass` does.
     """
     apertures, semi_diameter = _apertures(block, unit, report)
     label, (ahead, behind) = block.last("SLB"), _poses(block, unit)
-    glass = _medium(block, before, private, user, report)
+    glass, is_break = _medium(block, before, private, user, report), "BREAK" in own
+    radius = number((own["RADIUS"].text or "?").strip(), "radius", own["RADIUS"].place) if "RADIUS" in own else 1.0
     if is_break and ahead is None and behind is not None:
         ahead, behind = behind, None
     return Surface(
@@ -48,6 +51,7 @@ def build(
         curvature=_curvature(block, unit),
         conic=_conic(block),
         coefficients=_coefficients(block, unit),
+        phase=phase(block, radius, unit),
         before=ahead,
         after=behind,
         is_break=is_break,

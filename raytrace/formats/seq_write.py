@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from raytrace.formats import seq_glass
+from raytrace.formats import seq_glass, seq_phase
 from raytrace.formats.seq_keywords import APERTURES, FIELD_KINDS, LEFT_HANDED, LETTERS, OWN, POSE_WORDS, RING
 from raytrace.formats.seq_surface import INFINITY
 from raytrace.formats.source import LensFileError, Place
@@ -15,6 +15,7 @@ from raytrace.formats.spelling import exact, exact_list, one_line, quoted, refus
 from raytrace.media.glass import Glass
 from raytrace.system.aperture import Aperture
 from raytrace.system.lens import Lens, SystemAperture
+from raytrace.system.phases import RadialPhase
 from raytrace.system.pose import Pose, undone
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface
@@ -45,6 +46,10 @@ def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
 
 def _system(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
     fields = lens.fields
+    if lens.environment is not None or any(surface.environment is not None for surface in lens.surfaces):
+        raise LensFileError(
+            "a temperature or pressure, which a .seq file does not hold here; write a table (.csv)", place
+        )
     if fields.telecentric:
         raise LensFileError("a telecentric object space, which a .seq file does not hold here", place)
     waves = [seq_glass.nanometres(wave) for wave in exact_list(lens.wavelengths, "wavelength", place)]
@@ -148,7 +153,9 @@ def _decimal(number: Fraction) -> str:
 def _surface(
     lens: Lens, number: int, surface: Surface, private: dict[str, Glass], user: Sequence[Path], place: Place
 ) -> list[str]:
-    refuse_departure(dataclasses.replace(surface, before=None, after=None, is_break=False), place)
+    is_round = isinstance(surface.phase, RadialPhase)
+    rest = dataclasses.replace(surface, before=None, after=None, is_break=False)
+    refuse_departure(dataclasses.replace(rest, phase=None) if is_round else rest, place)
     last = len(lens.surfaces) - 1
     name = {0: "SO", last: "SI"}.get(number, "S")
     curvature = "0.0" if surface.curvature is None else exact(surface.curvature, "curvature", place)
@@ -161,9 +168,14 @@ def _surface(
         f"  {OWN.lower()} break" if surface.is_break else "",
         *_poses(surface, place),
         *_shape(surface, place),
+        *(seq_phase.lines(surface.phase, _reference(lens), place) if is_round else []),
         *_apertures(surface.apertures, place),
         "" if surface.semi_diameter is None else f"  CIR EDG {exact(surface.semi_diameter, 'semi-diameter', place)}",
     ]
+
+
+def _reference(lens: Lens) -> float:
+    return float(lens.wavelengths[lens.primary_wavelength])
 
 
 def _medium(lens: Lens, number: int) -> Glass:
