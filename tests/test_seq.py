@@ -14,7 +14,7 @@ from test_formats import damaged, leaves, read_damaged
 
 import raytrace as rt
 from raytrace.formats import FORMATS, LensFileError, LensFileWarning, read_lens, read_lens_with_report, write_lens
-from raytrace.formats.seq_keywords import FIELD_KINDS, SURFACE_READ, SYSTEM_READ
+from raytrace.formats.seq_keywords import FIELD_KINDS, POSE_WORDS, SURFACE_READ, SYSTEM_READ
 from raytrace.formats.source import Place, UnsupportedSurface, decode
 from raytrace.media.catalog import UnknownGlass
 from raytrace.media.glass import constant, index, model_glass
@@ -50,7 +50,7 @@ TITLE 'a lens'; INI 'xy'
 !raytrace catalogs SCHOTT OHARA
 !raytrace aiming real
 !raytrace unnamed MEDIUM1
-NAO 0.01; DIM I; TEM 20; PRE 760; CA YES
+NAO 0.01; DIM I; TEM 20; PRE 760; CA YES; PUI 1; PUX 1; PUY 1; TEL NO
 WL 656.3 587.6 &
  486.1
 REF 2; WTW 1 2 1; WTW W1 0.5
@@ -338,6 +338,24 @@ def test_poses_come_back_bit_for_bit(kind):
     assert leaves(again(dataclasses.replace(lens, stop=5))) == leaves(dataclasses.replace(lens, stop=5))
 
 
+def test_tilts_about_x_and_y_are_left_handed_and_that_about_z_is_right_handed():
+    """So LightTools' manual says of itself and of CODE V, and OpticStudio's converter turns the same two signs."""
+    pose = of(SINGLET.replace("STO", "STO\nXDE 1; YDE 2; ZDE 3; ADE 4; BDE 5; CDE 6"))[0].surfaces[1].before
+    assert [float(getattr(pose, name)) for name in POSE_WORDS] == [1, 2, 3, -4, -5, 6]
+    assert not pose.tilts_first
+
+
+def test_a_landscape_lens_in_curvatures_by_paraxial_image_heights():
+    """ray-optics, landscape_lens.seq: scaled to a focal length of 10, its image at the paraxial focus."""
+    surfaces = "S 0 1.664\nSTO\nS -0.2 0.22 NBK7_SCHOTT !was 500.625\nS -0.387040626 10.150245"
+    lens, _ = of(sequence(surfaces, "EPD 1;WL 650 550 450;REF 2;YIM 0 3", "RDM N"))
+    found = rt.first_order(lens)
+    assert float(found.effective_focal_length) == pytest.approx(10, abs=1e-7)
+    assert float(found.back_focal_distance) == pytest.approx(10.150245, abs=1e-6)
+    assert lens.fields.kind == "paraxial_image_height"
+    assert float(rt.spot(lens).centroid[1, 1, 1]) == pytest.approx(3.0, rel=0.02)  # but for distortion
+
+
 def test_a_bend_comes_back_and_what_no_command_tells_is_refused():
     lens, tilt = read_lens("hubble"), Pose(y=number(2.0), tilt_x=number(30.0))
     mirror = next(k for k, surface in enumerate(lens.surfaces) if surface.is_mirror)
@@ -584,7 +602,7 @@ def test_a_written_lens_is_one_that_code_v_reads():
     lens = dataclasses.replace(read_lens("cooke_triplet"), notes=("a note",))
     text = FORMATS[".seq"].write(lens, "lens.seq").decode()
     assert max(map(len, text.splitlines())) <= 80
-    assert text.startswith('RDM N;LEN "raytrace"\n!raytrace note a note\n')
+    assert text.startswith("RDM N;LEN\n!raytrace note a note\n")
     assert "SO 0.0 0.1e14\n" in text
     assert f"WL {' '.join(f'{1e3 * w:.10g}' for w in lens.wavelengths.tolist())}" in text
     assert text.endswith("GO\n")

@@ -49,7 +49,7 @@ def _words(text: str) -> frozenset[str]:
 
 
 SYSTEM_READ = _words(
-    "RDM LEN TIT EPD FNO NAO DIM WL REF WTW WTF VUX VLX VUY VLY SO S SI GO PRV PWL END ZOO TEM PRE CA PIM"
+    "RDM LEN TIT EPD FNO NAO DIM WL REF WTW WTF VUX VLX VUY VLY SO S SI GO PRV PWL END ZOO TEM PRE CA PIM PUX PUY PUI"
 ) | {word for pair in FIELD_KINDS.values() for word in pair}
 SURFACE_READ = _words("CUY RDY THI GLA RMD STO SLB SPH CON ASP K CUF DIF HOR HWL HCT HCO") | {
     *LETTERS,
@@ -78,6 +78,10 @@ LEFT_OUT = _by_word(
         " BSZ TIR CYD CYN IRR HOM ROL CMP SWV",
         "coatings do not bend rays": "MFL COA CWL",
         "polarisation": "POL",
+        "thermal expansion": "TCE",
+        "how the program finds the rays of a wide field": "WID",
+        "listing, drawing or analysis: changes no lens": "LIS SUR VIE DRA MTF PSF SPO RIM FIE WAV FIR THO FOO RSI SIN"
+        " PMA OUT SAV EXI",
     }
 )
 
@@ -92,14 +96,15 @@ REFUSED = _by_word(
         "diffractive surface": "HOE GRT GRO GRS GRX GRY GRZ HV1 HV2 HX1 HX2 HY1 HY2 HZ1 HZ2",
         "gradient index": "GRI GRN GRC",
         "thermal gradient": "THG",
-        "non-sequential surfaces": "NSS NSC EXI",
+        "non-sequential surfaces": "NSS NSC",
         "array": "ARR",
         "lens module": "MOD MCO",
         "birefringent medium": "BIR OAX OAY OAZ",
         "numerical aperture in image space": "NA",
         "telecentric object space": "TEL",
         "afocal image space": "AFC AFI",
-        "beam whose intensity varies over the pupil": "PUX PUY PUI",
+        "glass of one side of a surface": "GL1 GL2",
+        "surface deformed by a file": "INT ISF",
         "command that puts in, takes out or turns round surfaces": "INS DEL FLY SCA COP MOV",
         "optimisation": "AUT",
         "another file": "IN RES RUN",
@@ -245,7 +250,7 @@ class Stream:
         elif word in SURFACE_READ:
             self._of_surface(record)
         else:
-            reason = "no number in it" if word in REFUSED else LEFT_OUT.get(word, "")
+            reason = "0, or switched off" if word in REFUSED else LEFT_OUT.get(word, "")
             self.report.met(word[:40], IGNORED if reason else UNKNOWN, self._place(record), reason)
 
     def _place(self, record: Record) -> Place:
@@ -357,7 +362,9 @@ _HANDLED = {
 
 
 def _says_nothing(record: Record) -> bool:
-    """Whether a decentre or a like number is given and 0."""
+    """Whether a decentre or a like number is given and 0, or what would not be modelled is switched off."""
+    if [word.upper() for word in record.words] in (["N"], ["NO"]):
+        return True
     numbers = [word for word in record.words if is_number(word)]
     return bool(numbers) and not any(float(re.sub("[dD]", "e", word)) for word in numbers)
 

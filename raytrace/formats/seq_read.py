@@ -327,6 +327,9 @@ def _remarks(system: Block, report: Draft) -> None:
         if record and record.number(0, "environment", normal[0]) not in normal:
             message = f"{keyword} {record.words[0][:20]} {unit}: indices are those of 20 °C and 1 atm"
             report.warn(message, record.place)
+    beam = system.last("PUI", "PUX", "PUY")
+    if beam:
+        report.warn(f"the beam is apodised ({beam.keyword}); taken as uniform", beam.place)
     zoom = system.last("ZOO")
     if zoom and zoom.words and zoom.integer(0, "number of zoom positions") > 1:
         report.warn(f"{zoom.words[0][:20]} zoom positions (ZOO): the first is read", zoom.place)

@@ -6,6 +6,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from raytrace.formats import seq_glass, seq_phase
 from raytrace.formats.seq_keywords import APERTURES, FIELD_KINDS, LEFT_HANDED, LETTERS, OWN, POSE_WORDS, RING
@@ -55,20 +56,25 @@ def _system(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
     waves = [seq_glass.nanometres(wave) for wave in exact_list(lens.wavelengths, "wavelength", place)]
     x, y = FIELD_KINDS[fields.kind]
     return [
-        'RDM N;LEN "raytrace"',
+        "RDM N;LEN",
         *_own(lens, private, place),
         f"TITLE {_quoted(lens.name, 'the title', place)}" if lens.name else "",
         _aperture(lens.aperture, lens.surfaces[0], place),
         "DIM M",
         _listed("WL", waves),
         f"REF {lens.primary_wavelength + 1}",
-        _listed("WTW", exact_list(lens.wavelength_weights, "weight of a wavelength", place)),
+        _listed("WTW", _weights(lens.wavelength_weights, "weight of a wavelength", place)),
         _listed(x, exact_list(fields.x, "field", place)),
         _listed(y, exact_list(fields.y, "field", place)),
-        _listed("WTF", exact_list(fields.weight, "weight of a field", place)),
+        _listed("WTF", _weights(fields.weight, "weight of a field", place)),
         *_vignetting(lens, place),
         *map(_wrapped, seq_glass.private_lines(private, waves, place)),
     ]
+
+
+def _weights(numbers: Tensor, what: str, place: Place) -> list[str]:
+    """Whole numbers without a point."""
+    return [weight.removesuffix(".0") for weight in exact_list(numbers, what, place)]
 
 
 def _own(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
