@@ -11,6 +11,8 @@ import torch
 from mutations import Reader, survive
 from PIL import Image
 from problems import number
+from test_oslo import CONIC, FAR, SINGLET, double_gauss
+from test_oslo import text as oslo_text
 from test_prescriptions import LOWENTHAL, NOCTILUX, summilux
 from test_seq import ACHROMAT, ASPHERE, DOUBLE_GAUSS, EVERYTHING, QUESTAR, THREE_MIRRORS
 from test_zemax_archive import archive
@@ -112,6 +114,23 @@ def lenses(suffix: str, folder: Path) -> Reader:
     )
 
 
+def oslo(folder: Path) -> Reader:
+    """Every command that is read, and some that are left out or refused."""
+    solved = ("TH 200", "GLA MOD G1 1.564 1.571 1.561; CV 0.02; TH 3", "PK GLA -1; TH 1", "RFL; PU 0.1; PY 0")
+    originals = [
+        double_gauss("WV 0.48613 0.58756; WV3 0.65627; WW 1 1; WW3 0.5"),
+        oslo_text((FAR, "AST; AP CHK 10; TH 0", *CONIC), 'EBR 10\nANG 5\nUNI 25.4\nSNO1 "a // note"'),
+        oslo_text((*SINGLET, "AIR; TH 1; TLA 0; DT 1; TCE 7"), "FNO 4; OBH -1e19", tail="CFG NEW; TH 1 2; END"),
+        oslo_text((FAR, *solved[1:]), "EBR 2; ANG 1"),
+        oslo_text((*solved[:2], "RD -50; PY 0"), "NAO 0.02; OBH 3; TELE OFF; DES me", stated="50 3"),
+    ]
+    path = folder / "lens.len"
+    read = from_file(read_lens_with_report, path)
+    for text in originals:
+        read(text.encode())
+    return Reader(tuple(text.encode() for text in originals), read, (LensFileError, UnknownGlass))
+
+
 def archives(folder: Path) -> Reader:
     """The lens and a catalog it names, of both layouts, packed and stored."""
     lens = (ROOT / "lenses" / "singlet.zmx").read_bytes()
@@ -168,6 +187,7 @@ def arrays(folder: Path) -> Reader:
 READERS = {
     "agf": catalogs,
     "zar": archives,
+    "len": oslo,
     "pictures": pictures,
     "npz": arrays,
     "rays": rays,

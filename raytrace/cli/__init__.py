@@ -23,7 +23,7 @@ start here:
   raytrace focus lenses/double_gauss.zmx --object-distance 25000 --plot focus.png
   raytrace glass N-BK7 --wavelength 0.5876
 
-LENS is a lens file (.zmx, .zar, .seq, or a prescription table .csv, .tsv, .txt) or the name of a shipped lens, as
+LENS is a lens file (.zmx, .zar, .seq, .len, or a prescription table .csv, .tsv, .txt) or the name of a shipped lens, as
 double_gauss.
 Lengths are mm, wavelengths µm, angles degrees. `raytrace COMMAND --help` teaches each command by example.
 

@@ -9,7 +9,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 from raytrace.files import shipped, write_atomically
-from raytrace.formats import seq_read, seq_write, table_read, table_write, zemax_archive, zemax_read, zemax_write
+from raytrace.formats import (
+    oslo_read,
+    seq_read,
+    seq_write,
+    table_read,
+    table_write,
+    zemax_archive,
+    zemax_read,
+    zemax_write,
+)
 from raytrace.formats.report import ImportReport as ImportReport
 from raytrace.formats.source import LensFileError as LensFileError
 from raytrace.formats.source import LensFileWarning as LensFileWarning
@@ -39,6 +48,7 @@ FORMATS = {
     ".zmx": Format(zemax_read.read, zemax_write.write),
     ".zar": Format(zemax_archive.read, load=zemax_archive.load),
     ".seq": Format(seq_read.read, seq_write.write),
+    ".len": Format(oslo_read.read),
     ".csv": Format(table_read.read, table_write.write),
     ".tsv": Format(table_read.read, partial(table_write.write, separator="\t")),
     ".txt": Format(table_read.read, partial(table_write.write, separator="\t")),
@@ -49,7 +59,7 @@ WRITTEN = tuple(suffix for suffix, form in FORMATS.items() if form.write)
 
 
 def read_lens(path: str | os.PathLike, *, catalogs: Sequence[str | Path] = (), strict: bool = False) -> Lens:
-    """The lens of a file, in mm and µm: .zmx or .zar (OpticStudio), .seq (CODE V), or a table .csv, .tsv, .txt.
+    """The lens of a file, in mm and µm: .zmx, .zar (OpticStudio), .seq (CODE V), .len (OSLO), or a table.
 
     path: of a file, or the name of a shipped lens, as "double_gauss". catalogs: further glass catalogs (.agf), searched
     as `raytrace.media.catalog.find_glass` does; a catalog that the file names and that lies beside it, or in it, is
