@@ -126,9 +126,10 @@ def oslo(folder: Path) -> Reader:
     ]
     path = folder / "lens.len"
     read = from_file(read_lens_with_report, path)
-    for text in originals:
-        read(text.encode())
-    return Reader(tuple(text.encode() for text in originals), read, (LensFileError, UnknownGlass))
+    whole = tuple(one.encode() for one in originals)
+    for content in whole:
+        read(content)
+    return Reader(whole, read, (LensFileError, UnknownGlass))
 
 
 def archives(folder: Path) -> Reader:
