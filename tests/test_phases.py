@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from bends import real
 
 import raytrace as rt
 from raytrace.maths.bivariate import fringe, fringe_to_powers, polynomial_xy, powers
@@ -14,10 +15,6 @@ from raytrace.system.rays import start
 from raytrace.system.surface import Surface
 
 WAVELENGTH = torch.tensor(0.55, dtype=torch.float64)
-
-
-def real(numbers) -> torch.Tensor:
-    return torch.tensor(numbers, dtype=torch.float64)
 
 
 def some(count: int, seed: int = 0) -> torch.Tensor:

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from bends import pose, real
 
 import raytrace as rt
 from raytrace.optics.laws import bend_slopes, diffract, reflect, refract
@@ -12,16 +13,6 @@ from raytrace.system.phases import Added
 from raytrace.system.pose import Pose, direction_in, direction_out, point_in, point_out
 from raytrace.system.rays import start
 from raytrace.system.surface import Surface
-
-
-def real(number) -> torch.Tensor:
-    return torch.tensor(number, dtype=torch.float64)
-
-
-def pose(**numbers) -> Pose:
-    flag = numbers.pop("tilts_first", False)
-    return Pose(**{name: real(number) for name, number in numbers.items()}, tilts_first=flag)
-
 
 SOME = {"x": 1.5, "y": -2.0, "z": 0.25, "tilt_x": 20.0, "tilt_y": -33.0, "tilt_z": 71.0}
 

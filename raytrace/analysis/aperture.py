@@ -12,6 +12,7 @@ from raytrace.maths import zernike
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import value
+from raytrace.optics.axis import is_bent
 from raytrace.optics.scene import Scene, beam_share
 from raytrace.optics.wavefront import wavefront_of
 from raytrace.system.lens import name_of_field
@@ -67,23 +68,35 @@ def exit_pupil(scene: Scene, *, size: int | None = None) -> ExitPupil:
         )
     orders = [zernike.noll(j) for j in range(1, _TERMS + 1)]
     normal = (probe.direction[:2] - middle[..., None]) / half[..., None]
-    basis = zernike.polynomials(orders, *normal).movedim(0, -1)
+    turn = _to_disc(normal.detach(), probe.usable) if is_bent(scene.lens) else None
+    basis = zernike.polynomials(orders, *_on_disc(turn, *normal)).movedim(0, -1)
     root = safe_sqrt(torch.where(probe.usable, probe.weights, 0.0))[..., None]
     map_to_pupil = torch.linalg.lstsq(root * basis, root * points.T).solution  # (1, F, W, J, 2)
     nodes, values, slopes = _interpolation(size, like)
     y, x = torch.meshgrid(nodes, nodes, indexing="ij")
-    at_nodes = torch.einsum("jyx,...jc->c...yx", zernike.polynomials(orders, x, y), map_to_pupil)
+    if turn is None:
+        at_nodes = torch.einsum("jyx,...jc->c...yx", zernike.polynomials(orders, x, y), map_to_pupil)
+    else:
+        terms = zernike.polynomials(orders, *_on_disc(turn[..., None], x, y))
+        at_nodes = torch.einsum("j...yx,...jc->c...yx", terms, map_to_pupil)
     pupil, by_l, by_m = (
         rows @ at_nodes @ columns.T for rows, columns in ((values, values), (values, slopes), (slopes, values))
     )
     line = (2 * torch.arange(size, **like) + 1 - size) / size
     inside = line * line + (line * line)[:, None] <= 1
+    own = None
+    if turn is not None:
+        u, v = _on_disc(turn[..., None], line.expand(size, -1), line[:, None].expand(-1, size))
+        own = u * u + v * v <= 1
+        inside = own.any(2).any(1)[0]
+        own = own[..., inside]
     together = piece(480 * probe.opd[..., 0].numel())
     cells = [
         _cells(scene, *some, size=size)
         for some in zip(*(part[..., inside].split(together, -1) for part in (pupil, by_l, by_m)), strict=True)
     ]
     field, light = (torch.cat(parts, -1) for parts in zip(*cells, strict=True))
+    field, light = (part if own is None else torch.where(own, part, 0.0) for part in (field, light))
     amplitude = field.new_zeros(*field.shape[1:3], size, size)
     amplitude[..., inside] = field[0]
     energy = torch.where(probe.valid, probe.energy, 0.0)
@@ -97,6 +110,31 @@ def exit_pupil(scene: Scene, *, size: int | None = None) -> ExitPupil:
         centroid=(probe.centre[:2] + offset)[:, 0],
         light=total[0],
     )
+
+
+def _to_disc(normal: Tensor, usable: Tensor) -> Tensor:
+    """Matrices (2, 2, ..., 1) that make the directions (2, ..., P), an ellipse that may be askew in its box, a disc.
+
+    The root of their covariance, by which the outermost come to lie within the margin.
+    """
+    count = usable.sum(-1)
+    x, y = torch.where(usable, normal, 0.0)
+    xx, xy, yy = ((a * b).sum(-1) / count for a, b in ((x, x), (x, y), (y, y)))
+    across = safe_sqrt(yy - xy * xy / xx)
+    zero = torch.zeros_like(xx)
+    matrix = torch.stack(
+        [torch.stack([1 / safe_sqrt(xx), zero]), torch.stack([-xy / xx, torch.ones_like(xx)]) / across]
+    )
+    u, v = _on_disc(matrix[..., None], x, y)
+    farthest = torch.hypot(u, v).amax(-1)
+    return (matrix / (MARGIN * farthest))[..., None]
+
+
+def _on_disc(turn: Tensor | None, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    if turn is None:
+        return x, y
+    (xx, xy), (yx, yy) = turn
+    return xx * x + xy * y, yx * x + yy * y
 
 
 def _interpolation(size: int, like: dict) -> tuple[Tensor, Tensor, Tensor]:

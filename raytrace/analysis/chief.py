@@ -18,7 +18,8 @@ from raytrace.analysis.setting import (
 from raytrace.maths.numerics import dot_2, safe_divide, safe_sqrt
 from raytrace.maths.result import masked
 from raytrace.maths.value import value
-from raytrace.optics.arrivals import chief_points, keeps_coordinates
+from raytrace.optics.arrivals import chief_points, keeps_coordinates, unclipped
+from raytrace.optics.axis import is_bent
 from raytrace.optics.focus import image_rays
 from raytrace.optics.launch import is_at_infinity
 from raytrace.system.lens import Lens
@@ -58,7 +59,7 @@ class Distortion(OverField):
 
 @value
 class FieldCurvature(OverField):
-    """Where close rays about the chief ray meet: (F, W) mm from the sensor, positive behind it.
+    """Where close rays about the chief ray meet: (F, W) mm from the sensor along its z, positive behind it.
 
     tangential: of rays in the plane of the field; sagittal: across it; fields: (2, F); valid: (F, W) bool.
     """
@@ -118,11 +119,12 @@ def distortion(lens: Lens, *, fields: Points = None, wavelengths: Numbers = None
 def _distortion(lens: Lens, fields: Tensor) -> Distortion:
     bare = unvignetted(lens)
     described, angles, extent, found = in_object_space(bare, fields)
-    close = field_range(lens, 2)[:, 1:] * _NEAR_AXIS
+    close = _close_fields(lens, fields)
     _, close_angles, close_extent, _ = in_object_space(bare, close)
     length = dot_2(fields, _meridian(fields)).sign() * safe_sqrt(dot_2(extent, extent))
-    height, valid = _height(described, angles, fields)
-    scale = _height(described, close_angles, close)[0] / safe_sqrt(dot_2(close_extent, close_extent))
+    height, valid = _height(described, angles, fields, each_axis=True)
+    reach = safe_sqrt(dot_2(close_extent, close_extent))
+    scale = _height(described, close_angles, close, each_axis=True)[0] / reach[:, None]
     f_tan = _relative(height, scale * length[:, None])
     f_theta = _relative(height, scale * torch.atan(length)[:, None]) if is_at_infinity(lens) else None
     return Distortion(lens, fields, height, f_tan, f_theta, valid & found[:, None])
@@ -135,7 +137,8 @@ def field_curvature(
 
     fields: y or (x, y), by default `samples` from the axis to the lens's largest; wavelengths: µm. Tangential is the
     plane through the axis and the field point, sagittal the one across it. Close rays that leave the lens parallel have
-    no focus: invalid.
+    no focus: nan, and invalid where neither section has one. Where the axis bends, s counts along the normal of the
+    sensor to where the two rays of a section come closest.
     """
     asked = fields is not None
     lens, fields = setting(lens, fields, wavelengths, samples=samples)
@@ -159,13 +162,20 @@ def _close_foci(lens: Lens, fields: Tensor, along: Tensor) -> tuple[Tensor, Tens
     pupil = torch.cat([along, -along, across, -across], 1) * _NEAR_CHIEF
     rays = image_rays(lens, pupil, fields=fields)
     slope = safe_divide(rays.direction[:2], rays.direction[2].expand_as(rays.direction[:2]))
-    foci, valid = [], (rays.valid | keeps_coordinates(rays.direction)).all(-1)
-    for section, pair in ((along, slice(0, 2)), (across, slice(2, 4))):
-        place, tilt = (dot_2(part[..., pair], section[:, :, None, None]) for part in (rays.position[:2], slope))
-        opening = tilt[..., 0] - tilt[..., 1]
-        foci.append(-safe_divide(place[..., 0] - place[..., 1], opening))
-        valid = valid & (opening.abs() > 8 * torch.finfo(opening.dtype).eps)
-    return *foci, valid
+    bent = is_bent(lens)
+    kept = unclipped(lens, pupil, fields, lens.wavelengths) if bent else keeps_coordinates(rays.direction)
+    foci, exist = [], []
+    for section, k in ((along, 0), (across, 2)):
+        apart, opening = (part[..., k] - part[..., k + 1] for part in (rays.position[:2], slope))
+        if bent:  # on the sensor the section of the pupil may be turned, or slanted
+            foci.append(-safe_divide(dot_2(apart, opening), dot_2(opening, opening)))
+            opening = torch.hypot(*opening)
+        else:
+            apart, opening = (dot_2(part, section[:, :, None]) for part in (apart, opening))
+            foci.append(-safe_divide(apart, opening))
+        exist.append(opening.abs() > 8 * torch.finfo(opening.dtype).eps)
+    tangential, sagittal = (torch.where(there, at, torch.nan) for there, at in zip(exist, foci, strict=True))
+    return tangential, sagittal, (rays.valid | kept).all(-1) & (exist[0] | exist[1])
 
 
 def lateral_colour(
@@ -192,9 +202,31 @@ def _lateral_colour(lens: Lens, fields: Tensor) -> LateralColour:
     return LateralColour(lens, fields, torch.where(valid, height - height[:, primary], 0.0), valid)
 
 
-def _height(lens: Lens, fields: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
-    """Heights (F, W) of chief rays in the meridians of `along` (2, F), and whether they arrive or are but vignetted."""
+def _close_fields(lens: Lens, fields: Tensor) -> Tensor:
+    """Fields (2, 1), or (2, F) where directions differ, so close to the axis that they tell the scale of the image."""
+    largest = field_range(lens, 2)[:, 1:]
+    if not is_bent(lens):
+        return largest * _NEAR_AXIS
+    along = torch.where((fields == 0).all(0), _meridian(largest), _meridian(fields))
+    return along * torch.hypot(*largest) * _NEAR_AXIS
+
+
+def _height(lens: Lens, fields: Tensor, along: Tensor, *, each_axis: bool = False) -> tuple[Tensor, Tensor]:
+    """Heights (F, W) of chief rays in the meridians of `along` (2, F), and whether they arrive or are but vignetted.
+
+    Where the axis bends they count from its image at the primary wavelength, or at each one, along the image of the
+    meridian close to it, turned to the side of the field.
+    """
     points, valid = chief_points(lens, fields, lens.wavelengths)
+    if is_bent(lens):
+        meridian = _meridian(along)
+        close = meridian * torch.hypot(*fields).amax() * _NEAR_AXIS
+        axis, _ = chief_points(lens, torch.zeros_like(fields[:, :1]), lens.wavelengths)
+        way = chief_points(lens, close, lens.wavelengths)[0] - axis
+        side = torch.where(dot_2(way, meridian[:, :, None]).detach() < 0, -1.0, 1.0)
+        length = side * safe_sqrt(dot_2(way, way))
+        axis = axis if each_axis else axis[..., lens.primary_wavelength, None]
+        return safe_divide(dot_2(points - axis, way), length), valid
     return dot_2(points, _meridian(along)[:, :, None]), valid
 
 

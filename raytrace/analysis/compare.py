@@ -16,8 +16,9 @@ from raytrace.maths.grid import Grid, grid
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.result import Result, axis, number, numbers
 from raytrace.maths.value import value
+from raytrace.optics.axis import need_axis
 from raytrace.optics.focus import NoImage, focused, real_image_distance
-from raytrace.optics.paraxial import first_order
+from raytrace.optics.paraxial import first_order, largest_field
 from raytrace.optics.trace import media
 from raytrace.system.lens import Lens, SystemAperture, with_sensor_distance, with_wavelengths
 
@@ -191,6 +192,7 @@ def compare(
     focus_distance, start: of the one sensor, see `common_focus`; wavelengths: µm, of which the first is taken; pixel:
     mm, size: of the window. Raises NoImage for a distance of which the lens forms no real image.
     """
+    need_axis(lens, "the comparison of PSF models on the axis", "ask for kernels of one model by `psf`")
     distances = torch.as_tensor(object_distances, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
     try:
         lens = common_focus(lens, focus_distance, wavelength=wavelengths[0], start=start)
@@ -237,7 +239,7 @@ def abilities(lens: Lens, *, pixels: Grid | None = None) -> Abilities:
 
     pixels: about the axis, by default 21 × 21 of 5 µm.
     """
-    changed, upright, rows = _with_conic(lens), _largest_field(lens), []
+    changed, upright, rows = _with_conic(lens), largest_field(lens), []
     for model in _ROWS:
         work = {"tol": _TOLERANCE} if "rays" in model.compared else model.compared
         focused = _psf(lens, model, grid=pixels, **work)
@@ -269,12 +271,6 @@ def _anisotropy(covariance: Tensor) -> float:
     """√(larger/smaller eigenvalue) of a covariance (3,) mm²; 1 for a point."""
     short, long = torch.linalg.eigvalsh(covariance[[0, 1, 1, 2]].reshape(2, 2)).clamp_min(0).tolist()
     return math.sqrt(long / short) if short > 1e-18 else 1.0
-
-
-def _largest_field(lens: Lens) -> Tensor:
-    """The largest field (2, 1), turned upright."""
-    size = torch.hypot(lens.fields.x, lens.fields.y).amax()
-    return torch.stack([torch.zeros_like(size), size])[:, None]
 
 
 def _about_light(lens: Lens, fields: Tensor, pixels: Grid, model: Model) -> Grid:

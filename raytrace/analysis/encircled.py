@@ -20,8 +20,8 @@ from raytrace.budget import RAY_BYTES, afford, piece
 from raytrace.kernels.dft import phasor
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.value import value
+from raytrace.optics.f_number import axial_f_number
 from raytrace.optics.focus import image_rays
-from raytrace.optics.paraxial import first_order
 from raytrace.optics.scene import Scene
 from raytrace.system.lens import Lens, vector
 
@@ -79,7 +79,7 @@ def _encircled(lens: Lens, fields: Tensor, radii: Tensor | None, geometric: bool
     distance, energy, centroid = _rays(lens, fields)
     marked = radii is not None
     if radii is None:
-        airy = 6e-3 * primary_wavelength(lens) * first_order(lens).working_f_number
+        airy = 6e-3 * primary_wavelength(lens) * axial_f_number(lens)
         blur = torch.where(energy > 0, distance, 0.0).max()
         top = torch.maximum(blur * 1.02, airy * (not geometric)).detach()
         radii = top * torch.linspace(0, 1, 41, dtype=top.dtype, device=top.device)

@@ -11,7 +11,8 @@ from raytrace.maths.value import value
 from raytrace.optics.launch import launch
 from raytrace.optics.trace import lens_steps
 from raytrace.system.lens import Lens
-from raytrace.system.surface import Surface, normal
+from raytrace.system.pose import Gap, direction_in
+from raytrace.system.surface import Surface, gap_behind, normal
 
 _RAYS = ("lower", "chief", "upper")
 _CHIEF = _RAYS.index("chief")
@@ -63,7 +64,8 @@ def incidence(
     """Angles of incidence at every surface; fields: y or (x, y), by default `samples` from the axis to the largest.
 
     wavelengths: µm, by default the lens's primary one; surfaces: whether the text lists every surface, not the sensor
-    alone. The rim is that of each field's beam, vignetting factors and ray aiming applied.
+    alone. The rim is that of each field's beam, vignetting factors and ray aiming applied. A coordinate break has no
+    angles.
     """
     lens, fields = setting(
         lens, fields, primary_wavelength(lens) if wavelengths is None else wavelengths, samples=samples
@@ -74,12 +76,18 @@ def incidence(
 def _incidence(lens: Lens, fields: Tensor, *, surfaces: bool = False) -> Incidence:
     along = _directions(lens, fields)[:, :, None, None]  # (2, F, 1, 1), beside (F, W, P)
     rays = launch(lens, along * fields.new_tensor([-1.0, 0.0, 1.0]), fields=fields)
+    along = torch.cat([along, torch.zeros_like(along[:1])])
     angles, valid, reached = [], [], rays.valid
     crossings = lens_steps(lens, rays, lens.wavelengths[:, None])
+    gap = None
     for surface, crossing in zip(lens.surfaces[1:], crossings, strict=True):
         reached = reached & ~(crossing.missed | crossing.totally_reflected)
-        angles.append(_angle(surface, rays.direction, crossing.rays.position, along))
-        rays = crossing.rays
+        direction, along = (_told_at(surface, gap, vector) for vector in (rays.direction, along))
+        angles.append(_angle(surface, direction, crossing.rays.position, along))
+        rays, gap = crossing.rays, gap_behind(surface)
+        if surface.is_break:
+            valid.append(torch.zeros_like(reached))
+            continue
         is_chief = torch.arange(3, device=along.device) == _CHIEF
         valid.append(reached & (rays.valid | is_chief))
     valid = torch.stack(valid, -1)
@@ -87,7 +95,7 @@ def _incidence(lens: Lens, fields: Tensor, *, surfaces: bool = False) -> Inciden
         lens=lens,
         fields=fields,
         angle=torch.where(valid, torch.rad2deg(torch.stack(angles, -1)), 0.0),
-        height=(rays.position[:2] * along).sum(0),
+        height=(rays.position[:2] * along[:2]).sum(0),
         valid=valid,
         surfaces=surfaces,
     )
@@ -102,9 +110,17 @@ def _directions(lens: Lens, fields: Tensor) -> Tensor:
     return torch.stack([x / length, torch.where(on_axis, 1.0, y / length)])
 
 
+def _told_at(surface: Surface, gap: Tensor | Gap | None, vector: Tensor) -> Tensor:
+    """A direction (3, ...) behind the surface before, in the axes of this one."""
+    for pose in (gap.pose if isinstance(gap, Gap) else None, surface.before):
+        if pose is not None:
+            vector = torch.stack(torch.broadcast_tensors(*direction_in(pose, vector.unbind(0))))
+    return vector
+
+
 def _angle(surface: Surface, direction: Tensor, position: Tensor, along: Tensor) -> Tensor:
     """atan2(d·τ, |d·n|) of rays d and the normal n where they meet the surface; τ ⟂ n lies in the field's plane."""
     n, _ = normal(surface, position.unbind(0))
-    t_x, t_y = along
+    t_x, t_y, _ = along
     tangent = t_x * n[2], t_y * n[2], -(t_x * n[0] + t_y * n[1])
     return torch.atan2(dot(tangent, direction), dot(n, direction).abs())

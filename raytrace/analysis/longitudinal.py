@@ -8,6 +8,7 @@ from raytrace.analysis.setting import Numbers, like
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.result import axis, masked
 from raytrace.maths.value import value
+from raytrace.optics.axis import need_axis
 from raytrace.optics.focus import image_rays
 from raytrace.system.lens import Lens, with_wavelengths
 
@@ -42,8 +43,9 @@ def longitudinal_aberration(lens: Lens, *, wavelengths: Numbers = None, points: 
     """Spherical aberration of every wavelength as -y N/M of rays (0, M, N) through points of the pupil's y axis.
 
     wavelengths: µm; points: of the axis, from the middle to the rim. A ray parallel to the axis behind the lens has no
-    crossing, nor has a lost one.
+    crossing, nor has a lost one. Raises Bent for a lens whose axis bends.
     """
+    need_axis(lens, "longitudinal aberration", "`field_curvature` and `ray_fan` follow the chief ray")
     lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
     pupil = torch.linspace(0.0, 1.0, points, **like(lens))
     heights = torch.cat([torch.full_like(pupil[:1], _NEAR_AXIS), pupil[1:]])

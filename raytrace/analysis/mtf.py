@@ -23,8 +23,8 @@ from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.result import axis
 from raytrace.maths.value import value
+from raytrace.optics.f_number import axial_f_number
 from raytrace.optics.focus import image_rays
-from raytrace.optics.paraxial import first_order
 from raytrace.optics.scene import Scene
 from raytrace.optics.spot import spot_of
 from raytrace.system.lens import Lens, vector, with_sensor_distance
@@ -150,8 +150,9 @@ def frequency_range(lens: Lens, fields: Tensor, size: int) -> Tensor:
 
 
 def cutoff(lens: Lens, wavelength: Tensor) -> Tensor:
-    """Highest frequency 1/(λ N) in cycles/mm that passes on the axis, N the paraxial working F/#."""
-    return 1e3 / (wavelength * first_order(lens).working_f_number)
+    """Highest frequency 1/(λ N) in cycles/mm that passes on the axis, N the paraxial working F/#, see
+    `axial_f_number`."""
+    return 1e3 / (wavelength * axial_f_number(lens))
 
 
 def _diffraction(lens: Lens, fields: Tensor, frequencies: Tensor) -> tuple[Tensor, Tensor]:

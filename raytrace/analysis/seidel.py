@@ -20,10 +20,11 @@ from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Points, field_words, primary_wavelength
 from raytrace.maths.result import cell
 from raytrace.maths.value import value
+from raytrace.optics.axis import need_axis
 from raytrace.optics.launch import paraxial_field
-from raytrace.optics.paraxial import FirstOrder, first_order, marginal_ray, signed
+from raytrace.optics.paraxial import FirstOrder, first_order, largest_field, marginal_ray, signed
 from raytrace.optics.trace import media
-from raytrace.system.lens import Lens, field_points, largest_field
+from raytrace.system.lens import Lens, field_points
 from raytrace.system.surface import Surface, is_even, vertex_curvature
 
 
@@ -102,9 +103,11 @@ def seidel(lens: Lens, *, fields: Points = None, kind: str = "coefficients") -> 
     """
     if kind not in KINDS:
         raise ValueError(f"Seidel aberrations as {kind!r}: expected one of {', '.join(KINDS)}")
+    need_axis(lens, "Seidel's theory", "`wavefront` and `ray_fan` have the aberrations of traced rays")
     for number, surface in enumerate(lens.surfaces):
         if not is_even(surface):
             what = "has a departure" if surface.departure is not None else f"is an {surface.kind}"
+            what = what if surface.phase is None else f"has a {type(surface.phase).__name__}"
             raise ValueError(f"surface {number} {what}: Seidel's theory is of even powers of r")
     paraxial = first_order(lens)
     fields = largest_field(lens) if fields is None else field_points(fields, like=lens)

@@ -12,7 +12,7 @@ from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.result import flat
 from raytrace.optics.launch import is_at_infinity, object_field
 from raytrace.optics.losses import check_reach, losses
-from raytrace.optics.paraxial import first_order
+from raytrace.optics.paraxial import first_order, largest_field
 from raytrace.optics.scene import Scene
 from raytrace.optics.scene import scene as make_scene
 from raytrace.optics.spot import EmptySpot
@@ -20,7 +20,6 @@ from raytrace.system.lens import (
     FIELD_UNITS,
     Lens,
     field_points,
-    largest_field,
     name_of_field,
     with_field_kind,
     with_wavelengths,

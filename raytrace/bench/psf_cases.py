@@ -13,9 +13,9 @@ from raytrace.kernels.gaussian import kernels as gaussian_kernels
 from raytrace.kernels.result import Kernels
 from raytrace.maths import pupil
 from raytrace.maths.grid import Grid, grid
-from raytrace.optics.paraxial import first_order
+from raytrace.optics.paraxial import first_order, largest_field
 from raytrace.optics.scene import Scene, scene
-from raytrace.system.lens import Lens, largest_field, with_object_distance
+from raytrace.system.lens import Lens, with_object_distance
 
 PIXELS = 21  # across every window
 RANDOM, DIRECT = "random rays", "direct sum"

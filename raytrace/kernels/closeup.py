@@ -13,7 +13,7 @@ from raytrace.kernels.result import EmptyPsf, Psf, mixture
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_sqrt
 from raytrace.maths.value import value
-from raytrace.optics.paraxial import first_order
+from raytrace.optics.f_number import axial_f_number
 from raytrace.system.lens import with_object_distance
 
 _SIGMAS = 3.0  # of the rays, and Airy radii, that half a window holds: a uniform disc reaches 2 σ, a caustic 3
@@ -73,7 +73,7 @@ def close_up(found: Psf) -> CloseUp:
 
 def _f_number(found: Psf) -> Tensor:
     """Working F-number (D, 1)."""
-    return first_order(with_object_distance(found.lens, found.object_distances[:, None])).working_f_number.abs()
+    return axial_f_number(with_object_distance(found.lens, found.object_distances[:, None])).abs()
 
 
 def _windows(found: Psf) -> tuple[Tensor, Tensor]:

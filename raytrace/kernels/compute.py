@@ -20,6 +20,7 @@ from raytrace.maths.grid import Grid
 from raytrace.maths.grid import grid as make_grid
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
+from raytrace.optics.axis import is_bent
 from raytrace.optics.losses import beam_hint, losses, warn_of_losses
 from raytrace.optics.reuse import Memo
 from raytrace.optics.scene import Scene, scene, trace_scene
@@ -93,7 +94,7 @@ def psf(
     weights = torch.ones_like(wavelengths) if weights is None else _row(weights, like)
     _check_batch(fields, distances, wavelengths, weights)
     options = {"rho": rho, "zernike": zernike}
-    drive = _driver(model, options, tol, rays, order, share, max_bytes, progress)
+    drive = _driver(lens, model, options, tol, rays, order, share, max_bytes, progress)
     if share is not None and share.processes > 1:
         check_shares(lens, (rho, zernike))
     shares = weights / weights.sum()
@@ -130,7 +131,7 @@ def psf(
     )
 
 
-def _driver(model, options: Mapping, tol, rays, order, share: Share | None, max_bytes, progress):
+def _driver(lens: Lens, model, options: Mapping, tol, rays, order, share: Share | None, max_bytes, progress):
     """What computes a Psf of (scene, grid, weights), as the arguments of `psf` say."""
     streams = rays is not None and max_bytes is not None and MODELS[model].plain is not None
 
@@ -147,7 +148,8 @@ def _driver(model, options: Mapping, tol, rays, order, share: Share | None, max_
         return between(*found, weights, MODELS[model])
 
     if model == "auto":
-        return functools.partial(climb, rungs=[own(name) for name in RUNGS], tol=tol or 0.01)
+        rungs = [own(name) for name in RUNGS if MODELS[name].traces or not is_bent(lens)]
+        return functools.partial(climb, rungs=rungs, tol=tol or 0.01)
     if streams:
         return stream
     if order is not None:

@@ -16,7 +16,7 @@ from raytrace.budget import afford, piece
 from raytrace.maths.grid import Grid, centres
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.pupil import gauss_rings
-from raytrace.optics.paraxial import first_order
+from raytrace.optics.f_number import axial_f_number
 from raytrace.optics.scene import Scene
 
 
@@ -261,4 +261,4 @@ def afford_sensor(what: str, scene: Scene, grid: Grid, nodes: int) -> None:
 
 
 def _speed(scene: Scene) -> str:
-    return f"F/{float(first_order(scene.lens).working_f_number.detach().abs().min()):.3g}"
+    return f"F/{float(axial_f_number(scene.lens).detach().abs().min()):.3g}"

@@ -13,6 +13,7 @@ from raytrace.kernels.models import Model
 from raytrace.kernels.result import Kernels, Psf, polychromatic
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.optics.f_number import axial_f_number
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.scene import Scene, varies
 
@@ -105,7 +106,7 @@ def climb(batch: Scene, pixels: Grid, weights: Tensor | None, rungs: Sequence[Mo
 def _diffracts(batch: Scene, pixels: Grid, light: Psf) -> bool:
     """Whether somewhere neither a pixel nor the blur is twice as wide as the Airy disc: rays alike prove nothing."""
     with torch.no_grad():
-        airy = 1.22e-3 * batch.wavelengths.max() * first_order(batch.lens).working_f_number.max()
+        airy = 1.22e-3 * batch.wavelengths.max() * axial_f_number(batch.lens).max()
         blur = 2 * safe_sqrt(light.ray_covariance[0] + light.ray_covariance[2])
         return bool((torch.maximum(blur, pixels.pitch) < 4 * airy).any())
 

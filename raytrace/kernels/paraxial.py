@@ -7,10 +7,13 @@ from raytrace.kernels.pixels import gaussian_pixels
 from raytrace.kernels.result import Kernels
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide
+from raytrace.optics.axis import need_axis
 from raytrace.optics.launch import object_field
 from raytrace.optics.paraxial import first_order, signed, system_matrix
 from raytrace.optics.scene import Scene, is_on_axis
 from raytrace.optics.trace import media
+
+_INSTEAD = "take model=gaussian, drt or wave, which trace rays"
 
 
 def kernels(scene: Scene, grid: Grid, *, order: int = 0, rho: float | Tensor = 0.5) -> Kernels:
@@ -18,7 +21,9 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0, rho: float | Tensor = 0
 
     order: 0, the only one; rho: 0.5 gives the second moment per axis of a uniform disc of radius ε. In focus σ is 0 and
     so is its gradient: the Gaussian's energy moves between pixels with σ², so nothing is lost.
+    Raises Bent for a lens whose axis bends.
     """
+    need_axis(scene.lens, "the paraxial PSF model", _INSTEAD)
     sigma = rho * blur_radius(scene)
     variance = (sigma * sigma).expand(scene.shape)
     centroid = chief_ray_height(scene)

@@ -32,21 +32,44 @@ def at_stop(lens: Lens, rays: Rays, wavelength: Tensor) -> tuple[Tensor, Tensor]
 
 
 def aim_at_stop(
-    lens: Lens, through: Callable[[Tensor, float], Rays], pupil: Tensor, wavelength: Tensor, radius: Tensor
+    lens: Lens,
+    through: Callable[[Tensor, float], Rays],
+    pupil: Tensor,
+    target: Tensor,
+    wavelength: Tensor,
+    radius: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Entrance pupil points (2, ...) whose rays pass the stop at `pupil` times `radius`; and whether found (...).
+    """Entrance pupil points (2, ...) whose rays pass the stop at `target` times `radius`; and whether found (...).
 
-    radius: mm, negative where the entrance pupil is an inverted image of the stop; through(pupil, fraction): rays of a
-    fraction of the field.
+    pupil: (2, ...), where to begin: the points that the targets have the name of; radius: mm, negative where the
+    entrance pupil is an inverted image of the stop; through(pupil, fraction): rays of a fraction of the field.
     """
-    pupil = with_batch_axes(pupil, radius.dim())  # an axis of object distances, which pupil points may not have
+    # An axis of object distances, which pupil points may not have.
+    pupil, target = (with_batch_axes(points, radius.dim()) for points in (pupil, target))
 
     def missed(aim: Tensor, fraction: float) -> tuple[Tensor, Tensor]:
         position, arrives = at_stop(lens, through(aim, fraction), wavelength)
-        return torch.stack([at / radius - to for at, to in zip(position, pupil, strict=True)]), arrives
+        return torch.stack([at / radius - to for at, to in zip(position, target, strict=True)]), arrives
 
     aim, found = _root(missed, pupil, origin=lambda start: start)
     return torch.stack([torch.where(found, at, to) for at, to in zip(aim, pupil, strict=True)]), found
+
+
+def aim_at_middle(
+    lens: Lens, through: Callable[[Tensor], Rays], start: Tensor, wavelength: Tensor, size: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Points (2, ...) whose rays pass the middle of the stop, and whether found (...): where they are not, the start.
+
+    through(points): rays; size: () mm, by which it is judged how near that is. Second derivatives are exact too.
+    """
+
+    def missed(point: Tensor, fraction: float) -> tuple[Tensor, Tensor]:
+        position, arrives = at_stop(lens, through(point), wavelength)
+        return position / size, arrives
+
+    root, found = _root(missed, start, origin=lambda start: start)
+    root = root - _solve(_error_and_jacobian(missed, root.detach(), 1.0)[1], missed(root, 1.0)[0])
+    return torch.where(found, root, start), found
 
 
 def aim_at_image(

@@ -7,9 +7,11 @@ from torch import Tensor
 
 from raytrace.maths.result import Result, axis, masked
 from raytrace.maths.value import value
+from raytrace.optics.axis import is_bent
 from raytrace.optics.focus import image_rays
 from raytrace.optics.launch import launch
 from raytrace.optics.losses import STATUS, fates
+from raytrace.optics.trace import lens_steps
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.rays import Rays
 
@@ -88,8 +90,20 @@ def _field(lens: Lens, pupil: Tensor, field: Tensor, ray_aiming: str | None) -> 
 def chief_points(lens: Lens, fields: Tensor, wavelengths: Tensor) -> tuple[Tensor, Tensor]:
     """Where chief rays of fields (2, F) meet the sensor, (2, F, W) mm; whether they arrive or were only vignetted."""
     rays = image_rays(lens, fields.new_zeros(2, 1), fields=fields, wavelengths=wavelengths)
+    if is_bent(lens):
+        return rays.position[:2, ..., 0], unclipped(lens, fields.new_zeros(2, 1), fields, wavelengths)[..., 0]
     on_axis = (fields == 0).all(0)[:, None]
     return rays.position[:2, ..., 0], (rays.valid | keeps_coordinates(rays.direction))[..., 0] | on_axis
+
+
+@torch.no_grad()
+def unclipped(lens: Lens, pupil: Tensor, fields: Tensor, wavelengths: Tensor) -> Tensor:
+    """Which rays (F, W, P) of pupil points (2, P) reach the sensor, or would if nothing clipped any."""
+    rays = launch(lens, pupil, fields=fields, wavelengths=wavelengths)
+    reached = rays.valid
+    for crossing in lens_steps(lens, rays, wavelengths[:, None]):
+        reached = reached & ~crossing.missed & ~crossing.totally_reflected
+    return reached
 
 
 def chief_reference(lens: Lens, fields: Tensor) -> Tensor:
@@ -99,5 +113,5 @@ def chief_reference(lens: Lens, fields: Tensor) -> Tensor:
 
 
 def keeps_coordinates(direction: Tensor) -> Tensor:
-    """Whether rays keep their coordinates: a ray that missed a surface has become an axial one."""
+    """Whether rays keep their coordinates, if the axis is straight: one that missed a surface has become axial."""
     return (direction[:2] != 0).any(0)

@@ -1,7 +1,7 @@
 """Focus: the sensor distance of least RMS spot, in closed form.
 
-Rays in image space are straight: moving the sensor by s moves a hit by s·m, m = (L, M)/N. The mean square radius about
-each spot's own centroid is a parabola in s, so nothing is retraced:
+Rays in image space are straight: moving the sensor by s along its normal moves a hit by s·m, m = (L, M)/N. The mean
+square radius about each spot's own centroid is a parabola in s, so nothing is retraced:
 
     s = -Σ W cov(x, m) / Σ W var(m)
 """
@@ -15,12 +15,15 @@ from torch import Tensor
 from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.pupil import gauss_rings
+from raytrace.optics.axis import is_bent
+from raytrace.optics.base_ray import base_ray
 from raytrace.optics.conjugates import sequence_of
 from raytrace.optics.launch import launch
 from raytrace.optics.paraxial import paraxial_image_distance
 from raytrace.optics.spot import EmptySpot, Spot, spot_of, spot_of_points, where_lit
 from raytrace.optics.trace import media, trace_surfaces
 from raytrace.system.lens import Lens, with_object_distance, with_sensor_distance
+from raytrace.system.pose import direction_in
 from raytrace.system.rays import Rays
 
 _RINGS = 12  # of the pupil, where focus on the axis is found
@@ -77,9 +80,9 @@ def spot_parabola(rays: Rays, weights: Tensor | None = None, *, empty: str = "na
 
 
 def through_focus(rays: Rays, shifts: Tensor, weights: Tensor | None = None, *, empty: str = "nan") -> Spot:
-    """Spots (S, ...) on the sensor moved by each of the shifts (S,) mm; rays: (3, ..., P) on the sensor.
+    """Spots (S, ...) on the sensor moved by each of the shifts (S,) mm along its own normal.
 
-    empty: as for `spot_of`.
+    rays: (3, ..., P) on the sensor; empty: as for `spot_of`.
     """
     points, slopes = _points_and_slopes(rays)
     shifts = shifts.reshape(-1, *(1,) * (points.dim() - 1))
@@ -104,7 +107,8 @@ def focus_of_rms(lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = "na
         )
     if empty == "error" and not bool(variance > 0):
         raise EmptySpot("no sensor distance is best: the rays are parallel, or there is only one")
-    return torch.where(variance > 0, lens.surfaces[-2].thickness - safe_divide(covariance, variance), torch.nan)
+    shift = safe_divide(covariance, variance) / along_normal(lens)
+    return torch.where(variance > 0, lens.surfaces[-2].thickness - shift, torch.nan)
 
 
 def focus_of_mean_radius(lens: Lens, pupil: Tensor, weights: Tensor, **scene) -> Tensor:
@@ -123,7 +127,8 @@ def focus_of_mean_radius(lens: Lens, pupil: Tensor, weights: Tensor, **scene) ->
     def merit(sensor: Tensor) -> Tensor:
         total = torch.zeros_like(sensor)
         for rays, share in traced:
-            found = through_focus(rays, (sensor - lens.surfaces[-2].thickness).reshape(1), weights)
+            shift = (sensor - lens.surfaces[-2].thickness) * along_normal(lens)
+            found = through_focus(rays, shift.reshape(1), weights)
             x, y = torch.where(found.valid, found.points - found.centroid[..., None], 0.0)
             light = torch.where(rays.valid, weights, 0.0)
             radius = safe_divide((light * safe_sqrt(x * x + y * y)).sum(-1), light.sum(-1))
@@ -186,10 +191,34 @@ def best_focus(lens: Lens) -> Tensor:
     return focus_of_rms(lens, *gauss_rings(_RINGS), fields=axis, wavelength_weights=weights, empty="error")
 
 
+def along_normal(lens: Lens) -> Tensor | float:
+    """By how many mm the sensor moves along its own normal where its distance grows by 1 mm: less where it is tilted
+    in the axes that the distance is laid along."""
+    pose = lens.surfaces[-1].before
+    if pose is None:
+        return 1.0
+    zero = torch.zeros_like(lens.surfaces[-2].thickness)
+    return direction_in(pose, [zero, zero, torch.ones_like(zero)])[2]
+
+
+def paraxial_sensor(lens: Lens, object_distances: Tensor) -> Tensor:
+    """Sensor distances (D,) mm of the paraxial images of objects at distances (D,) mm, inf allowed.
+
+    Where the axis bends, that halfway between the images of both sections along the base ray; or that of one.
+    """
+    if not is_bent(lens):
+        return paraxial_image_distance(lens, object_distances)
+    base = base_ray(with_object_distance(lens, object_distances))
+    there = torch.isfinite(base.image_distance)
+    total, count = torch.where(there, base.image_distance, 0.0).sum(0), there.sum(0)
+    ahead = torch.where(count > 0, total / count.clamp_min(1), torch.inf) - base.way_to_image
+    return lens.surfaces[-2].thickness + ahead * base.direction[2] / along_normal(lens)
+
+
 def real_image_distance(lens: Lens, object_distances: Tensor) -> Tensor:
     """Sensor distances (D,) mm of the paraxial images of objects at distances (D,) mm. Raises NoImage for one that is
     not behind the lens."""
-    images = paraxial_image_distance(lens, object_distances)
+    images = paraxial_sensor(lens, object_distances)
     wrong = ~(_behind(lens, images) & torch.isfinite(images))
     if bool(wrong.any()):
         distance, image = (float(one[wrong][0]) for one in (object_distances.detach(), images.detach()))
@@ -206,6 +235,10 @@ def is_behind(lens: Lens, distance: Tensor) -> bool:
 
 
 def _behind(lens: Lens, distance: Tensor) -> Tensor:
+    if is_bent(lens):
+        base = base_ray(lens)
+        ahead = (distance - lens.surfaces[-2].thickness) * along_normal(lens) / base.direction[2]
+        return (base.way_to_image + ahead > 0).detach()
     side = -1 if sum(surface.is_mirror for surface in lens.surfaces) % 2 else 1
     return (side * distance > 0).detach()
 

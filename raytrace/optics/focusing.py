@@ -17,9 +17,10 @@ from raytrace.optics.focus import (
     image_rays,
     is_behind,
     mean_rms_radius,
+    paraxial_sensor,
 )
 from raytrace.optics.losses import LostRays, warn_of_losses
-from raytrace.optics.paraxial import first_order, paraxial_image_distance
+from raytrace.optics.paraxial import first_order
 from raytrace.system.lens import (
     FIELD_UNITS,
     Lens,
@@ -165,7 +166,7 @@ def focus(
     wavelengths = primary if wavelengths is None else wavelengths_of(lens, wavelengths)
     like = lens.surfaces[-2].thickness
     at, weights = pupil.sampled(sampling, rings=rings, points=points, seed=seed, dtype=like.dtype, device=like.device)
-    paraxial = paraxial_image_distance(lens, distances)
+    paraxial = paraxial_sensor(lens, distances)
     looked_at = {
         "object_distances": distances,
         "fields": fields,

@@ -2,7 +2,7 @@
 
 Rays start on the plane of the paraxial entrance pupil (at the primary wavelength), wherever it lies; an object 10¹² mm
 away costs no digits. With ray aiming they are steered until they fill the stop, whose radius is that of the paraxial or
-of the real marginal ray.
+of the real marginal ray; where the axis bends they set out for what the stop looks like along the base ray.
 """
 
 import dataclasses
@@ -15,6 +15,8 @@ from torch import Tensor
 from raytrace.maths.numerics import broadcast_shape, dot, dot_2, safe_divide, safe_sqrt, unit
 from raytrace.maths.pupil import gauss_rings
 from raytrace.optics.aiming import aim_at_image, aim_at_stop, at_stop
+from raytrace.optics.axis import is_bent
+from raytrace.optics.base_ray import Entrance, entrance_of
 from raytrace.optics.paraxial import FirstOrder, first_order
 from raytrace.optics.vignetting import vignette
 from raytrace.system.lens import RAY_AIMING, Lens, field_points, index_behind, wavelengths_of
@@ -88,11 +90,15 @@ def rays_of_field(
     index = index_behind(lens, 0, wavelength).to(pupil.dtype)
     field, reached = object_field(lens, field, paraxial)
 
-    def through(pupil: Tensor, fraction: float = 1.0) -> Rays:
-        return _through_entrance_pupil(lens, _part_of_field(lens, field, fraction), pupil, paraxial, index)
+    entrance = _entrance(lens)
 
-    if lens.ray_aiming != "off" and not lens.fields.telecentric:
-        pupil, found = aim_at_stop(lens, through, pupil, wavelength, _aimed_radius(lens, paraxial))
+    def through(pupil: Tensor, fraction: float = 1.0) -> Rays:
+        return _through_entrance_pupil(lens, _part_of_field(lens, field, fraction), pupil, paraxial, index, entrance)
+
+    if _is_aimed(lens):
+        radius = _aimed_radius(lens, paraxial, entrance)
+        target = pupil if entrance is None else _turned(entrance.turn, pupil)
+        pupil, found = aim_at_stop(lens, through, pupil, target, wavelength, radius)
         reached = reached & found
     rays = through(pupil)
     return dataclasses.replace(rays, valid=rays.valid & reached)
@@ -163,6 +169,21 @@ def _part_of_field(lens: Lens, field: Tensor, fraction: float) -> Tensor:
     return _scaled(field, safe_divide(torch.tan(fraction * torch.atan(slope)), slope))
 
 
+def _is_aimed(lens: Lens) -> bool:
+    return lens.ray_aiming != "off" and not lens.fields.telecentric
+
+
+def _entrance(lens: Lens) -> Entrance | None:
+    """Where aimed rays set out for in a lens whose axis bends; None: for the paraxial entrance pupil."""
+    return entrance_of(lens) if _is_aimed(lens) and is_bent(lens) else None
+
+
+def _turned(matrix: Tensor, points: Tensor) -> Tensor:
+    """A matrix (2, 2, ...) times points (2, ...)."""
+    (xx, xy), (yx, yy) = matrix
+    return torch.stack([xx * points[0] + xy * points[1], yx * points[0] + yy * points[1]])
+
+
 def with_ray_aiming(lens: Lens, ray_aiming: str | None) -> Lens:
     """The lens with another kind of ray aiming, a key of RAY_AIMING; its own where that is None or "file"."""
     if ray_aiming in (None, "file", lens.ray_aiming):
@@ -176,39 +197,49 @@ def stop_radius(lens: Lens) -> Tensor:
     """Radius in mm of the stop: where the axial ray through the edge of the entrance pupil meets it.
 
     The paraxial ray where rays are aimed by it, or where the real one does not reach the stop; else the real one. At
-    the primary wavelength.
+    the primary wavelength. Where the axis bends it counts from the base ray.
     """
+    return _stop_radius(lens, first_order(lens), _entrance(lens))
+
+
+def _stop_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> Tensor:
     if lens.aperture.kind == "float_by_stop":
         return lens.aperture.value
-    paraxial = first_order(lens)
+    estimate = paraxial.stop_height.abs() if entrance is None else entrance.radius
     if lens.ray_aiming == "paraxial":
-        return paraxial.stop_height.abs()
-    height, arrives = _marginal_height(lens, paraxial)
-    return torch.where(arrives, height.abs(), paraxial.stop_height.abs())
+        return estimate
+    height, arrives = _marginal_height(lens, paraxial, entrance)
+    return torch.where(arrives, height.abs(), estimate)
 
 
-def _aimed_radius(lens: Lens, paraxial: FirstOrder) -> Tensor:
-    """The radius of the stop with the sign of `FirstOrder.stop_height`; warns MarginalRayLost."""
+def _aimed_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> Tensor:
+    """The radius of the stop with the sign of `FirstOrder.stop_height`; warns MarginalRayLost.
+
+    Where the axis bends an `Entrance` tells what an inverted image of the stop turns, and the sign is +.
+    """
     by_real_ray = lens.ray_aiming == "real" and lens.aperture.kind != "float_by_stop"
-    if by_real_ray and not bool(_marginal_height(lens, paraxial)[1].all()):
+    if by_real_ray and not bool(_marginal_height(lens, paraxial, entrance)[1].all()):
         message = "the real marginal ray does not reach the stop; rays are aimed over the radius of the paraxial one"
         warnings.warn(message, MarginalRayLost, stacklevel=4)
-    return stop_radius(lens) * torch.where(paraxial.stop_height.detach() < 0, -1.0, 1.0)
+    radius = _stop_radius(lens, paraxial, entrance)
+    return radius * torch.where(paraxial.stop_height.detach() < 0, -1.0, 1.0) if entrance is None else radius
 
 
-def _marginal_height(lens: Lens, paraxial: FirstOrder) -> tuple[Tensor, Tensor]:
+def _marginal_height(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> tuple[Tensor, Tensor]:
     """Height in mm at the stop of the real axial ray through the edge of the entrance pupil, and whether it arrives."""
     wavelength = lens.wavelengths[lens.primary_wavelength]
     edge = lens.wavelengths.new_tensor([0.0, 1.0]).to(paraxial.entrance_pupil_diameter.dtype)
     index = index_behind(lens, 0, wavelength).to(edge.dtype)
-    position, arrives = at_stop(
-        lens, _through_entrance_pupil(lens, torch.zeros_like(edge), edge, paraxial, index), wavelength
-    )
-    return position[1], arrives
+    rays = _through_entrance_pupil(lens, torch.zeros_like(edge), edge, paraxial, index, entrance)
+    position, arrives = at_stop(lens, rays, wavelength)
+    return (position[1] if entrance is None else safe_sqrt(dot_2(position, position))), arrives
 
 
-def _through_entrance_pupil(lens: Lens, field: Tensor, pupil: Tensor, paraxial: FirstOrder, index: Tensor) -> Rays:
-    """Rays from a slope or object height (2, ...) to the paraxial entrance pupil at fractions (2, ...)."""
+def _through_entrance_pupil(
+    lens: Lens, field: Tensor, pupil: Tensor, paraxial: FirstOrder, index: Tensor, entrance: Entrance | None
+) -> Rays:
+    """Rays from a slope or object height (2, ...) to the entrance pupil, the paraxial one if there is no other, at
+    fractions (2, ...)."""
     distance = lens.surfaces[0].thickness
     at_infinity = is_at_infinity(lens)
     radius, depth = 0.5 * paraxial.entrance_pupil_diameter, paraxial.entrance_pupil_position
@@ -216,6 +247,9 @@ def _through_entrance_pupil(lens: Lens, field: Tensor, pupil: Tensor, paraxial: 
         # The pupil is at infinity: cones of equal rays about a chief ray parallel to the axis.
         radius, depth = _telecentric_radius(lens, paraxial, index), torch.zeros_like(distance)
         aim_x, aim_y = field[0] + radius * pupil[0], field[1] + radius * pupil[1]
+    elif entrance is not None:
+        aim_x, aim_y = (at + to for at, to in zip(entrance.centre, _turned(entrance.spread, pupil), strict=True))
+        depth = entrance.position
     else:
         aim_x, aim_y = radius * pupil[0], radius * pupil[1]
     # Not the index: all wavelengths start alike, and only their paths differ.
@@ -264,11 +298,13 @@ def _field_of_real_height(lens, height: Tensor, estimate: Tensor, paraxial: Firs
     wavelength = lens.wavelengths[lens.primary_wavelength]
     index = index_behind(lens, 0, wavelength).to(height.dtype)
 
-    def through(field: Tensor, pupil: Tensor) -> Rays:
-        return _through_entrance_pupil(lens, field, pupil, paraxial, index)
+    entrance = _entrance(lens)
 
-    aimed = lens.ray_aiming != "off" and not lens.fields.telecentric
-    return aim_at_image(lens, through, height, estimate, _aimed_radius(lens, paraxial) if aimed else None)
+    def through(field: Tensor, pupil: Tensor) -> Rays:
+        return _through_entrance_pupil(lens, field, pupil, paraxial, index, entrance)
+
+    radius = _aimed_radius(lens, paraxial, entrance) if _is_aimed(lens) else None
+    return aim_at_image(lens, through, height, estimate, radius)
 
 
 def _scaled(field: Tensor, factor: Tensor) -> Tensor:

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from raytrace.maths.value import value
 from raytrace.optics.trace import media
-from raytrace.system.lens import Lens, largest_field
+from raytrace.system.lens import Lens
 from raytrace.system.phases import power_of
-from raytrace.system.surface import Surface, vertex_curvature
+from raytrace.system.surface import Surface, is_posed, is_round, vertex_curvature
 
 
 @value
@@ -109,7 +109,7 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
     entrance_pupil = n_object * B1 / A1
     exit_pupil = -n_image * B2 / D2 - surfaces[-1].thickness
 
-    vergence = n_object / _object_distance(lens)  # 0 for an object at infinity
+    vergence = n_object / object_distance_of(lens)  # 0 for an object at infinity
     y, omega = A + B * vergence, C + D * vergence
     image_distance = -n_image * y / omega
 
@@ -143,10 +143,23 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
     )
 
 
-def _object_distance(lens: Lens) -> Tensor:
+def object_distance_of(lens: Lens) -> Tensor:
     """The distance (...) mm of the object; of one at surface 1 so little that all is what it is in the limit."""
     distance = lens.surfaces[0].thickness
     return torch.where(distance == 0, torch.finfo(distance.dtype).tiny ** 0.5, distance)
+
+
+def largest_field(lens: Lens) -> Tensor:
+    """The field point (2, 1) along y that is as far from the axis as the lens's outermost, in its own unit.
+
+    Where not every surface is round about one axis it is the outermost itself: directions are not alike.
+    """
+    size = torch.hypot(lens.fields.x, lens.fields.y)
+    if all(is_round(surface) and not is_posed(surface) for surface in lens.surfaces):
+        largest = size.amax()
+        return torch.stack([torch.zeros_like(largest), largest])[:, None]
+    outermost = size.argmax()
+    return torch.stack([lens.fields.x[outermost], lens.fields.y[outermost]])[:, None]
 
 
 def marginal_ray(lens: Lens) -> tuple[Tensor, Tensor]:
@@ -154,7 +167,7 @@ def marginal_ray(lens: Lens) -> tuple[Tensor, Tensor]:
     wavelength = lens.wavelengths[lens.primary_wavelength]
     n_object = media(lens, wavelength)[0]
     data = first_order(lens)
-    vergence = n_object / _object_distance(lens)
+    vergence = n_object / object_distance_of(lens)
     y = _marginal_height(lens, data.entrance_pupil_position, data.entrance_pupil_diameter, n_object, vergence)
     return y, y * vergence
 
@@ -176,12 +189,12 @@ def _marginal_height(lens: Lens, entrance_pupil, diameter, n_object, vergence) -
     """
     if lens.aperture.kind in ("object_na", "object_cone_angle"):
         pupil_before_object = 1 + entrance_pupil * vergence / n_object < 0
-        height = (lens.surfaces[0].thickness * torch.tan(_cone_angle(lens, n_object))).abs()
+        height = (lens.surfaces[0].thickness * torch.tan(cone_angle(lens, n_object))).abs()
         return torch.where(pupil_before_object, -height, height)
     return 0.5 * diameter / (1 + entrance_pupil * vergence / n_object)
 
 
-def _cone_angle(lens: Lens, n_object: Tensor) -> Tensor:
+def cone_angle(lens: Lens, n_object: Tensor) -> Tensor:
     """Half angle of the cone at the object, radians, of an aperture that is given as one."""
     kind, number = lens.aperture.kind, lens.aperture.value
     return torch.asin(number / n_object) if kind == "object_na" else torch.deg2rad(number)
@@ -189,7 +202,7 @@ def _cone_angle(lens: Lens, n_object: Tensor) -> Tensor:
 
 def _optical_invariant(lens: Lens, radius, n_object, slope_object, omega_image) -> Tensor:
     """|n u h| at the object, |n ū y| at the entrance pupil or |n′ u′ h′| at the image, as the largest field is told."""
-    largest = largest_field(lens)[1, 0]
+    largest = torch.hypot(*largest_field(lens))[0]
     if lens.fields.kind == "angle":
         return (n_object * radius * torch.tan(torch.deg2rad(largest))).abs()
     return ((n_object * slope_object if lens.fields.kind == "object_height" else omega_image) * largest).abs()
@@ -217,4 +230,4 @@ def _entrance_pupil_diameter(lens, focal_length, entrance_pupil, A1, n_object, n
         slope = 0.5 / (number * n_image.abs())
         return 2 * (slope * n_image / omega * (1 + entrance_pupil * vergence / n_object)).abs()
     distance = lens.surfaces[0].thickness + entrance_pupil
-    return 2 * (distance * torch.tan(_cone_angle(lens, n_object))).abs()
+    return 2 * (distance * torch.tan(cone_angle(lens, n_object))).abs()

@@ -9,12 +9,13 @@ from torch import Tensor
 from raytrace.maths.result import Result, number, numbers
 from raytrace.maths.value import detached, value
 from raytrace.media.environment import told
+from raytrace.optics.base_ray import base_ray
 from raytrace.optics.f_number import real_working_f_number
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.trace import media
 from raytrace.system.lens import FIELD_UNITS, Lens, field_points, name_of_field, wavelengths_of
 from raytrace.system.shapes import EVEN
-from raytrace.system.surface import Surface, vertex_curvature
+from raytrace.system.surface import Surface, is_posed, is_round, vertex_curvature
 
 #: Lines of `raytrace info`: words, entry of FirstOrder (and the real working F/#), unit.
 FIRST_ORDER_LINES = (
@@ -35,6 +36,19 @@ FIRST_ORDER_LINES = (
     ("object NA", "object_na", ""),
     ("image NA", "image_na", ""),
     ("Petzval radius", "petzval_radius", "mm"),
+)
+
+#: Lines of a lens whose axis bends, or whose sections differ: words, entry of BaseRay, unit.
+BASE_RAY_LINES = (
+    ("focal length", "focal_length", "mm"),
+    ("back focal distance", "back_focal_distance", "mm along the base ray, from the last surface that is no break"),
+    ("entrance pupil position", "entrance_pupil_position", "mm along the base ray, from surface 1"),
+    ("entrance pupil diameter", "entrance_pupil_diameter", "mm"),
+    ("exit pupil position", "exit_pupil_position", "mm along the base ray, from the image"),
+    ("exit pupil diameter", "exit_pupil_diameter", "mm"),
+    ("image distance", "image_distance", "mm along the base ray, from the last surface that is no break"),
+    ("working F/#", "working_f_number", "1/(2 n' u')"),
+    ("magnification", "magnification", ""),
 )
 
 
@@ -72,6 +86,7 @@ class Info(Result):
         return {
             "name": lens.name,
             **{name: number(figure) for (_, name, _), figure in zip(FIRST_ORDER_LINES, _figures(lens), strict=True)},
+            **_about_base_ray(lens),
             "wavelengths": numbers(lens.wavelengths),
             "wavelength_weights": numbers(lens.wavelength_weights),
             "primary_wavelength": lens.primary_wavelength,
@@ -107,6 +122,7 @@ class Info(Result):
         lines = [lens.name or "Lens", ""]
         for (words, _, unit), figure in zip(FIRST_ORDER_LINES, _figures(lens), strict=True):
             lines.append(f"  {words:<24} {_quantity(figure):>16}  {unit}".rstrip())
+        lines += _base_ray_lines(lens)
         points = ", ".join(f"({x:g}, {y:g})" for x, y in field_points(None, like=lens).T.tolist())
         several = len(lens.wavelengths) > 1
         shown = [
@@ -219,6 +235,34 @@ def _figures(lens: Lens) -> list[float]:
     """The numbers of FIRST_ORDER_LINES; nan or infinite where a quantity does not exist."""
     data, real = first_order(lens), real_working_f_number(lens)
     return [float(getattr(data, name, real)) for _, name, _ in FIRST_ORDER_LINES]
+
+
+def _has_sections(lens: Lens) -> bool:
+    """Whether first-order data about the base ray say more than the straightened ones."""
+    return not all(is_round(surface) and not is_posed(surface) for surface in lens.surfaces)
+
+
+def _about_base_ray(lens: Lens) -> dict:
+    """What JSON says of the base ray: (tangential, sagittal) of every figure, null for what does not exist."""
+    if not _has_sections(lens):
+        return {}
+    base = base_ray(lens)
+    figures = {name: numbers(getattr(base, name)) for _, name, _ in BASE_RAY_LINES}
+    place = {"position": numbers(base.position), "direction": numbers(base.direction)}
+    return {"base_ray": {"valid": bool(base.valid), **place, **figures}}
+
+
+def _base_ray_lines(lens: Lens) -> list[str]:
+    if not _has_sections(lens):
+        return []
+    base = base_ray(lens)
+    if not bool(base.valid):
+        return ["", "  the axial chief ray does not reach the image"]
+    lines = ["", f"  {'about the axial chief ray':<24} {'tangential':>16} {'sagittal':>16}"]
+    for words, name, unit in BASE_RAY_LINES:
+        figures = " ".join(f"{_quantity(figure):>16}" for figure in getattr(base, name).tolist())
+        lines.append(f"  {words:<24} {figures}  {unit}".rstrip())
+    return [*lines, ""]
 
 
 def _remarks(lens: Lens, k: int) -> str:

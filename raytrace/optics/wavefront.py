@@ -12,6 +12,8 @@ from torch import Tensor
 from raytrace.maths import zernike
 from raytrace.maths.numerics import dot, safe_divide, safe_sqrt, unit
 from raytrace.maths.value import value
+from raytrace.optics.axis import is_bent
+from raytrace.optics.base_ray import base_ray
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.scene import Scene, beam_share, trace_scene
 from raytrace.optics.spot import where_lit
@@ -123,10 +125,22 @@ def wavefront_of(
 def _on_sensor(scene: Scene, with_chief: Tensor) -> tuple[Rays, Tensor]:
     """Rays of pupil points, the chief ray first, and which have numbers that mean something."""
     rays = trace_scene(scene, with_chief)
+    if is_bent(scene.lens):
+        return rays, rays.valid | _unclipped(scene, with_chief)
     usable = rays.valid | (rays.position != 0).any(0) | (rays.direction[:2] != 0).any(0)
     # A chief ray along the axis has the numbers of a lost ray, and means them.
     on_axis = (scene.fields == 0).all(0)[:, None, None] & (with_chief[..., :1] == 0).all(0)
     return rays, torch.cat([usable[..., :1] | on_axis, usable[..., 1:]], -1)
+
+
+def _unclipped(scene: Scene, pupil: Tensor) -> Tensor:
+    """Which rays would arrive if nothing clipped any (D, F, W, P): behind turned axes numbers alone do not tell."""
+    if not any(surface.apertures for surface in scene.lens.surfaces):
+        return torch.zeros_like(scene.fields[0], dtype=torch.bool)[:, None, None]
+    surfaces = tuple(dataclasses.replace(surface, apertures=()) for surface in scene.lens.surfaces)
+    open_lens = dataclasses.replace(scene.lens, surfaces=surfaces)
+    with torch.no_grad():
+        return trace_scene(dataclasses.replace(scene, lens=open_lens, memo=None), pupil).valid
 
 
 def _at_chief(quantity: Tensor, valid: Tensor, usable: Tensor) -> Tensor:
@@ -139,14 +153,35 @@ def _at_chief(quantity: Tensor, valid: Tensor, usable: Tensor) -> Tensor:
 def _reference_sphere(scene: Scene, rays: Rays, usable: Tensor) -> tuple[Tensor, Tensor]:
     """Centre (3, D, F, W, 1) mm, the chief ray's point of the sensor, and signed radius (D, F, W, 1) mm.
 
-    The radius runs along the chief ray from the plane of the paraxial exit pupil; inf for a pupil at infinity.
+    The radius runs along the chief ray from the plane of the paraxial exit pupil, or, where the axis bends, from that
+    across the base ray halfway between the images of the stop; inf for a pupil at infinity.
     """
     centre = _at_chief(rays.position, rays.valid, usable)
-    N = unit(_at_chief(rays.direction, rays.valid, usable))[2]
+    direction = unit(_at_chief(rays.direction, rays.valid, usable))
+    if is_bent(scene.lens):
+        return centre, _from_bent_pupil(scene, centre, direction)
+    N = direction[2]
     pupil = first_order(scene.lens).exit_pupil_position[..., None]
     finite = torch.isfinite(pupil) & (N != 0)
     along = (centre[2] - torch.where(finite, pupil, 0.0)) / torch.where(finite, N, 1.0)
     return centre, torch.where(finite & (along != 0), along, torch.inf)
+
+
+def _from_bent_pupil(scene: Scene, centre: Tensor, direction: Tensor) -> Tensor:
+    """Radius (D, F, W, 1) mm along chief rays from the plane across the base ray at the mean vergence of both pupils.
+
+    R = ((C - B)·b - z)/(d·b),  z = 2/(1/z_t + 1/z_s) the place of the pupil along the base ray B + z b
+    """
+    base = base_ray(scene.lens)
+    tangential, sagittal = base.exit_pupil_position
+    place = safe_divide(2 * tangential, 1 + tangential / sagittal)
+    place = torch.where(torch.isinf(tangential), 2 * sagittal, place)
+    at, along = (vector[..., None] for vector in (base.position, base.direction))
+    slant = dot(direction, along)
+    finite = base.valid[..., None] & torch.isfinite(place)[..., None] & (slant != 0)
+    ahead = dot(centre - at, along) - torch.where(finite, place[..., None], 0.0)
+    radius = ahead / torch.where(finite, slant, 1.0)
+    return torch.where(finite & (radius != 0), radius, torch.inf)
 
 
 def mean_opd(wavefront: Wavefront, *, empty: str = "nan") -> Tensor:

@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from raytrace.maths.numerics import safe_divide
-from raytrace.optics.focus import focus_moments, image_rays, through_focus
+from raytrace.optics.f_number import axial_f_number
+from raytrace.optics.focus import along_normal, focus_moments, image_rays, through_focus
 from raytrace.optics.focusing import Focus
 from raytrace.optics.paraxial import first_order
 from raytrace.plot import style
@@ -22,21 +23,25 @@ _SAMPLES = 401
 
 
 class FocusRays(NamedTuple):
-    """Rays (3, C, P) on the sensor, one batch for every curve, with their weights (P,) or (C, P)."""
+    """Rays (3, C, P) on the sensor, one batch for every curve, with their weights (P,) or (C, P).
+
+    slant: how far the sensor moves along its normal for each mm of its distance.
+    """
 
     rays: Rays
     weights: Tensor
+    slant: float = 1.0
 
     @property
     def best(self) -> np.ndarray:
         """Shifts (C,) mm of the sensor to the least RMS spot of every curve."""
-        covariance, variance = focus_moments(*self)
-        return style.array(-safe_divide(covariance, variance))
+        covariance, variance = focus_moments(self.rays, self.weights)
+        return style.array(-safe_divide(covariance, variance)) / self.slant
 
     def radii(self, shifts: np.ndarray) -> np.ndarray:
         """RMS radii (S, C) mm on the sensor moved by shifts (S,) mm."""
         shifts = torch.as_tensor(shifts, dtype=self.weights.dtype, device=self.weights.device)
-        return style.array(through_focus(self.rays, shifts, self.weights).rms_radius)
+        return style.array(through_focus(self.rays, self.slant * shifts, self.weights).rms_radius)
 
 
 @style.styled
@@ -89,15 +94,16 @@ def focus_rays(
 ) -> FocusRays:
     """The rays of every curve: by "field" all wavelengths in one with their weights, by "wavelength" each by itself."""
     points, weights = pupil
-    shares = shares_of(lens, wavelengths, wavelength_weights)
+    shares, slant = shares_of(lens, wavelengths, wavelength_weights), float(along_normal(lens))
     with torch.no_grad():
         rays = image_rays(lens, points, fields=fields, wavelengths=wavelengths)
     if by == "wavelength":
         return FocusRays(
-            Rays(rays.position.flatten(1, 2), rays.direction.flatten(1, 2), rays.valid.flatten(0, 1)), weights
+            Rays(rays.position.flatten(1, 2), rays.direction.flatten(1, 2), rays.valid.flatten(0, 1)), weights, slant
         )
     weights = (shares[:, None] * weights).flatten()
-    return FocusRays(Rays(rays.position.flatten(2), rays.direction.flatten(2), rays.valid.flatten(1)), weights)
+    joined = Rays(rays.position.flatten(2), rays.direction.flatten(2), rays.valid.flatten(1))
+    return FocusRays(joined, weights, slant)
 
 
 def focus_span(lens: Lens, bundle: FocusRays, sensor: float, marks) -> tuple[float, float]:
@@ -108,7 +114,7 @@ def focus_span(lens: Lens, bundle: FocusRays, sensor: float, marks) -> tuple[flo
     """
     best = bundle.best
     least = np.diagonal(bundle.radii(best))
-    number = float(first_order(lens).working_f_number)
+    number = float(axial_f_number(lens))
     number = number if math.isfinite(number) else 0.0
     sharpest = min(least[np.isfinite(least)], default=0.0)  # no number where no ray arrives
     blur = max(2 * math.sqrt(8) * number * sharpest, 1e-2 * float(lens.wavelengths.min()) * number**2)

@@ -15,6 +15,7 @@ from torch import Tensor
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings, hexapolar, with_rim
 from raytrace.optics.arrivals import chief_reference
+from raytrace.optics.f_number import axial_f_number
 from raytrace.optics.focus import image_rays
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.spot import Spot, spot_of_points
@@ -27,7 +28,7 @@ _DOT_RINGS = 12  # 469 dots of a wavelength
 
 def airy_radius(lens: Lens) -> Tensor:
     """Radius in mm of the first dark ring, 1.22 λ N: λ the primary wavelength, N the paraxial working F/#."""
-    return 1.22e-3 * lens.wavelengths[lens.primary_wavelength] * first_order(lens).working_f_number
+    return 1.22e-3 * lens.wavelengths[lens.primary_wavelength] * axial_f_number(lens)
 
 
 def field_spots(

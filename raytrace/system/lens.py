@@ -319,12 +319,6 @@ def with_field_kind(lens: Lens, kind: str) -> Lens:
     return dataclasses.replace(lens, fields=dataclasses.replace(lens.fields, kind=kind))
 
 
-def largest_field(lens: Lens) -> Tensor:
-    """The field point (2, 1) along y that is as far from the axis as the lens's outermost, in its own unit."""
-    largest = torch.hypot(lens.fields.x, lens.fields.y).amax()
-    return torch.stack([torch.zeros_like(largest), largest])[:, None]
-
-
 def name_of_field(field: Tensor) -> str:
     """A field point (2,) in words: its y alone on the axis of x."""
     x, y = field.tolist()
