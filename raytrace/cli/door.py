@@ -27,7 +27,7 @@ def find_lens(name: str) -> Path:
         return path
     if found := shipped_lens(path):
         return found
-    names = sorted({lens.stem for lens in shipped("lenses").glob("*.zmx")})
+    names = sorted({lens.stem for lens in shipped("lenses").rglob("*.zmx")})
     beside = [str(file) for file in path.parent.glob("*") if file.suffix.lower() in FORMATS]
     meant = did_you_mean(name, [*names, *beside])
     raise CommandError(f"{name}: no such lens file{meant or ';'} the shipped lenses are {', '.join(names)}")

@@ -131,11 +131,11 @@ def convert(
 
 
 def shipped_lens(name: str | os.PathLike) -> Path | None:
-    """The file of a lens that travels with the package, with or without lenses/ and .zmx; None if there is none."""
+    """The file of a lens that travels with the package, with or without its folder and .zmx; None if there is none."""
     path, folder = Path(name), shipped("lenses")
-    if not path.name or path.parent not in (Path(), Path("lenses")):
+    if not path.name or path.parent not in (Path(), Path("lenses"), Path("lenses/examples")):
         return None
-    candidates = (folder / path.name, folder / f"{path.name}.zmx")
+    candidates = [folder / part / file for part in ("", "examples") for file in (path.name, f"{path.name}.zmx")]
     return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
