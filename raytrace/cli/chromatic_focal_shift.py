@@ -8,7 +8,7 @@ SUMMARY = "chromatic focal shift"
 DESCRIPTION = "Where each wavelength has its paraxial focus, mm from that of the primary one."
 EXAMPLES = """examples:
   raytrace chromatic-focal-shift cemented_achromat --plot shift.png
-  raytrace chromatic-focal-shift singlet --wavelength 0.45 0.65 --json      from the shortest to the longest"""
+  raytrace chromatic-focal-shift singlet --wavelength 0.45 0.65 --json"""
 
 
 def options(parser: argparse.ArgumentParser) -> None:

@@ -7,8 +7,8 @@ DESCRIPTION = "Draw the cross section of a lens with the rays of its fields; fol
 EXAMPLES = """examples:
   raytrace layout double_gauss --plot layout.png
   raytrace layout lens.zmx --field 0 14 -14,0 --plot layout.pdf
-  raytrace layout relay.zmx --view 3d --plot relay.png
-  raytrace layout spectrometer.zmx --wavelength 0.45 0.55 0.65      rays coloured by wavelength"""
+  raytrace layout folded_relay --view 3d --plot relay.png
+  raytrace layout spectrometer --wavelength 0.45 0.55 0.65"""
 
 
 def options(parser):
