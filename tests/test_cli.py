@@ -305,8 +305,8 @@ BAD_LENSES = {
         r"unknown_glass\.zmx:43, surface 1: unknown glass 'SK22'.*Nearest names: .*--catalog",
     ),
     "unsupported.zmx": (
-        TEXT.replace("SURF 4\n  TYPE STANDARD", "SURF 4\n  TYPE COORDBRK"),
-        r"unsupported\.zmx:57, surface 4: type COORDBRK",
+        TEXT.replace("SURF 4\n  TYPE STANDARD", "SURF 4\n  TYPE NONSEQCO"),
+        r"unsupported\.zmx:57, surface 4: type NONSEQCO",
     ),
     "nan.zmx": (TEXT.replace("DISZ 8.74664", "DISZ nan"), r"nan\.zmx:42, surface 1: .*nan"),
     "words.zmx": (TEXT.replace("DISZ 8.74664", "DISZ abc"), r"words\.zmx:42, surface 1: .*'abc'"),
