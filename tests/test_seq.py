@@ -439,6 +439,20 @@ def test_glasses_by_their_names():
         of(SINGLET.replace("NBK7_SCHOTT", "NBK8_SCHOTT"))
 
 
+def test_a_catalog_beside_the_file_is_found_by_its_name(tmp_path):
+    written = "CC mine\nNM MY-1 1 0 1.6 50 0 -1\nGC\nED 0 0 0 0 0\nCD 2.56 0 0 0 0 0\nLD 0.3 2.5\n"
+    (tmp_path / "Mine.agf").write_text(written)
+    path = tmp_path / "lens.seq"
+    path.write_text(SINGLET.replace("NBK7_SCHOTT", "MY1_MINE"))
+    lens, report = read_lens_with_report(path)
+    assert (lens.surfaces[1].glass.name, float(index(lens.surfaces[1].glass, 0.5))) == ("MY-1", 1.6)
+    assert any("Mine.agf beside the lens" in note for note in report.notes)
+    write_lens(lens, tmp_path / "again.seq")
+    assert leaves(read_lens(tmp_path / "again.seq")) == leaves(lens)
+    with pytest.raises(UnknownGlass, match="MY1_MINE"):
+        of(path.read_text())
+
+
 def private(rows: str, word: str) -> str:
     return SINGLET.replace("SO 0", f"PRV\n{rows}\nEND\nSO 0").replace("NBK7_SCHOTT", word)
 
@@ -556,6 +570,7 @@ def test_what_is_not_modelled_is_refused_by_name_line_and_surface(command):
         ("YAN 0", "YAN 0;VUX 0.1", "without its other side"),
         ("EPD 10", "FNO 5", "FNO of an object at a finite distance"),
         ("EPD 10", "", "no system aperture"),
+        ("EPD 10", "EPD 10;NAO 0.1", "several system apertures (EPD in line 3 and NAO in line 3)"),
         ("STO", "STO\nA 1e-5", "put ASP before it"),
         ("STO", "STO\nK -1", "put CON or ASP before it"),
         ("STO", "STO\nCON; CUF 0.5", "CUF 0.5"),

@@ -11,16 +11,17 @@ import warnings
 from collections.abc import Sequence
 from decimal import Decimal
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 
-from raytrace.formats.media import by_figures, is_code, is_left_out, listed_glass
+from raytrace.formats.media import beside, by_figures, catalogs_at_hand, is_code, is_left_out, listed_glass
 from raytrace.formats.report import Draft
 from raytrace.formats.seq_keywords import unquoted
 from raytrace.formats.source import LensFileError, Place, shown
 from raytrace.formats.spelling import double, exact, exact_list, is_number, number
 from raytrace.formats.zemax_keywords import Record
-from raytrace.media.catalog import UnknownGlass, find_glass, plain_names, same_catalog
+from raytrace.media.catalog import Catalog, UnknownGlass, find_glass, plain_names, same_catalog
 from raytrace.media.formulas import FORMULAS
 from raytrace.media.glass import AIR, Glass, constant, from_table, mil_glass, refractive_index
 
@@ -37,19 +38,35 @@ _PAIR = re.compile(r"([^:]+):([^:]+)")
 # -- reading ----------------------------------------------------------------------------------------------------------
 
 
-def medium(word: str, private: dict[str, Glass], *, user: Sequence[Path], place: Place, report: Draft) -> Glass:
+class Shelf(NamedTuple):
+    """Where glasses stand: private ones by name in capitals, catalogs that came with the lens, those of the user."""
+
+    private: dict[str, Glass]
+    came: Sequence[Catalog]
+    user: Sequence[Path]
+
+
+def came_with(file: str, words: Sequence[str], user: Sequence[Path], report: Draft) -> list[Catalog]:
+    """The catalogs beside a file that words of glasses name, as MINE of NAME_MINE."""
+    lying = beside(file)
+    named = [name for word in words if (name := unquoted(word).rpartition("_")[2]).upper() in lying]
+    found = catalogs_at_hand(named, user, report) if named else ()
+    return [catalog for catalog in found if isinstance(catalog, Catalog)]
+
+
+def medium(word: str, shelf: Shelf, *, place: Place, report: Draft) -> Glass:
     """The medium of a word. Raises UnknownGlass, and LensFileError for what is no glass."""
     name = unquoted(word)
-    if name.upper() in private:
+    if name.upper() in shelf.private:
         report.glass(place.surface, name, "private glass of the file (PRV)")
-        return private[name.upper()]
+        return shelf.private[name.upper()]
     if name.upper() == "AIR" or not name:
         return AIR
     figures = _figures(name, place)
     if figures is not None:
         report.glass(place.surface, name, "nd and Vd by its digits, partial dispersion of the normal line")
         return figures
-    return _listed(name, user=user, place=place, report=report)
+    return _listed(name, shelf, place=place, report=report)
 
 
 def _figures(name: str, place: Place) -> Glass | None:
@@ -69,34 +86,38 @@ def _figures(name: str, place: Place) -> Glass | None:
     return None
 
 
-def _listed(name: str, *, user: Sequence[Path], place: Place, report: Draft) -> Glass:
+def _listed(name: str, shelf: Shelf, *, place: Place, report: Draft) -> Glass:
     """The glass of a catalog, by NAME_CATALOG or NAME."""
     plain, _, catalog = name.rpartition("_")
-    found = [hit for hit in plain_names(plain, user=user) if same_catalog(hit[1], catalog)] if plain else []
-    found = found or list(plain_names(name, user=user))
+    hits = plain_names(plain, came=shelf.came, user=shelf.user) if plain else ()
+    found = [hit for hit in hits if same_catalog(hit[1], catalog)]
+    is_told = bool(found)
+    found = found or list(plain_names(name, came=shelf.came, user=shelf.user))
     if not found:
-        return _by_alias(plain, catalog, name, user=user, place=place, report=report)
+        return _by_alias(plain, catalog, name, shelf, place=place, report=report)
     spelling, home = found[0]
-    rivals = [f"{other} ({where})" for other, where in found[1:] if where == home or other != spelling]
-    if any(where == home for _, where in found[1:]):
-        raise LensFileError(f"{shown(name)} may be {spelling} ({home}) or {', '.join(rivals)}; spell it in full", place)
+    here = {other for other, where in found[1:] if where == home and other != spelling}
+    if here:
+        listed = ", ".join([spelling, *sorted(here)])
+        raise LensFileError(f"{shown(name)} may be {listed} of {home}; spell it as the catalog does", place)
+    rivals = [f"{other} ({where})" for other, where in found[1:] if other != spelling]
     if rivals:
         report.warn(f"{name} is taken for {spelling} ({home}), but may be {', '.join(rivals)}", place)
-    told = [home] if (plain and same_catalog(home, catalog)) or rivals else []
-    return listed_glass(spelling, catalogs=told, user=user, place=place, report=report)
+    told = [next((catalog for catalog in shelf.came if catalog.name == home), home)] if is_told or rivals else []
+    return listed_glass(spelling, catalogs=told, user=shelf.user, place=place, report=report)
 
 
-def _by_alias(plain: str, catalog: str, name: str, *, user: Sequence[Path], place: Place, report: Draft) -> Glass:
+def _by_alias(plain: str, catalog: str, name: str, shelf: Shelf, *, place: Place, report: Draft) -> Glass:
     """A glass by another spelling of its catalog. Raises UnknownGlass."""
     if plain:
         try:
             with warnings.catch_warnings(action="ignore"):
-                glass = find_glass(plain, catalogs=[catalog], user=user, where=str(place))
+                glass = find_glass(plain, catalogs=[catalog], user=shelf.user, where=str(place))
         except UnknownGlass:
             glass = None
         if glass is not None and same_catalog(glass.catalog, catalog):
-            return listed_glass(glass.listed_name, catalogs=[catalog], user=user, place=place, report=report)
-    return listed_glass(name, catalogs=[], user=user, place=place, report=report)
+            return listed_glass(glass.listed_name, catalogs=[catalog], user=shelf.user, place=place, report=report)
+    return listed_glass(name, catalogs=shelf.came, user=shelf.user, place=place, report=report)
 
 
 def private_glasses(
@@ -233,7 +254,9 @@ def _catalog_name(glass: Glass, user: Sequence[Path], place: Place) -> str:
     written = f"{re.sub('[^A-Za-z0-9+]', '', listed)}_{glass.catalog}".upper()
     try:
         with warnings.catch_warnings(action="ignore"):
-            found = _listed(written, user=user, place=place, report=Draft(place.file, "seq"))
+            report = Draft(place.file, "seq")
+            shelf = Shelf({}, came_with(place.file, [written], user, report), user)
+            found = _listed(written, shelf, place=place, report=report)
     except UnknownGlass:
         if glass.catalog:
             return written

@@ -63,7 +63,9 @@ def read(text: str, file: str, *, catalogs: Sequence[Path] = (), strict: bool = 
     unit = _unit(system, report)
     wavelengths, weights, primary = _wavelengths(system)
     private = seq_glass.private_glasses(found.private, wavelengths.tolist(), _own_words(found, "UNNAMED"), report)
-    surfaces = _surfaces(found, unit, private, catalogs, report)
+    words = [record.words[0] for block in found.surfaces for record in block.all("GLA") if record.words]
+    shelf = seq_glass.Shelf(private, seq_glass.came_with(file, words, catalogs, report), catalogs)
+    surfaces = _surfaces(found, unit, shelf, report)
     solve = system.last("PIM")
     if solve and not (solve.words and solve.words[0][:1] in "Nn"):
         surfaces = _at_paraxial_image(surfaces, wavelengths[primary], solve.place, report)
@@ -103,11 +105,11 @@ def _unit(system: Block, report: Draft) -> float:
     return UNITS[word]
 
 
-def _surfaces(found: Sections, unit: float, private: dict, user: Sequence[Path], report: Draft) -> tuple[Surface, ...]:
+def _surfaces(found: Sections, unit: float, shelf: seq_glass.Shelf, report: Draft) -> tuple[Surface, ...]:
     surfaces, before = [], AIR
     for k, block in enumerate(found.surfaces):
         own = {record.keyword: record for record in found.own if record.place.surface == k}
-        surface = seq_surface.build(block, unit, before, own=own, private=private, user=user, report=report)
+        surface = seq_surface.build(block, unit, before, own=own, shelf=shelf, report=report)
         before = before if surface.is_mirror or surface.is_break else surface.glass
         surfaces.append(surface)
     return tuple(surfaces)
@@ -164,11 +166,14 @@ def _stop(surfaces: Sequence[Block], report: Draft) -> int:
 
 
 def _aperture(system: Block, first: Surface, unit: float) -> SystemAperture:
-    """The system aperture: the last of EPD, FNO (of an object at infinity) and NAO."""
+    """The system aperture: EPD, FNO (of an object at infinity) or NAO."""
     found = system.all("EPD", "FNO", "NAO")
     if not found:
         raise LensFileError("no system aperture; expected one of EPD, FNO, NAO", system.place)
     record = found[-1]
+    if len({other.keyword for other in found}) > 1:
+        names = " and ".join(f"{other.keyword} in line {other.place.line}" for other in found)
+        raise LensFileError(f"several system apertures ({names}), expected one", record.place)
     size = record.number(0, "size of the aperture")
     if size <= 0:
         raise LensFileError(f"{record.keyword} is {shown(record.words[0])}, expected a positive number", record.place)

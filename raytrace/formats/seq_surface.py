@@ -1,12 +1,9 @@
 """A surface of a CODE V sequence as a `Surface`: shape, medium and apertures."""
 
-from collections.abc import Sequence
-from pathlib import Path
-
 from torch import Tensor
 
 from raytrace.formats.report import Draft
-from raytrace.formats.seq_glass import medium
+from raytrace.formats.seq_glass import Shelf, medium
 from raytrace.formats.seq_keywords import APERTURES, LEFT_HANDED, LETTERS, POSE_WORDS, RING, unquoted
 from raytrace.formats.seq_phase import phase
 from raytrace.formats.source import LensFileError, UnsupportedSurface, shown
@@ -24,25 +21,15 @@ INFINITY = 1e10
 _KINDS = ("CLR", "OBS", "EDG", "HOL")
 
 
-def build(
-    block: Block,
-    unit: float,
-    before: Glass,
-    *,
-    own: dict[str, Record],
-    private: dict[str, Glass],
-    user: Sequence[Path],
-    report: Draft,
-) -> Surface:
+def build(block: Block, unit: float, before: Glass, *, own: dict[str, Record], shelf: Shelf, report: Draft) -> Surface:
     """The surface of a block, its lengths in units of `unit` mm; before: the medium before it.
 
-    own: what our comments say of it: BREAK makes a coordinate break of a dummy surface, RADIUS tells that of its phase;
-    private: private glasses by name, user:
-    further catalogs. Raises UnknownGlass as `find_glass` does.
+    own: what our comments say of it: BREAK makes a coordinate break of a dummy surface, RADIUS tells that of its phase.
+    shelf: where its glass stands. Raises UnknownGlass as `find_glass` does.
     """
     apertures, semi_diameter = _apertures(block, unit, report)
     label, (ahead, behind) = block.last("SLB"), _poses(block, unit)
-    glass, is_break = _medium(block, before, private, user, report), "BREAK" in own
+    glass, is_break = _medium(block, before, shelf, report), "BREAK" in own
     radius = number((own["RADIUS"].text or "?").strip(), "radius", own["RADIUS"].place) if "RADIUS" in own else 1.0
     if is_break and ahead is None and behind is not None:
         ahead, behind = behind, None
@@ -116,14 +103,14 @@ def _coefficients(block: Block, unit: float) -> Tensor | None:
     return double([0.0, *(value / unit ** (2 * j - 1) for j, value in enumerate(found, 2))])
 
 
-def _medium(block: Block, before: Glass, private: dict[str, Glass], user: Sequence[Path], report: Draft) -> Glass:
+def _medium(block: Block, before: Glass, shelf: Shelf, report: Draft) -> Glass:
     mode, glass = block.last("RMD"), block.last("GLA")
     word = unquoted(mode.words[0]).upper() if mode and mode.words else "REFR"
     if word not in ("REFL", "REFR"):
         raise UnsupportedSurface(f"RMD {word[:40]} is not modelled; modelled are REFL and REFR", mode.place)
     place = glass.place if glass else block.place
     given = glass.words[0] if glass and glass.words else ""
-    found = medium(given, private, user=user, place=place, report=report)
+    found = medium(given, shelf, place=place, report=report)
     if word == "REFR":
         return found
     if block.place.surface == 0:

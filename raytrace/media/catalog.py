@@ -145,10 +145,16 @@ def _nearest(name: str, own: Sequence[Catalog], count: int = 5) -> tuple[tuple[s
     return tuple(hit for spelling in near for hit in spellings[spelling])[:count]
 
 
-def plain_names(name: str, *, user: Sequence[str | Path] = ()) -> tuple[tuple[str, str], ...]:
-    """The (glass, catalog) whose names are `name` but for hyphens, underscores, blanks and points, in search order."""
+def plain_names(
+    name: str, *, came: Sequence[Catalog] = (), user: Sequence[str | Path] = ()
+) -> tuple[tuple[str, str], ...]:
+    """The (glass, catalog) whose names are `name` but for hyphens, underscores, blanks and points, in search order.
+
+    came: catalogs that came with a lens; user: further AGF files.
+    """
     bare = _bare(name)
     own = [(glass, load(path).name) for path in user_catalogs(user) for glass in load(path).glasses]
+    own += [(glass, catalog.name) for catalog in came for glass in catalog.glasses]
     shipped = [(glass, catalog) for catalog in SHIPPED for glass in _shipped_names(catalog).values()]
     return tuple((glass, catalog) for glass, catalog in own + shipped if _bare(glass) == bare)
 
