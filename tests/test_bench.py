@@ -1,11 +1,13 @@
 """`raytrace bench trace` runs end to end, and its high-precision reference agrees with the package. No timings."""
 
 import json
+import math
 from dataclasses import asdict
 
 import pytest
 import torch
 
+from raytrace.bench import beyond
 from raytrace.bench.measure import (
     SAMPLE,
     Own,
@@ -54,6 +56,30 @@ def test_json_is_one_document_with_errors_beside_every_speed(capsys):
         assert (row["errors"]["path"] is None) == (not row["path"])
         assert not row["path"] or 0 < row["errors"]["path"] < path
         assert row["ratio"] is None
+
+
+def test_other_systems_stand_beside_plain_conics(capsys):
+    assert main([*TINY, "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["beyond"]
+    assert [row["system"] for row in rows] == [name for name in beyond.SYSTEMS for _ in range(4)]
+    for row in rows:
+        assert row["speed"] > 0
+        assert row["ratio"] == 1 if row["system"] == "conics" else row["ratio"] > 0
+        assert row["error"] < BOUNDS[row["dtype"]][0]
+    assert main([*TINY, "--lens", "cooke_triplet", "--json"]) == 0
+    assert "beyond" not in json.loads(capsys.readouterr().out)
+
+
+def test_the_spectrometer_disperses_as_its_grating_says():
+    """All light arrives, and the image of the slit moves by f · order · frequency · Δλ/cos θ, to aberrations."""
+    lens = beyond.spectrometer()
+    rays, moved = field_rays(lens, 200), []
+    for wavelength in (0.549, 0.551):
+        end = trace_lens(lens, rays, tensor(wavelength))
+        assert end.valid.all()
+        moved.append(float(end.position[1].mean()))
+    sine = math.sin(math.radians(20.0)) + 0.3 * 0.55
+    assert abs(moved[1] - moved[0]) == pytest.approx(150.0 * 0.3 * 0.002 / math.sqrt(1 - sine * sine), rel=0.02)
 
 
 def test_report_and_figure_are_written(tmp_path, capsys):

@@ -90,7 +90,8 @@ class Own:
 
     def gradient(self, rays: Rays, centroid: Tensor) -> tuple[Tensor, ...]:
         with tracing(self.engine):
-            end = trace_surfaces(self.surfaces, self._with_path(rays), indices=self.indices)
+            how = {"indices": self.indices, "wavelength": self.wavelength}
+            end = trace_surfaces(self.surfaces, self._with_path(rays), **how)
             return torch.autograd.grad(squared_radius(*end.position[:2], centroid), self.leaves)
 
     def _with_path(self, rays: Rays) -> Rays:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import torch
 
+from raytrace.bench import beyond
 from raytrace.bench.measure import (
     DTYPES,
     SAMPLE,
@@ -58,10 +59,15 @@ def bench(asked: Asked) -> Measured:
     if not bool(field_rays(lens, 1000).valid.all()):
         raise CommandError(f"{name}: not every ray of the middle field starts; choose another lens")
     tracers = tracers_of(lens, asked.peers.peers(lens) if asked.peers else [])
-    with progress(calls(tracers, counts, repeats), "call", what="measuring") as bar:
-        rows = measure(lens, tracers, counts, repeats=repeats, threads=asked.threads, progress=bar.update)
+    how = {"repeats": repeats, "threads": asked.threads}
+    others = 0 if asked.arguments.lens else beyond.calls(repeats)
+    with progress(calls(tracers, counts, repeats) + others, "call", what="measuring") as bar:
+        rows = measure(lens, tracers, counts, **how, progress=bar.update)
+        beside = beyond.measure(max(counts), **how, progress=bar.update) if others else []
     about = {"lens": name, "surfaces": surfaces_of(lens), "repeats": repeats, "machine": asked.about()}
-    return Measured(rows, report(rows, **about), about, ("trace_figure",))
+    lines = report(rows, **about) + (beyond.report(beside) if others else [])
+    told = about | ({"beyond": [dataclasses.asdict(row) for row in beside]} if others else {})
+    return Measured(rows, lines, told, ("trace_figure",))
 
 
 def tracers_of(lens: Lens, peers: Sequence[Tracer] = ()) -> list[Tracer]:
