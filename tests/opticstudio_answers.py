@@ -4,6 +4,7 @@ Every answer is a flat list in the order and the units of OpticStudio's report: 
 PSFs in µm, OPD in waves with the sign turned, distortion in %.
 """
 
+import dataclasses
 import functools
 import gzip
 import json
@@ -18,6 +19,7 @@ from raytrace.kernels import diffraction
 from raytrace.maths import pupil, zernike
 from raytrace.media import glass
 from raytrace.media.catalog import find_glass
+from raytrace.media.environment import Environment
 from raytrace.optics.launch import launch, stop_radius
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.scene import Scene, scene
@@ -50,6 +52,9 @@ def tensor(numbers) -> torch.Tensor:
 
 # ---------------------------------------------------------------- systems
 
+#: atm behind surfaces: operands of the files (PRES 0, those between it and PRES 1) that the descriptions do not have.
+PRESSURES = {"f_vacuum_cell": {3: 0.0, 5: 0.0}}
+
 
 def description(name: str) -> dict:
     """The keys of a system, those of its base first."""
@@ -62,6 +67,8 @@ def system(name: str) -> Lens:
     """The lens of a name."""
     told = description(name)
     surfaces = [_surface(k, row, told) for k, row in enumerate(told["surfaces"])]
+    for k, pressure in PRESSURES.get(name, {}).items():
+        surfaces[k] = dataclasses.replace(surfaces[k], environment=Environment(tensor(20.0), tensor(pressure)))
     kind, size = told["aperture"][:2]
     stop = told["stop"]
     if kind == "FLOA":

@@ -175,7 +175,7 @@ def _glass(block: Sequence[tuple[int, str, str]], catalog: str, path: Path) -> G
         listed_name=name,
         comment=comment,
         records=tuple(
-            (keyword, _numbers(text.split(), path, line, blanks=True))
+            (keyword, _numbers(_told(keyword, text.split()), path, line, blanks=True))
             for line, keyword, text in block
             if keyword in _NUMERIC.keys() - {"CD", "LD"} and text
         ),
@@ -204,6 +204,13 @@ def _only(block: Sequence[tuple[int, str, str]], keyword: str, name: str, path: 
         fix = "is the NM line of the next glass missing or misspelt?"
         raise _fault(path, found[1][0], f"a second {keyword} record for {name}", "one for each glass", fix)
     return found[0]
+
+
+def _told(keyword: str, words: list[str]) -> list[str]:
+    """The words of a record; a thermal coefficient that is not known is 0, as AGF has it, and its temperature 20 °C."""
+    if keyword != "TD":
+        return words
+    return [("20" if k == 6 else "0") if word in ("-", "_") else word for k, word in enumerate(words)]
 
 
 def _numbers(words: Sequence[str], path: Path, line: int, *, blanks: bool = False) -> tuple[float, ...]:
