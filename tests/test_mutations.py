@@ -117,11 +117,16 @@ def lenses(suffix: str, folder: Path) -> Reader:
 def oslo(folder: Path) -> Reader:
     """Every command that is read, and some that are left out or refused."""
     solved = ("TH 200", "GLA MOD G1 1.564 1.571 1.561; CV 0.02; TH 3", "PK GLA -1; TH 1", "RFL; PU 0.1; PY 0")
+    tilts = "DCX 1; DCY 2; DCZ 3; TLA 4; TLB 5; TLC 6; DT -1; RCO"
+    picked = "PK CVM -1 .01; PK TH -1 1; TLA 1", "PK CV -1; PK THM -1", "RFH; TLB 45; BEN; TH -10; TOX 0"
     originals = [
         double_gauss("WV 0.48613 0.58756; WV3 0.65627; WW 1 1; WW3 0.5"),
         oslo_text((FAR, "AST; AP CHK 10; TH 0", *CONIC), 'EBR 10\nANG 5\nUNI 25.4\nSNO1 "a // note"'),
         oslo_text((*SINGLET, "AIR; TH 1; TLA 0; DT 1; TCE 7"), "FNO 4; OBH -1e19", tail="CFG NEW; TH 1 2; END"),
         oslo_text((FAR, *solved[1:]), "EBR 2; ANG 1"),
+        oslo_text(
+            (FAR, "RD 20; GLA 1.5; TH 2; DCX 1; DCY 2; DCZ 3; TLA 4; TLB 5; TLC 6; DT -1; RCO", *picked), "EBR 1"
+        ),
         oslo_text((*solved[:2], "RD -50; PY 0"), "NAO 0.02; OBH 3; TELE OFF; DES me", stated="50 3"),
     ]
     path = folder / "lens.len"

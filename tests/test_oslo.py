@@ -19,6 +19,7 @@ from raytrace.cli import main
 from raytrace.formats import LensFileError, UnsupportedSurface, convert, oslo_read, read_lens
 from raytrace.media.catalog import UnknownGlass, find_glass
 from raytrace.media.glass import refractive_index
+from raytrace.optics.frames import frames
 from raytrace.optics.scene import scene
 from raytrace.optics.wavefront import wavefront_of
 from raytrace.system.lens import check
@@ -308,6 +309,104 @@ def test_the_beam_of_a_near_object_by_its_sine():
     assert float(rt.first_order(found).entrance_pupil_diameter) == pytest.approx(20, rel=1e-12)
 
 
+def test_numbers_of_surfaces_before():
+    """Optiland's tests: radius -1/0.09 with conic -1 and terms of the other sign, thicknesses 3 and 5, index 1.5."""
+    first = "GLA 1.5; RD 10; CC -1; AD .001; TH 2"
+    found = lens((FAR, first, "PK CVM -1 .01; PK TH -1 1; PK GLA -1", "AIR; PK CV -1 0; TH 5"), "EBR 1")
+    one, two, three = found.surfaces[1:4]
+    assert [1 / float(surface.curvature) for surface in (two, three)] == pytest.approx([-1 / 0.09, -1 / 0.09])
+    assert float(two.conic) == -1
+    assert torch.equal(two.coefficients, -one.coefficients)
+    assert (float(two.thickness), refractive_index(two.glass, found.wavelengths).tolist()) == (3.0, [1.5])
+    folded = lens((FAR, "RD 10; TH 2", "PK THM -1; UNI 10", "PK THM -1 1"), "EBR 1")
+    assert [float(surface.thickness) for surface in folded.surfaces[1:4]] == [20.0, -20.0, 30.0]
+
+
+# -- tilts ------------------------------------------------------------------------------------------------------------
+
+
+def turned(axis: str, degrees: float) -> torch.Tensor:
+    """The right-handed turn about an axis."""
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    rows = {"x": [[1, 0, 0], [0, c, -s], [0, s, c]], "y": [[c, 0, s], [0, 1, 0], [-s, 0, c]]}
+    return torch.tensor((rows | {"z": [[c, -s, 0], [s, c, 0], [0, 0, 1]]})[axis], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("order", ["", "DT 1;", "DT -1;"])
+def test_the_order_and_the_signs_of_tilts(order):
+    """Those that Lambda Research tells for another program, +TLC, -TLB, -TLA by the right hand; Optiland's matrices."""
+    tilts = f"{order} DCX 1; DCY 2; DCZ 3; TLA 10; TLB 20; TLC 30"
+    found = lens((FAR, f"GLA 1.5; RD 20; TH 2; {tilts}", "RD -20; TH 20"), "EBR 2")
+    x, y, z = turned("x", -10), turned("y", -20), turned("z", 30)
+    expected = z @ y @ x if "-" in order else x @ y @ z
+    shift = torch.tensor([1.0, 2, 3], dtype=torch.float64)
+    here, behind = frames(found)[1:3]
+    assert (here.axes - expected).abs().max() < 1e-15
+    assert (here.origin - (expected @ shift if "-" in order else shift)).abs().max() < 1e-14
+    assert (behind.axes - expected).abs().max() < 1e-15  # what follows stands in the axes of the surface
+    assert (behind.origin - here.origin - 2 * expected[:, 2]).abs().max() < 1e-14
+
+
+def test_a_return_leads_back():
+    """Optiland's tests: behind RCO the next vertex is at 0, 0, 2."""
+    for tilts in ("DCY 4; TLA 30", "DT -1; DCX 1; DCY 2; DCZ 3; TLA 10; TLB 20; TLC 30"):
+        found = lens((FAR, f"GLA 1.5; RD 20; TH 2; {tilts}; RCO", "RD -20; TH 20"), "EBR 2")
+        behind = frames(found)[2]
+        assert behind.origin.tolist() == pytest.approx([0, 0, 2], abs=1e-14)
+        assert (behind.axes - torch.eye(3)).abs().max() < 1e-15
+
+
+def test_a_mirror_that_bends_the_axis():
+    """Optiland's tests: behind a mirror of TLA 45 with BEN, TH -10 leads to 0, -10, 0, and the ray with it."""
+    found = lens((FAR, "RFH; TLA 45; BEN; TH -10"), "EBR 1")
+    assert frames(found)[2].origin.tolist() == pytest.approx([0, -10, 0], abs=1e-14)
+    end = rt.trace(found, rt.rays(found, fields=[0], pupil=torch.zeros(2, 1, dtype=torch.float64)))
+    assert end.position.flatten().tolist() == pytest.approx([0, 0, 0], abs=1e-14)
+    assert end.direction.flatten().abs().tolist() == pytest.approx([0, 0, 1], abs=1e-14)
+
+
+def test_a_tilted_lens_is_written_as_a_lens_file_of_opticstudio(tmp_path):
+    path = tmp_path / "fold.len"
+    surfaces = (
+        "GLA N-BK7; RD 50; TH 4; DCY 1; TLA 3; TLC 5",
+        "TH 30; AST",
+        "RFL; TLA 45; BEN; TH -10; DT 1",
+        "TH -5; TLB 2",
+    )
+    path.write_text(text((FAR, *surfaces), "EBR 1; ANG 1"))
+    convert(path, tmp_path / "fold.zmx")
+    ours, theirs = (frames(read_lens(one)) for one in (path, tmp_path / "fold.zmx"))
+    for one, other in zip(ours[1:], theirs[1:], strict=True):
+        assert (one.origin - other.origin).abs().max() < 1e-12
+        assert (one.axes - other.axes).abs().max() < 1e-14
+
+
+def test_the_pentaprism_of_the_user_guide():
+    """Sinclair Optics' list of it: faces of 2, mirrors at TLA 22.5 with BEN, 2.414214, -2 and 2.414214 between them.
+
+    A pentaprism turns light by 90° whatever its own tilt, along 2 + √2 times its face, and lets it out at right angles.
+    """
+    for tilt in ("", "TLA 3;"):
+        found = lens(
+            (
+                *("TH 1e20", f"{tilt} TH 1", "GLA 1.57; TH 2.414214", "RFL; TLA 22.5; BEN; TH -2"),
+                *("RFL; TLA 22.5; BEN; TH 2.414214", "AIR; TH 1; RCO"),
+            ),
+            "EBR 0.1",
+        )
+        entrance, first, second, leaving = frames(found)[2:6]
+        assert float(entrance.axes[:, 2] @ leaving.axes[:, 2]) == pytest.approx(0, abs=1e-12)
+        path = (first.origin - entrance.origin, second.origin - first.origin, leaving.origin - second.origin)
+        assert sum(float(leg.norm()) for leg in path) == pytest.approx(2 * (2 + math.sqrt(2)), abs=1e-5)
+        # The face at which light leaves stands at right angles on the one at which it comes, an edge of 1 away.
+        corner = leaving.origin - entrance.origin
+        assert abs(float(corner @ entrance.axes[:, 2])) == pytest.approx(1, abs=1e-5)
+        assert abs(float(corner @ leaving.axes[:, 2])) == pytest.approx(1, abs=1e-5)
+        end = rt.trace(found, rt.rays(found, fields=[0], pupil=torch.zeros(2, 1, dtype=torch.float64)))
+        if not tilt:
+            assert end.position.flatten().tolist() == pytest.approx([0, 0, 0], abs=1e-5)
+
+
 def test_lengths_in_inches():
     """RD 20 at UNI 25.4 is 508 mm (optical-format-import), and every other length goes with it."""
     surfaces = ("TH 1e20", "RD 20; GLA N-BK7; TH 1; AP CHK 2; AD 1e-3; AE 1e-4", "RD -20; TH 5; AST")
@@ -404,11 +503,11 @@ def test_glasses_are_looked_up_and_never_replaced():
 
 
 def test_commands_that_change_nothing_are_told_with_their_reason():
-    surfaces = (FAR, "RD 50; GLA N-BK7; TH 4; TCE 71; DRW ON; LMO ELE; TLA 0; DCY 0.0; DT 1", "RD -50; TH 40")
+    surfaces = (FAR, "RD 50; GLA N-BK7; TH 4; TCE 71; DRW ON; LMO ELE; TOX 0", "RD -50; TH 40")
     _, report = read(surfaces, "EBR 5; TELE OFF; FOO 1", tail="CFG NEW\nTH 1 2 8\nEND\n")
     told = {one.name: (one.status, one.reason) for one in report.keywords}
     assert {name for name, (status, _) in told.items() if status == "ignored"} >= {
-        *("TCE", "DRW", "LMO", "TLA", "DCY", "DT", "TELE", "CFG")
+        *("TCE", "DRW", "LMO", "TOX", "TELE", "CFG")
     }
     assert all(reason for status, reason in told.values() if status == "ignored")
     assert told["FOO"] == ("unknown", "")
@@ -417,16 +516,11 @@ def test_commands_that_change_nothing_are_told_with_their_reason():
 
 
 REFUSED = {
-    "DCX 1": "tilted or decentred",
-    "DCY -0.5": "tilted or decentred",
-    "DCZ 1": "tilted or decentred",
-    "TLA 45": "tilted or decentred",
-    "TLB 1e-3": "tilted or decentred",
-    "TLC 1": "tilted or decentred",
-    "TOX 1": "tilted or decentred",
+    "TOX 1": "about another point",
     "GC 1": "axes of its own",
-    "RCO": "axes of its own",
-    "BEN": "axes of its own",
+    "RCO 1; TLA 1": "RCO 1",
+    "BEN; TLA 45": "on a mirror",
+    "BEN ON": "BEN ON",
     "ASP ASR 4": "general asphere",
     "AS3 1e-6": "general asphere",
     "CVX 0.01": "toroid",
@@ -440,8 +534,10 @@ REFUSED = {
     "PUC 0": "by chief ray",
     "PYC 0": "by chief ray",
     "EC 10": "by chief ray or by edge",
-    "PK CV -1": "pickup",
-    "PK TH 1 2": "pickup",
+    "PK LN -1 1": "pickup",
+    "PK AP -1": "pickup",
+    "PK GLA -1 2": "pickup",
+    "PK": "pickup",
     "PK GLA 1": "how many surfaces before",
     "PK GLA -9": "how many surfaces before",
     "GLA MOD 1.6 50": "index and Abbe number",
@@ -462,7 +558,7 @@ def test_what_is_not_modelled_is_refused_by_name_and_place(command):
     with pytest.raises(UnsupportedSurface, match=REFUSED[command]) as caught:
         lens((FAR, f"RD 50; GLA N-BK7; TH 4; {command}", "RD -50; TH 40"), "EBR 5")
     assert caught.value.line == 4
-    assert command.split()[0] in str(caught.value)
+    assert command.partition(";")[0].split()[0] in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -493,6 +589,16 @@ def test_what_is_not_modelled_is_refused_by_name_and_place(command):
         ((FAR, "GLA; TH 4", "TH 5"), "EBR 5", "without a name"),
         ((FAR, "WV 0.5; GLA 1.5 1.6 1.7 1.8; TH 4", "TH 5"), "EBR 5", "4 indices for 3 wavelengths"),
         ((FAR,), "EBR 5", "2 surfaces, expected at least"),
+        ((FAR, "TLA 1; DT 3", "TH 5"), "EBR 5", "DT is 3"),
+        (("TH 1e20; TLA 1", "TH 4", "TH 5"), "EBR 5", "TLA (a tilted or decentred object)"),
+        ((FAR, "TLA 5; RD 50; GLA N-BK7; TH 4", "PY 0"), "EBR 5", "PY (a solve) in a lens with tilted"),
+        ((FAR, "RFL; TLA 5; TLB 5; BEN; TH -4", "TH 5"), "EBR 5", "by TLA or by TLB alone"),
+        ((FAR, "RFL; TLA 5; DCY 1; BEN; TH -4", "TH 5"), "EBR 5", "by TLA or by TLB alone"),
+        ((FAR, "RFL; TLA 5; RCO; BEN; TH -4", "TH 5"), "EBR 5", "without RCO"),
+        ((FAR, "RD 50; TH 4", "RD 5; PK CV -1"), "EBR 5", "RD in line 5 and PK CV -1 tell the same number twice"),
+        ((FAR, "RD 50; GLA N-BK7; TH 4", "PU -0.1; PK CV -1"), "EBR 5", "PK in line 5 and PU tell the same"),
+        ((FAR, "GLA N-BK7; TH 4", "PU -0.1; TH 3", "PK CV -1"), "EBR 5", "PK CV -1 of what is solved for"),
+        ((FAR, "RFL; TH -4", "PK GLA -1"), "EBR 5", "picks up a mirror"),
     ],
 )
 def test_what_cannot_be_read_is_refused_in_a_line(surfaces, system, message):

@@ -40,7 +40,10 @@ _SYSTEM_REFUSED = _rows(
 _OFF = ("OFF", "0", "NO")
 _SWITCHES = {"TELE": "telecentric object space", "WARM": "wide-angle ray aiming", "AFO": "afocal image space"}
 
-_SURFACE_READ = _words("AIR GLA RFL RFH RD CV TH CC AD AE AF AG AP AST PK PU PY NOT")
+#: Numbers that tilt or decentre a surface.
+POSE_NUMBERS = ("DCX", "DCY", "DCZ", "TLA", "TLB", "TLC")
+
+_SURFACE_READ = _words("AIR GLA RFL RFH RD CV TH CC AD AE AF AG AP AST PK PU PY NOT DT BEN RCO") | {*POSE_NUMBERS}
 _SURFACE_IGNORED = _rows(
     {
         "how the program draws it": "DRW LDP BDI BDD VX PF",
@@ -51,7 +54,7 @@ _SURFACE_IGNORED = _rows(
 #: Commands that make a surface into what is not modelled, or not settled, and what that is.
 _SURFACE_REFUSED = _rows(
     {
-        "axes of its own": "GC RCO BEN",
+        "axes of its own": "GC",
         "a general asphere": "ASP",
         "a toroid": "CVX RDX",
         "a perfect lens, which obeys the sine condition": "PFL PFM",
@@ -60,8 +63,8 @@ _SURFACE_REFUSED = _rows(
         "a solve by chief ray or by edge": "PUC PYC EC",
     }
 )
-#: Numbers that tilt or decentre a surface unless they are 0; DT tells their order.
-POSES = _words("DCX DCY DCZ TLA TLB TLC TOX TOY TOZ DT")
+#: The point that a tilt is about, unless it is the vertex.
+_PIVOTS = _words("TOX TOY TOZ")
 
 #: What follows the lens belongs to these.
 TAIL_REASON = "behind END: variables, operands, fields of analyses or configurations, not part of the lens"
@@ -202,11 +205,11 @@ def _beyond(of_surface: Record, record: Record, report: Draft, at_end: bool) -> 
         if not record.words or record.words[0].upper() not in _OFF:
             raise UnsupportedSurface(f"{word} ({_SWITCHES[word]}) is not modelled", record.place)
         report.met(word, IGNORED, record.place, f"{_SWITCHES[word]}: switched off")
-    elif word in POSES:
-        if word != "DT" and record.number(0, "tilt or decentre"):
-            message = f"{word} {record.words[0]} (a tilted or decentred surface) is not modelled in lens files of OSLO"
+    elif word in _PIVOTS:
+        if record.number(0, "point that the tilt is about"):
+            message = f"{word} {record.words[0]} (a tilt about another point than the vertex) is not modelled"
             raise UnsupportedSurface(message, of_surface.place)
-        report.met(word, IGNORED, of_surface.place, "neither tilts nor decentres anything")
+        report.met(word, IGNORED, of_surface.place, "tilted about the vertex")
     elif word == "LMO" and [text.upper() for text in record.words[:1]] in (["ELE"], ["EGR"]):
         report.met(word, IGNORED, of_surface.place, "a group of surfaces under one name")
     elif word in _SURFACE_REFUSED or word == "LMO" or re.fullmatch(r"AS\d+", word):
@@ -230,6 +233,6 @@ def _tail(record: Record, report: Draft) -> None:
 def _warn_of_repeats(surfaces: list[Surface], report: Draft) -> None:
     for surface in surfaces:
         for word, found in surface.records.items():
-            if len(found) > 1:
+            if len(found) > 1 and word != "PK":
                 first = found[0].place.line
                 report.warn(f"{word} stands again (first in line {first}); the last is used", found[-1].place)

@@ -11,7 +11,10 @@ Conventions, each settled against figures of files that others wrote, most of th
 - AP sizes a surface, AP CHK also clips. AST marks the stop; without it surface 1 is the stop.
 - Solves are not stored with what they came to: PU, PY 0 of the axial ray are solved again. Others are refused.
 
-Tilts and decentres, pickups but of a glass, special surfaces and apertures are refused by name.
+- How surfaces are tilted, decentred and bent is told in `oslo_poses`. Pickups are of a surface so many before: GLA; CV
+  and TH, to which a number is added, and CVM and THM, which change the sign; with a curvature go conic and terms.
+
+Other pickups, special surfaces and apertures, and further configurations are refused by name.
 """
 
 import math
@@ -23,12 +26,13 @@ from torch import Tensor
 from raytrace.formats import oslo_surface
 from raytrace.formats.oslo_keywords import DEFAULT_WAVELENGTHS, Sections, sections
 from raytrace.formats.oslo_solves import Step, focal_length, solve
+from raytrace.formats.oslo_surface import Built
 from raytrace.formats.report import Draft, ImportReport
 from raytrace.formats.source import LensFileError, UnsupportedSurface, shown
 from raytrace.formats.spelling import double, is_number, number, refuse_overflow
 from raytrace.formats.zemax_keywords import Record
 from raytrace.system.lens import Fields, Lens, SystemAperture
-from raytrace.system.surface import Surface
+from raytrace.system.surface import Surface, is_posed
 
 #: Field points, as fractions of the largest height or tangent: OSLO's own three.
 FRACTIONS = (0.0, 0.7, 1.0)
@@ -47,12 +51,12 @@ def read(text: str, file: str, *, catalogs: Sequence[Path] = (), strict: bool = 
     found = sections(text, file, report)
     _refuse_incomplete(found)
     unit = _unit(found)
-    surfaces: list[Surface] = []
+    built: list[oslo_surface.Built] = []
     for commands in found.surfaces:
-        surfaces.append(oslo_surface.build(commands, surfaces, unit, catalogs, report))
+        built.append(oslo_surface.build(commands, built, unit, catalogs, report))
     wavelengths, weights = _wavelengths(found, report)
-    aperture = _aperture(found, surfaces, unit, report)
-    surfaces = _solved(found, surfaces, float(wavelengths[0]), aperture, unit, report)
+    aperture = _aperture(found, built[0].surface, unit, report)
+    surfaces = _solved(found, built, float(wavelengths[0]), aperture, unit, report)
     title, notes = _texts(found)
     lens = Lens(
         surfaces=tuple(surfaces),
@@ -144,7 +148,7 @@ _APERTURES = {
 }
 
 
-def _aperture(found: Sections, surfaces: Sequence[Surface], unit: float, report: Draft) -> SystemAperture:
+def _aperture(found: Sections, first: Surface, unit: float, report: Draft) -> SystemAperture:
     records = found.system.all(*_APERTURES)
     if not records:
         raise LensFileError(f"no system aperture; expected one of {', '.join(_APERTURES)}", found.head.place)
@@ -156,7 +160,7 @@ def _aperture(found: Sections, surfaces: Sequence[Surface], unit: float, report:
     if size <= 0:
         raise LensFileError(f"{record.keyword} is {shown(record.words[0])}, expected a positive number", record.place)
     kind, far = _APERTURES[record.keyword]
-    if far != _is_far(surfaces[0]):
+    if far != _is_far(first):
         where = "a near object" if far else "an object at infinity"
         raise UnsupportedSurface(f"{record.keyword} of {where} is not modelled", record.place)
     return SystemAperture(kind, double(2 * size * unit if record.keyword == "EBR" else size))
@@ -219,12 +223,13 @@ def _stop(found: Sections, report: Draft) -> int:
 
 
 def _solved(
-    found: Sections, surfaces: Sequence[Surface], primary: float, aperture: SystemAperture, unit: float, report: Draft
+    found: Sections, built: Sequence[Built], primary: float, aperture: SystemAperture, unit: float, report: Draft
 ) -> list[Surface]:
     """The surfaces with what is solved for, and a note where the lens has not the focal length that the file states."""
     steps: list[Step] = []
-    for surface, commands in zip(surfaces, found.surfaces, strict=True):
-        steps.append(oslo_surface.step(surface, commands, primary, steps[-1] if steps else None))
+    for one in built:
+        steps.append(oslo_surface.step(one, primary, steps[-1] if steps else None))
+    _refuse_tilted_solves(built)
     beam = 0.5 * float(aperture.value) if aperture.kind == "entrance_pupil_diameter" else None
     solve(steps, beam, unit)
     for step in steps:
@@ -233,7 +238,14 @@ def _solved(
             words = f"{record.keyword} {record.words[0]}"
             report.note(f"surface {record.place.surface}: {words} solved again, {value} in mm")
     _compare(found, focal_length(steps), unit, report)
-    return [oslo_surface.solved(surface, step) for surface, step in zip(surfaces, steps, strict=True)]
+    return [oslo_surface.solved(one.surface, step) for one, step in zip(built, steps, strict=True)]
+
+
+def _refuse_tilted_solves(built: Sequence[Built]) -> None:
+    solves = [record for one in built for record in one.commands.all("PU", "PY")]
+    if solves and any(is_posed(one.surface) for one in built):
+        message = f"{solves[0].keyword} (a solve) in a lens with tilted or decentred surfaces is not modelled"
+        raise UnsupportedSurface(message, solves[0].place)
 
 
 def _compare(found: Sections, focal: float | None, unit: float, report: Draft) -> None:

@@ -8,6 +8,8 @@ import torch
 
 from raytrace.formats.media import listed_glass
 from raytrace.formats.oslo_keywords import Surface as Commands
+from raytrace.formats.oslo_pickups import Built, curved, picked_up, what
+from raytrace.formats.oslo_poses import poses
 from raytrace.formats.oslo_solves import Step
 from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, UnsupportedSurface, shown
@@ -27,7 +29,7 @@ _TERMS = {"AD": 4, "AE": 6, "AF": 8, "AG": 10}
 _SMALLEST, _LARGEST = 0.1, 6.0
 
 
-def build(commands: Commands, before: Sequence[Surface], unit: float, user: Sequence[Path], report: Draft) -> Surface:
+def build(commands: Commands, before: Sequence[Built], unit: float, user: Sequence[Path], report: Draft) -> Built:
     """The surface of its commands, lengths in units of `unit` mm; what is solved for is 0 until it is solved.
 
     before: the surfaces that it may pick up from. user: glass catalogs (.agf). Raises LensFileError, UnsupportedSurface
@@ -35,32 +37,52 @@ def build(commands: Commands, before: Sequence[Surface], unit: float, user: Sequ
     """
     note = commands.last("NOT")
     radius, aperture = _aperture(commands, unit)
-    conic = commands.last("CC")
-    k = conic.number(0, "conic constant") if conic else 0.0
-    return Surface(
-        thickness=double(_thickness(commands, unit)),
-        curvature=double(_curvature(commands) / unit) if _curvature(commands) else None,
-        conic=double(k) if k else None,
-        coefficients=_coefficients(commands, unit),
-        glass=_medium(commands, before, user, report),
+    picked = picked_up(commands, before, unit, report)
+    shape = {
+        "thickness": double(_thickness(commands, unit)),
+        "curvature": curved(_curvature(commands) / unit),
+        "conic": curved(_last_number(commands, "CC", "conic constant")),
+        "coefficients": _coefficients(commands, unit),
+        "glass": picked["glass"] if "glass" in picked else _medium(commands, user, report),
+    }
+    surface = Surface(
         semi_diameter=radius,
         apertures=aperture,
         comment=" ".join(note.words) if note else "",
+        **(shape | picked),
+        **poses(commands, unit),
     )
+    return Built(surface, commands)
 
 
-def step(surface: Surface, commands: Commands, primary: float, before: Step | None) -> Step:
+def _last_number(commands: Commands, word: str, what: str) -> float:
+    record = commands.last(word)
+    return record.number(0, what) if record else 0.0
+
+
+def step(built: Built, primary: float, before: Step | None) -> Step:
     """The surface as the axial ray meets it, at the primary wavelength in µm."""
+    surface, commands = built
     index = before.index if surface.is_mirror else float(refractive_index(surface.glass, double(primary)))
     if not index:
         raise LensFileError(f"{surface.glass.name or 'the medium'} has no index at {primary:g} µm", commands.place)
     curvature = float(surface.curvature) if surface.curvature is not None else 0.0
+    return Step(commands.place, curvature, float(surface.thickness), index, surface.is_mirror, *_solves(commands))
+
+
+def _solves(commands: Commands) -> tuple[Record | None, Record | None]:
+    """PU and PY. Raises LensFileError where the number that they solve for is told beside them."""
     solves = commands.last("PU"), commands.last("PY")
-    for given, solved in ((commands.last("RD", "CV"), solves[0]), (commands.last("TH"), solves[1])):
+    pickups = {what(record): record for record in commands.all("PK")}
+    told = (
+        (commands.last("RD", "CV") or pickups.get("CV") or pickups.get("CVM")),
+        (commands.last("TH") or pickups.get("TH") or pickups.get("THM")),
+    )
+    for given, solved in zip(told, solves, strict=True):
         if given and solved:
             message = f"{given.keyword} in line {given.place.line} and {solved.keyword} tell the same number twice"
             raise LensFileError(f"{message}; delete one of them", solved.place)
-    return Step(commands.place, curvature, float(surface.thickness), index, surface.is_mirror, *solves)
+    return solves
 
 
 def solved(surface: Surface, found: Step) -> Surface:
@@ -113,33 +135,15 @@ def _aperture(commands: Commands, unit: float) -> tuple[float | None, tuple[Aper
     return radius or None, (Aperture("circular", (0.0, radius), False, (0.0, 0.0)),) if checked and radius else ()
 
 
-def _medium(commands: Commands, before: Sequence[Surface], user: Sequence[Path], report: Draft) -> Glass:
-    """AIR, RFL and RFH (a mirror), GLA or PK GLA: the last of them; air where none stands."""
-    found = [record for record in commands.all("AIR", "RFL", "RFH", "GLA", "PK")]
+def _medium(commands: Commands, user: Sequence[Path], report: Draft) -> Glass:
+    """AIR, RFL and RFH (a mirror) or GLA: the last of them; air where none stands."""
+    found = commands.all("AIR", "RFL", "RFH", "GLA")
     if not found:
         return AIR
     record = found[-1]
-    if record.keyword == "PK":
-        return _picked_up(record, before, report)
     if record.keyword in ("RFL", "RFH"):
         return MIRROR
     return AIR if record.keyword == "AIR" else _glass(record, commands, user, report)
-
-
-def _picked_up(record: Record, before: Sequence[Surface], report: Draft) -> Glass:
-    """PK GLA -k: the medium of the surface k before."""
-    what = record.words[0].upper() if record.words else ""
-    if what != "GLA" or len(record.words) != 2:
-        raise UnsupportedSurface(f"PK {shown(' '.join(record.words))} (a pickup) is not modelled", record.place)
-    back = -record.integer(1, "surface to pick up from")
-    if not 0 < back <= len(before):
-        message = f"PK GLA {record.words[1]}: expected how many surfaces before this one, as -2"
-        raise UnsupportedSurface(message, record.place)
-    glass = before[-back].glass
-    if glass.formula == "mirror":
-        raise UnsupportedSurface(f"PK GLA {record.words[1]} picks up a mirror, which is not modelled", record.place)
-    report.glass(record.place.surface, glass.name, f"that of surface {len(before) - back}")
-    return glass
 
 
 def _glass(record: Record, commands: Commands, user: Sequence[Path], report: Draft) -> Glass:
