@@ -124,9 +124,7 @@ def oslo(folder: Path) -> Reader:
         oslo_text((FAR, "AST; AP CHK 10; TH 0", *CONIC), 'EBR 10\nANG 5\nUNI 25.4\nSNO1 "a // note"'),
         oslo_text((*SINGLET, "AIR; TH 1; TLA 0; DT 1; TCE 7"), "FNO 4; OBH -1e19", tail="CFG NEW; TH 1 2; END"),
         oslo_text((FAR, *solved[1:]), "EBR 2; ANG 1"),
-        oslo_text(
-            (FAR, "RD 20; GLA 1.5; TH 2; DCX 1; DCY 2; DCZ 3; TLA 4; TLB 5; TLC 6; DT -1; RCO", *picked), "EBR 1"
-        ),
+        oslo_text((FAR, f"RD 20; GLA 1.5; TH 2; {tilts}", *picked), "EBR 1"),
         oslo_text((*solved[:2], "RD -50; PY 0"), "NAO 0.02; OBH 3; TELE OFF; DES me", stated="50 3"),
     ]
     path = folder / "lens.len"
