@@ -12,9 +12,9 @@ from raytrace.media.environment import told
 from raytrace.optics.base_ray import base_ray
 from raytrace.optics.f_number import real_working_f_number
 from raytrace.optics.paraxial import first_order
+from raytrace.optics.remarks import entries, remarks
 from raytrace.optics.trace import media
 from raytrace.system.lens import FIELD_UNITS, Lens, field_points, name_of_field, wavelengths_of
-from raytrace.system.shapes import EVEN
 from raytrace.system.surface import Surface, is_posed, is_round, vertex_curvature
 
 #: Lines of `raytrace info`: words, entry of FirstOrder (and the real working F/#), unit.
@@ -105,7 +105,7 @@ class Info(Result):
                     "curvature": number(0.0 if surface.curvature is None else surface.curvature),
                     "conic": number(0.0 if surface.conic is None else surface.conic),
                     "coefficients": [] if surface.coefficients is None else numbers(surface.coefficients),
-                    **({} if surface.kind == EVEN else {"kind": surface.kind}),
+                    **entries(surface),
                     "thickness": number(surface.thickness),
                     "glass": surface.glass.name or None,
                     "indices": numbers(indices[k].expand_as(lens.wavelengths)),
@@ -137,9 +137,9 @@ class Info(Result):
             f"  {'surface':>7} {'radius':>13} {'thickness':>12} {'glass':<12} {'index':>9} {'semi-dia.':>10}  note",
         ]
         for k, (surface, index) in enumerate(zip(lens.surfaces, _indices(lens), strict=True)):
-            radius, size = _radius(surface), surface.semi_diameter
+            size = surface.semi_diameter
             lines.append(
-                f"  {k:>7} {'inf' if math.isinf(radius) else f'{radius:.6g}':>13} {float(surface.thickness):>12.7g} "
+                f"  {k:>7} {_radius_in_words(surface):>13} {float(surface.thickness):>12.7g} "
                 f"{surface.glass.name:<12} {index:>9.6f} {'' if size is None else f'{size:.5g}':>10}  "
                 f"{_remarks(lens, k)}".rstrip()
             )
@@ -212,6 +212,12 @@ def _radius(surface) -> float:
     return math.inf if curvature == 0 else 1 / curvature
 
 
+def _radius_in_words(surface: Surface) -> str:
+    """The radius as the table shows it; - for a coordinate break, which has none."""
+    radius = _radius(surface)
+    return "-" if surface.is_break else "inf" if math.isinf(radius) else f"{radius:.6g}"
+
+
 def _environment(holder: Lens | Surface) -> dict:
     """The entry of a document for an environment, where there is one."""
     place = holder.environment
@@ -270,8 +276,7 @@ def _remarks(lens: Lens, k: int) -> str:
     parts = {0: ["object"], lens.stop: ["stop"], len(lens.surfaces) - 1: ["image"]}.get(k, [])
     if surface.conic is not None:
         parts.append(f"conic {float(surface.conic):g}")
-    if surface.coefficients is not None:
-        parts.append(surface.kind)
+    parts += remarks(surface)
     if surface.environment is not None:
         parts.append(f"in {told(surface.environment)}")
     parts += [f"{a.shape} {'obscuration' if a.obscures else 'aperture'}" for a in surface.apertures]

@@ -1,0 +1,61 @@
+"""What the prescription of a lens says of surfaces that are more than conics."""
+
+import pytest
+from test_zemax_types import CASES, read, text
+
+import raytrace as rt
+from raytrace.optics.remarks import entries, remarks
+
+TOLD = {
+    "standard": [],
+    "break": ["coordinate break", "decentre x 1.5 y -2 mm", "tilt x 7° y -5° z 11°"],
+    "break of order 1": ["coordinate break", "tilt x 7° y -5° z 11°", "decentre x 1.5 y -2 mm"],
+    "grating": ["grating of 0.3 lines/µm, order -1"],
+    "ideal lens": ["ideal lens, f 37.3 mm"],
+    "crossed ideal lens": ["ideal lens, f 50 mm in x, -76.9231 mm in y"],
+    "binary 2": ["binary 2 over 10 mm, order 2"],
+    "hologram": ["hologram of 0.55 µm, order 1"],
+    "tilted": ["plane with slopes 0.2, -0.35"],
+    "toroid": ["toroidal", "radius x -60"],
+    "cylinder": ["toroidal", "radius x inf"],
+    "biconic": ["biconic", "radius x 30", "conic x 0.4"],
+    "tilts first": ["before: tilt x -2° y 5° z 10°", "decentre x 0.5 y 0.1 mm", "behind: tilt x 30° y 10°"],
+}
+
+
+@pytest.mark.parametrize("name", TOLD)
+def test_a_surface_is_told_in_the_words_of_the_field(name):
+    lens = read(text(name))[0]
+    assert remarks(lens.surfaces[2]) == TOLD[name]
+    row = str(rt.info(lens)).split("\n")[-3]
+    assert row.endswith(", ".join([*(["conic -0.4"] if name == "standard" else []), *TOLD[name], "the second"])) or (
+        ", ".join(TOLD[name]) in row and name in ("toroid", "biconic")  # their conic stands before
+    )
+    assert (row.split()[1] == "-") == ("break" in name)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_type_has_its_entries_in_the_document(name):
+    lens = read(text(name))[0]
+    known = {
+        "surface",
+        "curvature",
+        "conic",
+        "coefficients",
+        "thickness",
+        "glass",
+        "indices",
+        "semi_diameter",
+        "comment",
+    }
+    found = rt.info(lens).document()["surfaces"]
+    assert found[1].keys() == known
+    assert found[2].keys() - known == entries(lens.surfaces[2]).keys()
+    assert ("is_break" in found[2]) == ("break" in name)
+
+
+def test_a_document_holds_the_numbers_of_a_phase_and_a_pose():
+    found = rt.info(read(text("tilted grating"))[0]).document()["surfaces"][2]
+    assert found["phase"] == {"kind": "Grating", "frequency": 0.3, "order": -1.0}
+    pose = {"x": 0.3, "y": -0.2, "tilt_x": 4.0, "tilt_y": -3.0, "tilt_z": 25.0, "tilts_first": False}
+    assert found["before"] == pose
