@@ -103,3 +103,14 @@ def test_a_decentred_aperture_shows_that_part_of_a_mirror():
     (face,) = [line for line in rt.layout(tilted).plot().axes[0].lines if line.get_gid() == "mirror 2"]
     assert (face.get_ydata().min(), face.get_ydata().max()) == (46.0, 154.0)
     assert np.abs(face.get_xdata() - (600 - face.get_ydata() ** 2 / 2000)).max() < 1e-9
+
+
+def test_rays_by_wavelength_show_the_spectrum_on_the_image():
+    """Where the rays of every colour land stands beside the layout, in the colour and place of the traced ones."""
+    lens = rt.read_lens("spectrometer")
+    figure = rt.layout(lens, wavelengths=[0.45, 0.55, 0.65]).plot()
+    lines = [line for line in figure.axes[1].lines if line.get_marker() == "."]
+    assert len({line.get_color() for line in lines}) == 3
+    traced = rt.spot(lens, wavelengths=[0.45, 0.55, 0.65]).centroid[1, 0]
+    drawn = [float(np.mean(line.get_ydata())) for line in lines]
+    assert drawn == pytest.approx(traced.tolist(), abs=0.01)

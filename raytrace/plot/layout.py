@@ -9,10 +9,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from torch import Tensor
 
-from raytrace.maths.pupil import fan
-from raytrace.optics.launch import stop_radius
+from raytrace.maths.pupil import fan, hexapolar
+from raytrace.optics.launch import launch, stop_radius
 from raytrace.optics.paraxial import first_order
-from raytrace.optics.trace import media
+from raytrace.optics.trace import media, trace_lens
 from raytrace.optics.views import Layout
 from raytrace.plot import outline, space, style
 from raytrace.system.aperture import reach
@@ -37,14 +37,38 @@ def layout(found: Layout) -> Figure:
     if found.view == "3d":
         return _finished(space.draw(lens, fields, wavelengths.detach(), found.rays), lens, fields, wavelengths, 7.5)
     figure = style.new_figure(8.0, 4.0)
-    axes = figure.add_subplot()
+    axes, spectrum = figure.add_subplot(), None
+    if len(wavelengths) > 1:
+        figure.delaxes(axes)
+        axes, spectrum = figure.subplots(1, 2, width_ratios=(5, 1))
     draw_layout(axes, lens, fields=fields, wavelengths=wavelengths.detach(), rays=found.rays, view=found.view)
     (z0, z1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
     shape = (y1 - y0) / (z1 - z0)
     width = min(max(6.0 / shape, 5.5), 8.0)
-    figure.set_size_inches(width, min(max(0.98 * width * shape, 1.2), 6.0) + 1.1)
+    height = min(max(0.98 * width * shape, 1.2), 6.0) + 1.1
+    if spectrum is not None:
+        width, height = 1.2 * width, max(height, 3.6)
+        _draw_spectrum(spectrum, lens, fields, wavelengths.detach())
+    figure.set_size_inches(width, height)
     axes.set_title(style.first_order_text(lens, first_order(lens)), fontsize=8.5, color=style.GREY, pad=4)
     return _finished(figure, lens, fields, wavelengths, width)
+
+
+def _draw_spectrum(axes: Axes, lens: Lens, fields: Tensor, wavelengths: Tensor) -> None:
+    """Where rays of every wavelength land on the image."""
+    points = hexapolar(4, dtype=wavelengths.dtype, device=wavelengths.device)[0]
+    end = trace_lens(lens, launch(lens, points, fields=fields, wavelengths=wavelengths), wavelengths[:, None])
+    x, y = style.array(torch.where(end.valid, end.position[:2], torch.nan))
+    for w, colour in enumerate(style.wavelength_colours(wavelengths.tolist())):
+        axes.plot(x[:, w].ravel(), y[:, w].ravel(), ".", color=colour, markersize=2.5, markeredgewidth=0)
+    if np.isfinite(x).any():
+        low, high = np.nanmin(y), np.nanmax(y)
+        half = 0.55 * max(np.nanmax(x) - np.nanmin(x), 0.25 * (high - low))
+        middle = 0.5 * (np.nanmin(x) + np.nanmax(x))
+        axes.set_xlim(middle - half, middle + half)
+    axes.set_aspect("equal")
+    axes.set(xlabel="x (mm)", ylabel="y (mm)")
+    axes.set_title("on the image", fontsize=8.5, color=style.GREY, pad=4)
 
 
 def _finished(figure: Figure, lens: Lens, fields: Tensor, wavelengths: Tensor, width: float) -> Figure:

@@ -111,7 +111,8 @@ def spot_diagram(found: Spots) -> Figure:
         title=f"{style.first_order_text(lens, first_order(lens))}\n"
         f"centred on the {'centroid' if about is None else 'chief ray'}; RMS and GEO (largest) radius about it, "
         "all wavelengths together",
-        loc="outside lower center", ncols=6, handletextpad=0.3, title_fontproperties={"size": 8}, alignment="center",
+        loc="outside lower center", ncols=min(6, int(width / 1.05)), handletextpad=0.3,
+        title_fontproperties={"size": 8}, alignment="center",
     )  # fmt: skip
     legend.get_title().set(color=style.GREY, multialignment="center")
     return figure
