@@ -1,6 +1,7 @@
 """The compiled trace of tilted and decentred surfaces, coordinate breaks, gratings, phases and ideal lenses."""
 
 import itertools
+import random
 
 import pytest
 import torch
@@ -183,6 +184,84 @@ def test_forward_derivatives_are_the_gradients_of_torch(name):
     assert_close((hits * weights[:2]).sum((1, 2, 3)), expected, rtol=1e-10, atol=1e-10)
     found = (weights[3:6] * direction[0]).sum() + (weights[6] * path[0]).sum()
     assert_close(found, sum((g * step).sum() for g, step in zip(by_rest, steps, strict=True) if g is not None))
+
+
+@pytest.mark.parametrize("glass", [1.0, 1.5, MIRROR])
+def test_whether_an_order_is_evanescent_is_not_left_to_rounding(glass):
+    """Rays of float32 about the angle where their order leaves the surface along it, decided by both as in float64."""
+    n2 = glass if isinstance(glass, float) else 1.0
+    sine = torch.linspace(-2e-6, 2e-6, 801, dtype=torch.float64) + n2 - 0.8
+    rays = start(torch.zeros(3, 801), torch.stack([0 * sine, sine, torch.sqrt(1 - sine * sine)]).float(), None)
+    grating = surface(None, 0.0, glass, phase=rt.Grating(scalar(1.6), scalar(1.0)))
+    grating = to(grating, dtype=torch.float32)
+    n = [torch.tensor(1.0), torch.tensor(n2)]
+    found = both(lambda: trace_surfaces([grating], rays, indices=n, wavelength=torch.tensor(0.5)).valid)
+    slope = (torch.tensor(1.6) * torch.tensor(0.5)).double()
+    _, M, N = rays.direction.double()
+    squared = N * N + (n[1].double() ** 2 - 1) - slope * (2 * M + slope)
+    assert torch.equal(found[0], found[1])
+    assert 100 < int(found[0].sum()) < 700
+    sure = squared.abs() > 1e-12
+    assert torch.equal(found[0][sure], squared[sure] > 0)
+
+
+def drawn_system(seed: int) -> list[Surface]:
+    """Surfaces of any kind in any order, tilted and decentred anyhow, breaks and mirrors among them."""
+    chance = random.Random(seed)
+    phases = [None, None, GRATING, RADIAL, FREE, FRINGE, ROUND, UNLIKE]
+    surfaces, side = [], 1
+    for _ in range(8):
+        poses = [None if chance.random() < 0.5 else any_pose(chance) for _ in range(2)]
+        gap = side * chance.uniform(0.0, 8.0)
+        if chance.random() < 0.25:
+            surfaces.append(Surface(scalar(gap), before=poses[0], after=poses[1], is_break=True))
+            continue
+        shape = chance.choice(["plane", "sphere", "conic", "asphere"])
+        mirror = chance.random() < 0.25
+        side = -side if mirror else side
+        surfaces.append(
+            surface(
+                None if shape == "plane" else chance.uniform(-0.02, 0.02),
+                side * abs(gap),
+                MIRROR if mirror else chance.choice([1.0, 1.5, 1.7]),
+                conic=chance.uniform(-2.0, 1.0) if shape == "conic" else None,
+                coefficients=[1e-4, chance.uniform(-1e-6, 1e-6)] if shape == "asphere" else None,
+                phase=chance.choice(phases),
+                before=poses[0],
+                after=poses[1],
+                semi_diameter=60.0,
+                apertures=(Aperture("circular", (0.0, 25.0)),) if chance.random() < 0.2 else (),
+            )
+        )
+    return surfaces
+
+
+def any_pose(chance: random.Random) -> Pose:
+    names = [name for name in ANGLES if chance.random() < 0.6]
+    sizes = {name: chance.uniform(-8.0, 8.0) if "tilt" in name else chance.uniform(-1.0, 1.0) for name in names}
+    return posed(**sizes, tilts_first=chance.random() < 0.5)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_systems_drawn_at_random(seed):
+    """Rays, and the gradient of all that comes out by all that goes in, with the path or without it by turns."""
+    system = lens(drawn_system(seed))
+    rays, indices = some_rays(200), media(system, WAVELENGTHS)
+    rays = Rays(rays.position[:, None], rays.direction[:, None], rays.valid[None], rays.opl[None] if seed % 2 else None)
+    weights = drawn(7, 3, 200, seed=seed)
+
+    def outcome():
+        own, n, leaves = with_leaves(system.surfaces[1:], indices)
+        end = trace_surfaces(own, rays, indices=n, wavelength=WAVELENGTHS)
+        merit = (weights[:3] * end.position).sum() + (weights[3:6] * end.direction).sum()
+        merit = merit if end.opl is None else merit + (weights[6] * end.opl).sum()
+        return end, torch.autograd.grad(merit, leaves, allow_unused=True)
+
+    (fused, by_fused), (eager, by_eager) = both(outcome)
+    size = max(100.0, float(eager.position.detach().abs().max()))
+    assert_same_rays(fused, eager, 1e-12, size)
+    for f, e in zip(by_fused, by_eager, strict=True):
+        assert (e is None) or float((f - e).abs().max()) <= 1e-10 * (float(e.abs().max()) + size)
 
 
 def test_gradients_are_differences_and_have_gradients_of_their_own():

@@ -15,13 +15,13 @@ from raytrace.fused.choice import is_fused
 from raytrace.fused.run import trace_compiled
 from raytrace.fused.structure import is_expressible
 from raytrace.maths.numerics import dot
-from raytrace.maths.value import value
+from raytrace.maths.value import to, value
 from raytrace.optics.conjugates import sequence_of
 from raytrace.optics.indices import media
-from raytrace.optics.laws import bend_slopes, diffract, reflect, refract
+from raytrace.optics.laws import bend_slopes, diffract, diffracted_root, reflect, refract
 from raytrace.system.aperture import inside
 from raytrace.system.lens import Lens
-from raytrace.system.phases import added_path, ideal_path, kind_of
+from raytrace.system.phases import added_path, ideal_path, kind_of, path_of
 from raytrace.system.pose import Gap, Turn, direction_in, point_in
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface, gap_behind, in_double, meet, normal
@@ -112,7 +112,7 @@ def _cross(surface: Surface, rays: _Ray, gap, side: int, n1: Tensor, n2: Tensor,
         opl = opl + n1 * _reduced_path(rays.position, hit, direction, gap, side)
     passes = None
     if surface.phase is not None:
-        direction, passes, added = _through_phase(surface, hit, direction, cosine, known, n1, n2, wavelength)
+        direction, passes, added = _through_phase(surface, hit, direction, cosine, known, exact, n1, n2, wavelength)
         opl = opl if opl is None or added is None else opl + added
     elif surface.is_mirror or n2 is not n1:
         n, norm_squared = normal(surface, hit) if known is None else known
@@ -151,7 +151,17 @@ def _approach(surface: Surface, rays: _Ray, gap: Tensor | Gap | None, side: int,
     return _Ray(position, direction, rays.valid, opl)
 
 
-def _through_phase(surface: Surface, hit, direction, cosine, known, n1, n2, wavelength):
+@torch.no_grad()
+def _diffracted_discriminant(surface: Surface, hit, direction, n1: Tensor, n2: Tensor, wavelength) -> Tensor:
+    """b² of `diffract` in float64, outside the graph, of a path with the numbers that the rays have it with."""
+    path = path_of(surface.phase, None if wavelength is None else wavelength.to(n1.dtype))
+    phase = to(surface.phase if path is None else path, dtype=torch.float64)
+    n, norm_squared = normal(in_double(surface), hit)
+    added = added_path(phase, hit[0], hit[1], wavelength)
+    return diffracted_root(direction, n, dot(n, direction), norm_squared, n1.double(), n2.double(), added)
+
+
+def _through_phase(surface: Surface, hit, direction, cosine, known, exact, n1, n2, wavelength):
     """Direction behind a surface with a phase, whether light passes (None: all does), and the path that is added."""
     kind, phase = kind_of(surface.phase), surface.phase
     if kind.slopes:
@@ -161,7 +171,8 @@ def _through_phase(surface: Surface, hit, direction, cosine, known, n1, n2, wave
     if kind.flat:
         return *refract(direction, n, dot(n, direction), norm_squared, n1, n2), None
     added, mirror = added_path(phase, hit[0], hit[1], wavelength), surface.is_mirror
-    direction, passes = diffract(direction, n, cosine, norm_squared, n1, n2, added, mirror=mirror)
+    sure = None if exact is None else _diffracted_discriminant(surface, *exact, n1, n2, wavelength)
+    direction, passes = diffract(direction, n, cosine, norm_squared, n1, n2, added, mirror=mirror, b_squared=sure)
     return direction, passes, added.path
 
 
