@@ -157,8 +157,9 @@ def path(block, x, y, wavelength: float, waves: float):
 
 
 def slopes(function, x: float, y: float) -> tuple[float, float]:
-    if x == y == 0:  # also of a cone, whose vertex has no slope
-        x = y = 1e-20
+    if x == y == 0:  # the mean of both sides: a cone has no slope at its vertex
+        sides = slopes(function, 1e-20, 1e-20), slopes(function, -1e-20, -1e-20)
+        return tuple((a + b) / 2 for a, b in zip(*sides, strict=True))
     step = 1j * _STEP
     return (function(x + step, y + 0j).imag / _STEP, function(x + 0j, y + step).imag / _STEP)
 

@@ -5,7 +5,8 @@ from raytrace.cli import options as words
 SUMMARY = "trace rays of a table, surface by surface"
 DESCRIPTION = (
     "Trace rays and write one row per ray and surface: ray,surface,x,y,z,l,m,n,opl,status in each surface's own "
-    "frame, direction after the surface, opl the optical path from the given start. status: ok, miss, tir, "
+    "frame, direction after the surface, opl the optical path from the given start. At a coordinate break a ray has "
+    "met nothing: its row is the point and the path that it had before, told in the new axes. status: ok, miss, tir, "
     "vignetted. A vignetted ray keeps its coordinates; a missed or totally reflected one ends with an empty row. "
     "Chief and marginal rays, at the primary wavelength or those of --wavelength, are named in further columns: "
     "object_distance,field_x,field_y,wavelength,pupil_x,pupil_y."
