@@ -10,6 +10,7 @@ from bends import pose, real
 
 import raytrace as rt
 from raytrace.analysis.setting import scene_of
+from raytrace.optics.axis import Bent
 from raytrace.optics.focus import along_normal, focus_of_rms
 from raytrace.optics.scene import symmetry
 from raytrace.optics.wavefront import rms, wavefront_of
@@ -240,3 +241,78 @@ def test_the_strehl_ratio_is_differentiated_by_a_tilt():
         return rt.wavefront(lens, size=9).strehl
 
     assert torch.autograd.gradcheck(ratio, [real(0.3).requires_grad_()], eps=1e-5, atol=1e-4)
+
+
+def cylinders() -> rt.Lens:
+    return rt.lens(
+        [{"thickness": 0.0, "phase": rt.IdealLens(1 / 60, 1 / 50)}, {"thickness": 54.0}],
+        stop=1, entrance_pupil_diameter=4.0, fields=[0.0],
+    )  # fmt: skip
+
+
+def toroid() -> rt.Lens:
+    """A plano-convex lens of focal lengths 100 mm along y and 120 mm along x."""
+    front = {"radius": 50.0, "kind": "toroidal", "coefficients": [1 / 60], "thickness": 4.0, "glass": 1.5}
+    return rt.lens([front, {"thickness": 100.0}], stop=1, entrance_pupil_diameter=6.0, fields=[0.0, 3.0])
+
+
+def test_a_toroid_has_the_foci_of_its_sections():
+    found = rt.base_ray(toroid())
+    assert found.focal_length.tolist() == pytest.approx([100.0, 120.0], abs=1e-9)
+    assert found.back_focal_distance.tolist() == pytest.approx([100 - 4 / 1.5, 120 - 4 / 1.5], abs=1e-9)
+    curvature = rt.field_curvature(toroid(), fields=[0.0])
+    assert float(curvature.tangential) == pytest.approx(-4 / 1.5, abs=1e-5)
+    assert float(curvature.sagittal) == pytest.approx(20 - 4 / 1.5, abs=1e-5)
+
+
+def test_two_foci_show_in_focus_field_curvature_and_mtf():
+    """Lines at 50 and 60 mm: their places from the sensor, the least spot between them, and what is sharp at each."""
+    lens = cylinders()
+    found = rt.field_curvature(lens, fields=[0.0])
+    assert float(found.tangential) == pytest.approx(-4.0, abs=1e-6)
+    assert float(found.sagittal) == pytest.approx(6.0, abs=1e-6)
+    # Σ W cov / Σ W var of a disc: 1/s = (1/50 + 1/60)/(1/50² + 1/60²)
+    best = (1 / 50 + 1 / 60) / (1 / 50**2 + 1 / 60**2)
+    assert float(rt.focus(lens).sensor_distance) == pytest.approx(best, abs=1e-9)
+    lines = [rt.mtf(lens.at(sensor_distance=at), [50.0]) for at in (50.0, 60.0)]
+    assert float(lines[0].tangential) > 0.4 > 0.1 > float(lines[0].sagittal)
+    assert float(lines[1].sagittal) > 0.4 > 0.1 > float(lines[1].tangential)
+
+
+def test_models_of_one_focus_refuse_two():
+    with pytest.raises(Bent, match=r"needs one focus, but surface 1 bends light differently along x and y; take model"):
+        rt.psf(cylinders(), "paraxial")
+    with pytest.raises(Bent, match="needs one focus"):
+        rt.psf(cylinders(), "fourier")
+
+
+@pytest.mark.parametrize("name", ["fold", "spectrometer", "mirror", "toroid"])
+def test_light_paths_and_rays_are_of_one_wave(name):
+    """Malus and Dupin: the path grows over the image as the rays lean, ∂W = n d·∂P, by central differences."""
+    lens = {
+        "fold": lambda: bends.folded(rt.read_lens("double_gauss"), 10, tilt_x=45.0),
+        "spectrometer": bends.spectrometer,
+        "mirror": lambda: bends.on_tilted_sensor(bends.tilted_mirror(-200.0, 30.0, 80.0), tilt_x=25.0, tilt_y=10.0),
+        "toroid": toroid,
+    }[name]()
+    generator = torch.Generator().manual_seed(3)
+    points, step = torch.rand(2, 20, generator=generator, dtype=torch.float64) - 0.5, 1e-4
+    ways = real([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, -1.0]]) * step
+    around = (points[:, None] + ways[:, :, None]).flatten(1)
+    middle, beside = (rt.trace(lens, rt.rays(lens, pupil=p, fields=[0.0])) for p in (points, around))
+    moved, grown = beside.position.unflatten(-1, (2, 2, -1)), beside.opl.unflatten(-1, (2, 2, -1))
+    moved, grown = moved[..., 0, :] - moved[..., 1, :], grown[..., 0, :] - grown[..., 1, :]
+    lag = grown - (middle.direction[..., None, :] * moved).sum(0)
+    assert float((lag.abs() / torch.linalg.vector_norm(moved, dim=0).amax()).max()) < 1e-6
+
+
+def test_strehl_and_mtf_of_a_fold_that_is_not_quite_one():
+    """A mirror tilted by δ turns all light by 2 δ: the image moves by 2 δ f, and is no worse."""
+    f, tilt = 200.0, 0.05
+    lens = rt.lens([{"thickness": f, "phase": rt.IdealLens(1 / f, 1 / f)}], stop=1, entrance_pupil_diameter=10.0)
+    fold = bends.folded(lens, 1, 0.25, tilt_x=45.0)
+    mirror = dataclasses.replace(fold.surfaces[2], before=pose(tilt_x=45.0 + tilt), after=pose(tilt_x=45.0 - tilt))
+    off = dataclasses.replace(fold, surfaces=(*fold.surfaces[:2], mirror, *fold.surfaces[3:]))
+    place = float(rt.spot(off).centroid[1, 0, 0])
+    assert abs(place) == pytest.approx(0.75 * f * math.tan(math.radians(2 * tilt)), rel=1e-9)
+    assert float(rt.wavefront(off, size=9).strehl) == pytest.approx(1.0, abs=1e-3)

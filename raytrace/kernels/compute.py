@@ -13,6 +13,7 @@ from raytrace.budget import within
 from raytrace.kernels import gaussian
 from raytrace.kernels.ladder import between, by_order, by_rays, by_tolerance, climb
 from raytrace.kernels.models import MODELS, RUNGS, Model
+from raytrace.kernels.paraxial import has_one_focus
 from raytrace.kernels.result import EmptyPsf, Psf, combined, polychromatic, without_dark
 from raytrace.kernels.sharing import check_shares, shared_model
 from raytrace.kernels.streaming import stream_kernels
@@ -20,7 +21,6 @@ from raytrace.maths.grid import Grid
 from raytrace.maths.grid import grid as make_grid
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
-from raytrace.optics.axis import is_bent
 from raytrace.optics.losses import beam_hint, losses, warn_of_losses
 from raytrace.optics.reuse import Memo
 from raytrace.optics.scene import Scene, scene, trace_scene
@@ -148,7 +148,7 @@ def _driver(lens: Lens, model, options: Mapping, tol, rays, order, share: Share 
         return between(*found, weights, MODELS[model])
 
     if model == "auto":
-        rungs = [own(name) for name in RUNGS if MODELS[name].traces or not is_bent(lens)]
+        rungs = [own(name) for name in RUNGS if MODELS[name].traces or has_one_focus(lens)]
         return functools.partial(climb, rungs=rungs, tol=tol or 0.01)
     if streams:
         return stream

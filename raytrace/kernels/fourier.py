@@ -32,14 +32,13 @@ from raytrace.kernels.dft import (
     to_grid,
     window_moments,
 )
-from raytrace.kernels.paraxial import chief_ray_height
+from raytrace.kernels.paraxial import chief_ray_height, need_one_focus
 from raytrace.kernels.radial import is_centred, light_of_radii, radii_of_waves, reach
 from raytrace.kernels.result import Kernels, moments
 from raytrace.maths import zernike as polynomials
 from raytrace.maths.grid import Grid
 from raytrace.maths.pupil import gauss_rings, with_rim
 from raytrace.maths.value import to, value
-from raytrace.optics.axis import need_axis
 from raytrace.optics.paraxial import first_order, signed
 from raytrace.optics.scene import Scene, symmetry
 from raytrace.optics.trace import media
@@ -67,9 +66,9 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0, zernike: Tensor | None 
     order: from -2 on; each one adds pupil points and pixel nodes, successive ones estimate the error.
     centroid and covariance are those of the light inside the window, for the second moment of
     a hard-edged diffraction pattern does not exist; those of the geometric limit are given beside them.
-    Raises ValueError where the window or the blur would need too many pupil points, Bent for a lens whose axis bends.
+    Raises ValueError where the window or the blur would need too many pupil points, Bent as the paraxial model.
     """
-    need_axis(scene.lens, "the Fourier PSF model", "take model=wave, which traces the wavefront")
+    need_one_focus(scene.lens, "the Fourier PSF model", "take model=wave, which traces the wavefront")
     # Phases of hundreds of radians leave single precision three digits.
     single = grid.pitch.dtype != torch.float64 or scene.wavelengths.dtype != torch.float64
     scene, window = (to(each, dtype=torch.float64) if single else each for each in (scene, grid))

@@ -2,18 +2,24 @@
 
 import torch
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
+from torch.utils import _pytree as pytree
 
 from raytrace.kernels.pixels import gaussian_pixels
 from raytrace.kernels.result import Kernels
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide
-from raytrace.optics.axis import need_axis
+from raytrace.maths.value import detached
+from raytrace.optics.axis import Bent, is_bent, need_axis
+from raytrace.optics.base_ray import base_ray
 from raytrace.optics.launch import object_field
 from raytrace.optics.paraxial import first_order, signed, system_matrix
 from raytrace.optics.scene import Scene, is_on_axis
 from raytrace.optics.trace import media
+from raytrace.system.lens import Lens
+from raytrace.system.surface import is_round
 
-_INSTEAD = "take model=gaussian, drt or wave, which trace rays"
+_ALIKE = 1e-3  # of the power: sections that differ by less have one focus
 
 
 def kernels(scene: Scene, grid: Grid, *, order: int = 0, rho: float | Tensor = 0.5) -> Kernels:
@@ -21,15 +27,37 @@ def kernels(scene: Scene, grid: Grid, *, order: int = 0, rho: float | Tensor = 0
 
     order: 0, the only one; rho: 0.5 gives the second moment per axis of a uniform disc of radius ε. In focus σ is 0 and
     so is its gradient: the Gaussian's energy moves between pixels with σ², so nothing is lost.
-    Raises Bent for a lens whose axis bends.
+    Raises Bent for a lens whose axis bends, or that bends light differently along x and y.
     """
-    need_axis(scene.lens, "the paraxial PSF model", _INSTEAD)
+    need_one_focus(scene.lens, "the paraxial PSF model", "take model=gaussian, drt or wave, which trace rays")
     sigma = rho * blur_radius(scene)
     variance = (sigma * sigma).expand(scene.shape)
     centroid = chief_ray_height(scene)
     kernel = gaussian_pixels(grid, centroid, torch.stack([variance, variance]))
     covariance = torch.stack([variance, torch.zeros_like(variance), variance])
     return Kernels(kernel, grid, centroid, covariance, rays=0)
+
+
+def need_one_focus(lens: Lens, what: str, instead: str) -> None:
+    """Raise Bent for a lens without one axis, or with different powers along x and y; words as for `need_axis`."""
+    need_axis(lens, what, instead)
+    if has_one_focus(lens):
+        return
+    number = next(k for k, surface in enumerate(lens.surfaces) if not is_round(surface))
+    raise Bent(f"{what} needs one focus, but surface {number} bends light differently along x and y; {instead}")
+
+
+def has_one_focus(lens: Lens) -> bool:
+    """Whether a lens has one axis, and the same power along x and y."""
+    if is_bent(lens):
+        return False
+    numbers = pytree.tree_leaves(lens)
+    if all(map(is_round, lens.surfaces)) or any(map(is_functorch_wrapped_tensor, numbers)):
+        return True
+    with torch.no_grad():
+        tangential, sagittal = 1 / base_ray(detached(lens)).focal_length.flatten(1)
+    largest = torch.maximum(tangential.abs(), sagittal.abs())
+    return bool(((tangential - sagittal).abs() <= _ALIKE * largest).all())
 
 
 def blur_radius(scene: Scene) -> Tensor:
