@@ -19,6 +19,7 @@ from raytrace.optics.jacobian import hit_jacobian
 from raytrace.optics.trace import media, trace_surfaces
 from raytrace.system.pose import Gap, Pose, direction_in, passage, point_in
 from raytrace.system.rays import Rays, start
+from raytrace.system.shapes import EVEN
 from raytrace.system.surface import Aperture, Surface, gap_behind
 
 pytestmark = pytest.mark.usefixtures("compiler")
@@ -205,6 +206,9 @@ def test_whether_an_order_is_evanescent_is_not_left_to_rounding(glass):
     assert torch.equal(found[0][sure], squared[sure] > 0)
 
 
+SHAPES = [("plane", None), ("sphere", None), ("conic", None), ("free", EVEN), ("free", "toroidal"), ("free", "biconic")]
+
+
 def drawn_system(seed: int) -> list[Surface]:
     """Surfaces of any kind in any order, tilted and decentred anyhow, breaks and mirrors among them."""
     chance = random.Random(seed)
@@ -216,7 +220,7 @@ def drawn_system(seed: int) -> list[Surface]:
         if chance.random() < 0.25:
             surfaces.append(Surface(scalar(gap), before=poses[0], after=poses[1], is_break=True))
             continue
-        shape = chance.choice(["plane", "sphere", "conic", "asphere"])
+        shape, kind = chance.choice(SHAPES)
         mirror = chance.random() < 0.25
         side = -side if mirror else side
         surfaces.append(
@@ -225,7 +229,8 @@ def drawn_system(seed: int) -> list[Surface]:
                 side * abs(gap),
                 MIRROR if mirror else chance.choice([1.0, 1.5, 1.7]),
                 conic=chance.uniform(-2.0, 1.0) if shape == "conic" else None,
-                coefficients=[1e-4, chance.uniform(-1e-6, 1e-6)] if shape == "asphere" else None,
+                coefficients=[1e-3, chance.uniform(-1e-6, 1e-6)] if kind else None,
+                kind=kind or EVEN,
                 phase=chance.choice(phases),
                 before=poses[0],
                 after=poses[1],
@@ -317,7 +322,7 @@ def test_neither_neighbours_nor_threads_change_anything():
         assert torch.equal(part, whole[..., chosen])
 
 
-@pytest.mark.parametrize(("first", "second"), itertools.product([None, False, True], repeat=2))
+@pytest.mark.parametrize(("first", "second"), list(itertools.product([None, False, True], repeat=2)))
 def test_a_passage_is_its_steps_one_after_the_other(first, second):
     poses = [None if order is None else posed(**ANGLES, tilts_first=order) for order in (first, second)]
     gap = scalar(3.0) if poses[0] is None else Gap(poses[0], scalar(3.0))
