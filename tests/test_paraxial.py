@@ -86,6 +86,14 @@ def test_newtons_equation_and_the_magnification(system, distance):
     assert data.magnification.item() == pytest.approx((-f / x).item(), rel=1e-9)
 
 
+def test_an_object_at_surface_1_is_the_limit_of_one_before_it():
+    """A file may say so (DISZ 0): its figures are numbers, and those of an object a picometre away."""
+    system = thick_lens()
+    touching, near = (first_order(with_object_distance(system, scalar(d))) for d in (0.0, 1e-9))
+    for name in ("magnification", "paraxial_image_distance"):
+        assert float(getattr(touching, name)) == pytest.approx(float(getattr(near, name)), rel=1e-7), name
+
+
 @each
 def test_object_distance_tends_to_infinity(system):
     far = first_order(with_object_distance(system, 1e12))
