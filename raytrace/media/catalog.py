@@ -259,7 +259,7 @@ def _warn_if_ambiguous(candidates: Sequence[Glass], where: str) -> None:
     if rivals:
         message = (
             f"{_at(where)}{glass.listed_name} is taken from {glass.catalog}, but another glass has this name in other "
-            f"catalogs (index differs in {', '.join(rivals)}); name the catalog in the lens file"
+            f"catalogs (index differs in {', '.join(rivals)}); name the catalog in the file, or give it (--catalog)"
         )
         warnings.warn(message, AmbiguousGlass, stacklevel=3)
 
