@@ -6,10 +6,11 @@ trust       what may be executed: what nobody else can have written
 structure   a run of surfaces as that code reads it
 run         the code called on tensors, forward and backward
 block.h     what it works on: blocks of rays that stay in the cache
-sags.h      the kinds of sag, as rows of shapes.py
+sags.h      the kinds of sag, as rows of shapes.py; freeform.h: those that are not round
 paths.h     the paths that phases add, as polynomials
 apertures.h the shapes of apertures, as rows of aperture.py
 loops.h     the surfaces as loops over a block, where nothing can go wrong
+search.h    the first crossing of one ray with what is more than a conic, as search.py finds it
 careful.h   one ray at one surface, with every case that surface.py and search.py know
 phases.h    what gratings, diffractive and ideal lenses do to rays; phase_slopes.h: differentiated
 turns.h     axes that turn between two surfaces

@@ -32,8 +32,8 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
   const T gap = s.gap, c = s.c, k = s.k, shape = T(1) + k, n1 = s.n1, n2 = s.n2;
   const T mu = n1 / n2, D = (n2 - n1) * (n2 + n1), over_n2 = T(1) / n2, side = T(s.at->side);
   const bool has_gap = s.at->gap >= 0;
-  T sum_gap = 0, sum_c = 0, sum_k = 0, sum_n1 = 0, sum_n2 = 0;
-#pragma omp simd reduction(+ : sum_gap, sum_c, sum_k, sum_n1, sum_n2)
+  T sum_gap = 0, sum_c = 0, sum_k = 0, sum_n1 = 0, sum_n2 = 0, sum_first = 0, sum_second = 0;
+#pragma omp simd reduction(+ : sum_gap, sum_c, sum_k, sum_n1, sum_n2, sum_first, sum_second)
   for (int i = 0; i < n; i++) {
     T x = from.x[i], y = from.y[i], z = from.z[i], L = from.L[i], M = from.M[i], N = from.N[i];
     T hx = to.x[i], hy = to.y[i], hz = to.z[i];
@@ -41,6 +41,7 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
     T u = hx * hx + hy * hy;
 
     // The normal, its squared length and the cosine.
+    [[maybe_unused]] std::conditional_t<is_freeform(kind), SheetOf<T, kind, terms>, int> sheet{};
     T nx = 0, ny = 0, nz = 1, w = 1, S, dS = 0, d2S = 0;
     if (kind == kSphere || kind == kConic) {
       nx = -c * hx, ny = -c * hy, nz = T(1) - shape * c * hz;
@@ -48,6 +49,9 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
     } else if (has_terms(kind)) {
       sag<kind, true>(s, terms, u, S, dS, d2S);
       nx = T(-2) * dS * hx, ny = T(-2) * dS * hy, w = T(1) + T(4) * dS * dS * u;
+    } else if constexpr (is_freeform(kind)) {
+      sheet = sheet_at<kind, terms, true>(s, hx, hy);
+      nx = -sheet.x, ny = -sheet.y, w = T(1) + nx * nx + ny * ny;
     }
     T tilt = nx * L + ny * M, cosine = tilt + nz * N, over_cosine;
 
@@ -98,7 +102,7 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
     }
 
     // The normal depends on the hit and on the shape.
-    T gdS = 0, over_w = 0, conic_sag = 0;
+    T gdS = 0, over_w = 0, conic_sag = 0, gx = 0, gy = 0;  // gx, gy: of the slopes of a freeform sag
     if (kind == kSphere || kind == kConic) {
       gX -= c * gnx, gY -= c * gny, gZ -= shape * c * gnz;
       sum_c -= hx * gnx + hy * gny + shape * hz * gnz;
@@ -119,6 +123,9 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
       T third = over_w * over_w * over_w;
       sum_c += T(0.5) * gdS * third;
       sum_k += T(0.25) * gdS * c * c * c * u * third;
+    } else if constexpr (is_freeform(kind)) {
+      gx = T(2) * sheet.x * gw - gnx, gy = T(2) * sheet.y * gw - gny;
+      gX += sheet.xx * gx + sheet.xy * gy, gY += sheet.xy * gx + sheet.yy * gy;
     }
 
     // The hit: implicit function theorem.
@@ -133,6 +140,10 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
       sum_c += s_bar * u * over_w * over_w / (over_w + T(1));
       sum_k += T(0.5) * s_bar * c * conic_sag * conic_sag * over_w;
       notes.px[i] = s_bar, notes.py[i] = gdS;
+    } else if constexpr (is_freeform(kind)) {
+      const Shares<T> shares = sheet.pulled(s_bar, gx, gy);
+      sum_c += shares.c, sum_k += shares.k, sum_first += shares.first, sum_second += shares.second;
+      notes.px[i] = shares.height, notes.py[i] = shares.slope;
     }
     T t = (hx - x) * L + (hy - y) * M + (hz - (z - gap)) * N;
     g.L[i] = gL + t * gX, g.M[i] = gM + t * gY, g.N[i] = gN + t * gZ;
@@ -142,6 +153,9 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
   Sums<T> sums;
   sums.gap = sum_gap, sums.c = sum_c, sums.k = sum_k, sums.n1 = sum_n1, sums.n2 = sum_n2;
   if constexpr (has_terms(kind)) sum_terms<kind>(to, notes, n, s.at->terms, sums.a);
+  if constexpr (is_freeform(kind)) sums.a[0] = sum_first;
+  if constexpr (kind == kBiconic) sums.a[1] = sum_second;
+  if constexpr (kind == kToroidal && terms > 1) sum_series<1, false, true>(to, notes, n, s.at->terms - 1, sums.a + 1);
   return sums;
 }
 

@@ -1,110 +1,10 @@
 // One ray at one surface in the arithmetic of raytrace/system/surface.py and search.py, with every case they know; in float64
 // also for float32 rays, for what becomes of a ray must not be decided by rounding.
 #pragma once
-#include "loops.h"
 #include "phases.h"
+#include "search.h"
 
 namespace raytrace {
-
-// First crossing with an asphere, search.py line by line: Newton's method from the base conic, accepted by a
-// residual relative to the size of the terms, and a bracketed search for the rays that fail.
-struct AsphereSearch {
-  const Surface<double>& s;
-  double x, y, z, L, M, N;
-
-  struct Residual { double F, dF, scale, u; bool inside; };
-  struct Found { double t; bool small, forward; double radius; };
-
-  Residual residual(double t) const {
-    double hx = x + t * L, hy = y + t * M, hz = z + t * N, u = hx * hx + hy * hy;
-    auto [S, dS, size, inside] = slope_at(s, u);
-    double radial = hx * L + hy * M;
-    double scale = std::fabs(hz) + std::fabs(s.c * u) + size + std::fabs(z) + std::fabs(t * N);
-    scale += 2 * std::fabs(dS) * (u + std::fabs(radial) * std::fabs(t));
-    return {hz - S, N - 2 * dS * radial, scale, u, inside};
-  }
-
-  Found newton(double t) const {
-    const double rounding = std::numeric_limits<double>::epsilon();
-    for (int step = 0; step < 24; step++) {
-      Residual r = residual(t);
-      if (r.dF == 0 || !std::isfinite(r.F)) break;
-      t -= r.F / r.dF;
-      if (!(std::fabs(r.F) > rounding * r.scale)) break;
-    }
-    Residual r = residual(t);
-    bool small = std::fabs(r.F) <= 64 * rounding * r.scale && r.inside && std::isfinite(t);
-    return {t, small, r.dF * (N < 0 ? -1 : 1) > 0, std::sqrt(r.u)};
-  }
-
-  double start() const {
-    double plane = std::fabs(N) > 1e-6 ? -z / N : 0, shape = 1 + s.k;
-    double A = s.c * (L * L + M * M + shape * N * N);
-    double G = N - s.c * (x * L + y * M + shape * z * N);
-    double F = s.c * (x * x + y * y + shape * z * z) - 2 * z;
-    double discriminant = G * G - A * F;
-    if (!(discriminant > 0) || !(G * N > 0)) return plane;
-    double t = F / (G + signed_as(std::sqrt(discriminant), N));
-    return std::hypot(x + t * L, y + t * M) <= s.rim ? t : plane;
-  }
-
-  bool bracketed(double& found_at) const {
-    const int samples = 96, bisections = 64;
-    const double infinity = std::numeric_limits<double>::infinity();
-    const double big = std::pow(std::numeric_limits<double>::max(), 0.48);  // its square is a number
-    double closed = (1 + s.k) * s.c * s.c, edge = closed > 0 ? 1 / std::sqrt(closed) : big;
-    double reach = 4 * (std::sqrt(x * x + y * y) + std::fabs(z));
-    double radius = edge < big ? std::fmin(edge, s.rim) : s.rim;
-    if (!(radius < big)) radius = reach;
-
-    double A = L * L + M * M, B = x * L + y * M, C = x * x + y * y - radius * radius;
-    double discriminant = B * B - A * C, width_root = std::sqrt(std::fmax(discriminant, 0.0));
-    double first = A > 0 ? (-B - width_root) / A : -big, last = A > 0 ? (-B + width_root) / A : big;
-    bool possible = A > 0 ? discriminant >= 0 : C <= 0;
-
-    double low = infinity, high = -infinity;
-    for (int i = 0; i <= 64; i++) {
-      double at = i / 64.0 * radius, S = slope_at(s, at * at * (1 - 1e-7)).S;
-      low = std::fmin(low, S), high = std::fmax(high, S);
-    }
-    double margin = (high - low) * 0.05 + std::numeric_limits<double>::min();
-    low -= margin, high += margin;
-    if (std::fabs(N) > 1e-9) {
-      double at_low = (low - z) / N, at_high = (high - z) / N;
-      first = std::fmax(first, std::fmin(at_low, at_high));
-      last = std::fmin(last, std::fmax(at_low, at_high));
-    }
-    if (!possible || !(last >= first)) return false;
-
-    double sign = N < 0 ? -1 : 1, width = (last - first) / samples, before = sign * residual(first).F;
-    bool found = false;
-    double left = first;
-    for (int i = 1; i <= samples && !found; i++) {
-      double t = first + i * width, after = sign * residual(t).F;
-      if (before <= 0 && after > 0) left = t - width, found = true;
-      before = after;
-    }
-    if (!found) return false;
-    double right = left + width;
-    for (int i = 0; i < bisections; i++) {
-      double middle = 0.5 * (left + right);
-      (sign * residual(middle).F <= 0 ? left : right) = middle;
-    }
-    double t = 0.5 * (left + right);
-    Found polished = newton(t);
-    bool stayed = polished.small && polished.forward && std::fabs(polished.t - t) <= std::fabs(width);
-    found_at = stayed ? polished.t : t;
-    return true;
-  }
-
-  bool operator()(double& t) const {
-    Found found = newton(start());
-    bool converged = found.small && found.forward;
-    t = found.t;
-    if (converged && found.radius <= s.rim) return true;
-    return bracketed(t) || converged;
-  }
-};
 
 inline const Surface<double>& in_double(const Surface<double>& s) { return s; }
 inline Surface<double> in_double(const Surface<float>& s) {
@@ -120,6 +20,7 @@ struct Ray { double x, y, z, L, M, N, path; };
 // Path from the foot of the perpendicular; whether there is a crossing.
 inline bool crossing(const Surface<double>& s, double x, double y, double z, double L, double M, double N, double& t) {
   if (has_terms(s.at->kind)) return AsphereSearch{s, x, y, z, L, M, N}(t);
+  if (is_freeform(s.at->kind)) return FreeformSearch{s, x, y, z, L, M, N}(t);
   double c = s.c, shape = 1 + s.k;
   double A = c * (L * L + M * M + shape * N * N);
   double G = s.at->kind == kSphere ? N : N - c * (x * L + y * M + shape * z * N);
@@ -143,7 +44,7 @@ bool carry(Ray& ray, const Surface<double>& s, const C* phase, double farthest, 
     if (!(std::fabs(t) < farthest)) return false;
     hx = x - t * L, hy = y - t * M, hz = 0;
   } else {
-    const bool asphere = has_terms(s.at->kind);
+    const bool asphere = has_terms(s.at->kind), freeform = is_freeform(s.at->kind);
     double slide = -(x * L + y * M + ahead * N), t = 0, F, dF;
     double px = x + slide * L, py = y + slide * M, pz = ahead + slide * N;
     if (!crossing(s, px, py, pz, L, M, N, t)) return false;
@@ -151,6 +52,9 @@ bool carry(Ray& ray, const Surface<double>& s, const C* phase, double farthest, 
     if (asphere) {
       Slope at = slope_at(s, hx * hx + hy * hy);
       F = hz - at.S, dF = N - 2 * at.dS * (hx * L + hy * M);
+    } else if (freeform) {
+      Height at = height_at(s, hx, hy);
+      F = hz - at.z, dF = N - (at.x * L + at.y * M);
     } else {
       F = 0.5 * s.c * (hx * hx + hy * hy + shape * hz * hz) - hz;
       dF = s.c * (hx * L + hy * M + shape * hz * N) - N;
@@ -160,6 +64,9 @@ bool carry(Ray& ray, const Surface<double>& s, const C* phase, double farthest, 
     if (asphere) {
       double dS = slope_at(s, hx * hx + hy * hy).dS;
       nx = -2 * dS * hx, ny = -2 * dS * hy, w = 1 + 4 * dS * dS * (hx * hx + hy * hy);
+    } else if (freeform) {
+      Height at = height_at(s, hx, hy);
+      nx = -at.x, ny = -at.y, w = 1 + nx * nx + ny * ny;
     } else {
       nx = -s.c * hx, ny = -s.c * hy, nz = 1 - shape * s.c * hz, w = 1 - s.k * s.c * s.c * (hx * hx + hy * hy);
     }

@@ -1,6 +1,6 @@
 // The surfaces as loops over a block: the algebra of raytrace/system/surface.py and trace.py where nothing can go wrong.
 #pragma once
-#include "sags.h"
+#include "freeform.h"
 
 namespace raytrace {
 
@@ -129,9 +129,18 @@ void newton(const Rays<T>& from, Notes<T>& notes, int n, const Surface<T>& s) {
     T x = from.x[i], y = from.y[i], z = from.z[i] - gap, L = from.L[i], M = from.M[i], N = from.N[i];
     T slide = x * L + y * M + z * N;
     T px = x - slide * L, py = y - slide * M, pz = z - slide * N;
-    T A = c * (L * L + M * M + shape * N * N);
-    T G = N - c * (px * L + py * M + shape * pz * N);
-    T F = c * (px * px + py * py + shape * pz * pz) - T(2) * pz;
+    T A, G, F;
+    if (is_freeform(kind)) {  // the quadric that osculates at the vertex, as round as its larger curvature is
+      T c_x = s.a[0], c_y = curvature_along_y<kind>(s);
+      T c_z = magnitude(c_x * px * px) > magnitude(c_y * py * py) ? c_x : c_y;
+      A = c_x * L * L + c_y * M * M + c_z * N * N;
+      G = N - (c_x * px * L + c_y * py * M + c_z * pz * N);
+      F = c_x * px * px + c_y * py * py + c_z * pz * pz - T(2) * pz;
+    } else {
+      A = c * (L * L + M * M + shape * N * N);
+      G = N - c * (px * L + py * M + shape * pz * N);
+      F = c * (px * px + py * py + shape * pz * pz) - T(2) * pz;
+    }
     T discriminant = G * G - A * F;
     bool usable = (discriminant > 0) & (G * N > 0);
     T t = F / (usable ? G + signed_as(root(usable ? discriminant : T(1)), N) : T(1));
@@ -149,9 +158,14 @@ void newton(const Rays<T>& from, Notes<T>& notes, int n, const Surface<T>& s) {
     for (int i = 0; i < n; i++) {
       T L = from.L[i], M = from.M[i], N = from.N[i], t = notes.t[i];
       T x = notes.px[i] + t * L, y = notes.py[i] + t * M, z = notes.pz[i] + t * N;
-      T u = x * x + y * y, S, dS, d2S;
-      sag<kind, false>(s, terms, u, S, dS, d2S);
-      T dF = N - T(2) * dS * (x * L + y * M);
+      T u = x * x + y * y, S, dS, d2S, dF;
+      if constexpr (is_freeform(kind)) {
+        const auto sheet = sheet_at<kind, terms, false>(s, x, y);
+        S = sheet.z, dF = N - (sheet.x * L + sheet.y * M);
+      } else {
+        sag<kind, false>(s, terms, u, S, dS, d2S);
+        dF = N - T(2) * dS * (x * L + y * M);
+      }
       T change = (z - S) / dF;
       bool active = notes.active[i] > 0;
       notes.t[i] = active ? t - change : t;
@@ -174,15 +188,24 @@ int cross_asphere(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, cons
   for (int i = 0; i < n; i++) {
     T x = from.x[i], y = from.y[i], z = from.z[i], L = from.L[i], M = from.M[i], N = from.N[i], t = notes.t[i];
     T hx = notes.px[i] + t * L, hy = notes.py[i] + t * M, hz = notes.pz[i] + t * N;
-    T u = hx * hx + hy * hy, S, dS, d2S;
-    bool good = sag<kind, false>(s, terms, u, S, dS, d2S);
-    T slope = T(2) * dS, cosine = N - slope * (hx * L + hy * M);
-    T w = T(1) + slope * slope * u;
+    T u = hx * hx + hy * hy, nx, ny, cosine, w;
+    bool good;
+    if constexpr (is_freeform(kind)) {
+      const auto sheet = sheet_at<kind, terms, false>(s, hx, hy);
+      good = sheet.inside, nx = -sheet.x, ny = -sheet.y;
+      cosine = N + nx * L + ny * M, w = T(1) + nx * nx + ny * ny;
+    } else {
+      T S, dS, d2S;
+      good = sag<kind, false>(s, terms, u, S, dS, d2S);
+      T slope = T(2) * dS;
+      nx = -slope * hx, ny = -slope * hy, cosine = N - slope * (hx * L + hy * M);
+      w = T(1) + slope * slope * u;
+    }
     // `active` is 1 where Newton's method has not arrived, and NaN compares as false.
     good &= (notes.active[i] < T(0.5)) & (u <= rim_squared) & (cosine * N > 0);
     good &= cosine * cosine > kGrazing<T> * T(0.1) * w;
     T l = L, m = M, o = N;
-    if (bend != kNone) good &= law(l, m, o, -slope * hx, -slope * hy, T(1), cosine, w);
+    if (bend != kNone) good &= law(l, m, o, nx, ny, T(1), cosine, w);
     if (path) to.path[i] = from.path[i] + s.n1 * reduced_path(hx, hy, hz, x, y, z, L, M, N, gap, has_gap, side);
     flagged += leave(to, notes, i, hx, hy, hz, l, m, o, good);
   }
@@ -203,6 +226,9 @@ void normals(const Rays<T>& at, Normals<T>& to, int n, const Surface<T>& s) {
       T S, dS, d2S;
       sag<kind, false>(s, terms, u, S, dS, d2S);
       nx = T(-2) * dS * x, ny = T(-2) * dS * y, w = T(1) + T(4) * dS * dS * u;
+    } else if constexpr (is_freeform(kind)) {
+      const auto sheet = sheet_at<kind, terms, false>(s, x, y);
+      nx = -sheet.x, ny = -sheet.y, w = T(1) + nx * nx + ny * ny;
     }
     to.x[i] = nx, to.y[i] = ny, to.z[i] = nz, to.w[i] = w;
   }

@@ -7,9 +7,11 @@
 
 namespace raytrace {
 
-enum Kind { kPlane, kSphere, kConic, kEven, kOdd };
+enum Kind { kPlane, kSphere, kConic, kEven, kOdd, kToroidal, kBiconic };
 
-constexpr bool has_terms(int kind) { return kind >= kEven; }
+constexpr bool has_terms(int kind) { return kind == kEven || kind == kOdd; }
+constexpr bool is_freeform(int kind) { return kind >= kToroidal; }  // see freeform.h
+constexpr bool is_searched(int kind) { return kind >= kEven; }
 
 template <int number>
 using Constant = std::integral_constant<int, number>;
@@ -54,7 +56,7 @@ inline void add_terms(const T* a, int count, T u, T& S, T& dS, T& d2S) {
 }
 
 // What a_j of Σ a_j v u^j, v = u or r, gets from each ray, s b_j + S̄' b_j', summed; s and S̄' stand in notes.px and py.
-template <int stride = 1, bool by_radius = false, typename T>
+template <int stride = 1, bool by_radius = false, bool along_y = false, typename T>
 void sum_series(const Rays<T>& to, Notes<T>& notes, int n, int count, T* sums) {
 #pragma omp simd
   for (int i = 0; i < n; i++) notes.pz[i] = 1;
@@ -62,7 +64,7 @@ void sum_series(const Rays<T>& to, Notes<T>& notes, int n, int count, T* sums) {
     T sum = 0;
 #pragma omp simd reduction(+ : sum)
     for (int i = 0; i < n; i++) {
-      T u = to.x[i] * to.x[i] + to.y[i] * to.y[i];
+      T u = along_y ? to.y[i] * to.y[i] : to.x[i] * to.x[i] + to.y[i] * to.y[i];
       if constexpr (by_radius) {
         const Radius<T> at(u);
         sum += notes.pz[i] * (notes.px[i] * at.r + T(2 * j + 1) * at.dr * notes.py[i]);
@@ -90,6 +92,9 @@ void sum_terms(const Rays<T>& to, Notes<T>& notes, int n, int count, T* sums) {
 template <typename Work>
 void by_kind_of_terms(const Layout& at, Work work) {
   if (at.kind == kOdd) work(Constant<kOdd>{}, Constant<8>{});
+  else if (at.kind == kToroidal && at.terms == 1) work(Constant<kToroidal>{}, Constant<1>{});
+  else if (at.kind == kToroidal) work(Constant<kToroidal>{}, Constant<8>{});
+  else if (at.kind == kBiconic) work(Constant<kBiconic>{}, Constant<2>{});
   else if (at.terms <= 4) work(Constant<kEven>{}, Constant<4>{});
   else if (at.terms <= 8) work(Constant<kEven>{}, Constant<8>{});
   else work(Constant<kEven>{}, Constant<kTerms>{});
@@ -115,8 +120,10 @@ inline Slope slope_at(const Surface<double>& s, double u) {
   double sizes[kTerms], d = 0, d2 = 0;
   for (int j = 0; j < kTerms; j++) sizes[j] = std::fabs(s.a[j]);
   by_kind_of_terms(*s.at, [&](auto kind, auto) {
-    found.inside = sag<kind(), false>(s, s.at->terms, u, found.S, found.dS, d2);
-    add_terms<kind(), false>(sizes, s.at->terms, u, found.size, d, d2);
+    if constexpr (has_terms(kind())) {
+      found.inside = sag<kind(), false>(s, s.at->terms, u, found.S, found.dS, d2);
+      add_terms<kind(), false>(sizes, s.at->terms, u, found.size, d, d2);
+    }
   });
   return found;
 }

@@ -50,6 +50,8 @@ void push(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, Notes<T>& notes, i
 
     // The normal, its squared length, and what the numbers of the surface do to F at the hit.
     T nx = 0, ny = 0, nz = 1, w = 1, S, dS = 0, d2S = 0, moved = 0, slope = 0, steep = 0;
+    [[maybe_unused]] std::conditional_t<is_freeform(kind), SheetOf<T, kind, terms>, int> sheet{};
+    [[maybe_unused]] Turned<T> turned{};
     if (kind == kSphere || kind == kConic) {
       nx = -c * hx, ny = -c * hy, nz = T(1) - shape * c * hz;
       if (kind == kConic) w = T(1) - k * c * c * u;
@@ -63,6 +65,11 @@ void push(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, Notes<T>& notes, i
       add_terms<kind, false>(change.a, terms, u, P, dP, d2P);
       moved = -(dc * u * over_w * over_w / (over_w + T(1)) + T(0.5) * dk * c * conic_sag * conic_sag * over_w + P);
       slope = T(0.5) * dc * third + T(0.25) * dk * c * (c * c * u) * third + dP;
+    } else if constexpr (is_freeform(kind)) {
+      sheet = sheet_at<kind, terms, true>(s, hx, hy);
+      nx = -sheet.x, ny = -sheet.y, w = T(1) + nx * nx + ny * ny;
+      turned = sheet.pushed(dc, dk, change.a);
+      moved = -turned.z;
     }
     T cosine = nx * L + ny * M + nz * N;
 
@@ -97,6 +104,9 @@ void push(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, Notes<T>& notes, i
       slope += T(0.5) * shape * steep * (steep * hx * (steep * px) + steep * hy * (steep * py));
       dnx = T(-2) * (slope * hx + dS * px), dny = T(-2) * (slope * hy + dS * py);
       dw = T(8) * (dS * u * slope + dS * hx * (dS * px) + dS * hy * (dS * py));
+    } else if constexpr (is_freeform(kind)) {
+      dnx = -(turned.x + sheet.xx * px + sheet.xy * py), dny = -(turned.y + sheet.xy * px + sheet.yy * py);
+      dw = T(2) * (nx * dnx + ny * dny);
     }
 
     // Behind the surface.

@@ -48,7 +48,7 @@ struct Of {
   static constexpr int law = bend == kPhase ? kNone : bend;
   static Crosses<T> crosses() {
     if constexpr (kind == kPlane) return cross_plane<T, law, path>;
-    else if constexpr (has_terms(kind)) return cross_asphere<T, kind, law, path, terms>;
+    else if constexpr (is_searched(kind)) return cross_asphere<T, kind, law, path, terms>;
     else return cross_conic<T, law, path, kind == kConic>;
   }
   static Pulls<T> pulls() { return pull<T, kind, bend, path, terms>; }

@@ -1,0 +1,138 @@
+"""Sags that are not round in the compiled trace: rays, adjoint and tangents as torch finds them."""
+
+import dataclasses
+
+import pytest
+import torch
+from fused_rays import CLOSE, assert_same_rays, both, some_rays, with_leaves
+from problems import scalar, vector
+from torch.autograd import gradcheck, gradgradcheck
+
+from raytrace.fused import tracing
+from raytrace.fused.structure import is_expressible
+from raytrace.maths.value import to
+from raytrace.media.glass import MIRROR
+from raytrace.optics.jacobian import hit_jacobian
+from raytrace.optics.trace import trace_surfaces
+from raytrace.system.rays import Rays
+from raytrace.system.surface import Surface
+
+
+def freeform(kind: str, curvature, conic, *coefficients: float, thickness: float = 4.0, **others) -> Surface:
+    c, k = (None if number is None else scalar(number) for number in (curvature, conic))
+    return Surface(scalar(thickness), c, k, vector(*coefficients), kind=kind, **others)
+
+
+#: Each with what it stands in: indices before and behind. Steep enough for rays of `some_rays` to miss some of them.
+FACES = {
+    "toroid": freeform("toroidal", 1 / 14, -0.7, -1 / 11, 1e-3, -2e-5, 1e-7),
+    "toroid of one curve": freeform("toroidal", 1 / 12, None, 1 / 9),
+    "cylinder along x": freeform("toroidal", None, None, 1 / 7),
+    "cylinder along y": freeform("toroidal", 1 / 7, None, 0.0),
+    "biconic": freeform("biconic", 1 / 12, -1.0, -1 / 15, 0.5),
+    "biconic of positive curvatures": freeform("biconic", 1 / 12, 0.3, 1 / 9, -2.5),
+}
+each = pytest.mark.parametrize("name", FACES)
+END = Surface(scalar(0.0))
+
+
+def systems(name: str) -> list[Surface]:
+    """The surface refracting into glass and out of it, and reflecting."""
+    face = FACES[name]
+    mirror = dataclasses.replace(face, glass=MIRROR, thickness=scalar(-9.0), semi_diameter=5.0)
+    return [face, dataclasses.replace(face, curvature=scalar(-0.02), thickness=scalar(6.0)), mirror]
+
+
+def indices(dtype=torch.float64) -> list[torch.Tensor]:
+    air, glass = scalar(1.0).to(dtype), scalar(1.6).to(dtype)
+    return [air, glass, air, air]
+
+
+@each
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("with_path", [True, False])
+def test_rays_of_all_fates_are_traced_as_by_torch(name, dtype, with_path):
+    surfaces, rays = to(systems(name), dtype=dtype), some_rays(dtype=dtype)
+    assert all(is_expressible(surface) for surface in surfaces)
+    rays = rays if with_path else dataclasses.replace(rays, opl=None)
+    fused, eager = both(lambda: trace_surfaces(surfaces, rays, indices=indices(dtype)))
+    assert 5 < int((~eager.valid).sum()) < 690
+    assert_same_rays(fused, eager, 10 * CLOSE[dtype])
+
+
+@each
+@pytest.mark.parametrize(("dtype", "close"), [(torch.float64, 1e-11), (torch.float32, 2e-3)])
+@pytest.mark.parametrize("with_path", [True, False])
+def test_the_adjoint_is_what_autograd_finds(name, dtype, close, with_path):
+    rays, given_surfaces = some_rays(dtype=dtype), to(systems(name), dtype=dtype)
+    weights = torch.randn(7, 700, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype)
+
+    def gradients():
+        surfaces, media, leaves = with_leaves(given_surfaces, indices(dtype))
+        given = [rays.position.clone().requires_grad_(), rays.direction.clone().requires_grad_()]
+        opl = rays.opl.clone().requires_grad_() if with_path else None
+        end = trace_surfaces(surfaces, Rays(*given, rays.valid, opl), indices=media)
+        out = [end.position, end.direction, *([end.opl[None]] if with_path else [])]
+        merit = sum((w * x).sum() for w, x in zip(weights.split([3, 3, 1]), out, strict=False))
+        return torch.autograd.grad(merit, [*leaves, *given, *([opl] if with_path else [])], allow_unused=True)
+
+    for f, e in zip(*both(gradients), strict=True):
+        if e is None:
+            assert f is None or not f.any()
+            continue
+        assert torch.isfinite(f).all()
+        assert float((f - e).abs().max()) <= close * (float(e.abs().max()) + 1.0)
+
+
+@each
+@pytest.mark.parametrize(("dtype", "close"), [(torch.float64, 1e-11), (torch.float32, 2e-3)])
+def test_the_tangents_are_those_of_torch(name, dtype, close):
+    rays = some_rays(200, dtype=dtype)
+    surfaces, media, leaves = with_leaves(to(systems(name), dtype=dtype), indices(dtype))
+    fused, eager = both(lambda: hit_jacobian(surfaces, rays, leaves, indices=media))
+    for f, e in zip(fused, eager, strict=True):
+        assert float((f - e).abs().max()) <= close * (float(e.abs().max()) + 1.0)
+
+
+@each
+def test_gradients_by_differences_and_their_gradients_with_lost_rays(name):
+    face = FACES[name]
+    rays = Rays(*(part[..., 46:54] for part in (some_rays().position, some_rays().direction, some_rays().valid)))
+
+    def hits(*numbers):
+        changed = dict(zip(("curvature", "conic", "coefficients"), numbers, strict=True))
+        changed["coefficients"] = changed["coefficients"] * share
+        surfaces = [dataclasses.replace(face, **changed), END]
+        end = trace_surfaces(surfaces, rays, indices=[*indices()[:2], indices()[1]])
+        return torch.where(end.valid, end.position[:2], 0.0)
+
+    numbers = [scalar(0.03) if n is None else n for n in (face.curvature, face.conic, face.coefficients)]
+    share = 3.0 ** (-2 * torch.arange(len(face.coefficients), dtype=torch.float64))  # so that all weigh alike
+    numbers = tuple((number / share if number.dim() else number).requires_grad_() for number in numbers)
+    with tracing("fused"):
+        assert gradcheck(hits, numbers, atol=1e-6)
+        assert gradgradcheck(hits, numbers, atol=1e-5, fast_mode=True)
+
+
+@each
+def test_rays_do_not_depend_on_their_neighbours_nor_gradients_on_threads(name):
+    rays = some_rays(40_000)
+
+    def gradient(threads):
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        try:
+            surfaces, media, leaves = with_leaves(systems(name), indices())
+            end = trace_surfaces(surfaces, rays, indices=media)
+            return torch.autograd.grad((end.position**2).sum(), leaves, allow_unused=True)
+        finally:
+            torch.set_num_threads(before)
+
+    with tracing("fused"):
+        for a, b in zip(gradient(1), gradient(2), strict=True):
+            assert a is b is None or torch.equal(a, b)
+        some = slice(1237, 1300)
+        few = Rays(rays.position[:, some], rays.direction[:, some], rays.valid[some], rays.opl[some])
+        alone, among = (trace_surfaces(systems(name), given, indices=indices()) for given in (few, rays))
+    assert torch.equal(alone.position, among.position[:, some])
+    assert torch.equal(alone.direction, among.direction[:, some])
