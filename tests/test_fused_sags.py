@@ -28,7 +28,7 @@ FACES = {
     "toroid": freeform("toroidal", 1 / 14, -0.7, -1 / 11, 1e-3, -2e-5, 1e-7),
     "toroid of one curve": freeform("toroidal", 1 / 12, None, 1 / 9),
     "cylinder along x": freeform("toroidal", None, None, 1 / 7),
-    "cylinder along y": freeform("toroidal", 1 / 7, None, 0.0),
+    "cylinder along y": freeform("toroidal", 1 / 14, None, 0.0),
     "biconic": freeform("biconic", 1 / 12, -1.0, -1 / 15, 0.5),
     "biconic of positive curvatures": freeform("biconic", 1 / 12, 0.3, 1 / 9, -2.5),
 }

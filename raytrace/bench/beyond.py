@@ -38,6 +38,15 @@ def conics() -> Lens:
     return lens
 
 
+def toroids() -> Lens:
+    """The same with every surface a toroid, its curvature along x 3 % stronger, planes as cylinders."""
+    lens = conics()
+    for number, surface in enumerate(lens.surfaces[1:-1], 1):
+        c = 1.03 * surface.curvature + 1e-4
+        lens = lens.replace(number, kind="toroidal", coefficients=c[None])
+    return lens
+
+
 def spectrometer() -> Lens:
     """Czerny and Turner's: slit, window, collimator, grating, camera mirror and detector; all but the slit tilted."""
     fold, grating = 8.0, -20.0
@@ -71,7 +80,7 @@ def spectrometer() -> Lens:
 
 
 #: What is measured, each over the first.
-SYSTEMS = {"conics": conics, "tilted grating spectrometer": spectrometer}
+SYSTEMS = {"conics": conics, "toroids": toroids, "tilted grating spectrometer": spectrometer}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,7 +21,7 @@ struct Toroid {
   T hx, hy, c, k, c_x;
   T z, x, y, xx, xy, yy;  // the sag and its derivatives
   bool inside;
-  T u, over_s, g, dS, dg, q, over_w, turn;  // over_s: 1/√ of the section along y
+  T u, over_s, share_s, g, dS, dg, q, over_w, turn;  // over_s, share_s: 1/√ of the section along y, 1/(1 + √)
 
   template <int second>
   void at(const Surface<T>& s, T px, T py, Constant<second>) {
@@ -29,8 +29,9 @@ struct Toroid {
     T shape = T(1) + k, radicand = T(1) - shape * c * c * u, d2S = 0;
     bool open = radicand > 0;
     T root_s = root(open ? radicand : std::numeric_limits<T>::min());
-    over_s = T(1) / root_s;
-    g = c * u / (T(1) + root_s), dS = T(0.5) * c * over_s;
+    T both_s = T(1) / (root_s * (T(1) + root_s));  // one division for two
+    over_s = (T(1) + root_s) * both_s, share_s = root_s * both_s;
+    g = c * u * share_s, dS = T(0.5) * c * over_s;
     series<second>(s.a + 1, terms - 1, u, g, dS, d2S);
     dg = T(2) * dS * hy;
     T p = c_x * hx;
@@ -38,8 +39,9 @@ struct Toroid {
     inside = open & (q > magnitude(p));
     q = inside ? q : T(1), p = inside ? p : T(0);
     T w = root((q - p) * (q + p));
-    over_w = T(1) / w;
-    z = g + hx * p / (q + w), x = p * over_w, y = q * over_w * dg;
+    T both = T(1) / (w * (q + w));
+    over_w = (q + w) * both;
+    z = g + hx * p * w * both, x = p * over_w, y = q * over_w * dg;
     if (second) {
       T tilt = c * over_s * hy;
       T d2g = T(2) * dS + shape * c * over_s * tilt * tilt + T(4) * d2S * u;
@@ -51,9 +53,9 @@ struct Toroid {
   // From the cotangents of z and its slopes.
   Shares<T> pulled(T gz, T gx, T gy) const {
     T height = q * over_w * (gz + turn * (gx * x + gy * y)) - gy * turn * dg, slope = gy * q * over_w;
-    T gdS = T(2) * slope * hy, third = over_s * over_s * over_s, conic_sag = c * u * over_s / (over_s + T(1));
+    T gdS = T(2) * slope * hy, third = over_s * over_s * over_s, conic_sag = c * u * share_s;
     Shares<T> to{};
-    to.c = T(0.5) * gdS * third + height * u * over_s * over_s / (over_s + T(1));
+    to.c = T(0.5) * gdS * third + height * u * over_s * share_s;
     to.k = T(0.25) * gdS * c * c * c * u * third + T(0.5) * height * c * conic_sag * conic_sag * over_s;
     T by_c = T(0.5) * over_w * (hx * hx + z * z - g * g), w_c = -(z + c_x * by_c);
     to.first = gz * by_c + over_w * (gx * (hx - x * w_c) - gy * (g * dg + y * w_c));
@@ -63,13 +65,40 @@ struct Toroid {
 
   // By changes of the numbers.
   Turned<T> pushed(T dc, T dk, const T* da) const {
-    T third = over_s * over_s * over_s, conic_sag = c * u * over_s / (over_s + T(1)), P = 0, dP = 0, d2P = 0;
+    T third = over_s * over_s * over_s, conic_sag = c * u * share_s, P = 0, dP = 0, d2P = 0;
     series<false>(da + 1, terms - 1, u, P, dP, d2P);
-    T height = dc * u * over_s * over_s / (over_s + T(1)) + T(0.5) * dk * c * conic_sag * conic_sag * over_s + P;
+    T height = dc * u * over_s * share_s + T(0.5) * dk * c * conic_sag * conic_sag * over_s + P;
     T slope = T(2) * hy * (T(0.5) * dc * third + T(0.25) * dk * c * (c * c * u) * third + dP);
     T by_c = T(0.5) * over_w * (hx * hx + z * z - g * g), w_c = -(z + c_x * by_c), lift = q * over_w * height;
     return {lift + da[0] * by_c, turn * x * lift + da[0] * over_w * (hx - x * w_c),
             turn * (y * lift - dg * height) + q * over_w * slope - da[0] * over_w * (g * dg + y * w_c)};
+  }
+};
+
+// E = z - g - c_x (x² + z² - g²)/2, which is 0 on a toroid, along a ray: E/E' with one division, or the normal ∇E, which
+// needs no second root: (-c_x x, -q g', 1 - c_x z).
+// In float64, where roots and divisions are what a crossing costs; in float32 the sag itself is faster.
+template <typename T>
+constexpr bool has_ring(int kind) { return kind == kToroidal && sizeof(T) == 8; }
+
+template <typename T, int terms>
+struct Ring {
+  T root_s, scale, g, dg;  // g and g' times the scale
+  bool open;
+
+  Ring(const Surface<T>& s, T y) {
+    T c = s.c, u = y * y, radicand = T(1) - (T(1) + s.k) * c * c * u, P = 0, dP = 0, d2P = 0;
+    open = radicand > 0;
+    root_s = root(open ? radicand : std::numeric_limits<T>::min());
+    scale = root_s * (T(1) + root_s);
+    series<false>(s.a + 1, terms - 1, u, P, dP, d2P);
+    g = c * u * root_s + P * scale, dg = y * (c * (T(1) + root_s) + T(2) * dP * scale);
+  }
+
+  T newton(T c_x, T x, T z, T L, T M, T N) const {
+    T square = scale * scale;
+    T E = (z - T(0.5) * c_x * (x * x + z * z)) * square - g * scale + T(0.5) * c_x * g * g;
+    return E / (((T(1) - c_x * z) * N - c_x * x * L) * square - (scale - c_x * g) * dg * M);
   }
 };
 

@@ -159,14 +159,19 @@ void newton(const Rays<T>& from, Notes<T>& notes, int n, const Surface<T>& s) {
       T L = from.L[i], M = from.M[i], N = from.N[i], t = notes.t[i];
       T x = notes.px[i] + t * L, y = notes.py[i] + t * M, z = notes.pz[i] + t * N;
       T u = x * x + y * y, S, dS, d2S, dF;
-      if constexpr (is_freeform(kind)) {
-        const auto sheet = sheet_at<kind, terms, false>(s, x, y);
-        S = sheet.z, dF = N - (sheet.x * L + sheet.y * M);
+      T change;
+      if constexpr (has_ring<T>(kind)) {
+        change = Ring<T, terms>(s, y).newton(s.a[0], x, z, L, M, N);
       } else {
-        sag<kind, false>(s, terms, u, S, dS, d2S);
-        dF = N - T(2) * dS * (x * L + y * M);
+        if constexpr (is_freeform(kind)) {
+          const auto sheet = sheet_at<kind, terms, false>(s, x, y);
+          S = sheet.z, dF = N - (sheet.x * L + sheet.y * M);
+        } else {
+          sag<kind, false>(s, terms, u, S, dS, d2S);
+          dF = N - T(2) * dS * (x * L + y * M);
+        }
+        change = (z - S) / dF;
       }
-      T change = (z - S) / dF;
       bool active = notes.active[i] > 0;
       notes.t[i] = active ? t - change : t;
       bool more = active & !(change * change <= kSmallStep<T> * kSmallStep<T> * (u + z * z));
@@ -188,9 +193,15 @@ int cross_asphere(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, cons
   for (int i = 0; i < n; i++) {
     T x = from.x[i], y = from.y[i], z = from.z[i], L = from.L[i], M = from.M[i], N = from.N[i], t = notes.t[i];
     T hx = notes.px[i] + t * L, hy = notes.py[i] + t * M, hz = notes.pz[i] + t * N;
-    T u = hx * hx + hy * hy, nx, ny, cosine, w;
+    T u = hx * hx + hy * hy, nx, ny, nz = 1, cosine, w;
     bool good;
-    if constexpr (is_freeform(kind)) {
+    if constexpr (has_ring<T>(kind)) {
+      const Ring<T, terms> ring(s, hy);
+      T c_x = s.a[0], over = T(1) / ring.scale, q = T(1) - c_x * ring.g * over;
+      nx = -c_x * hx, ny = -q * ring.dg * over, nz = T(1) - c_x * hz;
+      good = ring.open & (q > 0) & (nz > (T(1) - kEdge<T>) * q);
+      cosine = nx * L + ny * M + nz * N, w = nx * nx + ny * ny + nz * nz;
+    } else if constexpr (is_freeform(kind)) {
       const auto sheet = sheet_at<kind, terms, false>(s, hx, hy);
       good = sheet.inside, nx = -sheet.x, ny = -sheet.y;
       cosine = N + nx * L + ny * M, w = T(1) + nx * nx + ny * ny;
@@ -205,7 +216,7 @@ int cross_asphere(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, cons
     good &= (notes.active[i] < T(0.5)) & (u <= rim_squared) & (cosine * N > 0);
     good &= cosine * cosine > kGrazing<T> * T(0.1) * w;
     T l = L, m = M, o = N;
-    if (bend != kNone) good &= law(l, m, o, nx, ny, T(1), cosine, w);
+    if (bend != kNone) good &= law(l, m, o, nx, ny, nz, cosine, w);
     if (path) to.path[i] = from.path[i] + s.n1 * reduced_path(hx, hy, hz, x, y, z, L, M, N, gap, has_gap, side);
     flagged += leave(to, notes, i, hx, hy, hz, l, m, o, good);
   }
