@@ -100,11 +100,12 @@ def test_real_files_come_back_bit_for_bit(path, tmp_path):
     plain = not any(
         is_posed(surface) or is_freeform(surface) or surface.phase or surface.departure for surface in lens.surfaces
     )
+    one = dataclasses.replace(lens, operands=(), current_configuration=1)  # others hold one configuration
     for suffix in SUFFIXES if plain else [".zmx", ".seq"]:
         refused = [LensFileError] if suffix == ".seq" else []  # where CODE V has no command for it
         with contextlib.suppress(*refused):
             write_lens(lens, tmp_path / f"lens{suffix}")
-            assert leaves(read_lens(tmp_path / f"lens{suffix}")) == leaves(lens)
+            assert leaves(read_lens(tmp_path / f"lens{suffix}")) == leaves(lens if suffix == ".zmx" else one)
 
 
 @pytest.mark.parametrize("path", OWN, ids=lambda path: path.name)

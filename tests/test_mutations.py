@@ -1,5 +1,6 @@
 """Damaged files: every reader gives a value or its own one-line error, in 5 s and 500 MB."""
 
+import contextlib
 import io
 import os
 import zipfile
@@ -11,10 +12,13 @@ import torch
 from mutations import Reader, survive
 from PIL import Image
 from problems import number
+from test_configurations import CASES as CONFIGURED
+from test_configurations import scan
 from test_oslo import CONIC, FAR, SINGLET, double_gauss
 from test_oslo import text as oslo_text
 from test_prescriptions import LOWENTHAL, NOCTILUX, summilux
 from test_seq import ACHROMAT, ASPHERE, DOUBLE_GAUSS, EVERYTHING, QUESTAR, THREE_MIRRORS
+from test_zemax import file
 from test_zemax_archive import archive
 from test_zemax_types import CASES, text
 
@@ -26,6 +30,7 @@ from raytrace.maths.arrays import ArrayError, read_npy, read_npz
 from raytrace.media.agf import CatalogError, read_agf
 from raytrace.media.catalog import UnknownGlass
 from raytrace.media.glass import ImplausibleWavelength, InvalidIndex
+from raytrace.system.configurations import count
 from raytrace.wave.element import Pixels, Rings
 from raytrace.wave.exchange import FORMATS as HEIGHTS
 from raytrace.wave.exchange import HeightMapError, read_heights, write_heights
@@ -107,11 +112,18 @@ def lenses(suffix: str, folder: Path) -> Reader:
         originals += own + [text.encode() for text in texts]
     elif suffix == ".zmx":
         originals += [text(name).encode() for name in CASES]
+        configured = (file(**changes, tail=tail) for tail, changes, _ in CONFIGURED.values())
+        originals += [one.encode() for one in (scan(), *configured)]
     else:
         originals += [text.encode() for text in (summilux("No.,R,Nd,νd,d", "No R n V d"), NOCTILUX, LOWENTHAL)]
-    return Reader(
-        tuple(originals), from_file(read_lens_with_report, folder / f"lens{suffix}"), (LensFileError, UnknownGlass)
-    )
+
+    def read(path: Path) -> None:
+        lens, _ = read_lens_with_report(path)
+        for one in range(1, count(lens.operands) + 1):
+            with contextlib.suppress(ValueError):  # a configuration that differs in what is not followed
+                lens.configuration(one)
+
+    return Reader(tuple(originals), from_file(read, folder / f"lens{suffix}"), (LensFileError, UnknownGlass))
 
 
 def oslo(folder: Path) -> Reader:

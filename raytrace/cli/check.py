@@ -23,4 +23,9 @@ def options(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace):
     from raytrace.cli.door import catalogs, find_lens
 
-    return raytrace.check(find_lens(arguments.lens), catalogs=catalogs(arguments), strict=arguments.strict)
+    return raytrace.check(
+        find_lens(arguments.lens),
+        catalogs=catalogs(arguments),
+        strict=arguments.strict,
+        configuration=arguments.configuration,
+    )

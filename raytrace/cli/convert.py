@@ -3,7 +3,7 @@
 import argparse
 
 import raytrace
-from raytrace.cli.options import catalog, file_name, json
+from raytrace.cli.options import catalog, configuration, file_name, json
 
 SUMMARY = "write a lens in another format"
 DESCRIPTION = "Read a lens file and write it as the suffix of OUT says. Every number comes back bit for bit."
@@ -18,6 +18,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "target", metavar="OUT", type=file_name, help="lens file to write: .zmx, .seq, .csv, .tsv, .txt"
     )
+    configuration(parser)
     catalog(parser)
     json(parser)
     parser.add_argument("--strict", action="store_true", help="fail on anything unknown or assumed in IN")
@@ -27,4 +28,6 @@ def run(arguments: argparse.Namespace):
     from raytrace.cli.door import catalogs, find_lens
 
     path, own = find_lens(arguments.source), catalogs(arguments)
-    return raytrace.convert(path, arguments.target, catalogs=own, strict=arguments.strict)
+    return raytrace.convert(
+        path, arguments.target, catalogs=own, strict=arguments.strict, configuration=arguments.configuration
+    )

@@ -36,7 +36,7 @@ def find_lens(name: str) -> Path:
 def open_lens(arguments: argparse.Namespace) -> Lens:
     """Read the lens and set the conditions that the arguments name; one object distance at a time."""
     path = find_lens(arguments.lens)
-    lens = read_lens(path, catalogs=catalogs(arguments))
+    lens = read_lens(path, catalogs=catalogs(arguments), configuration=getattr(arguments, "configuration", None))
     given = {name: getattr(arguments, name, None) for name in CONDITIONS}
     distance = getattr(arguments, "object_distances", None)
     try:

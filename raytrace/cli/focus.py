@@ -44,13 +44,15 @@ def run(arguments):
     from raytrace.cli.door import catalogs, find_lens, say
     from raytrace.cli.run import verb_of_lens
     from raytrace.formats import read_lens, write_lens
+    from raytrace.system.lens import with_sensor_distance
 
     found = verb_of_lens(sys.modules[__name__], arguments)
     if arguments.output:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # said when the file was read first
-            original = read_lens(find_lens(arguments.lens), catalogs=catalogs(arguments))
-        write_lens(original.at(sensor_distance=found.sensor_distance), arguments.output)
+            path, one = find_lens(arguments.lens), arguments.configuration
+            original = read_lens(path, catalogs=catalogs(arguments), configuration=one)
+        write_lens(with_sensor_distance(original, found.sensor_distance), arguments.output)
         say(f"written: {arguments.output}")
         arguments.output = None
     return found

@@ -141,10 +141,20 @@ def _number(text: str) -> float:
 
 
 def lens(parser: argparse.ArgumentParser) -> None:
-    """LENS, --catalog, --json."""
+    """LENS, --configuration, --catalog, --json."""
     parser.add_argument("lens", metavar="LENS", type=file_name, help="lens file, or the name of a shipped lens")
+    configuration(parser)
     catalog(parser)
     json(parser)
+
+
+def configuration(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--configuration",
+        metavar="N",
+        type=count,
+        help="which one of a multi-configuration file, from 1 (default: the one that was active when it was saved)",
+    )
 
 
 def catalog(parser: argparse.ArgumentParser) -> None:

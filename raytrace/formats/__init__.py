@@ -20,6 +20,7 @@ from raytrace.formats import (
     zemax_write,
 )
 from raytrace.formats.report import ImportReport as ImportReport
+from raytrace.formats.report import Varied
 from raytrace.formats.source import LensFileError as LensFileError
 from raytrace.formats.source import LensFileWarning as LensFileWarning
 from raytrace.formats.source import Place, decode, read_text, shown
@@ -35,18 +36,20 @@ from raytrace.system.lens import check as check_lens
 class Format(NamedTuple):
     """read(text, file, catalogs, strict) -> (Lens, ImportReport); write(lens, file, catalogs) -> content.
 
-    write: None for a format that is only read. load: what of a file's content is read, its text.
+    write: None for a format that is only read. load: what of a file's content is read, its text. configurations:
+    whether a file may hold several, of which `read` takes the number of one.
     """
 
     read: Callable[..., tuple[Lens, ImportReport]]
     write: Callable[..., bytes] | None = None
     load: Callable[[Path], str | bytes] = read_text
+    configurations: bool = False
 
 
 #: The formats by suffix, in lower case.
 FORMATS = {
-    ".zmx": Format(zemax_read.read, zemax_write.write),
-    ".zar": Format(zemax_archive.read, load=zemax_archive.load),
+    ".zmx": Format(zemax_read.read, zemax_write.write, configurations=True),
+    ".zar": Format(zemax_archive.read, load=zemax_archive.load, configurations=True),
     ".seq": Format(seq_read.read, seq_write.write),
     ".len": Format(oslo_read.read),
     ".csv": Format(table_read.read, table_write.write),
@@ -58,40 +61,65 @@ FORMATS = {
 WRITTEN = tuple(suffix for suffix, form in FORMATS.items() if form.write)
 
 
-def read_lens(path: str | os.PathLike, *, catalogs: Sequence[str | Path] = (), strict: bool = False) -> Lens:
+def read_lens(
+    path: str | os.PathLike,
+    *,
+    catalogs: Sequence[str | Path] = (),
+    strict: bool = False,
+    configuration: int | None = None,
+) -> Lens:
     """The lens of a file, in mm and µm: .zmx, .zar (OpticStudio), .seq (CODE V), .len (OSLO), or a table.
 
     path: of a file, or the name of a shipped lens, as "double_gauss". catalogs: further glass catalogs (.agf), searched
     as `raytrace.media.catalog.find_glass` does; a catalog that the file names and that lies beside it, or in it, is
     found by itself. strict: raise where the file holds something unknown or something has
-    to be assumed; otherwise that is one LensFileWarning.
+    to be assumed; otherwise that is one LensFileWarning. configuration: which one of a multi-configuration file, from
+    1; by default the one that was active when it was saved. `lens.configurations` are all of them.
     Raises LensFileError, its subclass UnsupportedSurface, and UnknownGlass, each naming file, line and surface.
     """
-    lens, report = read_lens_with_report(path, catalogs=catalogs, strict=strict)
+    lens, report = read_lens_with_report(path, catalogs=catalogs, strict=strict, configuration=configuration)
     if report.warnings:
         warnings.warn("; ".join(report.warnings), LensFileWarning, stacklevel=2)
     return lens
 
 
 def read_lens_with_report(
-    path: str | os.PathLike, *, catalogs: Sequence[str | Path] = (), strict: bool = False
+    path: str | os.PathLike,
+    *,
+    catalogs: Sequence[str | Path] = (),
+    strict: bool = False,
+    configuration: int | None = None,
 ) -> tuple[Lens, ImportReport]:
     """As `read_lens`, with the report of what became of every keyword; its warnings are in it, and not issued."""
     path = Path(path)
     if not path.exists():
         path = shipped_lens(path) or path
     form = _format(path)
-    lens, report = form.read(form.load(path), str(path), catalogs=tuple(catalogs), strict=strict)
+    asked = {"configuration": configuration} if form.configurations else {}
+    lens, report = form.read(form.load(path), str(path), catalogs=tuple(catalogs), strict=strict, **asked)
+    if configuration is not None and configuration != lens.current_configuration:
+        there = "a file of this format holds one"
+        raise LensFileError(f"has no configuration {configuration}; {there}", Place(str(path)))
     _refuse_other_units(lens, path)
-    return lens, dataclasses.replace(report, surfaces=len(lens.surfaces), stop_surface=lens.stop)
+    varied = [Varied(str(operand), tuple(operand.values())) for operand in lens.operands if operand.name != "MOFF"]
+    return lens, dataclasses.replace(
+        report, surfaces=len(lens.surfaces), stop_surface=lens.stop, configurations=tuple(varied)
+    )
 
 
-def check(path: str | os.PathLike, *, catalogs: Sequence[str | Path] = (), strict: bool = False) -> ImportReport:
+def check(
+    path: str | os.PathLike,
+    *,
+    catalogs: Sequence[str | Path] = (),
+    strict: bool = False,
+    configuration: int | None = None,
+) -> ImportReport:
     """What was read from a lens file, what was not, and where each glass came from.
 
-    strict: raise where something was assumed. Raises as `read_lens`, and LensFileError for what cannot be traced.
+    strict: raise where something was assumed. configuration: which one has to be such that it can be traced. Raises as
+    `read_lens`, and LensFileError for what cannot be traced.
     """
-    lens, report = read_lens_with_report(path, catalogs=catalogs, strict=strict)
+    lens, report = read_lens_with_report(path, catalogs=catalogs, strict=strict, configuration=configuration)
     try:
         check_lens(lens)
     except ValueError as error:
@@ -121,9 +149,10 @@ def convert(
     *,
     catalogs: Sequence[str | Path] = (),
     strict: bool = False,
+    configuration: int | None = None,
 ) -> Conversion:
     """Read a lens file and write it in the format of the suffix of `target`; as `read_lens` and `write_lens`."""
-    lens, report = read_lens_with_report(source, catalogs=catalogs, strict=strict)
+    lens, report = read_lens_with_report(source, catalogs=catalogs, strict=strict, configuration=configuration)
     for warning in report.warnings:
         warnings.warn(warning, LensFileWarning, stacklevel=2)
     write_lens(lens, target, catalogs=catalogs)
@@ -182,6 +211,10 @@ def _changed_texts(lens: Lens, content: bytes, form: Format, path: Path, catalog
     pairs += [(f"the catalog {name}", name, "") for name in lost]
     comments = zip(lens.surfaces, again.surfaces, strict=True)
     pairs += [(f"the comment of surface {k}", a.comment, b.comment) for k, (a, b) in enumerate(comments)]
+    if len(lens.configurations) != len(again.configurations):
+        pairs.append((f"the other configurations, {len(lens.configurations)} in all", lens.current_configuration, 0))
+    else:
+        pairs += [(str(a), a.values(), b.values()) for a, b in zip(lens.operands, again.operands, strict=False)]
     return [f"{what} ({shown(str(before))})" for what, before, after in pairs if before != after]
 
 

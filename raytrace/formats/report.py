@@ -53,12 +53,28 @@ class GlassSource:
         return f"surface {self.surface}: {self.name or '(unnamed)'}, {self.source}"
 
 
+@dataclass(frozen=True)
+class Varied:
+    """What differs between the configurations of a lens: the operand, "THIC 6", and its value in each."""
+
+    operand: str
+    values: tuple
+
+    def __str__(self) -> str:
+        return f"{self.operand:<12} " + " ".join(f"{_short(one):>14}" for one in self.values)
+
+
+def _short(one: object) -> str:
+    return f"{one:.9g}" if isinstance(one, float) else "-" if one is None else str(one)[:14] or '""'
+
+
 @value
 class ImportReport(Result):
     """What became of a lens file: every keyword met, where each glass came from, notes and warnings.
 
     A note says what was done where the file leaves a choice; a warning says what was assumed or lost, and is an
     error when the file is read with `strict=True`. surfaces, stop_surface: of the lens that was read.
+    configurations: what differs between those of a multi-configuration file.
     """
 
     file: str
@@ -69,9 +85,11 @@ class ImportReport(Result):
     warnings: tuple[str, ...] = ()
     surfaces: int = 0
     stop_surface: int = 0
+    configurations: tuple[Varied, ...] = ()
 
     def document(self) -> dict:
-        return asdict(self)
+        found = asdict(self)
+        return found if self.configurations else {name: one for name, one in found.items() if name != "configurations"}
 
     def columns(self) -> dict[str, Tensor]:
         """A row for each keyword."""
@@ -89,6 +107,9 @@ class ImportReport(Result):
             chosen = [str(keyword) for keyword in self.keywords if keyword.status == status]
             listed = _wrapped(chosen) if status == READ else [f"    {keyword}" for keyword in chosen]
             lines += [f"  {title}:", *listed] if chosen else []
+        if self.configurations:
+            numbers = " ".join(f"{k:>14}" for k in range(1, len(self.configurations[0].values) + 1))
+            lines += ["  configurations:", f"    {'':<12} {numbers}", *(f"    {one}" for one in self.configurations)]
         lines += ["  glasses:", *(f"    {use}" for use in self.glasses)] if self.glasses else []
         return "\n".join(lines)
 

@@ -81,7 +81,12 @@ def load(path: Path) -> bytes:
 
 
 def read(
-    content: bytes, file: str, *, catalogs: Sequence[Path] = (), strict: bool = False
+    content: bytes,
+    file: str,
+    *,
+    catalogs: Sequence[Path] = (),
+    strict: bool = False,
+    configuration: int | None = None,
 ) -> tuple[Lens, ImportReport]:
     """The lens of an archive's bytes and the report of its import, members first; otherwise as `zemax_read.read`."""
     found = members(content, Place(file))
@@ -90,7 +95,8 @@ def read(
     text = decode(unpacked(lens_member, MAX_BYTES, place), place)
     used: set[str] = set()
     packed = _catalogs(found, used)
-    lens, report = zemax_read.read(text, place.file, catalogs=catalogs, strict=strict, packed=packed)
+    own = {"catalogs": catalogs, "strict": strict, "configuration": configuration, "packed": packed}
+    lens, report = zemax_read.read(text, place.file, **own)
     listed = _listed(found, lens_member, used, file).finished(strict=strict)
     return lens, dataclasses.replace(
         report,

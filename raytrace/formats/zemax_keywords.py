@@ -64,7 +64,7 @@ SURFACE_IGNORED = _left_out(
 )
 
 #: What follows the last surface belongs to these, and not to the lens.
-TAIL_REASON = "merit function, tolerances or configurations: not part of the lens"
+TAIL_REASON = "merit function or tolerances: not part of the lens"
 
 #: Types of surface that are not modelled, by what OpticStudio calls them; those that are, are rows of `TYPES`.
 _TYPES = (
@@ -176,7 +176,7 @@ class Block:
 
 
 class Sections(NamedTuple):
-    """A file sorted: the system, one block per surface, and the multi-configuration operands that follow."""
+    """A file sorted: the system, one block per surface, and what follows them, multi-configuration operands last."""
 
     system: Block
     surfaces: list[Block]
@@ -197,7 +197,8 @@ def sections(text: str, file: str, report: Draft) -> Sections:
     """The records sorted by the keyword tables, each of them reported.
 
     A surface's records are indented in files of OpticStudio; in files that lost the indentation the keyword decides.
-    After the last surface come merit function, tolerances and configurations, whose operands have names of their own.
+    After the last surface come merit function, tolerances and configurations, whose operands have names of their own;
+    those after MNUM, the configurations, are left to be reported by who reads them.
     """
     found, of_surface = list(records(text, file)), surface_read()
     start = next((position for position, record in enumerate(found, 1) if record.keyword == "SURF"), None)
@@ -219,12 +220,19 @@ def sections(text: str, file: str, report: Draft) -> Sections:
         elif word not in SYSTEM_READ and (after_surfaces or (surfaces and word not in SYSTEM_IGNORED)):
             block, after_surfaces = system, True
             tail.append(record)
-            report.met(word, IGNORED, record.place, TAIL_REASON)
+            if not _follows_head(system, surfaces):
+                report.met(word, IGNORED, record.place, TAIL_REASON)
         else:
             block = system
             _classify(record, system, SYSTEM_READ, SYSTEM_IGNORED, report)
     _warn_of_repeats([system, *surfaces], report)
     return Sections(system, surfaces, tail)
+
+
+def _follows_head(system: Block, surfaces: list[Block]) -> bool:
+    """Whether MNUM, which heads the multi-configuration operands, has been met behind the surfaces."""
+    head = system.last("MNUM")
+    return bool(head and surfaces) and head.place.line > surfaces[-1].place.line
 
 
 def _next_surface(record: Record, surfaces: list[Block]) -> Block:

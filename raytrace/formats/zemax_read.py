@@ -9,20 +9,21 @@ that OpticStudio itself stored:
 - A surface without TYPE is STANDARD. CURV 0 and CONI 0 become None: a plane, a sphere.
 - EVENASPH: PARM j is the coefficient of r^(2j), from r² on.
 - WAVM has padded slots, field lists are padded; FTYP tells how many are used. PWAV counts from 1.
-- The surfaces of a multi-configuration file hold the configuration active when it was saved, normally the first.
+- The surfaces of a multi-configuration file hold the configuration active when it was saved, normally the first;
+  the others are read from its operands (`zemax_configurations`).
 """
 
-import re
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from torch import Tensor
 
-from raytrace.formats import zemax_surface
+from raytrace.formats import zemax_configurations, zemax_surface
 from raytrace.formats.media import AtHand, catalogs_at_hand
 from raytrace.formats.report import Draft, ImportReport
 from raytrace.formats.source import LensFileError, UnsupportedSurface, shown
-from raytrace.formats.spelling import MILLIMETRES, double, is_number, refuse_overflow
+from raytrace.formats.spelling import MILLIMETRES, double, refuse_overflow
 from raytrace.formats.zemax_keywords import (
     FIELD_KINDS,
     FIELD_LISTS,
@@ -35,51 +36,71 @@ from raytrace.formats.zemax_keywords import (
     sections,
 )
 from raytrace.system.lens import RAY_AIMING, Fields, Lens, SystemAperture
+from raytrace.system.surface import Surface
 
 #: More field points or wavelengths than any file has.
 _MOST = 1000
 
 
 def read(
-    text: str, file: str, *, catalogs: Sequence[Path] = (), strict: bool = False, packed: AtHand | None = None
+    text: str,
+    file: str,
+    *,
+    catalogs: Sequence[Path] = (),
+    strict: bool = False,
+    configuration: int | None = None,
+    packed: AtHand | None = None,
 ) -> tuple[Lens, ImportReport]:
     """The lens of a .zmx text and the report of its import.
 
     file: its name, for messages and for the catalogs beside it. catalogs: further glass catalogs (.agf). strict: every
-    warning is an error. packed: the catalogs of an archive, instead of those beside the file.
+    warning is an error. configuration: which one of a multi-configuration file, from 1; None: the one that its surfaces
+    hold. packed: the catalogs of an archive, instead of those beside the file.
     Raises LensFileError, UnsupportedSurface (a type that is not modelled) and UnknownGlass.
     """
     report = Draft(file, "zmx")
     found = sections(text, file, report)
     _refuse_incomplete(found)
     zemax_surface.refuse_unsupported(found.surfaces)
-    system = found.system
-    unit = _millimetres(system, report)
-    stop = _stop(found.surfaces)
-    names = tuple(name for record in system.all("GCAT") for name in record.words)
+    unit = _millimetres(found.system, report)
+    names = tuple(name for record in found.system.all("GCAT") for name in record.words)
     at_hand = catalogs_at_hand(names, catalogs, report, packed)
-    surfaces = [
-        zemax_surface.build(block, unit, catalogs=at_hand, user=catalogs, report=report) for block in found.surfaces
-    ]
+    build = partial(zemax_surface.build, millimetres=unit, catalogs=at_hand, user=catalogs)
+    lens = _lens(found, [build(block, report=report) for block in found.surfaces], unit, report)
+    refuse_overflow(lens, file)
+    _remarks(found, report)
+    known = dict(zip(found.surfaces, lens.surfaces, strict=True))
+
+    def rebuild(other: Sections) -> Lens:
+        """The lens of changed records; what they were before is known."""
+        draft = Draft(file, "zmx")
+        surfaces = [known.get(block) or build(block, report=draft) for block in other.surfaces]
+        changed = _lens(other, surfaces, unit, draft)
+        refuse_overflow(changed, file)
+        return changed
+
+    lens = zemax_configurations.read(found, lens, rebuild, report, configuration)
+    return lens, report.finished(strict=strict)
+
+
+def _lens(found: Sections, surfaces: Sequence[Surface], unit: float, report: Draft) -> Lens:
+    """The lens of these surfaces and the records of the system."""
+    system, stop = found.system, _stop(found.surfaces)
     wavelengths, weights = _wavelengths(system, report)
-    primary = _primary(system, len(wavelengths), report)
     name = system.last("NAME")
-    lens = Lens(
+    return Lens(
         surfaces=tuple(surfaces),
         stop=stop,
         aperture=_aperture(system, surfaces[stop].semi_diameter, unit, report),
         fields=_fields(system, unit, report),
         wavelengths=wavelengths,
         wavelength_weights=weights,
-        primary_wavelength=primary,
+        primary_wavelength=_primary(system, len(wavelengths), report),
         name=name.text.strip() if name else "",
         notes=_notes(system),
-        catalogs=names,
+        catalogs=tuple(name for record in system.all("GCAT") for name in record.words),
         ray_aiming=_ray_aiming(system),
     )
-    refuse_overflow(lens, file)
-    _remarks(found, report)
-    return lens, report.finished(strict=strict)
 
 
 def _refuse_incomplete(found: Sections) -> None:
@@ -281,7 +302,7 @@ def _ray_aiming(system: Block) -> str:
 
 
 def _remarks(found: Sections, report: Draft) -> None:
-    """Say what the file asks for and the lens does not carry: environment, apodisation, afocal, configurations."""
+    """Say what the file asks for and the lens does not carry: environment, apodisation, afocal."""
     environment = found.system.last("ENVD")
     if environment and environment.words:
         celsius, pressure = environment.number(0, "temperature"), environment.number(1, "pressure", 1.0)
@@ -295,77 +316,3 @@ def _remarks(found: Sections, report: Draft) -> None:
         record = found.system.last(keyword)
         if record and record.integer(position, what, 0):
             report.warn(message, record.place)
-    head = found.system.last("MNUM")
-    if head:
-        count = head.integer(0, "number of configurations", 1)
-        operands = [other for other in found.tail if _is_operand(other, head)]
-        active = 1 if count == 1 else head.integer(1, "active configuration", 0) or _active(found.surfaces, operands)
-        if count > 1:
-            _say_which(head, count, active, operands, report)
-        else:
-            _only_configuration(operands, found.surfaces, report)
-        _environment([other for other in operands if not active or int(other.words[1]) == active], report)
-
-
-def _is_operand(record: Record, head: Record) -> bool:
-    """Whether a record after the surfaces is a multi-configuration operand: after MNUM, as `THIC surface number …`."""
-    if record.place.line <= head.place.line or record.keyword == "MOFF" or len(record.words) < 3:
-        return False
-    return all(re.fullmatch(r"-?[0-9]{1,6}", word) for word in record.words[:2])
-
-
-def _environment(operands: list[Record], report: Draft) -> None:
-    """Warn of operands that set a temperature or a pressure, which move every index."""
-    told = {"PRES": ("1", "atm", "pressure"), "TEMP": ("20", "°C", "temperature")}
-    for operand in operands:
-        normal, unit, what = told.get(operand.keyword, (None, "", ""))
-        if normal is None or not is_number(operand.words[2]) or float(operand.words[2]) == float(normal):
-            continue
-        number, value = operand.words[1], float(operand.words[2])
-        message = f"{operand.keyword} {value:g} {unit} ({what} of configuration {number}): not followed; "
-        report.warn(f"{message}indices are those at {normal} {unit}", operand.place)
-
-
-def _only_configuration(operands: list[Record], surfaces: list[Block], report: Draft) -> None:
-    """Warn of operands of a single configuration, but for those that only repeat what the surfaces hold."""
-    for operand in operands:
-        if operand.keyword in ("PRES", "TEMP") or _stored(operand, surfaces):
-            continue
-        surface, _, value = operand.words[:3]
-        value = f"{float(value):g}" if is_number(value) else value
-        report.warn(f"multi-configuration operand {operand.keyword} {surface} = {value}: not followed", operand.place)
-
-
-def _stored(operand: Record, surfaces: list[Block]) -> bool | None:
-    """Whether a surface holds the value of an operand: None for operands other than CRVT and THIC."""
-    keyword = {"CRVT": "CURV", "THIC": "DISZ"}.get(operand.keyword)
-    if keyword is None or not is_number(operand.words[2]):
-        return None
-    surface, value = int(operand.words[0]), float(operand.words[2])
-    stored = surfaces[surface].last(keyword) if 0 <= surface < len(surfaces) else None
-    if not stored or not stored.words or not is_number(stored.words[0]):
-        return None
-    return abs(float(stored.words[0]) - value) <= 1e-9 * abs(value)
-
-
-def _say_which(record: Record, count: int, active: int, operands: list[Record], report: Draft) -> None:
-    """The surfaces of a file hold the configuration that was active when it was saved."""
-    which = f"configuration {active} of {count}" if active else f"one of {count} configurations"
-    varied = ", ".join(sorted({operand.keyword for operand in operands})[:8]) or "nothing"
-    message = f"multi-configuration file: {which} read, as stored in its surfaces; they differ in {varied}"
-    if active == 1:
-        report.note(message)
-    else:
-        report.warn(message, record.place)
-
-
-def _active(surfaces: list[Block], operands: list[Record]) -> int:
-    """The configuration whose curvatures and thicknesses are those of the surfaces; 0 if that singles out none."""
-    agrees: dict[int, bool] = {}
-    for operand in operands:
-        same = _stored(operand, surfaces)
-        if same is not None:
-            configuration = int(operand.words[1])
-            agrees[configuration] = agrees.get(configuration, True) and same
-    active = [configuration for configuration, same in agrees.items() if same]
-    return active[0] if len(active) == 1 else 0

@@ -1,6 +1,7 @@
 """Write a lens as a .zmx file that Zemax OpticStudio reads, every number with the digits that bring it back exactly."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from raytrace.formats.media import catalogs_needed, is_code, is_left_out, listed_name
@@ -8,6 +9,7 @@ from raytrace.formats.source import LensFileError, Place
 from raytrace.formats.spelling import exact, exact_list, one_line, thickness
 from raytrace.formats.zemax_keywords import FIELD_KINDS, FIELD_LISTS, NOTE_PIECE, SYSTEM_APERTURES
 from raytrace.formats.zemax_numbers import INVERSE, SurfaceType, numbers_of, spelled_inverse
+from raytrace.formats.zemax_operands_write import operand_lines, with_pickups
 from raytrace.formats.zemax_sags import stands_in_parameters
 from raytrace.formats.zemax_types import TYPES, type_of
 from raytrace.media.glass import Glass, mil_glass
@@ -28,12 +30,19 @@ def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
     Raises LensFileError for what a .zmx file cannot hold: a batch of lenses, nan, two apertures on one surface, more
     than 8 aspheric terms or 24 wavelengths, a glass whose figures are not those of its catalog.
     """
-    lines = _system(lens, Place(file), catalogs)
-    for number, surface in enumerate(lens.surfaces):
-        lines += _surface(lens, number, surface, Place(file, None, number))
-    lines += ["TOL TOFF   0   0 0 0   0 0 0 0 0", "MNUM 1 1", 'MOFF   0   1 "" 0 0 0 1 1 0 0.0 ""']
+    body = partial(_body, file=file, catalogs=catalogs)
+    lines = [*body(lens), "TOL TOFF   0   0 0 0   0 0 0 0 0", *operand_lines(lens, body, file)]
     text = "\n".join(lines) + "\n"
     return text.encode("ascii") if text.isascii() else b"\xff\xfe" + text.encode("utf-16-le")
+
+
+def _body(lens: Lens, file: str, catalogs: Sequence[Path]) -> list[str]:
+    """The system and the surfaces."""
+    lines = _system(lens, Place(file), catalogs)
+    for number, surface in enumerate(lens.surfaces):
+        place = Place(file, None, number)
+        lines += with_pickups(_surface(lens, number, surface, place), lens, number, place)
+    return lines
 
 
 def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
@@ -112,7 +121,7 @@ def _surface(lens: Lens, number: int, surface: Surface, place: Place) -> list[st
         *_glass(surface.glass, place),
         *([] if surface.conic is None else [f"  CONI {exact(surface.conic, 'conic constant', place)}"]),
         f'  DIAM {size} 0 0 1 ""',
-        *_apertures(surface.apertures, place),
+        *_apertures(surface.apertures, place, _floats(lens, number)),
     ]
     comment = one_line(surface.comment, "the comment", place)
     return [*lines, f"  COMM {comment}"] if comment else lines
@@ -216,7 +225,13 @@ def _glass(glass: Glass, place: Place) -> list[str]:
     return [f"  GLAS {name} {flag} 0 {' '.join(figures)} 0 0 0 0 0"]
 
 
-def _apertures(apertures: tuple[Aperture, ...], place: Place) -> list[str]:
+def _floats(lens: Lens, number: int) -> bool:
+    """Whether the aperture of a surface follows its semi-diameter from one configuration to the next."""
+    followed = [place.path[:3] for operand in lens.operands if operand.name == "SDIA" for place in operand.places]
+    return ("surfaces", number, "apertures") in followed
+
+
+def _apertures(apertures: tuple[Aperture, ...], place: Place, floats: bool) -> list[str]:
     if not apertures:
         return []
     if len(apertures) > 1:
@@ -224,7 +239,7 @@ def _apertures(apertures: tuple[Aperture, ...], place: Place) -> list[str]:
         raise LensFileError(f"{message}; put the others on dummy surfaces, or write a table (.csv)", place)
     aperture = apertures[0]
     sizes, shape = [exact(number, "size of the aperture", place) for number in aperture.extent], SHAPES[aperture.shape]
-    keyword = shape.zemax[aperture.obscures]
+    keyword = "FLAP" if floats else shape.zemax[aperture.obscures]
     lines = [f"  {keyword} {' '.join(sizes)} 0"] if shape.sizes else [f"  {keyword} 0 0 0", *_corners(sizes, place)]
     if any(aperture.centre):
         x, y = (exact(number, "decentre of the aperture", place) for number in aperture.centre)

@@ -14,6 +14,7 @@ from raytrace.optics.f_number import real_working_f_number
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.remarks import entries, remarks
 from raytrace.optics.trace import media
+from raytrace.system.configurations import count
 from raytrace.system.lens import FIELD_UNITS, Lens, field_points, name_of_field, wavelengths_of
 from raytrace.system.surface import Surface, is_posed, is_round, vertex_curvature
 
@@ -99,6 +100,7 @@ class Info(Result):
             "aperture": {"kind": lens.aperture.kind, "value": number(lens.aperture.value)},
             **_environment(lens),
             "stop_surface": lens.stop,
+            **_configuration(lens),
             "surfaces": [
                 {
                     "surface": k,
@@ -124,13 +126,14 @@ class Info(Result):
             lines.append(f"  {words:<24} {_quantity(figure):>16}  {unit}".rstrip())
         lines += _base_ray_lines(lens)
         points = ", ".join(f"({x:g}, {y:g})" for x, y in field_points(None, like=lens).T.tolist())
-        several = len(lens.wavelengths) > 1
+        several, which = len(lens.wavelengths) > 1, _configuration(lens)
         shown = [
             f"{w:g}" + ("*" if i == lens.primary_wavelength and several else "")
             for i, w in enumerate(lens.wavelengths.tolist())
         ]
         lines += [
             f"  {'wavelengths':<24} {', '.join(shown)} µm" + ("  (* primary)" if several else ""),
+            *([f"  {'configuration':<24} {' of '.join(map(str, which.values()))}"] if which else []),
             f"  {'fields':<24} {points} {FIELD_UNITS[lens.fields.kind]}, {lens.fields.kind.replace('_', ' ')}",
             *([f"  {'environment':<24} {told(lens.environment)}"] if lens.environment else []),
             "",
@@ -204,6 +207,12 @@ def text(lens: Lens) -> str:
         return str(info(lens))
     except (ValueError, RuntimeError):
         return repr(lens)
+
+
+def _configuration(lens: Lens) -> dict[str, int]:
+    """Which of its configurations a lens is in, and how many there are; nothing of a lens with one."""
+    several = count(lens.operands)
+    return {"configuration": lens.current_configuration, "configurations": several} if several > 1 else {}
 
 
 def _radius(surface) -> float:

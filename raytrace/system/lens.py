@@ -18,60 +18,15 @@ from raytrace.media.environment import (
     unknown_change,
 )
 from raytrace.media.glass import check_unit, check_wavelengths, refractive_index
+from raytrace.system import configurations as multiple
 from raytrace.system.aperture import SHAPES
+from raytrace.system.conditions import APERTURE_KINDS as APERTURE_KINDS
+from raytrace.system.conditions import FIELD_UNITS as FIELD_UNITS
+from raytrace.system.conditions import RAY_AIMING, Fields, SystemAperture
+from raytrace.system.configurations import Operand
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface
 from raytrace.words import did_you_mean
-
-#: Units of a field point by the kind of field.
-FIELD_UNITS = {
-    "angle": "degrees",
-    "object_height": "mm",
-    "paraxial_image_height": "mm",
-    "real_image_height": "mm",
-}
-
-#: How rays find the stop, in the order of OpticStudio's numbers 0, 1, 2.
-RAY_AIMING = {
-    "off": "through points of the paraxial entrance pupil",
-    "paraxial": "to points of the stop, whose radius is that of the paraxial marginal ray",
-    "real": "to points of the stop, whose radius is that of the real marginal ray",
-}
-
-#: What the number of a system aperture means.
-APERTURE_KINDS = {
-    "entrance_pupil_diameter": "mm",
-    "image_f_number": "EFL / entrance pupil diameter",
-    "working_f_number": "paraxial working F/#",
-    "object_na": "n sin θ of the marginal ray at the object",
-    "object_cone_angle": "degrees, half angle of the marginal ray at the object",
-    "float_by_stop": "mm, semi-diameter of the stop",
-}
-
-
-@value
-class SystemAperture:
-    """The size of the beam: a kind of APERTURE_KINDS and its number."""
-
-    kind: str
-    value: Tensor
-
-
-@value
-class Fields:
-    """Field points of one kind (a key of FIELD_UNITS), their weights and vignetting factors.
-
-    x, y, weight: (F,) in degrees or mm.
-    vignetting: (5, F): decentre VDX, VDY, compression VCX, VCY (pupil fractions) and angle VAN (degrees), or None.
-    telecentric: chief rays parallel to the axis in object space.
-    """
-
-    kind: str
-    x: Tensor
-    y: Tensor
-    weight: Tensor
-    vignetting: Tensor | None = None
-    telecentric: bool = False
 
 
 @value
@@ -87,6 +42,8 @@ class Lens:
     catalogs: glass catalogs in the order of the file.
     ray_aiming: a key of RAY_AIMING.
     environment: temperature and pressure of the lens and the air around it; None: every glass as its catalog has it.
+    operands: what differs from one configuration to the next; current_configuration: which one this is, from 1.
+        `lens.configurations` are all of them, `lens.configuration(2)` is one.
     """
 
     surfaces: tuple[Surface, ...]
@@ -101,7 +58,12 @@ class Lens:
     catalogs: tuple[str, ...] = ()
     ray_aiming: str = "off"
     environment: Environment | None = None
+    operands: tuple[Operand, ...] = ()
+    current_configuration: int = 1
 
+    with_configurations = multiple.made
+    configuration = multiple.chosen
+    configurations = property(multiple.every)
     __str__ = lent("optics.views.text")
     _repr_html_ = lent("plot.notebook.page")
 
@@ -117,6 +79,7 @@ class Lens:
         ray_aiming: str | None = None,
         temperature: Tensor | float | None = None,
         pressure: Tensor | float | None = None,
+        configuration: int | None = None,
     ) -> "Lens":
         """The same lens under other conditions; what is None stays.
 
@@ -124,10 +87,16 @@ class Lens:
         the image; f_number: image-space, EFL / entrance_pupil_diameter, which is in mm; wavelengths: (W,) µm, alike in
         weight, the first one primary; fields: y, or (x, y), in the lens's own kind, without vignetting factors;
         temperature: °C, pressure: atm, 0 in vacuum: what is not given of the two stays, or is 20 °C and 1 atm. Warns
-        NoThermalCoefficients.
+        NoThermalCoefficients. configuration: one of `lens.configurations`, from 1; the other conditions hold in all.
         Raises ValueError for conditions that no lens has.
         """
-        found = self
+        found = self if configuration is None else self.configuration(configuration)
+        found = multiple.freed(
+            found,
+            **dict(object_distance=object_distance, sensor_distance=sensor_distance, f_number=f_number),
+            **dict(entrance_pupil_diameter=entrance_pupil_diameter, wavelengths=wavelengths),
+            **dict(fields=fields, ray_aiming=ray_aiming, temperature=temperature, pressure=pressure),
+        )
         if object_distance is not None:
             found = with_object_distance(found, object_distance)
         if sensor_distance is not None:
@@ -160,7 +129,7 @@ class Lens:
             raise ValueError(f"surface {surface}: this lens has surfaces 0 to {len(self.surfaces) - 1}")
         surfaces = list(self.surfaces)
         surfaces[surface] = changed(surfaces[surface], numbers, f"surface {surface}", like=self.wavelengths)
-        return dataclasses.replace(self, surfaces=tuple(surfaces))
+        return multiple.kept(dataclasses.replace(self, surfaces=tuple(surfaces)))
 
 
 def changed(surface: Surface, numbers: Mapping[str, object], where: str, *, like: Tensor) -> Surface:

@@ -1,0 +1,384 @@
+"""Configurations: each is the file as it would be saved in it; one lens with shared numbers; written and chosen."""
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import pytest
+import torch
+from test_formats import leaves, readable
+from test_zemax import file, read
+
+import raytrace as rt
+from raytrace.cli import main
+from raytrace.formats import LensFileError, LensFileWarning, read_lens, write_lens
+from raytrace.system.configurations import differences, part
+
+SHARED = Path(__file__).parents[2] / "shared"
+FOUND = {path.name: path for name in ("scan3", "scan4", "splitter", "temp5") for path in SHARED.rglob(f"*{name}*")}
+REAL = [FOUND[name] for name in sorted(FOUND) if name.lower().endswith(".zmx")]
+
+#: A mirror that scans, folded by half a right angle; the axes are turned back behind it by pickups.
+MIRROR = """MODE SEQ
+UNIT MM X W X CM MR CPMM
+ENPD 10
+FTYP 0 0 1 1 0 0 0
+XFLN 0
+YFLN 0
+WAVM 1 0.55 1
+PWAV 1
+SURF 0
+  DISZ INFINITY
+SURF 1
+  STOP
+  DISZ 50
+SURF 2
+  TYPE COORDBRK
+  PARM 3 -45
+  DISZ 0
+SURF 3
+  TYPE COORDBRK
+  PARM 3 {angle}
+  DISZ 0
+SURF 4
+  DISZ 0
+  GLAS MIRROR 0 0 1.5 40
+SURF 5
+  TYPE COORDBRK
+  PARM 3 {back}
+  PPAR 3 3 -1.0 0.0 0
+  DISZ 0
+SURF 6
+  TYPE COORDBRK
+  PARM 3 -45
+  PPAR 3 2 1.0 0.0 0
+  DISZ -80
+SURF 7
+  DISZ 0
+"""
+ANGLES = (-10.0, -5.0, 0.0, 5.0, 10.0)
+SCANNED = [f"PRAM   3   {k} {angle} 0 3 0 1 1 1.0 0.0 0" for k, angle in enumerate(ANGLES, 1)]
+
+
+def scan(active: int = 1) -> str:
+    angle = ANGLES[active - 1]
+    return MIRROR.format(angle=angle, back=-angle) + "\n".join([f"MNUM 5 {active}", *SCANNED]) + "\n"
+
+
+def operands(*lines: str, count: int = 2, active: int = 1) -> str:
+    return "\n".join([f"MNUM {count} {active}", *lines])
+
+
+def two(name: str, number: int, first: str, second: str, parameter: int = 0) -> str:
+    """An operand with two values."""
+    return operands(*(f"{name} {number} {k} {v} 0 {parameter} 0 1 1 1.0 0.0 0" for k, v in ((1, first), (2, second))))
+
+
+def saved_alike(one, other) -> bool:
+    """Whether two lenses are alike; what is None in one may be 0 in the other, for it is modelled for the operand."""
+    for path in differences(one, other):
+        a, b = part(one, path), part(other, path)
+        zeros = [x is None or (isinstance(x, torch.Tensor) and not bool(x.any())) for x in (a, b)]
+        if path[0] not in ("operands", "current_configuration") and not all(zeros):
+            return False
+    return True
+
+
+#: An operand, its values, and the file saved in each of the configurations: (what stands there, what it becomes).
+ASPHERE = "TYPE EVENASPH\nPARM 1 0\nPARM 2 1e-5"
+CASES = {
+    "thickness": (two("THIC", 1, "4", "5.5"), {}, ("DISZ 4\n", "DISZ 5.5\n")),
+    "object": (two("THIC", 0, "1e10", "250"), {}, ("DISZ INFINITY", "DISZ 250")),
+    "curvature": (two("CRVT", 1, "0.02", "-0.03"), {}, ("CURV 0.02", "CURV -0.03")),
+    "plane": (two("CRVT", 2, "-0.02", "0"), {}, ("CURV -0.02", "CURV 0")),
+    "conic": (two("CONN", 1, "-1", "-2"), {"surface": "CONI -1"}, ("CONI -1", "CONI -2")),
+    "sphere to conic": (two("CONN", 1, "0", "-2"), {"surface": "CONI 0"}, ("CONI 0", "CONI -2")),
+    "glass": (two("GLSS", 1, '"N-BK7"', '"N-SF6"'), {}, ("GLAS N-BK7", "GLAS N-SF6")),
+    "no glass": (two("GLSS", 1, '"N-BK7"', '""'), {}, ("GLAS N-BK7", "GLAS AIR")),
+    "mirror": (two("GLSS", 2, '""', '"MIRROR"'), {"stop": "COMM here"}, ("COMM here", "COMM here\n  GLAS MIRROR 0 0")),
+    "model": (two("MIND", 1, "1.5", "1.6"), {"surface": "GLAS ___BLANK 1 0 1.5 60"}, ("1 0 1.5 60", "1 0 1.6 60")),
+    "asphere": (two("PRAM", 1, "1e-5", "2e-5", 2), {"surface": ASPHERE}, ("PARM 2 1e-5", "PARM 2 2e-5")),
+    "older": (two("PAR2", 1, "1e-5", "2e-5"), {"surface": ASPHERE}, ("PARM 2 1e-5", "PARM 2 2e-5")),
+    "further term": (
+        two("PRAM", 1, "0", "3e-9", 4),
+        {"surface": ASPHERE},
+        ("PARM 2 1e-5", "PARM 2 1e-5\n  PARM 4 3e-9"),
+    ),
+    "semi-diameter": (two("SDIA", 1, "6", "4"), {"surface": "FLAP 0 6 0"}, ("DIAM 6", "DIAM 4")),
+    "aperture": (two("APMX", 1, "5", "3"), {"surface": "CLAP 1 5 0"}, ("CLAP 1 5", "CLAP 1 3")),
+    "hole": (two("APMN", 1, "1", "2"), {"surface": "CLAP 1 5 0"}, ("CLAP 1 5", "CLAP 2 5")),
+    "decentre": (two("APDY", 1, "0.5", "1"), {"surface": "CLAP 0 5 0\nOBDC 0 0.5"}, ("OBDC 0 0.5", "OBDC 0 1")),
+    "before": (two("CBTX", 1, "0", "3"), {"surface": "SCBD 1 0 0 0 0 0 0 0"}, ("1 0 0 0 0 0 0 0", "1 0 0 0 0 3 0 0")),
+    "comment": (two("MCOM", 1, '"a"', '"b"'), {"surface": "COMM a"}, ("COMM a", "COMM b")),
+    "field": (two("YFIE", 2, "7", "3.5"), {}, ("YFLN 0 7", "YFLN 0 3.5")),
+    "field x": (two("XFIE", 2, "0", "2"), {}, ("XFLN 0 0", "XFLN 0 2")),
+    "weight": (two("FLWT", 2, "1", "3"), {"X": "XFLN 0 0\nFWGN 1 1"}, ("FWGN 1 1", "FWGN 1 3")),
+    "vignetting": (two("FVCY", 2, "0.1", "0.2"), {"X": "XFLN 0 0\nVCYN 0 0.1"}, ("VCYN 0 0.1", "VCYN 0 0.2")),
+    "wavelength": (two("WAVE", 1, "0.4861327", "0.45"), {}, ("WAVM 1 0.4861327", "WAVM 1 0.45")),
+    "its weight": (two("WLWT", 2, "0.5", "2"), {}, ("0.5875618 0.5", "0.5875618 2")),
+    "primary": (two("PRWV", 0, "2", "1"), {}, ("PWAV 2", "PWAV 1")),
+    "pupil": (two("APER", 0, "10", "6"), {}, ("ENPD 10", "ENPD 6")),
+    "F-number": (two("APER", 0, "5", "8"), {"APERTURE": "FNUM 5 0"}, ("FNUM 5 0", "FNUM 8 0")),
+    "telecentric": (two("TELE", 0, "0", "1"), {}, ("FTYP 0 0", "FTYP 0 1")),
+    "aiming": (two("RAAM", 0, "0", "1"), {"PWAV": "PWAV 2\nRAIM 0 0"}, ("RAIM 0 0", "RAIM 0 1")),
+    "title": (two("LTTL", 0, '"A singlet"', '"Far"'), {}, ("NAME A singlet", "NAME Far")),
+    "stop": (two("STPS", 0, "2", "1"), {"surface": "COMM here"}, ("COMM here", "COMM here\n  STOP")),
+}
+
+
+@pytest.mark.parametrize("unit", ["MM", "IN"])
+@pytest.mark.parametrize("name", CASES)
+def test_every_configuration_is_the_file_as_it_would_be_saved_in_it(name, unit, tmp_path):
+    tail, changes, (before, after) = CASES[name]
+    text = file(**changes, tail=tail, UNIT=f"UNIT {unit}")
+    assert text.count(before) == 1
+    saved = text.replace(before, after)
+    saved = saved.replace("SURF 2\n  STOP", "SURF 2") if name == "stop" else saved
+    lens, report = read(text)
+    assert [warning for warning in report.warnings if "stands again" not in warning] == []
+    assert any("configuration 1 of 2 read, as stored" in note for note in report.notes)
+    assert lens.current_configuration == 1
+    assert len(lens.configurations) == 2
+    assert saved_alike(lens.configuration(1), lens)
+    assert saved_alike(lens.configuration(2), read(saved[: saved.index("MNUM")])[0])
+    assert not saved_alike(lens.configuration(2), lens)
+    assert saved_alike(lens.configuration(2).configuration(1), lens)
+    again = read(saved.replace("MNUM 2 1", "MNUM 2 2"))[0]
+    assert saved_alike(again, lens.configuration(2))
+    assert saved_alike(again.configuration(1), lens)
+    for one in (lens, again):
+        write_lens(one, tmp_path / "lens.zmx")
+        assert leaves(read_lens(tmp_path / "lens.zmx")) == leaves(one)
+
+
+def test_a_scanning_mirror_turns_the_light_by_twice_its_angle_and_its_pickup_turns_back(tmp_path):
+    lens, report = read(scan())
+    assert report.warnings == ()
+    write_lens(lens, tmp_path / "lens.zmx")
+    assert leaves(read_lens(tmp_path / "lens.zmx")) == leaves(lens)
+    (operand,) = lens.operands
+    assert (operand.name, operand.number, operand.parameter) == ("PRAM", 3, 3)
+    assert [(place.path[1], place.factor) for place in operand.places] == [(3, 1.0), (5, -1.0)]
+    for angle, one in zip(ANGLES, lens.configurations, strict=True):
+        end = rt.trace(one, rt.rays(one, fields=[0], pupil=torch.zeros(2, 1, dtype=torch.float64)))
+        height = 80 * torch.tan(torch.deg2rad(torch.tensor(2 * angle, dtype=torch.float64)))
+        assert abs(abs(float(end.position[1])) - abs(float(height))) < 1e-12
+    for active in (2, 3, 5):  # whichever was current when it was saved
+        again = read(scan(active))[0]
+        assert again.current_configuration == active
+        for one, other in zip(again.configurations, lens.configurations, strict=True):
+            assert saved_alike(one, other)
+
+
+def test_what_no_operand_names_is_shared_and_derivatives_reach_both():
+    lens = read(file(tail=two("THIC", 1, "4", "5.5")))[0]
+    values = lens.operands[0].numbers.clone().requires_grad_()
+    curvature = lens.surfaces[2].curvature.clone().requires_grad_()
+    varied = lens.replace(2, curvature=curvature)
+    varied = dataclasses.replace(varied, operands=(dataclasses.replace(lens.operands[0], numbers=values),))
+    focal = [rt.first_order(one).effective_focal_length for one in varied.configurations]
+    by_value, by_curvature = torch.autograd.grad(focal[1], (values, curvature))
+    assert by_value[0] == 0
+    h = 1e-5
+    moved = lens.replace(2, curvature=curvature.detach())
+    ends = [
+        rt.first_order(moved.configuration(2).replace(1, thickness=5.5 + d)).effective_focal_length for d in (h, -h)
+    ]
+    assert abs(float(by_value[1]) - float((ends[0] - ends[1]) / (2 * h))) < 1e-6
+    assert float(by_curvature) != 0
+
+
+def test_replaced_numbers_belong_to_the_current_configuration_and_conditions_to_all():
+    lens = read(file(tail=two("THIC", 2, "47.5", "40")))[0]
+    moved = lens.configuration(2).replace(2, thickness=41.0)
+    assert [float(one.surfaces[2].thickness) for one in moved.configurations] == [47.5, 41.0]
+    held = lens.at(sensor_distance=30.0)
+    assert [float(one.surfaces[2].thickness) for one in held.configurations] == [30.0, 30.0]
+    assert float(lens.at(configuration=2).surfaces[2].thickness) == 40.0
+    fields = read(file(tail=two("YFIE", 2, "7", "3")))[0].at(fields=[1.0])
+    assert fields.configuration(2).fields.y.tolist() == [1.0]
+
+
+def test_configurations_are_made_from_plain_numbers(tmp_path):
+    lens = rt.read_lens("double_gauss").with_configurations(thickness={6: [12.0, 16.0], 5: [14.0, 10.0]})
+    assert [[float(one.surfaces[k].thickness) for k in (5, 6)] for one in lens.configurations] == [[14, 12], [10, 16]]
+    write_lens(lens, tmp_path / "zoom.zmx")
+    assert leaves(read_lens(tmp_path / "zoom.zmx")) == leaves(lens)
+    for wrong, said in (
+        ({"glass": {1: [1.5]}}, "'glass' does not differ"),
+        ({"thickness": {99: [1.0]}}, "surface 99"),
+        ({"thickness": {1: [1.0, 2.0], 2: [1.0]}}, "as many"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            lens.with_configurations(**wrong)
+
+
+def test_a_configuration_that_is_not_there_is_refused():
+    lens = read(file(tail=two("THIC", 1, "4", "5")))[0]
+    with pytest.raises(ValueError, match=r"configuration 3: this lens has configurations 1 to 2"):
+        lens.configuration(3)
+    assert read(file())[0].configurations[0].current_configuration == 1
+    with pytest.raises(ValueError, match="has one configuration"):
+        read(file())[0].configuration(2)
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("IGNR 1 {} {}", "not modelled"),
+        ("GLSS 1 {} N-BK7{}", "unknown glass"),
+        ("THIC 9 {} {}", "THIC of surface 9"),
+        ("THIC 1 {} 1e{}99", "too large"),
+    ],
+)
+def test_what_is_not_followed_is_told_and_the_configuration_refused(line, said):
+    text = file(tail=operands(line.format(1, 0), line.format(2, 7)))
+    lens, report = read(text)
+    number = text.splitlines().index(line.format(1, 0)) + 1
+    assert any(re.search(rf"lens.zmx:{number}.*not followed.*{said}", warning) for warning in report.warnings)
+    with pytest.raises(ValueError, match=rf"configuration 2: .*{said}"):
+        lens.configuration(2)
+    with pytest.raises(LensFileError, match=said):
+        read(text, configuration=2)
+
+
+def test_operands_that_contradict_the_surfaces_are_told_with_line_and_number():
+    text = file(tail=operands("CRVT 1 1 0.021 0 0", "CRVT 1 2 0.03 0 0", "THIC 1 1 4 0 0", "THIC 1 2 5 0 0"))
+    warnings = read(text)[1].warnings
+    line = text.splitlines().index("CRVT 1 1 0.021 0 0") + 1
+    assert len(warnings) == 1
+    assert re.search(rf":{line}.*CRVT 1 = 0.021.*holds 0.02 \(configuration 1\)", warnings[0])
+    rounded = file(tail=operands("CRVT 1 1 0.02000000000001 0 0", "CRVT 1 2 0.03 0 0"))
+    assert read(rounded)[1].warnings == ()
+
+
+def test_unknown_known_and_missing_operands_are_reported():
+    text = file(tail=operands("QQQQ 1 1 3", 'COTN 1 1 "AR" 0 0', 'COTN 1 2 "" 0 0', "THIC 1 2 5 0 0", "THIC 1 7 5"))
+    _, report = read(text)
+    status = {keyword.name: keyword.status for keyword in report.keywords}
+    assert (status["QQQQ"], status["COTN"], status["THIC"]) == ("unknown", "ignored", "read")
+    said = " ".join(report.warnings)
+    for piece in ("unknown keyword QQQQ", "THIC 1 has no value for configuration 1", "configuration 7, of 2"):
+        assert piece in said
+
+
+def test_what_rays_are_solved_for_is_told_where_operands_bend_them():
+    solved = {"stop": "MAZH 0 0"}
+    text = file(tail=two("THIC", 1, "4", "5"), **solved)
+    assert any(
+        "solved for configuration 1" in warning and "DISZ of surface 2" in warning for warning in read(text)[1].warnings
+    )
+    assert read(file(tail=two("YFIE", 2, "7", "3"), **solved))[1].warnings == ()
+    both = operands("THIC 1 1 4 0 0", "THIC 1 2 5 0 0", "THIC 2 1 47.5 0 0", "THIC 2 2 46 0 0")
+    assert read(file(tail=both, **solved))[1].warnings == ()
+
+
+PICKUPS = {
+    "thickness": (two("THIC", 1, "4", "5"), "PZUP 1 2 1 0", ("DISZ 47.5", "DISZ 9"), "thickness", 11.0),
+    "curvature": (two("CRVT", 1, "0.02", "0.03"), "", ("CURV -0.02", "CURV -0.02 4 1 -1 0"), "curvature", -0.03),
+    "glass": (two("GLSS", 1, '"N-BK7"', '"N-SF6"'), "GLAS N-BK7 2 1 1.5 64", ("", ""), "glass", "N-SF6"),
+    "another rule": (
+        two("THIC", 1, "4", "5"),
+        "PZUP 1 2 1 0",
+        ("", ""),
+        "thickness",
+        47.5,
+    ),  # for 47.5 is not 2 · 4 + 1
+}
+
+
+@pytest.mark.parametrize("name", PICKUPS)
+def test_pickups_are_followed_and_written_and_other_rules_left(name, tmp_path):
+    tail, stop, (before, after), field, expected = PICKUPS[name]
+    lens = read(file(tail=tail, stop=stop).replace(before or " ", after or " "))[0]
+    found = getattr(lens.configuration(2).surfaces[2], field)
+    assert (found.name if field == "glass" else float(found)) == expected
+    write_lens(lens, tmp_path / "lens.zmx")
+    assert leaves(read_lens(tmp_path / "lens.zmx")) == leaves(lens)
+
+
+def test_weights_and_comments_are_kept_with_the_lens(tmp_path):
+    tail = operands('MOFF 0 1 "far" 0 0', 'MOFF 0 2 "near" 0 0', "CWGT 0 1 1 0 0", "CWGT 0 2 2.5 0 0")
+    lens = read(file(tail=tail))[0]
+    assert [operand.values() for operand in lens.operands] == [["far", "near"], [1.0, 2.5]]
+    write_lens(lens, tmp_path / "lens.zmx")
+    assert leaves(read_lens(tmp_path / "lens.zmx")) == leaves(lens)
+
+
+def test_a_table_says_that_it_holds_one_configuration(tmp_path):
+    lens = read(file(tail=two("THIC", 1, "4", "5")))[0].configuration(2)
+    with pytest.warns(LensFileWarning, match="other configurations, 2 in all"):
+        write_lens(lens, tmp_path / "lens.csv")
+    assert float(read_lens(tmp_path / "lens.csv").surfaces[1].thickness) == 5.0
+
+
+@pytest.mark.skipif(not REAL, reason="the files of others are not at hand")
+@pytest.mark.parametrize("path", REAL, ids=lambda path: path.name)
+@pytest.mark.filterwarnings("ignore")
+def test_real_files_have_all_their_configurations(path, tmp_path):
+    lens = readable(path)
+    if lens is None:
+        pytest.skip("refused by name")
+    assert len(lens.configurations) > 1
+    assert saved_alike(lens.configurations[lens.current_configuration - 1], lens)
+    write_lens(lens, tmp_path / "lens.zmx")
+    again = read_lens(tmp_path / "lens.zmx")
+    for one, other in zip(lens.configurations, again.configurations, strict=True):
+        assert leaves(one) == leaves(other)
+
+
+# -- the command ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def zoom(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("zoom.zmx").write_text(
+        file(tail=operands("THIC 1 1 4 0 0", "THIC 1 2 5 0 0", "GLSS 1 1 N-BK7", "GLSS 1 2 N-SF6"))
+    )
+
+
+def test_the_command_opens_any_configuration(zoom, capsys):
+    for number, (thickness, glass) in enumerate([(4.0, "N-BK7"), (5.0, "N-SF6")], 1):
+        assert main(["info", "zoom.zmx", "--configuration", str(number), "--json"]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert (found["surfaces"][1]["thickness"], found["surfaces"][1]["glass"]) == (thickness, glass)
+    for command in (["info"], ["spot"], ["check"], ["trace"]):
+        assert main([*command, "zoom.zmx", "--configuration", "3"]) == 1
+        assert "zoom.zmx:33: configuration 3: this lens has configurations 1 to 2" in capsys.readouterr().err
+    assert main(["info", "double_gauss", "--configuration", "2"]) == 1
+    assert "configuration 2" in capsys.readouterr().err
+
+
+def test_info_says_which_configuration_it_is(zoom, capsys):
+    assert main(["info", "zoom.zmx", "--configuration", "2"]) == 0
+    assert re.search(r"configuration +2 of 2\n", capsys.readouterr().out)
+    assert main(["info", "zoom.zmx", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["configuration"], found["configurations"]) == (1, 2)
+    assert main(["info", "double_gauss", "--json"]) == 0
+    assert "configuration" not in capsys.readouterr().out
+
+
+def test_check_shows_what_differs(zoom, capsys):
+    assert main(["check", "zoom.zmx"]) == 0
+    out = capsys.readouterr().out
+    assert re.search(r"THIC 1 +4 +5\n", out)
+    assert re.search(r"GLSS 1 +N-BK7 +N-SF6\n", out)
+    assert main(["check", "zoom.zmx", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["configurations"][0] == {"operand": "THIC 1", "values": [4.0, 5.0]}
+    assert main(["check", "double_gauss", "--json"]) == 0
+    assert "configurations" not in json.loads(capsys.readouterr().out)
+
+
+def test_the_lens_of_a_configuration_is_written_with_all_of_them(zoom, capsys):
+    assert main(["convert", "zoom.zmx", "second.zmx", "--configuration", "2"]) == 0
+    second = read_lens("second.zmx", configuration=2)
+    assert second.current_configuration == 2
+    assert [float(one.surfaces[1].thickness) for one in second.configurations] == [4.0, 5.0]
+    assert main(["focus", "zoom.zmx", "--configuration", "2", "-o", "focused.zmx"]) == 0
+    focused = read_lens("focused.zmx", configuration=2)
+    assert float(focused.surfaces[1].thickness) == 5.0
+    assert float(focused.surfaces[2].thickness) != 47.5
+    capsys.readouterr()
