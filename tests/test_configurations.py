@@ -13,6 +13,7 @@ from test_zemax import file, read
 import raytrace as rt
 from raytrace.cli import main
 from raytrace.formats import LensFileError, LensFileWarning, read_lens, write_lens
+from raytrace.plot.layout import layout as layout_figure
 from raytrace.system.configurations import differences, part
 
 SHARED = Path(__file__).parents[2] / "shared"
@@ -382,3 +383,21 @@ def test_the_lens_of_a_configuration_is_written_with_all_of_them(zoom, capsys):
     assert float(focused.surfaces[1].thickness) == 5.0
     assert float(focused.surfaces[2].thickness) != 47.5
     capsys.readouterr()
+
+
+def test_layout_draws_all_configurations_in_one_figure(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("scan.zmx").write_text(scan())
+    assert main(["layout", "scan.zmx", "--configuration", "all", "--plot", "scan.png"]) == 0, capsys.readouterr().err
+    assert Path("scan.png").stat().st_size > 10_000
+    lens = read_lens("scan.zmx")
+    figure = layout_figure(rt.layout(lens, configuration="all", rays=3))
+    drawn = [line for line in figure.axes[0].lines if line.get_gid() == "ray"]
+    assert len(drawn) == 5 * 3
+    assert len({line.get_color() for line in drawn}) == 5
+    heights = sorted({round(float(line.get_xdata()[-1]) + float(line.get_ydata()[-1]), 6) for line in drawn})
+    assert len(heights) > 5
+    one = layout_figure(rt.layout(lens, configuration=2, rays=3))
+    assert len([line for line in one.axes[0].lines if line.get_gid() == "ray"]) == 3
+    with pytest.raises(ValueError, match="shows one configuration"):
+        rt.layout(lens, configuration="all", view="3d")

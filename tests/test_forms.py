@@ -34,6 +34,7 @@ DIFFERENT = {
     "--tolerance": "quantise compares several",
     "--steps": "quantise may take none",
     "--starts": "superres may take none",
+    "--configuration": "layout draws all of them in one figure",
     "--depth": "layers of a network, and distances of points",
 }
 

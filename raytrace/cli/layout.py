@@ -8,11 +8,12 @@ EXAMPLES = """examples:
   raytrace layout double_gauss --plot layout.png
   raytrace layout lens.zmx --field 0 14 -14,0 --plot layout.pdf
   raytrace layout folded_relay --view 3d --plot relay.png
-  raytrace layout spectrometer --wavelength 0.45 0.55 0.65"""
+  raytrace layout spectrometer --wavelength 0.45 0.55 0.65
+  raytrace layout scanner.zmx --configuration all --plot scan.png"""
 
 
 def options(parser):
-    words.lens(parser)
+    words.lens(parser, all_configurations="in one figure, superimposed")
     words.conditions(parser)
     words.fields(parser)
     parser.add_argument(

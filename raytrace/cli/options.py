@@ -61,6 +61,11 @@ def count(text: str) -> int:
     return number
 
 
+def count_or_all(text: str) -> int | str:
+    """A whole number above 0, or `all`."""
+    return text if text == "all" else count(text)
+
+
 def many(text: str) -> int:
     """A whole number above 0, also written as 1e9."""
     number = finite(text)
@@ -140,20 +145,22 @@ def _number(text: str) -> float:
     return number
 
 
-def lens(parser: argparse.ArgumentParser) -> None:
+def lens(parser: argparse.ArgumentParser, *, all_configurations: str = "") -> None:
     """LENS, --configuration, --catalog, --json."""
     parser.add_argument("lens", metavar="LENS", type=file_name, help="lens file, or the name of a shipped lens")
-    configuration(parser)
+    configuration(parser, several=all_configurations)
     catalog(parser)
     json(parser)
 
 
-def configuration(parser: argparse.ArgumentParser) -> None:
+def configuration(parser: argparse.ArgumentParser, *, several: str = "") -> None:
+    """several: what a command does with all of them."""
     parser.add_argument(
         "--configuration",
         metavar="N",
-        type=count,
-        help="which one of a multi-configuration file, from 1 (default: the one that was active when it was saved)",
+        type=count_or_all if several else count,
+        help="which one of a multi-configuration file, from 1 (default: the one that was active when it was saved)"
+        + (f"; all: {several}" if several else ""),
     )
 
 

@@ -153,11 +153,16 @@ class Info(Result):
 VIEWS = {"yz": "from the side, y upward", "xz": "from above, x upward", "3d": "in space"}
 
 
+#: All configurations of a lens, drawn together.
+ALL = "all"
+
+
 @value
 class Layout(Result):
     """The cross section of a lens with rays of fields (2, F), so many of each; wavelengths: (W,) µm, or the primary.
 
-    view: a key of VIEWS.
+    view: a key of VIEWS. configuration: ALL where those of the lens are drawn in each other's place, else None.
+    has_fields: whether the fields were asked for; in each configuration the lens's own are drawn if not.
     """
 
     lens: Lens
@@ -165,6 +170,8 @@ class Layout(Result):
     rays: int = 7
     view: str = "yz"
     wavelengths: Tensor | None = None
+    configuration: str | None = None
+    has_fields: bool = True
 
     FIGURE = "plot.layout.layout"
 
@@ -188,17 +195,24 @@ def layout(
     rays: int = 7,
     view: str = "yz",
     wavelengths: Tensor | Sequence[float] | None = None,
+    configuration: int | str | None = None,
 ) -> Layout:
     """The cross section, to be drawn by `plot`: glass filled by index, the stop marked, rays coloured by field.
 
     fields: y, (x, y) or (2, F), in the lens's own kind of field, by default its own; rays: how many of the fan of each,
     in the plane that is shown; view: a key of VIEWS; wavelengths: µm, by default the primary one; rays of several are
-    coloured by wavelength. Raises ValueError for a view that there is not.
+    coloured by wavelength; configuration: of `lens.configurations`, from 1, or "all": superimposed, rays coloured by
+    configuration. Raises ValueError for a view or a configuration that there is not.
     """
     if view not in VIEWS:
         raise ValueError(f"`view={view}`: expected one of {', '.join(VIEWS)}")
+    if configuration == ALL and view == "3d":
+        raise ValueError("`view=3d`: shows one configuration; `configuration=all` is drawn from the side or from above")
+    if configuration not in (None, ALL):
+        lens = lens.configuration(configuration)
     chosen = None if wavelengths is None else wavelengths_of(lens, wavelengths)
-    return Layout(lens, field_points(fields, like=lens), rays, view, chosen)
+    every = ALL if configuration == ALL else None
+    return Layout(lens, field_points(fields, like=lens), rays, view, chosen, every, fields is not None)
 
 
 def text(lens: Lens) -> str:

@@ -1,6 +1,8 @@
 """Layout: the cross section of a lens, from the side or from above, with the rays of its fields."""
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -13,10 +15,10 @@ from raytrace.maths.pupil import fan, hexapolar
 from raytrace.optics.launch import launch, stop_radius
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.trace import media, trace_lens
-from raytrace.optics.views import Layout
+from raytrace.optics.views import ALL, Layout
 from raytrace.plot import outline, space, style
 from raytrace.system.aperture import reach
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, field_points
 from raytrace.system.phases import IdealLens
 from raytrace.system.surface import Surface
 
@@ -34,6 +36,8 @@ def layout(found: Layout) -> Figure:
     """
     lens, fields = style.detached(found.lens), found.fields.detach()
     wavelengths = lens.wavelengths[lens.primary_wavelength][None] if found.wavelengths is None else found.wavelengths
+    if found.configuration == ALL:
+        return _superimposed(found, lens.configurations, fields, wavelengths.detach())
     if found.view == "3d":
         return _finished(space.draw(lens, fields, wavelengths.detach(), found.rays), lens, fields, wavelengths, 7.5)
     figure = style.new_figure(8.0, 4.0)
@@ -52,6 +56,27 @@ def layout(found: Layout) -> Figure:
     figure.set_size_inches(width, height)
     axes.set_title(style.first_order_text(lens, first_order(lens)), fontsize=8.5, color=style.GREY, pad=4)
     return _finished(figure, lens, fields, wavelengths, width)
+
+
+def _superimposed(found: Layout, lenses: Sequence[Lens], fields: Tensor, wavelengths: Tensor) -> Figure:
+    """The lens in all its configurations in one cross section, rays coloured by configuration."""
+    figure, colours = style.new_figure(8.0, 4.0), style.field_colours(len(lenses))
+    axes = figure.add_subplot()
+    drawn = []
+    for lens, colour in zip(lenses, colours, strict=True):
+        how = {"fields": fields if found.has_fields else field_points(None, like=lens), "rays": found.rays}
+        drawn.append(_drawn(axes, lens, wavelengths=wavelengths, view=found.view, colour=colour, **how))
+    _framed(axes, drawn)
+    shape = axes.get_ylim()[1] - axes.get_ylim()[0], axes.get_xlim()[1] - axes.get_xlim()[0]
+    width = min(max(6.0 * shape[1] / shape[0], 5.5), 8.0)
+    figure.set_size_inches(width, min(max(0.98 * width * shape[0] / shape[1], 1.2), 6.0) + 1.1)
+    figure.suptitle(style.fill(lenses[0].name, width, 11, bold=True) or "Lens", fontsize=11, fontweight="bold")
+    handles = [Line2D([], [], color=colour, label=str(k)) for k, colour in enumerate(colours, 1)]
+    figure.legend(
+        handles=[Line2D([], [], linestyle="", label="Configuration"), *handles],
+        loc="outside lower center", ncols=min(len(handles) + 1, int(1.5 * width)), handlelength=1.4, columnspacing=1.6,
+    )  # fmt: skip
+    return figure
 
 
 def _draw_spectrum(axes: Axes, lens: Lens, fields: Tensor, wavelengths: Tensor) -> None:
@@ -99,6 +124,22 @@ def draw_layout(
 ) -> None:
     """Draw the cross section into axes, equal in both directions, without ticks; wavelengths: (W,) µm, or primary."""
     wavelengths = lens.wavelengths[lens.primary_wavelength][None] if wavelengths is None else wavelengths
+    _framed(axes, [_drawn(axes, lens, fields=fields, wavelengths=wavelengths, rays=rays, view=view)])
+
+
+class _Drawn(NamedTuple):
+    """What a cross section takes: the places of its surfaces, whether it is bent, its extent in z and in height, mm."""
+
+    places: list[outline.Section]
+    is_bent: bool
+    extent: tuple[float, float]
+    heights: tuple[float, float]
+
+
+def _drawn(
+    axes: Axes, lens: Lens, *, fields: Tensor, wavelengths: Tensor, rays: int, view: str, colour: object = None
+) -> _Drawn:
+    """Draw surfaces and rays, of one colour if it is given; the frame is not drawn yet."""
     with torch.no_grad():
         places, radii = outline.sections(lens, view), outline.drawn_radii(lens, wavelengths, fields)
         indices = [float(index) for index in media(lens, wavelengths[0])]
@@ -118,19 +159,25 @@ def draw_layout(
         _draw_mirrors(axes, lens, places, radii, paths)
         _draw_apertures(axes, lens, places, radii)
         _draw_stop(axes, lens, places, radii)
-        _draw_rays(
-            axes, paths, [colour for row in style.ray_colours(fields.shape[1], wavelengths.tolist()) for colour in row]
-        )
+        own = [one for row in style.ray_colours(fields.shape[1], wavelengths.tolist()) for one in row]
+        _draw_rays(axes, paths, own if colour is None else [colour] * len(paths))
         half = _draw_sensor(axes, lens, places[-1], radii, paths)
         if near:
             _draw_object(axes, lens, places[0], paths)
-    if outline.is_bent(lens):
-        _frame_bent(axes, places)
-        return
-    largest = max(radii[1:-1])
-    low, high = _ray_heights(paths)
+    largest, (low, high) = max(radii[1:-1]), _ray_heights(paths)
     stop = radii[lens.stop] + 0.18 * largest
-    _frame(axes, (min(first, start), last), (min(low, -largest, -half, -stop), max(high, largest, half, stop)))
+    heights = min(low, -largest, -half, -stop), max(high, largest, half, stop)
+    return _Drawn(places, outline.is_bent(lens), (min(first, start), last), heights)
+
+
+def _framed(axes: Axes, drawn: Sequence[_Drawn]) -> None:
+    """The frame of one cross section, or of several in each other's place."""
+    if any(one.is_bent for one in drawn):
+        _frame_bent(axes, [one.places for one in drawn])
+        return
+    starts, ends = zip(*(one.extent for one in drawn), strict=True)
+    low, high = zip(*(one.heights for one in drawn), strict=True)
+    _frame(axes, (min(starts), max(ends)), (min(low), max(high)))
 
 
 def _extent(lens: Lens, places: list[outline.Section], radii: list[float]) -> tuple[tuple, tuple]:
@@ -298,14 +345,15 @@ def _frame(axes: Axes, extent: tuple[float, float], heights: tuple[float, float]
     axes.axis("off")
 
 
-def _frame_bent(axes: Axes, places: list[outline.Section]) -> None:
+def _frame_bent(axes: Axes, ways: Sequence[Sequence[outline.Section]]) -> None:
     """The mechanical axis from vertex to vertex, limits and scale bar of a system that is folded."""
     axes.relim()
     for patch in axes.patches:
         axes.update_datalim(patch.get_xy())
     (left, low), (right, high) = axes.dataLim.get_points()
-    way = np.array([place.origin for place in places[1:]]).T
-    axes.plot(*way, color=style.GREY, linewidth=0.6, linestyle=(0, (10, 3, 2, 3)), zorder=1)
+    for places in ways:
+        way = np.array([place.origin for place in places[1:]]).T
+        axes.plot(*way, color=style.GREY, linewidth=0.6, linestyle=(0, (10, 3, 2, 3)), zorder=1)
     size = max(right - left, high - low)
     bar = style.round_length(0.2 * size)
     bottom = low - 0.05 * size
