@@ -5,14 +5,17 @@ import math
 
 import pytest
 import torch
-from problems import scalar, vector
+from problems import both_engines, scalar, vector
 from torch.autograd import gradcheck, gradgradcheck
 from torch.testing import assert_close
 
 from raytrace.maths import zernike
 from raytrace.maths.bivariate import powers
+from raytrace.maths.value import to
+from raytrace.optics.trace import trace_surfaces
 from raytrace.system.departure import FringeSag
 from raytrace.system.polynomials import IrregularSag, PolynomialSag, TiltSag, as_polynomial
+from raytrace.system.rays import start
 from raytrace.system.shapes import KINDS, relief
 from raytrace.system.surface import Surface, intersect, normal, sag_at, vertex_curvature, vertex_curvatures
 
@@ -181,3 +184,84 @@ def test_derivatives_of_the_hit_by_every_number_with_lost_rays(name):
     given = tuple(number.clone().requires_grad_() for number in tensors)
     assert gradcheck(hits, given, atol=1e-6)
     assert gradgradcheck(hits, given, atol=1e-6, fast_mode=True)
+
+
+# -- hard cases ----------------------------------------------------------------------------------------------------
+
+
+def one_ray(position, direction):
+    d = vector(*direction)
+    return vector(*position)[:, None], (d / torch.linalg.vector_norm(d))[:, None]
+
+
+@both_engines
+@pytest.mark.parametrize("scale", [1e-100, 1e-3, 1.0, 1e3, 1e100])
+@pytest.mark.parametrize("kind", ["toroidal", "biconic"])
+def test_all_lengths_may_be_larger_or_smaller(engine, kind, scale):
+    """A lens and its rays, enlarged: the same directions, and hits that are enlarged."""
+
+    def traced(by):
+        numbers = {"toroidal": [-1 / 26 / by], "biconic": [-1 / 26 / by, 0.4]}[kind]
+        face = freeform(kind, 1 / 40 / by, -1.0, *numbers)
+        position, direction = bundle(50, 4.0)
+        rays = start(position * by, direction, torch.zeros(50, dtype=torch.float64))
+        return trace_surfaces([face], rays, indices=vector(1.0, 1.5).unbind())
+
+    end, true = traced(scale), traced(1.0)
+    assert torch.equal(end.valid, true.valid)
+    assert true.valid.all()
+    close(end.position / scale, true.position, atol=1e-14)
+    close(end.direction, true.direction, atol=4e-15)
+
+
+@both_engines
+def test_the_inner_sheet_of_a_toroid_is_not_met(engine):
+    """A ring of radius 10 about y turned at 26 mm: light that goes through its hole towards the far side misses it."""
+    toroid = freeform("toroidal", 1 / 10, None, 1 / 26)
+    rays = start(vector(0.0, 27.0, 3.0, 0.0, 0.0, 11.0, -5.0, -5.0, -5.0).reshape(3, 3), _along_z(3))
+    end = trace_surfaces([toroid], rays, indices=vector(1.0, 1.5).unbind())
+    assert end.valid.tolist() == [True, False, False]
+
+
+def _along_z(count: int) -> torch.Tensor:
+    zero = torch.zeros(count, dtype=torch.float64)
+    return torch.stack([zero, zero, zero + 1])
+
+
+@both_engines
+def test_a_cylinder_is_met_up_to_its_edge(engine):
+    """z = R - √(R² - x²) to rounding, at 1 - 1e-9 of the radius as well; beyond it there is nothing."""
+    x = 20 * vector(0.0, 0.5, 0.99, 1 - 1e-6, 1 - 1e-9, 1 + 1e-9, 1.5)
+    rays = start(torch.stack([x, 0 * x + 3, 0 * x - 5]), _along_z(7))
+    along_x, along_y = freeform("toroidal", None, None, 1 / 20), freeform("toroidal", 1 / 20, None, 0.0)
+    for face, turned in ((along_x, False), (along_y, True)):
+        given = dataclasses.replace(rays, position=rays.position[[1, 0, 2]]) if turned else rays
+        end = trace_surfaces([face], given, indices=[scalar(1.0)] * 2)
+        assert end.valid.tolist() == [True] * 5 + [False] * 2
+        true = 20 - torch.sqrt((20 - x[:5]) * (20 + x[:5]))
+        close(end.position[2, :5], true, atol=1e-10)  # rounding of x, 4e-15 mm, on a slope of 2e4
+        close(end.position[2, :4], true[:4], atol=2e-12)
+
+
+@both_engines
+def test_a_toroid_of_conic_minus_one_and_negative_radius(engine):
+    """A parabola c y²/2 turned at R = -26: the hit lies on (26 + z)² + x² = (26 + g)² with g = c y²/2."""
+    face = freeform("toroidal", 1 / 40, -1.0, -1 / 26)
+    end = trace_surfaces([face], start(*bundle(200, 6.0)), indices=[scalar(1.0)] * 2)
+    x, y, z = end.position
+    assert end.valid.all()
+    g = y * y / 80
+    close((26 + z) ** 2 + x * x, (26 + g) ** 2, rtol=1e-14)
+
+
+@both_engines
+def test_float32_misses_what_float64_misses(engine):
+    face = freeform("biconic", 1 / 8, -1.0, 1 / 9, 0.2)
+    rays = start(*bundle(400, 9.0, 0.5))
+    end, single = (
+        trace_surfaces([to(face, dtype=d)], to(rays, dtype=d), indices=[scalar(1.0).to(d), scalar(1.5).to(d)])
+        for d in (torch.float64, torch.float32)
+    )
+    assert 20 < int((~end.valid).sum()) < 380
+    assert torch.equal(end.valid, single.valid)
+    assert_close(single.position.double(), end.position, rtol=0, atol=2e-4)
