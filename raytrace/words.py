@@ -1,6 +1,7 @@
-"""Words: what may have been meant by one that is not known."""
+"""Words: what may have been meant by one that is not known, and what the kind of a value is called."""
 
 import difflib
+import re
 from collections.abc import Iterable
 
 
@@ -9,3 +10,13 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     spelled = {name.lower(): name for name in known}
     near = difflib.get_close_matches(word.lower(), spelled, n=1, cutoff=0.7)
     return f"; did you mean {spelled[near[0]]}?" if near else ""
+
+
+def named(part: object) -> str:
+    """The kind of a value as a sentence calls it: "an ideal lens", of an IdealLens."""
+    return with_article(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(part).__name__).lower())
+
+
+def with_article(noun: str) -> str:
+    """A noun with "a" or "an" before it."""
+    return ("an " if noun[0] in "aeiou" else "a ") + noun

@@ -4,7 +4,14 @@ import torch
 from torch import Tensor
 
 from raytrace.analysis.result import Analysis
-from raytrace.analysis.setting import Numbers, field_range, in_object_space, primary_wavelength, unvignetted
+from raytrace.analysis.setting import (
+    Numbers,
+    field_range,
+    in_object_space,
+    primary_wavelength,
+    refuse_axis,
+    unvignetted,
+)
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.result import axis, cell, masked
 from raytrace.maths.value import value
@@ -71,9 +78,12 @@ def distortion_grid(lens: Lens, *, wavelengths: Numbers = None, points: int = 11
     With the points (0, 0), (δ, 0) and (0, δ) close to the axis the ideal image of a field f is J f, J their differences
     over δ, counted from the image of the axis: on the sensor as it stands, whatever its focus. wavelengths: µm, the
     lens's primary one by default. Vignetting factors are left out: chief rays go through the middle of the pupil.
+    Raises NothingToShow for the axis alone.
     """
     lens = with_wavelengths(unvignetted(lens), primary_wavelength(lens) if wavelengths is None else wavelengths)
-    described, _, corner, found = in_object_space(lens, field_range(lens, 2)[:, 1:])
+    largest = field_range(lens, 2)[:, 1:]
+    refuse_axis(largest)
+    described, _, corner, found = in_object_space(lens, largest)
     half = safe_sqrt((corner * corner).sum() / 2)
     line = half * (2 * torch.arange(points, dtype=half.dtype, device=half.device) + 1 - points) / max(points - 1, 1)
     y, x = torch.meshgrid(line, line, indexing="ij")

@@ -26,6 +26,7 @@ from raytrace.optics.paraxial import FirstOrder, first_order, largest_field, mar
 from raytrace.optics.trace import media
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.surface import Surface, is_even, vertex_curvature
+from raytrace.words import named, with_article
 
 
 @value
@@ -106,9 +107,11 @@ def seidel(lens: Lens, *, fields: Points = None, kind: str = "coefficients") -> 
     need_axis(lens, "Seidel's theory", "`wavefront` and `ray_fan` have the aberrations of traced rays")
     for number, surface in enumerate(lens.surfaces):
         if not is_even(surface):
-            what = "has a departure" if surface.departure is not None else f"is an {surface.kind}"
-            what = what if surface.phase is None else f"has a {type(surface.phase).__name__}"
-            raise ValueError(f"surface {number} {what}: Seidel's theory is of even powers of r")
+            what = "has a departure" if surface.departure is not None else f"is {with_article(surface.kind)}"
+            what = what if surface.phase is None else f"is {named(surface.phase)}"
+            raise ValueError(
+                f"surface {number} {what}: Seidel's theory is of even powers of r; `wavefront` and `ray_fan` have the aberrations of traced rays"
+            )
     paraxial = first_order(lens)
     fields = largest_field(lens) if fields is None else field_points(fields, like=lens)
     marginal, chief = marginal_ray(lens), _chief_ray(lens, fields, paraxial)

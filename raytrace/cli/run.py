@@ -4,7 +4,7 @@ import argparse
 import inspect
 import math
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -111,8 +111,18 @@ def save(found: Result, arguments: argparse.Namespace) -> None:
     }
     for option, write in (("plot", partial(found.plot, **drawing)), ("output", found.save)):
         if path := getattr(arguments, option, None):
-            write(path)
+            with _named(arguments):
+                write(path)
             say(f"written: {path}")
+
+
+@contextmanager
+def _named(arguments: argparse.Namespace) -> Iterator[None]:
+    """What there is nothing to draw of is told with the name of the lens; other errors have names of their own."""
+    try:
+        yield
+    except raytrace.NothingToShow as error:
+        raise CommandError(f"{arguments.lens}: {error}") from error
 
 
 def _each(arguments: argparse.Namespace, distances: list[float]) -> Iterator[tuple[float, argparse.Namespace]]:

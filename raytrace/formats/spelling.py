@@ -10,6 +10,7 @@ from torch.utils import _pytree as pytree
 from raytrace.formats.source import LensFileError, Place, shown
 from raytrace.system.lens import Lens
 from raytrace.system.surface import SHAPE, Surface, is_freeform, is_posed
+from raytrace.words import named
 
 #: More characters than any number needs.
 _DIGITS = 400
@@ -109,18 +110,21 @@ def thickness(number: Tensor, infinity: str, place: Place) -> str:
     return exact(number, "thickness", place)
 
 
+#: What is said of a surface that a format has no words for.
+_ELSEWHERE = "this format does not hold; a .zmx file holds most kinds"
+
+
 def refuse_departure(surface: Surface, place: Place) -> None:
     """Raise LensFileError for a surface with a departure: the formats hold conics and terms of a kind."""
     if surface.departure is not None:
-        kind = type(surface.departure).__name__
-        raise LensFileError(f"the surface departs from a conic and even terms ({kind}), which no file holds", place)
+        kind = named(surface.departure)
+        raise LensFileError(f"the surface departs from a conic and even terms ({kind}), which {_ELSEWHERE}", place)
     if is_freeform(surface):
-        raise LensFileError(f"the surface is {surface.kind}, which this format does not hold", place)
+        raise LensFileError(f"the surface is {surface.kind}, which {_ELSEWHERE}", place)
     if surface.phase is not None:
-        kind = type(surface.phase).__name__
-        raise LensFileError(f"the surface has a phase ({kind}), which this format does not hold", place)
+        raise LensFileError(f"the surface has a phase ({named(surface.phase)}), which {_ELSEWHERE}", place)
     if is_posed(surface):
-        raise LensFileError("the surface is tilted or decentred, which this format does not hold", place)
+        raise LensFileError(f"the surface is tilted or decentred, which {_ELSEWHERE}", place)
 
 
 # -- texts: as they are where that brings them back, else quoted and escaped as in JSON -------------------------------

@@ -11,6 +11,7 @@ from raytrace.system.lens import Lens
 from raytrace.system.phases import kind_of
 from raytrace.system.rays import Rays
 from raytrace.system.surface import is_posed, is_round
+from raytrace.words import named
 
 _STRAIGHT = 1e-9  # mm and direction cosines: an axial ray that leaves the axis by less has not left it
 
@@ -58,5 +59,5 @@ def _bend(lens: Lens) -> str:
     for number, surface in enumerate(lens.surfaces):
         if not is_round(surface):
             part = surface.departure if surface.phase is None else surface.phase
-            return f"surface {number} ({type(part).__name__}) takes light off it"
+            return f"surface {number} ({named(part)}) takes light off it"
     return "it bends"

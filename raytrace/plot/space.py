@@ -35,8 +35,8 @@ def draw(lens: Lens, fields: Tensor, wavelengths: Tensor, rays: int) -> Figure:
         near = math.isfinite(distance) and 0 < distance <= 1.5 * size
         start = -distance if near else min(0.0, corners[2].min()) - _LEAD * size
         drawn = _draw_rays(axes, lens, fields, wavelengths, rays, start)
-        _draw_image(axes, lens, places[-1], drawn)
-    _frame(axes, np.concatenate([corners, *drawn], axis=1))
+        image = _draw_image(axes, places[-1], drawn)
+    _frame(axes, np.concatenate([corners, *drawn, image], axis=1))
     return figure
 
 
@@ -117,10 +117,10 @@ def _draw_rays(axes, lens: Lens, fields: Tensor, wavelengths: Tensor, rays: int,
     return arrived
 
 
-def _draw_image(axes, lens: Lens, frame: Frame, arrived: list[np.ndarray]) -> None:
-    """The image surface, a rectangle about where rays end."""
+def _draw_image(axes, frame: Frame, arrived: list[np.ndarray]) -> np.ndarray:
+    """The image surface, a rectangle about where rays end; returns its corners (3, 4)."""
     if not arrived:
-        return
+        return np.zeros((3, 0))
     ends = frame.origin.new_tensor(np.array([path[:, -1] for path in arrived]).T)
     x, y, _ = style.array(frame.inside(ends))
     least = 0.02 * max(np.ptp(np.concatenate(arrived, axis=1), axis=1))
@@ -128,10 +128,11 @@ def _draw_image(axes, lens: Lens, frame: Frame, arrived: list[np.ndarray]) -> No
     middle = 0.5 * (x.min() + x.max()), 0.5 * (y.min() + y.max())
     u = frame.origin.new_tensor([-half, half, half, -half]) + middle[0]
     v = frame.origin.new_tensor([-half, -half, half, half]) + middle[1]
-    corners = _seen(style.array(frame.outside(torch.stack([u, v, torch.zeros_like(u)])))).T
+    corners = style.array(frame.outside(torch.stack([u, v, torch.zeros_like(u)])))
     axes.add_collection3d(
-        Poly3DCollection([corners], facecolor="#f6f0d8", edgecolor=style.INK, linewidths=1.2, alpha=0.7)
+        Poly3DCollection([_seen(corners).T], facecolor="#f6f0d8", edgecolor=style.INK, linewidths=1.2, alpha=0.7)
     )
+    return corners
 
 
 def _fill(axes, points: np.ndarray) -> float:

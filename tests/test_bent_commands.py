@@ -1,0 +1,67 @@
+"""Commands on lenses whose axis bends: a figure that shows all of it, or one line that says why there is none."""
+
+import numpy as np
+import pytest
+import torch
+from bends import pose
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+import raytrace as rt
+from raytrace.plot.space import draw
+from raytrace.words import named, with_article
+
+
+@pytest.mark.parametrize("command", ["incidence", "rms-over-field", "distortion-grid", "distortion", "field-curvature"])
+def test_what_needs_fields_says_so_by_the_name_of_the_lens(run, tmp_path, command):
+    """A curve over one field point is an empty figure."""
+    figure = tmp_path / "figure.png"
+    outcome = run(command, "spectrometer", "--plot", str(figure))
+    assert outcome.code == 1
+    assert outcome.err.count("\n") == 1
+    assert "spectrometer: nothing to show over the field" in outcome.err
+    assert "--field" in outcome.err or command == "distortion-grid"
+    assert not figure.exists()
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        (["seidel", "hybrid_achromat"], "surface 2 is a radial phase: Seidel's theory is of even powers of r; `wave"),
+        (["seidel", "spectrometer"], "one straight axis, but surface 5 is a coordinate break; `wavefront`"),
+        (["convert", "cylinder_pair", "OUT.csv"], "surface is toroidal, which this format does not hold"),
+        (["convert", "hybrid_achromat", "OUT.csv"], "has a phase (a radial phase), which this format does not hold"),
+        (["convert", "folded_relay", "OUT.csv"], "tilted or decentred, which this format does not hold; a .zmx file"),
+        (["compare", "folded_relay"], "ask for kernels of one model by `psf`"),
+    ],
+)  # fmt: skip
+def test_a_refusal_names_the_surface_and_what_else_there_is(run, tmp_path, argv, said):
+    outcome = run(*(str(tmp_path / word) if word == "OUT.csv" else word for word in argv))
+    assert (outcome.code, outcome.out) == (1, "")
+    assert said in outcome.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_kinds_in_words():
+    assert named(rt.IdealLens(0.1, 0.1)) == "an ideal lens"
+    assert with_article("biconic") == "a biconic"
+
+
+def plate() -> rt.Lens:
+    """A tilted plate in a wide beam, which is as wide on the sensor."""
+    tilt = {"before": pose(tilt_x=20.0), "after": pose(tilt_x=-20.0, tilts_first=True)}
+    rows = [dict(thickness=5.0), dict(thickness=10.0, glass="N-BK7", **tilt), dict(thickness=20.0)]
+    return rt.lens(rows, stop=1, entrance_pupil_diameter=50)
+
+
+@pytest.mark.parametrize("name", ["plate", "cylinder_pair", "folded_relay"])
+def test_all_that_is_drawn_in_space_lies_inside_the_picture(name):
+    """The sensor too, which is drawn larger than where rays end."""
+    lens = plate() if name == "plate" else rt.read_lens(name)
+    figure = draw(lens, torch.stack([lens.fields.x, lens.fields.y]), lens.wavelengths[:1], 7)
+    FigureCanvasAgg(figure).draw()
+    (axes,) = figure.axes
+    for drawn in axes.collections:
+        points = np.concatenate([path.vertices for path in drawn.get_paths()])
+        seen = axes.transData.transform(points)
+        assert (seen >= axes.bbox.min).all()
+        assert (seen <= axes.bbox.max).all()
