@@ -104,14 +104,13 @@ def seidel(lens: Lens, *, fields: Points = None, kind: str = "coefficients") -> 
     """
     if kind not in KINDS:
         raise ValueError(f"Seidel aberrations as {kind!r}: expected one of {', '.join(KINDS)}")
-    need_axis(lens, "Seidel's theory", "`wavefront` and `ray_fan` have the aberrations of traced rays")
+    instead = "`wavefront` and `ray_fan` have the aberrations of traced rays"
+    need_axis(lens, "Seidel's theory", instead)
     for number, surface in enumerate(lens.surfaces):
         if not is_even(surface):
             what = "has a departure" if surface.departure is not None else f"is {with_article(surface.kind)}"
             what = what if surface.phase is None else f"is {named(surface.phase)}"
-            raise ValueError(
-                f"surface {number} {what}: Seidel's theory is of even powers of r; `wavefront` and `ray_fan` have the aberrations of traced rays"
-            )
+            raise ValueError(f"surface {number} {what}: Seidel's theory is of even powers of r; {instead}")
     paraxial = first_order(lens)
     fields = largest_field(lens) if fields is None else field_points(fields, like=lens)
     marginal, chief = marginal_ray(lens), _chief_ray(lens, fields, paraxial)

@@ -139,8 +139,8 @@ def _fill(axes, points: np.ndarray) -> float:
     """How much larger points (3, N) may be seen until they fill the axes."""
     axes.apply_aspect()
     x, y, _ = proj3d.proj_transform(*points, axes.get_proj())
-    seen = np.ptp(axes.transData.transform(np.stack([x, y], 1)), axis=0)
-    return float(0.9 * min(axes.bbox.width / seen[0], axes.bbox.height / seen[1]))
+    (left, low), (right, high) = axes.viewLim.get_points()  # about the middle of the box, which stands at (0, 0)
+    return float(0.95 / max(x.min() / left, x.max() / right, y.min() / low, y.max() / high))
 
 
 def _frame(axes, points: np.ndarray) -> None:
