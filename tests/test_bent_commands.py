@@ -7,6 +7,7 @@ from bends import pose
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import raytrace as rt
+from raytrace.analysis.compare import abilities
 from raytrace.plot.space import draw
 from raytrace.words import named, with_article
 
@@ -65,3 +66,26 @@ def test_all_that_is_drawn_in_space_lies_inside_the_picture(name):
         seen = axes.transData.transform(points)
         assert (seen >= axes.bbox.min).all()
         assert (seen <= axes.bbox.max).all()
+
+
+def test_a_parallel_beam_has_encircled_energy(tmp_path):
+    """Its F-number is infinite, which is no radius to draw up to."""
+    beam = rt.lens([dict(thickness=5.0), dict(thickness=20.0)], stop=1, entrance_pupil_diameter=0.8)
+    found = rt.encircled_energy(beam)
+    assert torch.isfinite(found.radii).all()
+    assert 0.9 < float(found.share.detach().max()) < 1  # some light is diffracted into the shadow
+    found.plot(tmp_path / "share.png")
+
+
+def test_models_are_compared_where_a_surface_is_curved():
+    ideal = rt.lens(
+        [dict(thickness=50.0, phase=rt.IdealLens(0.02, 0.02))], stop=1, entrance_pupil_diameter=5, fields=[0, 1]
+    )
+    with pytest.raises(ValueError, match="no surface of this lens that bends light is curved; ask for kernels"):
+        abilities(ideal)
+
+
+def test_an_object_at_the_first_surface_is_refused_with_the_way_out():
+    lens = rt.read_lens("singlet").at(fields=[0.0])
+    with pytest.raises(ValueError, match=r"other than 0 and nan; give others by `object_distances`"):
+        rt.psf(lens, "drt", object_distances=[0.0])

@@ -288,6 +288,11 @@ def _most_curved(lens: Lens) -> int:
         for k, surface in enumerate(lens.surfaces[:-1])
         if k > 0 and surface.curvature is not None and (surface.is_mirror or indices[k] is not indices[k - 1])
     }
+    if not strength:
+        raise ValueError(
+            "the comparison of PSF models changes a conic, but no surface of this lens that bends light is curved; "
+            "ask for kernels of one model by `psf`"
+        )
     return max(strength, key=strength.get)
 
 

@@ -81,6 +81,7 @@ def _encircled(lens: Lens, fields: Tensor, radii: Tensor | None, geometric: bool
     if radii is None:
         airy = 6e-3 * primary_wavelength(lens) * axial_f_number(lens)
         blur = torch.where(energy > 0, distance, 0.0).max()
+        airy = torch.where(airy.isfinite(), airy, 0.0)  # of a parallel beam there is none
         top = torch.maximum(blur * 1.02, airy * (not geometric)).detach()
         radii = top * torch.linspace(0, 1, 41, dtype=top.dtype, device=top.device)
     share = _of_rays(distance, energy, radii) if geometric else _of_waves(lens, fields, centroid, radii)

@@ -227,7 +227,9 @@ def _check_batch(fields: Tensor, distances: Tensor, wavelengths: Tensor, weights
         if values.dim() != 1 or not len(values):
             raise ValueError(f"{name} of shape {tuple(values.shape)}; expected one axis")
         if bool(values.isnan().any()) or bool((values == 0).any()):
-            raise ValueError(f"{name} {values.tolist()}; expected numbers other than 0 and nan")
+            raise ValueError(
+                f"{name} {values.tolist()}; expected numbers other than 0 and nan; give others by `{name}`"
+            )
     if weights.shape != wavelengths.shape:
         raise ValueError(f"{weights.numel()} wavelength_weights for {len(wavelengths)} wavelengths")
     if bool((weights < 0).any()) or not bool(weights.sum() > 0):
