@@ -89,3 +89,20 @@ def test_an_object_at_the_first_surface_is_refused_with_the_way_out():
     lens = rt.read_lens("singlet").at(fields=[0.0])
     with pytest.raises(ValueError, match=r"other than 0 and nan; give others by `object_distances`"):
         rt.psf(lens, "drt", object_distances=[0.0])
+
+
+def test_a_spectrum_is_no_blur_of_waves():
+    """Five colours 3 mm apart: of waves alone the light would be counted over and over."""
+    lens = rt.read_lens("spectrometer")
+    with pytest.raises(ValueError, match=r"from the centroid of all, .* `geometric`, or for one of the `wavelengths`"):
+        rt.encircled_energy(lens)
+    assert float(rt.encircled_energy(lens, geometric=True).share.detach().max()) <= 1
+
+
+def test_light_is_counted_once_however_large_the_radius():
+    """Beyond where waves are followed all of it is inside: a share is never above 1."""
+    lens = rt.read_lens("double_gauss").at(wavelengths=[0.5876], fields=[0.0])
+    share = rt.encircled_energy(lens, [0.1, 0.2, 0.3, 0.5, 3.0]).share.detach()[0]
+    assert (share.diff() >= 0).all()
+    assert share[2] > 0.95
+    assert share[3:].tolist() == [1.0, 1.0]

@@ -147,6 +147,8 @@ def _of_wave(pupil: ExitPupil, w: int, centroid: Tensor, radii: Tensor) -> Tenso
     step = pupil.step[:, 0, w]
     x, y = lag * step[0], lag[:, None] * step[1]
     offset_x, offset_y = centroid - pupil.centre[:, 0, w]
+    offset, period = torch.hypot(offset_x, offset_y).detach(), 1 / step.detach()  # the transform repeats the light
+    _refuse_far(offset, 0.5 * period.min())
     otf = (overlap * phasor(x * offset_x + y * offset_y)).real.flatten() * step.prod()
     width = step.min().detach() / _RINGS_PER_STEP
     place = torch.hypot(x, y).detach().flatten() / width
@@ -154,8 +156,18 @@ def _of_wave(pupil: ExitPupil, w: int, centroid: Tensor, radii: Tensor) -> Tenso
     rings = otf.new_zeros(int(ring.max()) + 2)
     rings = rings.index_add(0, ring, otf * (ring + 1 - place)).index_add(0, ring + 1, otf * (place - ring))
     frequency = (torch.arange(len(rings), dtype=radii.dtype, device=radii.device) * width).clamp_min(1e-6 * width)
-    r = radii.detach()[:, None]
-    return (r * torch.special.bessel_j1(2 * math.pi * r * frequency) / frequency) @ rings
+    r = radii.detach().clamp_max(0.5 * period.min())[:, None]
+    share = (r * torch.special.bessel_j1(2 * math.pi * r * frequency) / frequency) @ rings
+    return torch.where(radii < 0.5 * torch.hypot(*period) + offset, share, 1.0)
+
+
+def _refuse_far(offset: Tensor, reach: Tensor) -> None:
+    """Raise ValueError for light so far (mm) from the centroid that the transform would count its repetitions."""
+    if bool(offset > reach):
+        raise ValueError(
+            f"light of one wavelength lands {float(offset):.3g} mm from the centroid of all, beyond the "
+            f"{float(reach):.3g} mm that waves are followed: ask for `geometric`, or for one of the `wavelengths`"
+        )
 
 
 def _spiral(count: int, like: Tensor) -> Tensor:
