@@ -10,7 +10,7 @@ import torch
 from torch.autograd import gradcheck, gradgradcheck
 
 import raytrace as rt
-from raytrace.media.agf import parse_agf
+from raytrace.formats import read_lens_with_report
 from raytrace.media.catalog import SHIPPED, find_glass, shipped_catalog
 from raytrace.media.environment import Environment, NoThermalCoefficients, air_index, dn_dt, index_in, thermal
 from raytrace.media.glass import AIR, constant, from_table, model_glass, refractive_index
@@ -127,21 +127,6 @@ def test_derivatives_by_temperature_pressure_and_wavelength(name):
     # A degree moves an index by 1e-6: what changes it is looked at a million times larger.
     assert gradcheck(lambda *given: 1e4 * index(*given), (line, *numbers), eps=1e-4, atol=1e-5)
     assert gradgradcheck(lambda *given: 1e4 * index(*given), (line, *numbers), eps=1e-3, atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("record", "figures"),
-    [
-        ("TD - - - - - - -", (0.0,) * 6 + (20.0,)),
-        ("TD 1e-6 _ - 0 0 - 25", (1e-6, 0.0, 0.0, 0.0, 0.0, 0.0, 25.0)),
-        ("TD 1e-6 1e-8", (1e-6, 1e-8, 0.0, 0.0, 0.0, 0.0, 20.0)),
-        ("TD", (0.0,) * 6 + (20.0,)),
-        ("OD 1 1 1 1 1 1", (0.0,) * 6 + (20.0,)),
-    ],
-)
-def test_thermal_figures_that_a_catalog_leaves_out_are_zero(record, figures):
-    text = f"NM ONE 2 0 1.5 50.0 0 0\nCD 1.25 0 0 0 0 0\n{record}\nLD 0.3 2.5\n"
-    assert tuple(thermal(parse_agf(text, "one.agf").glasses["ONE"])) == figures
 
 
 # -- lenses -----------------------------------------------------------------------------------------------------------
@@ -388,3 +373,133 @@ def test_a_table_says_what_it_cannot_read(tmp_path, temperature, rest, said):
             rt.read_lens(path, strict=True)
     else:
         assert rt.read_lens(path, strict=True).environment.temperature.item() == 40
+
+
+# -- .zmx files -------------------------------------------------------------------------------------------------------
+
+#: A cell without air, as a file of OpticStudio tells one: the gaps 3 and 5 stand between two pressures.
+CELL = """MODE SEQ
+UNIT MM
+ENPD 4.0
+ENVD {environment}
+GCAT SCHOTT MISC
+FTYP 0 0 2 1 0 0 0
+XFLN 0 0
+YFLN 0 15
+WAVM 1 0.55 1
+PWAV 1
+{surfaces}MNUM 1 1
+{operands}
+"""
+ROWS = [
+    (0, "INFINITY", ""),
+    (0, 5, ""),
+    (0, 2, "SK16"),
+    (0, 15, ""),
+    (0.01, 5, "SK16"),
+    (-0.01, 15, ""),
+    (0, 2, "SK16"),
+]
+ROWS += [(0, 63.25768502176, ""), (0, 0, "")]
+OPERANDS = """PRES 0 1 0.0 0 0 0 1 1 1.0 0.0 0
+GLSS 3 1 "" 0 0 0 1 1 0 0.0
+GLSS 4 1 "SK16" 0 0 0 1 1 0 0.0
+GLSS 5 1 "" 0 0 0 1 1 0 0.0
+PRES 0 1 1.0 0 0 0 1 1 1.0 0.0 0"""
+
+
+def cell_file(folder, environment="20 1 1", operands=OPERANDS, glass="SK16"):
+    surfaces = ""
+    for k, (curvature, thickness, name) in enumerate(ROWS):
+        stop, medium = "  STOP\n" * (k == 1), f"  GLAS {glass} 0 0 1.5 40\n" if name else ""
+        surfaces += f"SURF {k}\n{stop}  CURV {curvature}\n  DISZ {thickness}\n{medium}"
+    path = folder / "cell.zmx"
+    path.write_text(CELL.format(environment=environment, surfaces=surfaces, operands=operands), encoding="utf-8")
+    return path
+
+
+def test_a_file_tells_which_surfaces_stand_in_another_pressure(tmp_path):
+    lens, report = read_lens_with_report(cell_file(tmp_path))
+    assert not report.warnings
+    assert [k for k, surface in enumerate(lens.surfaces) if surface.environment] == [3, 4, 5]
+    assert lens.environment.pressure.item() == 1.0
+    assert first_order(lens).paraxial_image_distance.item() == pytest.approx(63.25768502176, abs=1e-11)
+
+
+def test_pressures_with_no_surface_between_them_hold_for_none(tmp_path):
+    operands = "PRES 0 1 0.0 0 0 0 1 1 1.0 0.0 0\nMOFF 0 1\nPRES 0 1 1.0 0 0 0 1 1 1.0 0.0 0"
+    lens, report = read_lens_with_report(cell_file(tmp_path, operands=operands))
+    assert not any(surface.environment for surface in lens.surfaces)
+    assert "PRES 0 atm (pressure of configuration 1): not followed" in report.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("environment", "kept", "said"),
+    [
+        ("20 1 0", None, ""),
+        ("100 1 0", None, r"cell.zmx:4: environment of 100 °C and 1 atm, which indices do not follow .*third number 0"),
+        ("1.0E+2 0.5 1", (100.0, 0.5), ""),
+        ("-300 1 1", None, r"cell.zmx:4: temperature=-300: expected degrees Celsius above -272"),
+        ("20 -1 1", None, r"cell.zmx:4: pressure=-1: expected atmospheres, 0 \(vacuum\) or more"),
+        ("20 1 x", None, r"cell.zmx:4: .*whether indices follow the environment is 'x', expected a finite number"),
+        ("hot 1 1", None, r"cell.zmx:4: .*temperature is 'hot', expected a finite number"),
+    ],
+)
+def test_environment_of_a_file_is_followed_or_told(tmp_path, environment, kept, said):
+    path = cell_file(tmp_path, environment, "")
+    if said:
+        with pytest.raises(rt.LensFileError, match=said):
+            rt.read_lens(path, strict=True)
+    else:
+        found = rt.read_lens(path, strict=True).environment
+        assert (found and (found.temperature.item(), found.pressure.item())) == kept
+
+
+def test_a_file_names_the_glasses_whose_change_is_not_known(tmp_path):
+    """Once each, with the line of its first surface."""
+    warnings_ = read_lens_with_report(cell_file(tmp_path, "40 1 1", "", "LZ_K8"))[1].warnings
+    assert len(warnings_) == 1
+    assert "cell.zmx:21, surface 2: LZ_K8 (LZOS) has no thermal coefficients" in warnings_[0]
+
+
+@pytest.mark.parametrize("conditions", [{}, {"temperature": -40.1, "pressure": 1 / 3}])
+def test_a_file_brings_environments_back_bit_for_bit(tmp_path, conditions):
+    path, copy = tmp_path / "one.zmx", tmp_path / "two.zmx"
+    first = rt.read_lens(cell_file(tmp_path))
+    for lens in (first, vacuum_cell().at(pressure=0.7), doublet_at_100_degrees()):
+        lens = lens.at(**conditions)
+        rt.write_lens(lens, path)
+        again = rt.read_lens(path, strict=True)
+        same_environments(lens, again)
+        assert torch.equal(torch.stack(media(lens, lens.wavelengths)), torch.stack(media(again, lens.wavelengths)))
+        rt.write_lens(again, copy)
+        same_environments(lens, rt.read_lens(copy, strict=True))
+    rt.write_lens(rt.read_lens("double_gauss"), path)
+    assert "\nENVD 20 1 0\n" in path.read_text()
+
+
+def test_a_surface_in_an_environment_of_a_lens_without_one_is_not_written(tmp_path):
+    with pytest.raises(rt.LensFileError, match="surface 3: a surface in an environment of its own, of a lens without"):
+        rt.write_lens(vacuum_cell(), tmp_path / "cell.zmx")
+    assert not [*tmp_path.iterdir()]
+
+
+THERMAL = """MNUM 2 2
+TEMP 0 1 20 0 0 0 1 1 1.0 0.0 0
+TEMP 0 2 100 0 0 0 1 1 1.0 0.0 0
+PRES 0 1 1.0 0 0 0 1 1 1.0 0.0 0
+PRES 0 2 0.5 0 0 0 1 1 1.0 0.0 0"""
+
+
+def test_configurations_have_their_temperatures_and_pressures(tmp_path):
+    path = cell_file(tmp_path, "100 0.5 1", "")
+    path.write_text(path.read_text().replace("MNUM 1 1\n", THERMAL))
+    lens = rt.read_lens(path)
+    for found, place_ in zip(lens.configurations, [(20.0, 1.0), (100.0, 0.5)], strict=True):
+        assert (found.environment.temperature.item(), found.environment.pressure.item()) == place_
+        alone = lens.at(temperature=place_[0], pressure=place_[1])
+        assert torch.equal(torch.stack(media(found, lens.wavelengths)), torch.stack(media(alone, lens.wavelengths)))
+    rt.write_lens(lens, tmp_path / "copy.zmx")
+    again = rt.read_lens(tmp_path / "copy.zmx")
+    for one, other in zip(lens.configurations, again.configurations, strict=True):
+        same_environments(one, other)

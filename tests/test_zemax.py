@@ -392,7 +392,7 @@ def test_multi_configuration_file_says_which_configuration_is_read():
 
 
 def test_environment_apodisation_and_afocal_are_warned_of():
-    report = read(file(PWAV="PWAV 1\nENVD 100 1 1\nGFAC 1 1", FTYP="FTYP 0 0 2 2 0 0 1"))[1]
+    report = read(file(PWAV="PWAV 1\nENVD 100 1 0\nGFAC 1 1", FTYP="FTYP 0 0 2 2 0 0 1"))[1]
     assert [word in " ".join(report.warnings) for word in ("100 °C", "apodised", "afocal")] == [True] * 3
 
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from raytrace.formats import zemax_environment
 from raytrace.formats.report import IGNORED, READ, UNKNOWN, Draft
 from raytrace.formats.source import LensFileError
 from raytrace.formats.spelling import double, is_number
@@ -51,8 +52,10 @@ def read(found: Sections, lens: Lens, rebuild: Rebuild, report: Draft, configura
     if not 1 <= count <= MOST_CONFIGURATIONS:
         raise LensFileError(f"MNUM is {count}, expected 1 to {MOST_CONFIGURATIONS} configurations", head.place)
     cells = _cells([record for record in found.tail if record.place.line > head.place.line], count, report)
-    operands = [_operand(group, found, lens, rebuild) for group in _grouped(cells, count, report)]
+    groups = zemax_environment.with_covered(_grouped(cells, count, report))
     told = head.integer(1, "active configuration", 0) if count > 1 else 1
+    found, lens = _placed(found, lens, groups, told if 1 <= told <= count else 1, rebuild)
+    operands = [_operand(group, found, lens, rebuild) for group in groups]
     agreeing = [k for k in range(1, count + 1) if all(_agrees(one, lens, k) is not False for one in operands)]
     active = told if 1 <= told <= count else agreeing[0] if agreeing else 1
     _say(head, count, active, operands, bool(told or len(agreeing) == 1), configuration, report)
@@ -61,6 +64,16 @@ def read(found: Sections, lens: Lens, rebuild: Rebuild, report: Draft, configura
     _say_solved(found, operands, active, report)
     lens = _with_operands(lens, operands, count, active)
     return lens if configuration is None else _chosen(lens, configuration, head)
+
+
+def _placed(
+    found: Sections, lens: Lens, groups: Sequence[tuple[Cell, ...]], active: int, rebuild: Rebuild
+) -> tuple[Sections, Lens]:
+    """The records and the lens with the environments of surfaces, which operands alone tell."""
+    own = [group[active - 1] for group in groups if group[0].covered is not None]
+    for one in own:
+        found = applied(found, one, one.value)
+    return found, rebuild(found) if own else lens
 
 
 def _chosen(lens: Lens, configuration: int, head: Record) -> Lens:

@@ -16,6 +16,9 @@ from raytrace.formats.source import LensFileError, shown
 from raytrace.formats.spelling import is_infinite, is_number
 from raytrace.formats.zemax_keywords import FIELD_LISTS, Block, Record, Sections, aperture_keywords
 
+#: Stands for the temperature or the pressure of a surface where it is the lens's.
+UNTOLD = "-"
+
 #: At this distance an operand has the object at infinity.
 FAR = 1e10
 
@@ -104,7 +107,10 @@ REFUSED = (
 
 
 class Cell(NamedTuple):
-    """One line of the table: an operand's value in one configuration, as text."""
+    """One line of the table: an operand's value in one configuration, as text.
+
+    covered: of a temperature or pressure that only some surfaces have, which; None of the lens's.
+    """
 
     name: str
     number: int
@@ -112,6 +118,7 @@ class Cell(NamedTuple):
     configuration: int
     value: str
     record: Record
+    covered: tuple[int, ...] | None = None
 
     @property
     def key(self) -> tuple[str, int, int]:
@@ -147,6 +154,8 @@ def applied(found: Sections, one: Cell, value: str) -> Sections:
     row = ROWS[one.name]
     if row.keyword == "STOP":
         return _with_stop(found, one, value)
+    if one.covered is not None:
+        return _with_environments(found, one, value)
     if row.of != "surface":
         return found._replace(system=_put(found.system, one, value))
     if not 0 <= one.number < len(found.surfaces):
@@ -245,6 +254,21 @@ def _with_stop(found: Sections, one: Cell, value: str) -> Sections:
     surfaces = [_with_record(block, old, None) if (old := block.last("STOP")) else block for block in found.surfaces]
     made = Record("STOP", (), "", one.record.place._replace(surface=number), True)
     surfaces[number] = _with_record(surfaces[number], None, made)
+    return found._replace(surfaces=surfaces)
+
+
+def _with_environments(found: Sections, one: Cell, value: str) -> Sections:
+    """The records with a temperature or a pressure in the surfaces that it holds for."""
+    surfaces, position = list(found.surfaces), ROWS[one.name].position
+    for k in one.covered:
+        if not 0 <= k < len(surfaces):
+            last = len(surfaces) - 1
+            raise LensFileError(f"{one.name} of surface {k}; expected one from 0 to {last}", one.record.place)
+        old = surfaces[k].last("ENVD")
+        words = list(old.words if old else (UNTOLD, UNTOLD))
+        words[position] = value
+        made = Record("ENVD", tuple(words), " ".join(words), one.record.place._replace(surface=k), True)
+        surfaces[k] = _with_record(surfaces[k], old, made)
     return found._replace(surfaces=surfaces)
 
 

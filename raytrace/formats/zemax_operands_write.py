@@ -5,6 +5,7 @@ The word of an operand is the one that it stands for in the file of the lens in 
 
 from collections.abc import Callable
 
+from raytrace.formats import zemax_environment
 from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, Place
 from raytrace.formats.spelling import exact, is_infinite, one_line
@@ -19,6 +20,7 @@ def operand_lines(lens: Lens, body: Callable[[Lens], list[str]], file: str) -> l
 
     body: the lines of system and surfaces of a lens. Raises LensFileError for what they cannot tell.
     """
+    lens = zemax_environment.with_operands(lens, Place(file))
     if not lens.operands:
         return ["MNUM 1 1", 'MOFF   0   1 "" 0 0 0 1 1 0 0.0 ""']
     numbers = range(1, count(lens.operands) + 1)
@@ -38,7 +40,7 @@ def with_pickups(lines: list[str], lens: Lens, number: int, place: Place) -> lis
     for operand in lens.operands:
         first = operand.places[0].path if operand.places else ()
         for path, factor, offset in operand.places[1:]:
-            if path[:2] != ("surfaces", number) or number == operand.number:
+            if path[:2] != ("surfaces", number) or number == operand.number or path[2] == "environment":
                 continue
             name = "PRAM" if operand.name.startswith("PAR") else operand.name
             if name not in ("PRAM", "THIC", "CRVT", "GLSS") or path[2:] != first[2:] or path[2] == "phase":
@@ -72,7 +74,7 @@ def _line(operand: Operand, configuration: int, text: Sections, place: Place) ->
 
 def _word(operand: Operand, configuration: int, text: Sections, place: Place) -> str:
     """The value of an operand: the word in the file of its configuration, or its own where it stands for none."""
-    if operand.places and operand.name in ROWS:
+    if operand.places and operand.name in ROWS and not zemax_environment.is_of_surfaces(operand):
         found = word(text, _cell(operand, configuration, place))
         if found is not None:
             return repr(FAR) if is_infinite(found) else found.replace('"', "'")

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from raytrace.formats import zemax_configurations, zemax_surface
+from raytrace.formats import zemax_configurations, zemax_environment, zemax_surface
 from raytrace.formats.media import AtHand, catalogs_at_hand
 from raytrace.formats.report import Draft, ImportReport
 from raytrace.formats.source import LensFileError, UnsupportedSurface, shown
@@ -80,6 +80,7 @@ def read(
         return changed
 
     lens = zemax_configurations.read(found, lens, rebuild, report, configuration)
+    zemax_environment.tell(found, lens, report)
     return lens, report.finished(strict=strict)
 
 
@@ -87,9 +88,9 @@ def _lens(found: Sections, surfaces: Sequence[Surface], unit: float, report: Dra
     """The lens of these surfaces and the records of the system."""
     system, stop = found.system, _stop(found.surfaces)
     wavelengths, weights = _wavelengths(system, report)
-    name = system.last("NAME")
+    name, environment = system.last("NAME"), zemax_environment.environment(system)
     return Lens(
-        surfaces=tuple(surfaces),
+        surfaces=zemax_environment.placed(surfaces, found.surfaces, environment),
         stop=stop,
         aperture=_aperture(system, surfaces[stop].semi_diameter, unit, report),
         fields=_fields(system, unit, report),
@@ -100,6 +101,7 @@ def _lens(found: Sections, surfaces: Sequence[Surface], unit: float, report: Dra
         notes=_notes(system),
         catalogs=tuple(name for record in system.all("GCAT") for name in record.words),
         ray_aiming=_ray_aiming(system),
+        environment=environment,
     )
 
 
@@ -302,13 +304,7 @@ def _ray_aiming(system: Block) -> str:
 
 
 def _remarks(found: Sections, report: Draft) -> None:
-    """Say what the file asks for and the lens does not carry: environment, apodisation, afocal."""
-    environment = found.system.last("ENVD")
-    if environment and environment.words:
-        celsius, pressure = environment.number(0, "temperature"), environment.number(1, "pressure", 1.0)
-        if (celsius, pressure) != (20.0, 1.0):
-            message = f"environment of {celsius:g} °C and {pressure:g} atm; indices are those of 20 °C and 1 atm"
-            report.warn(message, environment.place)
+    """Say what the file asks for and the lens does not carry: apodisation, afocal."""
     for keyword, position, what, message in (
         ("GFAC", 1, "kind of apodisation", "the beam is apodised (GFAC); taken as uniform"),
         ("FTYP", 6, "afocal", "afocal image space (FTYP, seventh value); the image is taken as a plane"),

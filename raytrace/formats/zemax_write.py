@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+from raytrace.formats import zemax_environment
 from raytrace.formats.media import catalogs_needed, is_code, is_left_out, listed_name
 from raytrace.formats.source import LensFileError, Place
 from raytrace.formats.spelling import exact, exact_list, one_line, thickness
@@ -66,7 +67,7 @@ def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
         "LANG 0",
         "UNIT MM X W X CM MR CPMM",
         keyword if keyword == "FLOA" else " ".join(words),
-        "ENVD 20 1 0",
+        zemax_environment.line(lens, place),
         "GFAC 0 0",
         f"GCAT {' '.join(catalogs_needed(lens, catalogs, place.file))}".rstrip(),
         f"RAIM 0 {list(RAY_AIMING).index(lens.ray_aiming)} 1 1 0 0 0 0 0",
