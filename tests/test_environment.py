@@ -11,6 +11,7 @@ from torch.autograd import gradcheck, gradgradcheck
 
 import raytrace as rt
 from raytrace.formats import read_lens_with_report
+from raytrace.media.agf import parse_agf
 from raytrace.media.catalog import SHIPPED, find_glass, shipped_catalog
 from raytrace.media.environment import Environment, NoThermalCoefficients, air_index, dn_dt, index_in, thermal
 from raytrace.media.glass import AIR, constant, from_table, model_glass, refractive_index
@@ -127,6 +128,21 @@ def test_derivatives_by_temperature_pressure_and_wavelength(name):
     # A degree moves an index by 1e-6: what changes it is looked at a million times larger.
     assert gradcheck(lambda *given: 1e4 * index(*given), (line, *numbers), eps=1e-4, atol=1e-5)
     assert gradgradcheck(lambda *given: 1e4 * index(*given), (line, *numbers), eps=1e-3, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("record", "figures"),
+    [
+        ("TD - - - - - - -", (0.0,) * 6 + (20.0,)),
+        ("TD 1e-6 _ - 0 0 - 25", (1e-6, 0.0, 0.0, 0.0, 0.0, 0.0, 25.0)),
+        ("TD 1e-6 1e-8", (1e-6, 1e-8, 0.0, 0.0, 0.0, 0.0, 20.0)),
+        ("TD", (0.0,) * 6 + (20.0,)),
+        ("OD 1 1 1 1 1 1", (0.0,) * 6 + (20.0,)),
+    ],
+)
+def test_thermal_figures_that_a_catalog_leaves_out_are_zero(record, figures):
+    text = f"NM ONE 2 0 1.5 50.0 0 0\nCD 1.25 0 0 0 0 0\n{record}\nLD 0.3 2.5\n"
+    assert tuple(thermal(parse_agf(text, "one.agf").glasses["ONE"])) == figures
 
 
 # -- lenses -----------------------------------------------------------------------------------------------------------
