@@ -3,12 +3,9 @@
 import dataclasses
 
 import torch
+from problems import number as real
 
 import raytrace as rt
-
-
-def real(number) -> torch.Tensor:
-    return torch.tensor(number, dtype=torch.float64)
 
 
 def pose(**numbers) -> rt.Pose:

@@ -18,6 +18,7 @@ from pathlib import Path
 import pytest
 import test_corpus
 import torch
+from problems import number as real
 from test_corpus import MILLIMETRES, REFUSED, RIGHT, WRONG, Comparison
 from zemax_by_definition import surfaces, trace
 
@@ -62,10 +63,6 @@ SETTLED = {
     "IRREGULA": "stored semi-diameters (all but the angle and the tilt about y)",
     "JONESMAT": "stored semi-diameters: a plane; polarisation is not modelled",
 }
-
-
-def real(numbers) -> torch.Tensor:
-    return torch.tensor(numbers, dtype=torch.float64)
 
 
 @functools.cache

@@ -15,8 +15,8 @@ from raytrace.media.agf import parse_agf
 from raytrace.media.catalog import SHIPPED, find_glass, shipped_catalog
 from raytrace.media.environment import Environment, NoThermalCoefficients, air_index, dn_dt, index_in, thermal
 from raytrace.media.glass import AIR, constant, from_table, model_glass, refractive_index
-from raytrace.optics.indices import media
 from raytrace.optics.paraxial import first_order
+from raytrace.optics.sequence import media
 from raytrace.optics.spot import spot_of
 from raytrace.optics.trace import trace_lens
 from raytrace.system.lens import index_behind
@@ -202,7 +202,7 @@ def test_without_an_environment_nothing_is_computed_for_it(monkeypatch):
     lens = rt.read_lens("double_gauss")
     before = media(lens, lens.wavelengths)
     monkeypatch.setattr("raytrace.system.lens.index_in", None)
-    monkeypatch.setattr("raytrace.optics.indices._media_in_environment", None)
+    monkeypatch.setattr("raytrace.optics.sequence._media_in_environment", None)
     assert all(torch.equal(a, b) for a, b in zip(before, media(lens, lens.wavelengths), strict=True))
     assert lens.environment is None
     assert lens.at(f_number=4).environment is None

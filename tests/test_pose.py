@@ -7,8 +7,7 @@ import torch
 from bends import pose, real
 
 import raytrace as rt
-from raytrace.optics.laws import bend_slopes, diffract, reflect, refract
-from raytrace.optics.trace import axial_path, trace_surfaces
+from raytrace.optics.trace import axial_path, bend_slopes, diffract, reflect, refract, trace_surfaces
 from raytrace.system.phases import Added
 from raytrace.system.pose import Pose, direction_in, direction_out, point_in, point_out
 from raytrace.system.rays import start

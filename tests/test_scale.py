@@ -18,8 +18,7 @@ from torch.testing import assert_close
 from raytrace.fused import engine
 from raytrace.media.glass import AIR, constant
 from raytrace.optics.jacobian import hit_jacobian
-from raytrace.optics.laws import refract
-from raytrace.optics.trace import trace_surfaces
+from raytrace.optics.trace import refract, trace_surfaces
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import Surface
 

@@ -25,8 +25,7 @@ from raytrace.maths.numerics import dot
 from raytrace.maths.value import to
 from raytrace.media.glass import MIRROR, sellmeier
 from raytrace.optics.launch import launch, rays_from_infinity, rays_from_point
-from raytrace.optics.laws import reflect, refract
-from raytrace.optics.trace import axial_path, media, steps, trace_lens, trace_surfaces
+from raytrace.optics.trace import axial_path, media, reflect, refract, steps, trace_lens, trace_surfaces
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import normal
 

@@ -1,4 +1,4 @@
-// What a phase on a surface does to light there: raytrace/optics/laws.py, `diffract` and `bend_slopes`, and the path through
+// What a phase on a surface does to light there: raytrace/optics/trace.py, `diffract` and `bend_slopes`, and the path through
 // an ideal lens of raytrace/system/phases.py. Where rays meet the surface is the business of loops.h.
 #pragma once
 #include "paths.h"

@@ -17,9 +17,9 @@ from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.pupil import gauss_rings
 from raytrace.optics.axis import is_bent
 from raytrace.optics.base_ray import base_ray
-from raytrace.optics.conjugates import sequence_of
 from raytrace.optics.launch import launch
 from raytrace.optics.paraxial import paraxial_image_distance
+from raytrace.optics.sequence import sequence_of
 from raytrace.optics.spot import EmptySpot, Spot, spot_of, spot_of_points, where_lit
 from raytrace.optics.trace import media, trace_surfaces
 from raytrace.system.lens import Lens, with_object_distance, with_sensor_distance

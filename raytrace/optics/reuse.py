@@ -17,8 +17,8 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from raytrace.maths.numerics import broadcast_shape
-from raytrace.optics.conjugates import sequence_of
 from raytrace.optics.launch import rays_of_field
+from raytrace.optics.sequence import sequence_of
 from raytrace.optics.trace import Crossing, lens_steps, media, steps, trace_lens, trace_surfaces
 from raytrace.optics.vignetting import vignette
 from raytrace.system.lens import Lens, with_object_distance

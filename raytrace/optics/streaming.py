@@ -16,8 +16,8 @@ from raytrace.fused.choice import WORTH_COMPILING, prepare
 from raytrace.maths import pupil
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.value import to, value
-from raytrace.optics.conjugates import sequence_of
 from raytrace.optics.launch import is_at_infinity, launch, with_ray_aiming
+from raytrace.optics.sequence import sequence_of
 from raytrace.optics.spot import where_lit
 from raytrace.optics.trace import media, trace_surfaces
 from raytrace.system.lens import Lens

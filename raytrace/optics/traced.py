@@ -17,9 +17,9 @@ from torch import Tensor
 from raytrace.files import write_atomically
 from raytrace.maths.result import Result, called
 from raytrace.maths.value import value
-from raytrace.optics.conjugates import sequence_of
 from raytrace.optics.launch import rays as launched
 from raytrace.optics.losses import STATUS, LostRays
+from raytrace.optics.sequence import sequence_of
 from raytrace.optics.trace import axial_path, media, steps, trace_lens
 from raytrace.system.lens import Lens, field_points, vector, wavelengths_of
 from raytrace.system.rays import COLUMNS, Rays

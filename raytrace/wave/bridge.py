@@ -37,9 +37,9 @@ from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to
 from raytrace.maths.zernike import noll
 from raytrace.media.glass import index
-from raytrace.optics.conjugates import sequence_of
 from raytrace.optics.launch import rays_of_field
 from raytrace.optics.scene import Scene, scene, symmetry, trace_scene
+from raytrace.optics.sequence import sequence_of
 from raytrace.optics.trace import media, trace_surfaces
 from raytrace.optics.vignetting import vignette
 from raytrace.optics.wavefront import Wavefront, wavefront_of
