@@ -62,6 +62,13 @@ def test_crossed_cylinders_have_one_focus_and_two_focal_lengths():
     assert float(rt.spot(pair).rms_radius) < 0.03
 
 
+def test_the_scan_lens_has_spots_at_f_theta_in_each_configuration():
+    lens = rt.read_lens("scan_lens")
+    heights = [float(rt.spot(one).centroid[1]) for one in lens.configurations]
+    assert heights == pytest.approx([0.0, -160 * math.radians(20), 160 * math.radians(20)], abs=0.1)
+    assert max(float(rt.spot(one).rms_radius) for one in lens.configurations) < 0.0015
+
+
 def test_diffraction_undoes_the_dispersion_of_the_glass():
     hybrid = rt.read_lens("hybrid_achromat")
     assert float(rt.first_order(hybrid).effective_focal_length) == pytest.approx(100, abs=0.02)

@@ -135,12 +135,29 @@ def _draw_image(axes, frame: Frame, arrived: list[np.ndarray]) -> np.ndarray:
     return corners
 
 
-def _fill(axes, points: np.ndarray) -> float:
-    """How much larger points (3, N) may be seen until they fill the axes."""
+def _fill_page(axes, points: np.ndarray, span: np.ndarray) -> None:
+    """Make the page as high as what is seen of points (3, N) needs, and that as large as the page.
+
+    Axes in space are square: they are made as wide as the page, and reach beyond it above and below.
+    """
+    figure = axes.figure
+    width = figure.get_figwidth()
+    wide, high = _seen_size(axes, points)
+    page = min(max(width * high / wide + 1.3, 3.0), 6.5)
+    figure.set_figheight(page)
+    axes.set_position((0.0, 0.5 + (0.075 - 0.5 * width) / page, 1.0, width / page))
+    wide, high = _seen_size(axes, points)
+    room = (page - 1.15) * figure.dpi
+    axes.set_box_aspect(span, zoom=0.95 * min(axes.bbox.width / wide, room / high))
+
+
+def _seen_size(axes, points: np.ndarray) -> tuple[float, float]:
+    """Width and height in dots of what points (3, N) need about the middle of the box."""
     axes.apply_aspect()
     x, y, _ = proj3d.proj_transform(*points, axes.get_proj())
-    (left, low), (right, high) = axes.viewLim.get_points()  # about the middle of the box, which stands at (0, 0)
-    return float(0.95 / max(x.min() / left, x.max() / right, y.min() / low, y.max() / high))
+    (left, low), (right, high) = axes.viewLim.get_points()  # the middle of the box stands at (0, 0)
+    dots = axes.bbox.width / (right - left), axes.bbox.height / (high - low)
+    return 2 * np.abs(x).max() * dots[0], 2 * np.abs(y).max() * dots[1]
 
 
 def _frame(axes, points: np.ndarray) -> None:
@@ -155,8 +172,7 @@ def _frame(axes, points: np.ndarray) -> None:
     axes.set_proj_type("ortho")
     axes.view_init(elev=22, azim=-62)
     axes.set_axis_off()
-    axes.set_position((0.02, 0.1, 0.96, 0.8))
-    axes.set_box_aspect(span, zoom=_fill(axes, p))
+    _fill_page(axes, p, span)
     bar = style.round_length(0.25 * size)
     at = low - 0.02 * size
     axes.plot([at[0], at[0] + bar], [at[1]] * 2, [at[2]] * 2, color=style.INK, linewidth=1.5)

@@ -125,8 +125,6 @@ def made(lens: Whole, **varied: dict[int, Sequence[float]]) -> Whole:
 
 def kept(lens: Whole) -> Whole:
     """The lens whose operands say of its current configuration what it now holds."""
-    if not lens.operands:
-        return lens
     operands = tuple(taken(operand, lens, lens.current_configuration - 1) for operand in lens.operands)
     return dataclasses.replace(lens, operands=operands)
 

@@ -129,7 +129,8 @@ class Lens:
             raise ValueError(f"surface {surface}: this lens has surfaces 0 to {len(self.surfaces) - 1}")
         surfaces = list(self.surfaces)
         surfaces[surface] = changed(surfaces[surface], numbers, f"surface {surface}", like=self.wavelengths)
-        return multiple.kept(dataclasses.replace(self, surfaces=tuple(surfaces)))
+        found = dataclasses.replace(self, surfaces=tuple(surfaces))
+        return multiple.kept(found) if self.operands else found
 
 
 def changed(surface: Surface, numbers: Mapping[str, object], where: str, *, like: Tensor) -> Surface:
