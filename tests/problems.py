@@ -44,6 +44,12 @@ def field(*y: float) -> torch.Tensor:
     return number([[0.0] * len(y), list(y)])
 
 
+def points(count: int, reach: float, seed: int = 0) -> torch.Tensor:
+    """Points (2, count) within a square of half width `reach` mm."""
+    generator = torch.Generator().manual_seed(seed)
+    return (2 * torch.rand(2, count, generator=generator, dtype=torch.float64) - 1) * reach
+
+
 def vector(*numbers: float) -> torch.Tensor:
     return torch.tensor(numbers, dtype=torch.float64)
 

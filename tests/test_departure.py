@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from problems import lens, surface, vector
+from problems import lens, points, surface, vector
 from torch.autograd import gradcheck, gradgradcheck
 
 from raytrace.formats import write_lens
@@ -24,11 +24,6 @@ from raytrace.system.shapes import Relief, relief
 from raytrace.system.surface import intersect, normal, sag, sag_at
 
 RADIUS = vector(4.0)[0]
-
-
-def points(count: int, reach: float = 3.0, seed: int = 0) -> torch.Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return (2 * torch.rand(2, count, generator=generator, dtype=torch.float64) - 1) * reach
 
 
 def oblique(count: int = 40, reach: float = 2.5) -> tuple[torch.Tensor, torch.Tensor]:
@@ -75,7 +70,7 @@ ALL = {
 
 @pytest.mark.parametrize("departure", [bumpy(), sampled(wavy, 12)], ids=["zernike", "grid"])
 def test_slopes_are_the_derivatives_of_the_sag(departure):
-    x, y = points(50).requires_grad_().unbind()
+    x, y = points(50, 3.0).requires_grad_().unbind()
     found = relief(departure).sag(x, y)
     of_x, of_y = torch.autograd.grad(found.z.sum(), (x, y), create_graph=True)
     of_xx, of_xy = torch.autograd.grad(of_x.sum(), (x, y), retain_graph=True)
@@ -191,7 +186,9 @@ def test_tilt_is_a_prism():
     slope = 0.1
     tilted = dataclasses.replace(surface(None, 10.0), departure=noll(z3=slope * float(RADIUS) / 2))
     linear = dataclasses.replace(surface(None, 10.0), departure=sampled(lambda x, y: slope * y + 0 * x, 8))
-    rays = start(torch.stack([*points(10), torch.full((10,), -5.0, dtype=torch.float64)]), vector(0, 0, 1)[:, None])
+    rays = start(
+        torch.stack([*points(10, 3.0), torch.full((10,), -5.0, dtype=torch.float64)]), vector(0, 0, 1)[:, None]
+    )
     alpha = math.atan(slope)
     expected = math.asin(1.5 * math.sin(alpha)) - alpha
     for face in (tilted, linear):

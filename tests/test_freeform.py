@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from problems import both_engines, scalar, vector
+from problems import both_engines, points, scalar, vector
 from torch.autograd import gradcheck, gradgradcheck
 from torch.testing import assert_close
 
@@ -60,15 +60,10 @@ ALL = {
 each = pytest.mark.parametrize("name", ALL)
 
 
-def points(count: int = 200, reach: float = 5.0, seed: int = 1) -> torch.Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return (2 * torch.rand(2, count, generator=generator, dtype=torch.float64) - 1) * reach
-
-
 def bundle(count: int = 300, reach: float = 5.0, tilt: float = 0.3):
     direction = torch.cat([points(count, tilt, 2), torch.ones(1, count, dtype=torch.float64)])
     direction = direction / torch.linalg.vector_norm(direction, dim=0)
-    position = torch.cat([points(count, reach), torch.zeros(1, count, dtype=torch.float64)])
+    position = torch.cat([points(count, reach, 1), torch.zeros(1, count, dtype=torch.float64)])
     return position - 15 * direction, direction
 
 
@@ -89,7 +84,7 @@ def test_hits_lie_on_the_sag_and_normals_are_its_slopes(name):
 @each
 def test_derivatives_of_the_sag_are_written_out_right(name):
     surface = ALL[name]
-    x, y = points().requires_grad_().unbind()
+    x, y = points(200, 5.0, 1).requires_grad_().unbind()
     a = surface.coefficients
     if a is None:
         found = relief(surface.departure).sag(x, y)
@@ -114,7 +109,7 @@ def test_derivatives_of_the_sag_are_written_out_right(name):
 
 
 def test_a_toroid_of_equal_curvatures_is_a_sphere_and_a_biconic_a_conic():
-    x, y = points()
+    x, y = points(200, 5.0, 1)
     sphere = Surface(scalar(5.0), scalar(1 / 30))
     close(sag_at(freeform("toroidal", 1 / 30, None, 1 / 30), x, y), sag_at(sphere, x, y), atol=1e-15)
     conic = dataclasses.replace(sphere, conic=scalar(-1.7))
@@ -136,7 +131,7 @@ def test_sections_and_curvatures_at_the_vertex():
 
 
 def test_fringe_terms_are_the_polynomials_that_are_one_at_the_rim():
-    x, y = points(100, 4.0)
+    x, y = points(100, 4.0, 1)
     departure = fringes()
     u, v = (x - 0.5) / 8, (y + 0.4) / 8
     orders = [zernike.fringe(j) for j in range(1, 38)]
@@ -151,14 +146,14 @@ def test_fringe_terms_are_the_polynomials_that_are_one_at_the_rim():
 
 def test_polynomial_terms_stand_in_their_order():
     assert powers(9) == [(1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3)]
-    x, y = points(50)
+    x, y = points(50, 5.0, 1)
     departure = polynomial()
     direct = sum(c * (x / 8) ** i * (y / 8) ** j for (i, j), c in zip(powers(27), departure.coefficients, strict=True))
     close(relief(departure).sag(x, y).z, direct, atol=1e-16)
 
 
 def test_irregularity_and_tilt_are_their_formulas():
-    x, y = points(50)
+    x, y = points(50, 5.0, 1)
     turn, rho = math.radians(25), (x * x + y * y).sqrt() / 8
     v = (y * math.cos(turn) - x * math.sin(turn)) / 8
     close(relief(IRREGULAR).sag(x, y).z, 0.01 * rho**4 + 0.02 * v**2 + 0.013 * rho**2 * v, atol=1e-17)
