@@ -44,6 +44,13 @@ def field(*y: float) -> torch.Tensor:
     return number([[0.0] * len(y), list(y)])
 
 
+def rotation(axis: str, degrees: float) -> torch.Tensor:
+    """The right-handed turn (3, 3) about an axis, as the vendor's help writes it."""
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    rows = {"x": [[1, 0, 0], [0, c, -s], [0, s, c]], "y": [[c, 0, s], [0, 1, 0], [-s, 0, c]]}
+    return torch.tensor((rows | {"z": [[c, -s, 0], [s, c, 0], [0, 0, 1]]})[axis], dtype=torch.float64)
+
+
 def points(count: int, reach: float, seed: int = 0) -> torch.Tensor:
     """Points (2, count) within a square of half width `reach` mm."""
     generator = torch.Generator().manual_seed(seed)

@@ -12,6 +12,7 @@ import warnings
 
 import pytest
 import torch
+from problems import rotation
 
 import raytrace as rt
 from raytrace.analysis.seidel import seidel
@@ -325,19 +326,12 @@ def test_numbers_of_surfaces_before():
 # -- tilts ------------------------------------------------------------------------------------------------------------
 
 
-def turned(axis: str, degrees: float) -> torch.Tensor:
-    """The right-handed turn about an axis."""
-    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    rows = {"x": [[1, 0, 0], [0, c, -s], [0, s, c]], "y": [[c, 0, s], [0, 1, 0], [-s, 0, c]]}
-    return torch.tensor((rows | {"z": [[c, -s, 0], [s, c, 0], [0, 0, 1]]})[axis], dtype=torch.float64)
-
-
 @pytest.mark.parametrize("order", ["", "DT 1;", "DT -1;"])
 def test_the_order_and_the_signs_of_tilts(order):
     """Those that Lambda Research tells for another program, +TLC, -TLB, -TLA by the right hand; Optiland's matrices."""
     tilts = f"{order} DCX 1; DCY 2; DCZ 3; TLA 10; TLB 20; TLC 30"
     found = lens((FAR, f"GLA 1.5; RD 20; TH 2; {tilts}", "RD -20; TH 20"), "EBR 2")
-    x, y, z = turned("x", -10), turned("y", -20), turned("z", 30)
+    x, y, z = rotation("x", -10), rotation("y", -20), rotation("z", 30)
     expected = z @ y @ x if "-" in order else x @ y @ z
     shift = torch.tensor([1.0, 2, 3], dtype=torch.float64)
     here, behind = frames(found)[1:3]

@@ -1,10 +1,9 @@
 """Poses, coordinate breaks and phases: the laws they keep, and what is known exactly of them."""
 
-import math
-
 import pytest
 import torch
 from bends import pose, real
+from problems import rotation
 
 import raytrace as rt
 from raytrace.optics.trace import axial_path, bend_slopes, diffract, reflect, refract, trace_surfaces
@@ -14,13 +13,6 @@ from raytrace.system.rays import start
 from raytrace.system.surface import Surface
 
 SOME = {"x": 1.5, "y": -2.0, "z": 0.25, "tilt_x": 20.0, "tilt_y": -33.0, "tilt_z": 71.0}
-
-
-def rotation(axis: str, degrees: float) -> torch.Tensor:
-    """Right-handed, as the vendor's help writes it."""
-    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    rows = {"x": [[1, 0, 0], [0, c, -s], [0, s, c]], "y": [[c, 0, s], [0, 1, 0], [-s, 0, c]]}
-    return torch.tensor((rows | {"z": [[c, -s, 0], [s, c, 0], [0, 0, 1]]})[axis], dtype=torch.float64)
 
 
 @pytest.mark.parametrize("tilts_first", [False, True])

@@ -355,7 +355,7 @@ class TestWhatHasToKnow:
         for suffix in (".zmx", ".csv"):
             path = tmp_path / f"{name}{suffix}"
             if name == "ripple":
-                with pytest.raises(LensFileError, match="Ripple"):
+                with pytest.raises(LensFileError, match="ripple"):
                     write_lens(system, path)
                 continue
             write_lens(system, path)

@@ -66,7 +66,7 @@ SURFACE_IGNORED = _left_out(
 #: What follows the last surface belongs to these, and not to the lens.
 TAIL_REASON = "merit function or tolerances: not part of the lens"
 
-#: Types of surface that are not modelled, by what OpticStudio calls them; those that are, are rows of `TYPES`.
+#: Types of surface that are not modelled, by what OpticStudio calls them; those that are, are rows of `zemax_types`.
 _TYPES = (
     "EGRATING elliptical grating, XOSPHERE extended odd asphere, ZERNSAG Zernike sag, "
     "SZERNSAG Zernike standard sag, SZERNPHA Zernike standard phase, POLYNOMI polynomial, BINARY_3 binary 3, "

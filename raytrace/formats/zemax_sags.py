@@ -32,6 +32,11 @@ def _round(name: str) -> SurfaceType:
     )
 
 
+def round_types() -> dict[str, SurfaceType]:
+    """Types of the rotationally symmetric kinds, as their rows of KINDS tell them."""
+    return {kind.zemax: _round(kind.name) for kind in KINDS.values() if kind.zemax and kind.form is None}
+
+
 def _extended(numbers: Numbers) -> dict:
     """An even asphere: a_i = α_i / R^2i."""
     terms = [α / numbers.radius ** (2 * i) for i, α in enumerate(numbers.terms.tolist(), 1)]
@@ -131,8 +136,6 @@ def _same(a: Tensor | None, b: Tensor | None) -> bool:
 
 SAGS = {
     "STANDARD": SurfaceType("standard"),
-    "EVENASPH": _round(EVEN),
-    "ODDASPHE": _round("odd asphere"),
     "XASPHERE": SurfaceType(
         "extended asphere",
         _ROUND,
@@ -186,11 +189,10 @@ SAGS = {
     ),
 }
 
-#: TYPE by the departure of a surface, and by its kind of sag.
+#: TYPE by the departure of a surface; a kind of sag has its own in its row of KINDS.
 OF_DEPARTURES = {
     "TiltSag": "TILTSURF",
     "PolynomialSag": "XPOLYNOM",
     "FringeSag": "FZERNSAG",
     "IrregularSag": "IRREGULA",
 }
-OF_KINDS = {EVEN: "EVENASPH", "odd asphere": "ODDASPHE", "toroidal": "TOROIDAL", "biconic": "BICONICX"}

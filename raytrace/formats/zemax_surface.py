@@ -12,7 +12,7 @@ from raytrace.formats.spelling import double, is_infinite
 from raytrace.formats.zemax_keywords import TYPE_NAMES, Block, Record, aperture_keywords
 from raytrace.formats.zemax_numbers import SurfaceType
 from raytrace.formats.zemax_parameters import numbers, poses, report_unused
-from raytrace.formats.zemax_types import TYPES
+from raytrace.formats.zemax_types import types
 from raytrace.media.catalog import Catalog
 from raytrace.media.glass import AIR, MIRROR, Glass, mil_glass
 from raytrace.system.aperture import SHAPES, Aperture
@@ -37,7 +37,7 @@ def refuse_unsupported(blocks: Sequence[Block]) -> None:
 def _unsupported(block: Block, at_end: bool) -> str:
     """Why a surface is not modelled; at_end: whether it is the object or the image."""
     kind = _type(block)
-    row = TYPES.get(kind)
+    row = types().get(kind)
     if row is None:
         name = TYPE_NAMES.get(kind)
         return f"type {kind[:40]}" + (f" ({name})" if name else "")
@@ -69,7 +69,7 @@ def _type(block: Block) -> str:
 
 
 def _modelled() -> str:
-    *first, last = TYPES
+    *first, last = types()
     return f"{', '.join(first)} and {last}"
 
 
@@ -86,7 +86,7 @@ def build(
         raise LensFileError(f"surface {message}", block.place)
     comment = block.last("COMM")
     kind = _type(block)
-    row = TYPES[kind]
+    row = types()[kind]
     shape = {}
     if "curvature" in row.holds:
         shape["curvature"] = _nonzero(block, "CURV", "curvature", millimetres)

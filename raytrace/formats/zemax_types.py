@@ -2,12 +2,15 @@
 
 from raytrace.formats.zemax_numbers import SurfaceType
 from raytrace.formats.zemax_phases import OF_PHASES, PHASES_AND_BREAKS
-from raytrace.formats.zemax_sags import OF_DEPARTURES, OF_KINDS, SAGS
+from raytrace.formats.zemax_sags import OF_DEPARTURES, SAGS, round_types
 from raytrace.system.phases import IdealLens
-from raytrace.system.shapes import EVEN
+from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface
 
-TYPES: dict[str, SurfaceType] = SAGS | PHASES_AND_BREAKS
+
+def types() -> dict[str, SurfaceType]:
+    """Every type that is modelled, STANDARD first."""
+    return {"STANDARD": SAGS["STANDARD"]} | round_types() | SAGS | PHASES_AND_BREAKS
 
 
 def type_of(surface: Surface) -> str | None:
@@ -20,8 +23,9 @@ def type_of(surface: Surface) -> str | None:
         return OF_DEPARTURES.get(type(surface.departure).__name__)
     if surface.coefficients is None:
         return "STANDARD"
-    longer = surface.kind == EVEN and len(surface.coefficients) > len(SAGS["EVENASPH"].parameters)
-    return "XASPHERE" if longer else OF_KINDS.get(surface.kind)
+    kind = KINDS[surface.kind]
+    longer = surface.kind == EVEN and len(surface.coefficients) > kind.parameters
+    return "XASPHERE" if longer else kind.zemax
 
 
 def _type_of_phase(surface: Surface) -> str | None:

@@ -12,7 +12,7 @@ from raytrace.formats.zemax_keywords import FIELD_KINDS, FIELD_LISTS, NOTE_PIECE
 from raytrace.formats.zemax_numbers import INVERSE, SurfaceType, numbers_of, spelled_inverse
 from raytrace.formats.zemax_operands_write import operand_lines, with_pickups
 from raytrace.formats.zemax_sags import stands_in_parameters
-from raytrace.formats.zemax_types import TYPES, type_of
+from raytrace.formats.zemax_types import type_of, types
 from raytrace.media.glass import Glass, mil_glass
 from raytrace.system.aperture import SHAPES, Aperture
 from raytrace.system.lens import RAY_AIMING, Lens
@@ -117,7 +117,7 @@ def _surface(lens: Lens, number: int, surface: Surface, place: Place) -> list[st
         f"  TYPE {kind}",
         *_poses(surface, kind, place),
         f'  CURV {curvature} 0 0 0 0 ""',
-        *_numbers(surface, TYPES[kind], place),
+        *_numbers(surface, types()[kind], place),
         f"  DISZ {thickness(surface.thickness, 'INFINITY', place)}",
         *_glass(surface.glass, place),
         *([] if surface.conic is None else [f"  CONI {exact(surface.conic, 'conic constant', place)}"]),
@@ -144,7 +144,7 @@ def _type(surface: Surface, place: Place) -> str:
     if found is None:
         message = f"a .zmx file has no type for a surface of {_own(surface)}; write a table (.csv)"
         raise LensFileError(message, place)
-    row = TYPES[found]
+    row = types()[found]
     for name, what in _SHAPE.items():
         if getattr(surface, name) is not None and name not in row.holds:
             raise LensFileError(f"{_own(surface)} with a {what}: a {found} surface has none", place)
@@ -164,7 +164,7 @@ def _own(surface: Surface) -> str:
 
 
 def _check_terms(surface: Surface, found: str, place: Place) -> None:
-    kind, row, terms = KINDS[surface.kind], TYPES[found], surface.coefficients
+    kind, row, terms = KINDS[surface.kind], types()[found], surface.coefficients
     if (surface.phase is not None or surface.departure is not None) and surface.kind != EVEN:
         message = f"{_own(surface)} on a surface that is {surface.kind}, expected one that is an {EVEN} at most"
         raise LensFileError(f"{message}; a .zmx file holds no such surface", place)

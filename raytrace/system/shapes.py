@@ -79,8 +79,25 @@ KINDS = {
     for kind in (
         Kind(EVEN, even_terms, zemax="EVENASPH", words=("even", "evenasph"), code=3),
         Kind("odd asphere", odd_terms, step=1, zemax="ODDASPHE", words=("odd", "oddasphe"), code=4, compiled=8),
-        Kind("toroidal", form=freeform.TOROIDAL, heads=("curvature_x",), least=1, most=8, code=5, compiled=8),
-        Kind("biconic", form=freeform.BICONIC, heads=("curvature_x", "conic_x"), least=2, most=2, code=6),
+        Kind(
+            "toroidal",
+            zemax="TOROIDAL",
+            form=freeform.TOROIDAL,
+            heads=("curvature_x",),
+            least=1,
+            most=8,
+            code=5,
+            compiled=8,
+        ),
+        Kind(
+            "biconic",
+            zemax="BICONICX",
+            form=freeform.BICONIC,
+            heads=("curvature_x", "conic_x"),
+            least=2,
+            most=2,
+            code=6,
+        ),
     )
 }
 
