@@ -177,7 +177,8 @@ def test_derivatives_of_the_hit_by_every_number_with_lost_rays(name):
         return torch.where(met, hit, 0.0)
 
     given = tuple(number.clone().requires_grad_() for number in tensors)
-    assert gradcheck(hits, given, atol=1e-6)
+    many = sum(number.numel() for number in given) > 8  # then in random directions
+    assert gradcheck(hits, given, atol=1e-6, fast_mode=many)
     assert gradgradcheck(hits, given, atol=1e-6, fast_mode=True)
 
 
