@@ -68,7 +68,13 @@ def unfolded():
     return lens, images(lens)
 
 
-@pytest.mark.parametrize("fold", [*folds(rt.read_lens("double_gauss"))])
+QUICK = ("90° about x", "askew", "before the stop")
+
+
+@pytest.mark.parametrize(
+    "fold",
+    [pytest.param(f, marks=() if f in QUICK else pytest.mark.slow) for f in folds(rt.read_lens("double_gauss"))],
+)
 def test_a_fold_changes_no_image(unfolded, fold):
     lens, expected = unfolded
     for name, number in images(folds(lens)[fold]).items():

@@ -162,7 +162,10 @@ def test_irregularity_and_tilt_are_their_formulas():
     assert as_polynomial(tilt).coefficients.tolist() == [0.3, -0.2]
 
 
-@each
+LONG = {"fringe": pytest.mark.slow}
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=LONG.get(name, ())) for name in ALL])
 def test_derivatives_of_the_hit_by_every_number_with_lost_rays(name):
     surface = ALL[name]
     position = vector(0.3, 2.0, -1.5, 900.0, 0.4, -1.0, 2.2, 900.0, -9.0, -8.0, -9.0, -7.0).reshape(3, 4)
