@@ -244,6 +244,14 @@ def test_what_is_not_followed_is_told_and_the_configuration_refused(line, said):
         read(text, configuration=2)
 
 
+def test_an_operand_of_an_aperture_that_is_not_stored_is_told_and_its_configuration_refused():
+    lens, report = read(file(tail=operands("APMX 1 1 5 0 0", "APMX 1 2 3 0 0")))
+    assert any("APMX" in warning and "nothing there" in warning for warning in report.warnings)
+    assert lens.surfaces[1].apertures == ()
+    with pytest.raises(ValueError, match=r"configuration 2: .*nothing there"):
+        lens.configuration(2)
+
+
 def test_operands_that_contradict_the_surfaces_are_told_with_line_and_number():
     text = file(tail=operands("CRVT 1 1 0.021 0 0", "CRVT 1 2 0.03 0 0", "THIC 1 1 4 0 0", "THIC 1 2 5 0 0"))
     warnings = read(text)[1].warnings

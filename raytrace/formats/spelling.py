@@ -47,7 +47,12 @@ def is_number(text: str) -> bool:
     """True if `number` would accept the text."""
     if len(text) > _DIGITS or not _NUMBER.fullmatch(text):
         return False
-    return abs(float(re.sub("[dD]", "e", text))) != float("inf")
+    return abs(plain(text)) != float("inf")
+
+
+def plain(text: str) -> float:
+    """The number of a text that `is_number` accepts."""
+    return float(re.sub("[dD]", "e", text))
 
 
 def is_infinite(text: str) -> bool:

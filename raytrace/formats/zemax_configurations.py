@@ -14,7 +14,7 @@ from torch import Tensor
 from raytrace.formats import zemax_environment
 from raytrace.formats.report import IGNORED, READ, UNKNOWN, Draft
 from raytrace.formats.source import LensFileError
-from raytrace.formats.spelling import double, is_number
+from raytrace.formats.spelling import double, is_number, plain
 from raytrace.formats.zemax_keywords import Record, Sections
 from raytrace.formats.zemax_operands import IGNORED as OPERANDS_IGNORED
 from raytrace.formats.zemax_operands import KEPT, REFUSED, ROWS, Cell, applied, cell, solved
@@ -173,14 +173,23 @@ def _operand(cells: tuple[Cell, ...], found: Sections, lens: Lens, rebuild: Rebu
     if places:
         numbers = torch.stack([double(0.0) if row[0] is None else row[0] for row in held])
         return Found(Operand(**named, places=places, numbers=numbers), cells, probes[0])
+    if not all(_has_room(lens, path) for path in paths):
+        refusal = "as it is stored the lens has nothing there, an aperture, say"
+        return Found(Operand(**named, words=words, refusal=refusal), cells, lens)
     places = tuple(Place(path) for path in paths)
     if all(isinstance(row[0], Glass) and all(same(row[0], other) for other in row) for row in held):
         return Found(Operand(**named, places=places, media=tuple(row[0] for row in held)), cells, lens)
     return Found(Operand(**named, places=places, words=tuple(map(tuple, held))), cells, lens)
 
 
+def _has_room(lens: Lens, path: Path) -> bool:
+    """Whether a lens has a place for what stands at the end of a path."""
+    *start, end = path
+    return part(lens, path) is not None or (isinstance(end, str) and part(lens, tuple(start)) is not None)
+
+
 def _numbers(values: Sequence[str]) -> Tensor | None:
-    return double([float(value) for value in values]) if all(map(is_number, values)) else None
+    return double([plain(value) for value in values]) if all(map(is_number, values)) else None
 
 
 def _probed(found: Sections, one: Cell, rebuild: Rebuild) -> list[Lens]:
@@ -289,8 +298,8 @@ def _shown(held) -> str:
 def _say_environment(own: Cell, report: Draft) -> None:
     """Warn of an operand that sets a temperature or a pressure, which move every index."""
     normal, unit, what = {"PRES": (1, "atm", "pressure"), "TEMP": (20, "°C", "temperature")}[own.name]
-    if is_number(own.value) and float(own.value) != normal:
-        message = f"{own.name} {float(own.value):g} {unit} ({what} of configuration {own.configuration}): not followed"
+    if is_number(own.value) and plain(own.value) != normal:
+        message = f"{own.name} {plain(own.value):g} {unit} ({what} of configuration {own.configuration}): not followed"
         report.warn(f"{message}; indices are those at {normal} {unit}", own.record.place)
 
 

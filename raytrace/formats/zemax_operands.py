@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from raytrace.formats.source import LensFileError, shown
-from raytrace.formats.spelling import is_infinite, is_number
+from raytrace.formats.spelling import is_infinite, is_number, plain
 from raytrace.formats.zemax_keywords import FIELD_LISTS, Block, Record, Sections, aperture_keywords
 
 #: Stands for the temperature or the pressure of a surface where it is the lens's.
@@ -125,7 +125,7 @@ class Cell(NamedTuple):
         return self.name, self.number, self.parameter
 
     def __str__(self) -> str:
-        value = f"{float(self.value):g}" if is_number(self.value) else self.value or '""'
+        value = f"{plain(self.value):g}" if is_number(self.value) else self.value or '""'
         return f"{self.name} {self.number} = {value}"
 
 
@@ -186,7 +186,7 @@ def _put(block: Block, one: Cell, value: str) -> Block:
         return _with_glass(block, record, one, value)
     if keyword == "GLAS" and record is None:
         raise LensFileError(f"{one.name} of surface {one.number}, which has no glass", one.record.place)
-    if keyword == "DISZ" and one.number == 0 and is_number(value) and float(value) >= FAR:
+    if keyword == "DISZ" and one.number == 0 and is_number(value) and plain(value) >= FAR:
         value = "INFINITY"
     if is_infinite(value) and not (keyword == "DISZ" and one.number == 0):
         raise LensFileError(f"{one.name} is {shown(value)}; only the object may be at infinity", one.record.place)
@@ -247,7 +247,7 @@ def _with_glass(block: Block, record: Record | None, one: Cell, name: str) -> Bl
 
 
 def _with_stop(found: Sections, one: Cell, value: str) -> Sections:
-    number = int(float(value)) if is_number(value) else -1
+    number = int(plain(value)) if is_number(value) else -1
     if not 0 < number < len(found.surfaces) - 1:
         message = f"STPS is {shown(value)}; expected a surface from 1 to {len(found.surfaces) - 2}"
         raise LensFileError(message, one.record.place)
@@ -294,7 +294,7 @@ def _pickups(block: Block) -> list[tuple[Pickup, str]]:
     found = []
     for told in block.all("PPAR", "PZUP", "CURV"):
         first = {"PPAR": 1, "PZUP": 0, "CURV": 2}[told.keyword]
-        figures = [float(one) for one in told.words[first : first + 3] if is_number(one)]
+        figures = [plain(one) for one in told.words[first : first + 3] if is_number(one)]
         if len(figures) < 2 or (told.keyword == "CURV" and (told.words[1] != "4" or any(figures[2:]))):
             continue
         number = told.words[0]
@@ -318,7 +318,7 @@ def _followed(surfaces: list[Block], before: Sequence[Block]) -> list[Block]:
             stored = pickup.record.words[pickup.position] if pickup.position < len(pickup.record.words) else ""
             if old is None or new is None or old == new or not is_number(stored):
                 continue
-            if abs(float(stored) - old) <= 1e-9 * abs(old) + 1e-300:
+            if abs(plain(stored) - old) <= 1e-9 * abs(old) + 1e-300:
                 words = list(pickup.record.words)
                 words[pickup.position] = repr(new)
                 block = _with_record(block, pickup.record, pickup.record._replace(words=tuple(words)))
@@ -329,7 +329,7 @@ def _followed(surfaces: list[Block], before: Sequence[Block]) -> list[Block]:
 def _with_picked_glass(block: Block, surfaces: Sequence[Block], before: Sequence[Block]) -> Block:
     """A surface with the glass that it picks up from another, which has changed."""
     record = block.last("GLAS")
-    if not record or len(record.words) < 3 or record.words[1] != "2" or not record.words[2].isdigit():
+    if not record or len(record.words) < 3 or record.words[1] != "2" or not re.fullmatch("[0-9]{1,6}", record.words[2]):
         return block
     source = int(record.words[2])
     if source >= block.place.surface or surfaces[source] is before[source]:
@@ -345,7 +345,7 @@ def _picked(block: Block, pickup: Pickup, number: str) -> float | None:
     record = _numbered(block, keyword, number) if keyword == "PARM" else block.last(keyword)
     if not record or pickup.position >= len(record.words) or not is_number(record.words[pickup.position]):
         return None
-    return pickup.factor * float(record.words[pickup.position]) + pickup.offset
+    return pickup.factor * plain(record.words[pickup.position]) + pickup.offset
 
 
 def solved(surfaces: Sequence[Block]) -> list[str]:
