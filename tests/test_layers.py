@@ -31,14 +31,16 @@ FLOORS = {
     "analysis": 7,
     "wave": 7,
     "camera": 8,
+    "merit": 8,
+    "optimize": 9,
     # people
-    "plot": 9,
-    "cli": 10,
+    "plot": 10,
+    "cli": 11,
     # experiments and measurements: nothing imports them
-    "studies": 11,
-    "bench": 11,
-    "__init__": 12,
-    "__main__": 12,
+    "studies": 12,
+    "bench": 12,
+    "__init__": 13,
+    "__main__": 13,
 }
 
 #: Commands, whose imports may wait until they run.
