@@ -17,11 +17,12 @@ from raytrace.files import shipped
 from raytrace.formats import read_lens
 from raytrace.fused import engine, prepare, tracing
 from raytrace.fused.choice import is_fused
-from raytrace.fused.run import trace_compiled
+from raytrace.fused.run import task_of, trace_compiled
+from raytrace.fused.structure import with_numbers
 from raytrace.maths.pupil import sobol
 from raytrace.maths.value import to
 from raytrace.media.glass import MIRROR
-from raytrace.optics.jacobian import hit_jacobian
+from raytrace.optics.jacobian import hit_jacobian, pushed
 from raytrace.optics.launch import launch
 from raytrace.optics.trace import media, trace_lens, trace_surfaces
 from raytrace.system.departure import ZernikeSag
@@ -291,3 +292,32 @@ def test_without_a_compiler_torch_traces_and_one_line_says_why(tmp_path, environ
     assert reason in done.stderr
     assert done.stderr.endswith("; tracing by torch alone\n")
     assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize("with_path", [True, False])
+def test_rays_that_change_before_the_first_surface_are_pushed_on(with_path):
+    system = read_lens("tessar")
+    wavelengths = vector(0.5, 0.6)
+    indices, surfaces = media(system, wavelengths[:, None]), system.surfaces[1:]
+    rays = launch(system, sobol(9)[0], wavelengths=wavelengths)
+    task = task_of(surfaces, rays if with_path else dataclasses.replace(rays, opl=None), indices=indices)
+    position, direction, _, table = task.given
+    generator = torch.Generator().manual_seed(1)
+
+    def drawn(*shape):
+        return torch.randn(*shape, *task.valid.shape, generator=generator, dtype=table.dtype)
+
+    changes = 0.1 * torch.randn(2, *table.shape, generator=generator, dtype=table.dtype) * table.abs()
+    turned = 0.01 * drawn(3, 2)
+    turned = turned - (turned * direction[:, None]).sum(0) * direction[:, None]
+    start = drawn(3, 2), turned, drawn(2) if with_path else None
+    found, by_torch = both(lambda: pushed(surfaces, task, changes, start))
+    for one, other in zip(found, by_torch, strict=True):
+        assert one is other or torch.allclose(one.double(), other.double(), rtol=1e-10, atol=1e-10)
+    step = 1e-6
+    own, between, gap = with_numbers(
+        task.structure, surfaces, (table + step * changes[1]).reshape(3, 2, 1, -1).unbind(-1)
+    )
+    moved = Rays(position + step * start[0][:, 1], direction + step * start[1][:, 1], task.valid, rays.opl)
+    end = trace_surfaces(own, moved, indices=between, gap=gap)
+    assert_close((end.position - found.position)[:2] / step, found.by_position[:2, 1], rtol=1e-4, atol=1e-3)

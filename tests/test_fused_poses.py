@@ -169,7 +169,7 @@ def test_forward_derivatives_are_the_gradients_of_torch(name):
         towards = torch.autograd.grad(table, leaves, change, create_graph=True, allow_unused=True)
         steps = [drawn(*leaf.shape, size=0.1, seed=seed) for seed, leaf in enumerate(leaves)]
         moved = sum((t * step).sum() for t, step in zip(towards, steps, strict=True) if t is not None)
-        _, direction, path = push(task, torch.autograd.grad(moved, change)[0][None])
+        pushed = push(task, torch.autograd.grad(moved, change)[0][None])
     with tracing("eager"):
         end = trace_surfaces(own, rays, indices=indices, wavelength=WAVELENGTHS)
         by_hit, by_rest = (
@@ -183,7 +183,7 @@ def test_forward_derivatives_are_the_gradients_of_torch(name):
         [(torch.zeros_like(x) if g is None else g).reshape(-1) for x, g in zip(leaves, by_hit, strict=True)]
     )
     assert_close((hits * weights[:2]).sum((1, 2, 3)), expected, rtol=1e-10, atol=1e-10)
-    found = (weights[3:6] * direction[0]).sum() + (weights[6] * path[0]).sum()
+    found = (weights[3:6] * pushed.by_direction[:, 0]).sum() + (weights[6] * pushed.by_opl[0]).sum()
     assert_close(found, sum((g * step).sum() for g, step in zip(by_rest, steps, strict=True) if g is not None))
 
 

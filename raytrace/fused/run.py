@@ -36,6 +36,7 @@ class _Call(ctypes.Structure):
         ("changes", ctypes.c_int64),
         ("change", ctypes.c_void_p),
         ("changed", ctypes.c_void_p * 7),
+        ("at_start", ctypes.c_void_p * 7),
     )
 
 
@@ -190,19 +191,42 @@ def _backward(structure: Structure, given, cotangents, wanted: bool):
     return by_rays, torch.from_numpy(total).to(table.dtype)
 
 
-def push(task: Task, changes: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-    """How position (V, 3, ...), direction (V, 3, ...) and path (V, ...) behind the last surface change with the table.
+class Pushed(NamedTuple):
+    """Rays behind the last surface, and how their position (3, V, ...), direction (3, V, ...) and path (V, ...) change.
 
-    changes: (V, rows, K), that of the table for each of V variables; the rays before the first surface stay.
+    opl and by_opl: None where paths are not traced.
     """
+
+    position: Tensor
+    direction: Tensor
+    opl: Tensor | None
+    valid: Tensor
+    by_position: Tensor
+    by_direction: Tensor
+    by_opl: Tensor | None
+
+
+def push(task: Task, changes: Tensor, start: tuple[Tensor, Tensor, Tensor | None] | None = None) -> Pushed:
+    """The rays behind the last surface, and how they change with the table and with the rays before the first.
+
+    changes: (V, rows, K), that of the table for each of V variables; start: those of position (3, V, ...), direction
+    (3, V, ...) and path (V, ...) before the first surface, or None where these rays stay. A lost ray does not change.
+    """
+    position, direction, opl, table = task.given
     call = _call(task.structure, task.valid, *task.given)
     changes = changes.contiguous()
     call.changes, call.change = len(changes), changes.data_ptr()
-    position, direction = (changes.new_empty(3, len(changes), *task.valid.shape) for _ in range(2))
-    opl = None if task.given[2] is None else changes.new_empty(len(changes), *task.valid.shape)
-    call.changed = _pointers(position, direction, opl)
-    _run("tangents", call, changes)
-    return position.transpose(0, 1), direction.transpose(0, 1), opl
+    ends = torch.empty_like(position), torch.empty_like(direction), None if opl is None else torch.empty_like(opl)
+    valid = torch.empty_like(task.valid)
+    call.rays_out, call.valid_out = _pointers(*ends), valid.data_ptr()
+    by = [changes.new_empty(3, len(changes), *task.valid.shape) for _ in range(2)]
+    by_opl = None if opl is None else changes.new_empty(len(changes), *task.valid.shape)
+    call.changed = _pointers(*by, by_opl)
+    if start is not None:
+        start = [None if part is None else part.contiguous() for part in start]
+        call.at_start = _pointers(*start)
+    _run("tangents", call, table)
+    return Pushed(*ends, valid, *by, by_opl)
 
 
 def _call(structure: Structure, valid, position, direction, opl, table) -> _Call:

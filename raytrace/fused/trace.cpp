@@ -31,6 +31,7 @@ struct Call {
   int64_t changes;    // forward derivatives that are asked for at once
   const void* change;  // (changes, rows, numbers), of the rays' type
   void* changed[7];    // (changes, rows, rays) each: how the rays behind the last surface change; null: not wanted
+  const void* at_start[7];  // (changes, rows, rays) each: how the rays before the first change; null: not at all
 };
 
 template <typename T>
@@ -136,11 +137,16 @@ class Trace {
     auto notes = std::make_unique<Notes<T>>();
     auto d = std::make_unique<Rays<T>>();
     const int64_t all = call_.rows * call_.rays;
+    bool started = false;
+    for (const void* part : call_.at_start) started |= part != nullptr;
     each(first, last, [&](int64_t at, int count, int n) {
-      load(rays[0], *notes, at, count, n, false);
-      for (size_t k = 0; k < steps_.size(); k++) cross(k, rays[k], rays[k + 1], *notes, n, false);
+      load(rays[0], *notes, at, count, n, path_);
+      for (size_t k = 0; k < steps_.size(); k++) cross(k, rays[k], rays[k + 1], *notes, n, path_);
+      store(call_.out, rays[steps_.size()], at, count);
+      if (call_.valid_out) std::memcpy(call_.valid_out + at, notes->valid, count);
       for (int64_t number = 0; number < call_.changes; number++) {
-        push_all(number, at / call_.rays, rays.get(), *d, *notes, n);
+        set_off(*d, number * all + at, count, n);
+        push_all(number, at / call_.rays, rays.get(), *d, *notes, n, started);
         void* to[7];
         for (int p = 0; p < 7; p++)
           to[p] = call_.changed[p] ? static_cast<T*>(call_.changed[p]) + number * all : nullptr;
@@ -150,11 +156,20 @@ class Trace {
   }
 
  private:
-  // One change, from the first surface that it touches on. A ray lost at a surface starts anew behind it.
-  void push_all(int64_t number, int64_t row, const Rays<T>* rays, Rays<T>& d, Notes<T>& notes, int n) {
+  // How the rays before the first surface change.
+  void set_off(Rays<T>& d, int64_t at, int count, int n) {
+    for (int p = 0; p < 7; p++) {
+      const T* given = static_cast<const T*>(call_.at_start[p]);
+      if (given) std::memcpy(part(d, p), given + at, count * sizeof(T));
+      const int from = given ? count : 0;
+      std::memset(part(d, p) + from, 0, (n - from) * sizeof(T));
+    }
+  }
+
+  // One change, from the first surface that it touches on, or from the rays before the first if they change
+  // (`begun`). A ray lost at a surface starts anew behind it.
+  void push_all(int64_t number, int64_t row, const Rays<T>* rays, Rays<T>& d, Notes<T>& notes, int n, bool begun) {
     const T* changes = static_cast<const T*>(call_.change) + (number * call_.rows + row) * call_.numbers;
-    for (int p = 0; p < 7; p++) std::memset(part(d, p), 0, n * sizeof(T));
-    bool begun = false;
     for (size_t k = 0; k < steps_.size(); k++) {
       const Surface<T>& s = steps_[k].surface;
       const Change<T> change = change_of(*s.at, changes);

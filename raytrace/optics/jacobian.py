@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from raytrace.fused.choice import is_fused
-from raytrace.fused.run import Task, push, task_of
+from raytrace.fused.run import Pushed, Task, push, task_of
 from raytrace.fused.structure import is_expressible, with_numbers
 from raytrace.optics.trace import trace_surfaces
 from raytrace.system.rays import Rays
@@ -41,10 +41,20 @@ def hit_jacobian(
             "no Jacobian for departures, more than 16 terms, holograms, Fresnel lenses, numbers of another dtype than "
             "the rays, or numbers that differ along the last axis of the rays: use torch.func.jacfwd on the trace"
         )
-    changes = _changes(task.given[3], variables)
+    return pushed(surfaces, task, _changes(task.given[3], variables)).by_position[:2].transpose(0, 1)
+
+
+def pushed(
+    surfaces: Sequence[Surface], task: Task, changes: Tensor, start: tuple[Tensor, Tensor, Tensor | None] | None = None
+) -> Pushed:
+    """The rays behind the last surface and how they change, by the engine that is chosen; arguments as for `run.push`.
+
+    surfaces: those that the task was made of.
+    """
+    rays = Rays(*task.given[:2], task.valid, task.given[2])
     if is_fused(rays, changes, len(surfaces)):
-        return push(task, changes)[0][:, :2]
-    return torch.stack([_pushed_by_torch(surfaces, task, change) for change in changes])
+        return push(task, changes, start)
+    return _pushed_by_torch(surfaces, task, changes, start)
 
 
 def _changes(table: Tensor, variables: Sequence[Tensor]) -> Tensor:
@@ -60,14 +70,33 @@ def _changes(table: Tensor, variables: Sequence[Tensor]) -> Tensor:
     return torch.cat(columns).reshape(-1, *table.shape)
 
 
-def _pushed_by_torch(surfaces: Sequence[Surface], task: Task, change: Tensor) -> Tensor:
-    """The same of one change (rows, K): (2, ...)."""
-    position, direction, opl, table = task.given
-
-    def hits(table: Tensor) -> Tensor:
+def _pushed_by_torch(surfaces: Sequence[Surface], task: Task, changes: Tensor, start) -> Pushed:
+    def behind(position: Tensor, direction: Tensor, opl: Tensor | None, table: Tensor) -> tuple:
         shape = *task.valid.shape[:-1], 1
         numbers = [n.reshape(()) if len(table) == 1 else n.reshape(shape) for n in table.unbind(-1)]
-        own, indices, _ = with_numbers(task.structure, surfaces, numbers)
-        return trace_surfaces(own, Rays(position, direction, task.valid, opl), indices=indices).position[:2]
+        own, indices, gap = with_numbers(task.structure, surfaces, numbers)
+        end = trace_surfaces(own, Rays(position, direction, task.valid, opl), indices=indices, gap=gap)
+        return (end.position, end.direction, *([] if opl is None else [end.opl])), end.valid
 
-    return torch.func.jvp(hits, (table.detach(),), (change,))[1]
+    *rays, table = (None if part is None else part.detach() for part in task.given)
+    found = []
+    for number, change in enumerate(changes):
+        steps = [
+            None if part is None else torch.zeros_like(part) if start is None else start[k].select(int(k < 2), number)
+            for k, part in enumerate(rays)
+        ]
+        given = [(part, step) for part, step in zip((*rays, table), (*steps, change), strict=True) if part is not None]
+        without = rays[2] is None
+        function = (lambda p, d, t: behind(p, d, None, t)) if without else behind
+        found.append(torch.func.jvp(function, *map(tuple, zip(*given, strict=True)), has_aux=True))
+    (ends, _, valid), by = found[0], [torch.stack(parts) for parts in zip(*(f[1] for f in found), strict=True)]
+    position, direction, *opl = ends
+    return Pushed(
+        position,
+        direction,
+        opl[0] if opl else None,
+        valid,
+        by[0].transpose(0, 1),
+        by[1].transpose(0, 1),
+        by[2] if opl else None,
+    )
