@@ -191,6 +191,12 @@ def _backward(structure: Structure, given, cotangents, wanted: bool):
     return by_rays, torch.from_numpy(total).to(table.dtype)
 
 
+def forward(task: Task) -> Rays:
+    """The rays behind the last surface, outside the graph."""
+    position, direction, opl, valid = _forward(task.structure, task.valid, *task.given)
+    return Rays(position, direction, valid, opl)
+
+
 class Pushed(NamedTuple):
     """Rays behind the last surface, and how their position (3, V, ...), direction (3, V, ...) and path (V, ...) change.
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from raytrace.fused.choice import is_fused
-from raytrace.fused.run import Pushed, Task, push, task_of
+from raytrace.fused.run import Pushed, Task, forward, push, task_of
 from raytrace.fused.structure import is_expressible, with_numbers
 from raytrace.optics.trace import trace_surfaces
 from raytrace.system.rays import Rays
@@ -57,6 +57,21 @@ def pushed(
     return _pushed_by_torch(surfaces, task, changes, start)
 
 
+def ends(surfaces: Sequence[Surface], task: Task) -> Rays:
+    """The rays behind the last surface alone, by the engine that is chosen."""
+    position, direction, opl, table = task.given
+    if is_fused(Rays(position, direction, task.valid, opl), table, len(surfaces)):
+        return forward(task)
+    return _behind(surfaces, task, position, direction, opl, table)
+
+
+def _behind(surfaces: Sequence[Surface], task: Task, position, direction, opl, table: Tensor) -> Rays:
+    shape = *task.valid.shape[:-1], 1
+    numbers = [n.reshape(()) if len(table) == 1 else n.reshape(shape) for n in table.unbind(-1)]
+    own, indices, gap = with_numbers(task.structure, surfaces, numbers)
+    return trace_surfaces(own, Rays(position, direction, task.valid, opl), indices=indices, gap=gap)
+
+
 def _changes(table: Tensor, variables: Sequence[Tensor]) -> Tensor:
     """∂table/∂v (V, rows, K)."""
     every = torch.eye(table.numel(), dtype=table.dtype, device=table.device)
@@ -72,10 +87,7 @@ def _changes(table: Tensor, variables: Sequence[Tensor]) -> Tensor:
 
 def _pushed_by_torch(surfaces: Sequence[Surface], task: Task, changes: Tensor, start) -> Pushed:
     def behind(position: Tensor, direction: Tensor, opl: Tensor | None, table: Tensor) -> tuple:
-        shape = *task.valid.shape[:-1], 1
-        numbers = [n.reshape(()) if len(table) == 1 else n.reshape(shape) for n in table.unbind(-1)]
-        own, indices, gap = with_numbers(task.structure, surfaces, numbers)
-        end = trace_surfaces(own, Rays(position, direction, task.valid, opl), indices=indices, gap=gap)
+        end = _behind(surfaces, task, position, direction, opl, table)
         return (end.position, end.direction, *([] if opl is None else [end.opl])), end.valid
 
     *rays, table = (None if part is None else part.detach() for part in task.given)

@@ -68,6 +68,20 @@ def signed(surfaces: Sequence[Surface], indices: Sequence[Tensor]) -> list[Tenso
     return result
 
 
+def brackets(powers: Sequence, gaps: Sequence) -> tuple:
+    """(A, B, C, D) with y′ = A y + B ω, ω′ = C y + D ω through surfaces and the gaps behind them.
+
+    powers: of the surfaces; gaps: t/n behind all of them, or all but the last. Numbers of any arithmetic. Gauss's
+    brackets (Herzberger 1943).
+    """
+    A, B, C, D = 1.0, 0.0, 0.0, 1.0
+    for k, power in enumerate(powers):
+        C, D = C - power * A, D - power * B
+        if k < len(gaps):
+            A, B = A + gaps[k] * C, B + gaps[k] * D
+    return A, B, C, D
+
+
 def system_matrix(
     surfaces: Sequence[Surface], indices: Sequence[Tensor], wavelength: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -77,17 +91,16 @@ def system_matrix(
     along x and y counts by its section along y. indices: signed, len(surfaces) + 1, entries (...); wavelength: (...)
     µm, which surfaces with a phase need. C is minus the power; AD - BC = 1.
     """
+    powers = [power(s, n1, n2, wavelength) for s, n1, n2 in zip(surfaces, indices[:-1], indices[1:], strict=True)]
+    gaps = [surface.thickness / n for surface, n in zip(surfaces[:-1], indices[1:-1], strict=True)]
     one = torch.ones_like(indices[0])
-    A, B, C, D = one, torch.zeros_like(one), torch.zeros_like(one), one
-    for i, surface in enumerate(surfaces):
-        power = vertex_curvature(surface) * (indices[i + 1] - indices[i])
-        if surface.phase is not None:
-            power = power + power_of(surface.phase, wavelength)[1]
-        C, D = C - power * A, D - power * B
-        if i + 1 < len(surfaces):
-            gap = surface.thickness / indices[i + 1]
-            A, B = A + gap * C, B + gap * D
-    return A, B, C, D
+    return tuple(one * part for part in brackets(powers, gaps))
+
+
+def power(surface: Surface, before: Tensor, behind: Tensor, wavelength: Tensor | None = None) -> Tensor:
+    """Power (...) in 1/mm of a surface between signed indices (...), by its section along y."""
+    found = vertex_curvature(surface) * (behind - before)
+    return found if surface.phase is None else found + power_of(surface.phase, wavelength)[1]
 
 
 def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:

@@ -27,7 +27,7 @@ class Vary:
 class Solve:
     """A number that follows from others, at every moment.
 
-    surface, quantity: as for `Vary`. kind, a key of `optimize.solves.SOLVES`, and its numbers:
+    surface, quantity: as for `Vary`. kind, a key of `merit.solves.SOLVES`, and its numbers:
 
     "pickup": `scale` times a number of surface `source`, plus `offset`; quantity_of_source: which number, by default
         the one of the same name.
@@ -57,7 +57,7 @@ class Row:
         field's programs write them: surfaces, a wavelength (from 1, 0 the primary one) or rows; Hx, Hy, Px, Py or data.
     target, weight: the merit is the weighted mean square of value - target; a weight of 0 shows the value alone.
     text: what a line of text says; further: what else stands in the line.
-    Lengths in mm, whatever the unit of the file.
+    Lengths in `Intent.unit`: a merit of lengths and pure numbers depends on the unit, so rows stay as they were written.
     """
 
     operand: str
@@ -82,6 +82,7 @@ class Intent:
     variables: tuple[Vary, ...] = ()
     solves: tuple[Solve, ...] = ()
     merit: tuple[Row, ...] = ()
+    unit: float = 1.0
     tolerances: tuple[str, ...] = ()
     semi_diameters: tuple[int, ...] = ()
     semi_diameter_margin: tuple[float, float] = (0.0, 0.0)

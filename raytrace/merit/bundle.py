@@ -1,0 +1,301 @@
+"""Bundle: all rays that the rows of a merit function ask for, launched and traced in one pass, with derivatives.
+
+Rays are those of `optics.launch`. Where they set out from numbers of the whole lens only by the entrance pupil and the
+focal length, they are launched here, by the same formulas in numpy; in every other case (ray aiming, real image
+heights, telecentric objects, curved ones) by `optics.launch` itself, a forward derivative for every variable.
+"""
+
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from raytrace.fused.run import Task
+from raytrace.fused.structure import is_expressible
+from raytrace.maths.dual import Dual, value_of
+from raytrace.merit.moment import Moment
+from raytrace.optics.jacobian import ends, pushed
+from raytrace.optics.launch import rays_of_field
+from raytrace.optics.sequence import media, sequence_of
+from raytrace.optics.trace import trace_surfaces
+from raytrace.optics.vignetting import vignette
+from raytrace.system.rays import Rays
+
+
+class Ray(NamedTuple):
+    """A ray by its wavelength (from 0), field (Hx, Hy) as part of the largest, and pupil point before vignetting."""
+
+    wavelength: int
+    field: tuple[float, float]
+    pupil: tuple[float, float]
+
+
+class Hits(NamedTuple):
+    """Rays (R,) behind a surface: x, y, z mm in the axes of its vertex; L, M, N; path; valid: bool.
+
+    Components are arrays or dual numbers.
+    """
+
+    position: tuple
+    direction: tuple
+    opl: object
+    valid: np.ndarray
+
+    def at(self, places: np.ndarray) -> "Hits":
+        """Those of some rays."""
+        return Hits(
+            tuple(part[places] for part in self.position),
+            tuple(part[places] for part in self.direction),
+            self.opl[places],
+            self.valid[places],
+        )
+
+
+class Bundle:
+    """The rays asked for of a lens in one configuration, behind the surfaces 1 to `last`."""
+
+    def __init__(self, view, last: int):
+        self.view, self.last = view, last
+        self.rays: dict[Ray, int] = {}
+
+    def ask(self, wavelength: int, field: tuple[float, float], pupil: tuple[float, float]) -> int:
+        """The number of a ray, by which `Hits.at` finds it."""
+        return self.rays.setdefault(Ray(wavelength, tuple(field), tuple(pupil)), len(self.rays))
+
+    # -- found once ----------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _places(self) -> tuple[np.ndarray, list[list[Ray]]]:
+        """Where every ray stands in a table of wavelengths and rays, and its rows, filled up to one length."""
+        rows: list[list[Ray]] = [[] for _ in self.view.wavelengths]
+        places = []
+        for ray in self.rays:
+            places.append((ray.wavelength, len(rows[ray.wavelength])))
+            rows[ray.wavelength].append(ray)
+        length = max(map(len, rows))
+        filling = [row[0] if row else Ray(0, (0.0, 0.0), (0.0, 0.0)) for row in rows]
+        rows = [row + [one] * (length - len(row)) for row, one in zip(rows, filling, strict=True)]
+        return np.array([w * length + r for w, r in places]), rows
+
+    @cached_property
+    def field(self) -> np.ndarray:
+        """(2, W, R) in the lens's own kind of field."""
+        fields = self.view.lens.fields
+        largest = float(torch.hypot(fields.x, fields.y).max())
+        return largest * np.array([[ray.field for ray in row] for row in self._places[1]]).transpose(2, 0, 1)
+
+    @cached_property
+    def pupil(self) -> np.ndarray:
+        """(2, W, R) of the entrance pupil, vignetted."""
+        points = np.array([[ray.pupil for ray in row] for row in self._places[1]]).transpose(2, 0, 1)
+        return vignette(self.view.lens, torch.from_numpy(self.field), torch.from_numpy(points.copy())).numpy()
+
+    @cached_property
+    def _template(self):
+        """Surfaces, structure and table (W, K) as stored, and where the table holds what moves (`_Columns`)."""
+        with torch.enable_grad():
+            leaves, lens = self.view.leaves()
+            surfaces, structure, table = self.view.table_of(self.last, leaves, lens)
+            columns = _columns(table, leaves)
+        surfaces = self.view.table_of(self.last, {}, self.view.lens)[0]
+        return surfaces, structure, table.detach().numpy().copy(), columns
+
+    @cached_property
+    def is_expressible(self) -> bool:
+        """Whether tables can tell all the surfaces."""
+        return all(map(is_expressible, self.view.lens.surfaces[1 : self.last + 1]))
+
+    @cached_property
+    def _launches_itself(self) -> bool:
+        lens = self.view.lens
+        source = lens.surfaces[0]
+        plane = source.is_plane and source.after is None
+        usual = lens.fields.kind in ("angle", "object_height", "paraxial_image_height") and not lens.fields.telecentric
+        return plane and usual and lens.ray_aiming == "off"
+
+    # -- at a moment ---------------------------------------------------------------------------------------------------
+
+    def hits(self, moment: Moment) -> Hits:
+        """All rays on surface `last`, in the order in which they were asked for."""
+        if not self.is_expressible:
+            return self._hits_by_torch(moment)
+        surfaces, structure, *_ = self._template
+        table, changes = self.table(moment)
+        position, direction, opl, valid = self.launched(moment)
+        given = [np.stack([value_of(p) for p in part]) for part in (position, direction)] + [value_of(opl)]
+        given = [torch.from_numpy(np.ascontiguousarray(part)) for part in given]
+        task = Task(structure, torch.from_numpy(valid), (*given, torch.from_numpy(table)))
+        if not moment.count:
+            return self._told(ends(surfaces, task), None)
+        moves = any(isinstance(part, Dual) for part in (*position, *direction, opl))
+        start = self._start(moment.count, position, direction, opl) if moves else None
+        return self._told(pushed(surfaces, task, torch.from_numpy(changes), start), moment.count)
+
+    def _start(self, count: int, position, direction, opl) -> tuple[Tensor, Tensor, Tensor]:
+        shape = count, *self.field.shape[1:]
+        found = np.zeros((7, *shape))
+        for part, number in zip(found, (*position, *direction, opl), strict=True):
+            if isinstance(number, Dual):
+                part[:] = number.full()
+        found = torch.from_numpy(found)
+        return found[:3], found[3:6], found[6]
+
+    def _told(self, end, count: int | None) -> Hits:
+        """The rays of a table as those that were asked for."""
+        places = self._places[0]
+        valid = end.valid.numpy().reshape(-1)[places]
+
+        def picked(value: Tensor, slope: Tensor | None):
+            value = value.detach().numpy().reshape(-1)[places]
+            if count is None:
+                return value
+            return Dual(value, np.where(valid, slope.numpy().reshape(count, -1)[:, places], 0.0))
+
+        by = (end.by_position, end.by_direction, end.by_opl) if count is not None else ([None] * 3, [None] * 3, None)
+        return Hits(
+            tuple(map(picked, end.position, by[0])),
+            tuple(map(picked, end.direction, by[1])),
+            picked(end.opl, by[2]),
+            valid,
+        )
+
+    def table(self, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
+        """The table (W, K) of the lens at a moment, and its derivatives (n, W, K)."""
+        _, _, stored, columns = self._template
+        if columns is None:
+            return self._table_by_torch(moment)
+        table = stored.copy()
+        changes = np.zeros((moment.count, *table.shape))
+        for at, number in moment.numbers.items():
+            if at not in columns:
+                continue
+            table[:, columns[at]] = value_of(number)
+            if isinstance(number, Dual):
+                changes[:, :, columns[at]] = number.slope[:, None, None]
+        return table, changes
+
+    def _table_by_torch(self, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
+        with torch.enable_grad():
+            leaves, lens = self.view.leaves({at: value_of(n) for at, n in moment.numbers.items()})
+            table = self.view.table_of(self.last, leaves, lens)[2]
+            by = _by_leaves(table, leaves) if moment.count else {}
+        changes = np.zeros((moment.count, *table.shape))
+        for at, derivative in by.items():
+            if isinstance(moment.numbers[at], Dual):
+                changes += moment.numbers[at].slope[:, None, None] * derivative
+        return table.detach().numpy(), changes
+
+    def launched(self, moment: Moment):
+        """Position and direction (three of (W, R) each), path (W, R) and validity of the rays before surface 1."""
+        if not self._launches_itself:
+            return self._launched_by_torch(moment)
+        shape = self.field.shape[1:]
+        position, direction, opl = _launched(moment, self.field, self.pupil)
+        filled = [part + np.zeros(shape) for part in (*position, *direction, opl)]
+        return filled[:3], filled[3:6], filled[6], np.ones(shape, dtype=bool)
+
+    def _launched_by_torch(self, moment: Moment):
+        def start(lens) -> Rays:
+            field, pupil = torch.from_numpy(self.field), torch.from_numpy(self.pupil)
+            return rays_of_field(lens, field, pupil, wavelength=lens.wavelengths[:, None])
+
+        parts, valid = self._forward(moment, start)
+        return parts[:3], parts[3:6], parts[6], valid
+
+    def _hits_by_torch(self, moment: Moment) -> Hits:
+        def end(lens) -> Rays:
+            field, pupil, wavelength = torch.from_numpy(self.field), torch.from_numpy(self.pupil), lens.wavelengths
+            rays = rays_of_field(lens, field, pupil, wavelength=wavelength[:, None])
+            indices = media(lens, wavelength[:, None])[: self.last + 1]
+            return trace_surfaces(sequence_of(lens)[: self.last], rays, indices=indices, wavelength=wavelength[:, None])
+
+        parts, valid = self._forward(moment, end)
+        places = self._places[0]
+        parts = [part.reshape(-1)[places] for part in parts]
+        return Hits(tuple(parts[:3]), tuple(parts[3:6]), parts[6], valid.reshape(-1)[places])
+
+    def _forward(self, moment: Moment, function) -> tuple[list, np.ndarray]:
+        """x, y, z, L, M, N and path (W, R) of the rays that a function takes from a lens, and their validity."""
+        shape = self.field.shape[1:]
+
+        def told(rays: Rays) -> list[Tensor]:
+            return [part.expand(shape) for part in (*rays.position, *rays.direction, rays.opl)]
+
+        with torch.no_grad():
+            numbers, lens = self.view.leaves({at: value_of(n) for at, n in moment.numbers.items()})
+            rays = function(lens)
+            values, valid = [part.numpy().copy() for part in told(rays)], rays.valid.expand(shape).numpy().copy()
+        if not moment.count:
+            return values, valid
+        slopes = np.zeros((7, moment.count, *shape))
+        for variable in range(moment.count):
+            with forward_ad.dual_level():
+                moved = {
+                    at: forward_ad.make_dual(leaf.detach(), torch.tensor(float(number.slope[variable])).double())
+                    for (at, leaf), number in zip(numbers.items(), moment.numbers.values(), strict=True)
+                    if isinstance(number, Dual)
+                }
+                for part, number in zip(slopes, told(function(self.view.held(numbers | moved))), strict=True):
+                    tangent = forward_ad.unpack_dual(number).tangent
+                    if tangent is not None:
+                        part[variable] = tangent.numpy()
+        return [Dual(value, np.where(valid, slope, 0.0)) for value, slope in zip(values, slopes, strict=True)], valid
+
+
+def _launched(moment: Moment, field: np.ndarray, pupil: np.ndarray):
+    """Rays through the paraxial entrance pupil, as `optics.launch` starts them: position, direction and path."""
+    data = moment.gaussian(moment.primary)
+    kind, distance = moment.lens.fields.kind, moment.thickness[0]
+    index = np.abs(moment.view.indices[:, :1])
+    radius, depth = 0.5 * moment.entrance_pupil_diameter, data.entrance_pupil_position
+    at_infinity = np.isinf(value_of(distance))
+    if kind == "angle":
+        slope = np.tan(np.deg2rad(field))
+        x, y = slope if at_infinity else (-(distance + depth) * part for part in slope)
+    elif kind == "object_height":
+        x, y = field
+    else:
+        scale = -data.C / data.n_object if at_infinity else (data.C + data.D * moment.vergence) / moment.vergence
+        x, y = (scale * part for part in field)
+    aim = radius * pupil[0], radius * pupil[1], depth
+    if at_infinity:
+        length = np.sqrt(x * x + y * y + 1.0)
+        direction = x / length, y / length, 1.0 / length
+        return aim, direction, index * _dot(aim, direction)
+    source = x, y, -distance
+    chord = tuple(a - o for a, o in zip(aim, source, strict=True))
+    length, far = np.sqrt(_dot(chord, chord)), np.sqrt(_dot(source, source))
+    direction = tuple(part / length for part in chord)
+    if abs(value_of(distance)) < abs(value_of(depth)):
+        return source, direction, -index * far
+    path = (_dot(aim, aim) - 2 * _dot(aim, source)) / (length + far)
+    return aim, direction, index * path
+
+
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _by_leaves(table: Tensor, leaves: dict) -> dict:
+    """∂table/∂leaf (W, K) of every leaf that it depends on."""
+    every = torch.eye(table.numel(), dtype=table.dtype)
+    if not leaves or not table.requires_grad:
+        return {}
+    found = torch.autograd.grad(
+        table.reshape(-1), list(leaves.values()), every, is_grads_batched=True, allow_unused=True
+    )
+    return {at: g.reshape(table.shape).numpy() for at, g in zip(leaves, found, strict=True) if g is not None}
+
+
+def _columns(table: Tensor, leaves: dict) -> dict | None:
+    """The columns that hold what moves just as it is, by address; None where anything stands in it changed."""
+    found = {}
+    for at, derivative in _by_leaves(table, leaves).items():
+        held = table.detach().numpy() == float(leaves[at].detach())
+        if not ((derivative == 0) | ((derivative == 1) & held)).all() or (derivative != derivative[:1]).any():
+            return None
+        found[at] = np.nonzero(derivative[0])[0]
+    return found

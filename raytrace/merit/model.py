@@ -1,0 +1,256 @@
+"""Model: the numbers of a lens, in all its configurations, as functions of the variables of an optimisation.
+
+What a variable moves, what follows by a solve or a pickup, and where the tables of the compiled trace hold it, is found
+once; a `Moment` is the lens at given variables.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.fused.structure import structure_of
+from raytrace.merit.moment import Moment
+from raytrace.optics.paraxial import signed
+from raytrace.optics.sequence import media, sequence_of
+from raytrace.system.intent import Solve, Vary
+from raytrace.system.lens import Lens
+from raytrace.system.phases import power_of
+from raytrace.system.places import Place, number_at, places, with_number
+from raytrace.system.surface import Surface, gap_behind, is_posed, is_round, vertex_curvature
+
+#: A number of a lens: of which surface, and which.
+Address = tuple[int, str]
+
+#: Numbers that a surface keeps at 0 as None.
+_AT_ZERO = ("curvature", "conic")
+
+
+class UnknownNumber(ValueError):
+    """A variable, solve or pickup of a number that the lens does not have."""
+
+
+def place_of(surface: Surface, quantity: str, where: str = "") -> Place:
+    """Where a surface holds a number. Raises UnknownNumber."""
+    known = {"thickness": Place(("thickness",)), **places(surface)}
+    if quantity not in known:
+        raise UnknownNumber(f"{where}no {quantity!r}; it has {', '.join(known)}")
+    return known[quantity]
+
+
+def with_numbers_of(lens: Lens, numbers: dict[Address, Tensor]) -> Lens:
+    """The lens with other numbers of its surfaces."""
+    surfaces = list(lens.surfaces)
+    for (surface, quantity), number in numbers.items():
+        place = place_of(surfaces[surface], quantity, f"surface {surface}: ")
+        surfaces[surface] = with_number(surfaces[surface], place, number)
+    return dataclasses.replace(lens, surfaces=tuple(surfaces))
+
+
+@dataclasses.dataclass(frozen=True)
+class Model:
+    """A lens whose variables move.
+
+    lens: as it is at the start; variables, solves: of `Intent`. Raises UnknownNumber for numbers that it does not have.
+    """
+
+    lens: Lens
+    variables: tuple[Vary, ...] = ()
+    solves: tuple[Solve, ...] = ()
+
+    def __post_init__(self):
+        for one in (*self.variables, *self.solves):
+            if not 0 <= one.surface < len(self.lens.surfaces):
+                last = len(self.lens.surfaces) - 1
+                raise UnknownNumber(f"{one.quantity} of surface {one.surface}: this lens has surfaces 0 to {last}")
+        if len({(one.surface, one.quantity, one.configuration) for one in self.variables}) < len(self.variables):
+            raise UnknownNumber("a variable is named twice")
+
+    @cached_property
+    def views(self) -> tuple["View", ...]:
+        """The lens in each of its configurations."""
+        return tuple(View(self, number) for number in range(1, len(self.lens.configurations) + 1))
+
+    @cached_property
+    def start(self) -> np.ndarray:
+        """The variables (n,) as they stand."""
+        return np.array([self._standing(one) for one in self.variables])
+
+    def _standing(self, one: Vary) -> float:
+        if one.operand is not None:
+            return float(self.lens.operands[one.operand].numbers[one.configuration - 1])
+        held = number_at(self.lens.surfaces[one.surface], self._place(one))
+        return 0.0 if held is None else float(held)
+
+    def _place(self, one: Vary | Solve) -> Place:
+        return place_of(self.lens.surfaces[one.surface], one.quantity, f"surface {one.surface}: ")
+
+    def lens_at(self, variables: np.ndarray) -> Lens:
+        """The lens with its variables there, and with all that follows from them."""
+        lens = self.lens
+        like = lens.wavelengths
+        for one, number in zip(self.variables, variables, strict=True):
+            if one.operand is not None:
+                operand = lens.operands[one.operand]
+                numbers = operand.numbers.clone()
+                numbers[one.configuration - 1] = float(number)
+                moved = dataclasses.replace(operand, numbers=numbers)
+                lens = dataclasses.replace(
+                    lens, operands=(*lens.operands[: one.operand], moved, *lens.operands[one.operand + 1 :])
+                )
+        current = self.views[lens.current_configuration - 1]
+        numbers = current.moment(np.asarray(variables, dtype=float)).numbers
+        there = {at: like.new_tensor(float(n), dtype=torch.float64) for at, n in numbers.items()}
+        return with_numbers_of(lens, there)
+
+
+class View:
+    """A lens in one configuration: what of it moves, and what stays."""
+
+    def __init__(self, model: Model, configuration: int):
+        self.model, self.configuration = model, configuration
+        lens = _open(model.lens.configuration(configuration) if model.lens.operands else model.lens)
+        overridden = _overridden(lens)
+        self.variables: dict[Address, int] = {}
+        for number, one in enumerate(model.variables):
+            own = one.operand is None and (one.surface, one.quantity) not in overridden
+            if own or (one.operand is not None and one.configuration == configuration):
+                self.variables[one.surface, one.quantity] = number
+        self.solves = sorted(
+            (one for one in model.solves if (one.surface, one.quantity) not in overridden),
+            key=lambda one: (one.surface, one.quantity == "thickness"),
+        )
+        moved = (*self.variables, *((one.surface, one.quantity) for one in self.solves))
+        self.moved: tuple[Address, ...] = tuple(dict.fromkeys(moved))
+        self.lens = _modelled(lens, self.moved)
+        self.stored = {at: self.number(at) for at in self.moved}
+
+    @cached_property
+    def waits(self) -> bool:
+        """Whether a solve waits for others that come later, or for the entrance pupil that it moves itself."""
+        solved = {(one.surface, one.quantity): position for position, one in enumerate(self.solves)}
+
+        def is_late(position: int, one: Solve) -> bool:
+            if one.kind == "pickup":
+                return solved.get((one.source, one.quantity_of_source or one.quantity), -1) >= position
+            return one.surface < self.lens.stop or self.lens.aperture.kind in ("image_f_number", "working_f_number")
+
+        return any(is_late(*found) for found in enumerate(self.solves))
+
+    def number(self, at: Address) -> float:
+        """A number of the lens as it is stored."""
+        surface, quantity = at
+        held = number_at(self.lens.surfaces[surface], place_of(self.lens.surfaces[surface], quantity))
+        return 0.0 if held is None else float(held)
+
+    @cached_property
+    def wavelengths(self) -> list[float]:
+        return self.lens.wavelengths.tolist()
+
+    @cached_property
+    def indices(self) -> np.ndarray:
+        """Signed index (W, S) behind every surface, the object first."""
+        n = signed(self.lens.surfaces[1:], media(self.lens, self.lens.wavelengths))
+        return np.stack([x.detach().numpy() for x in n], -1)
+
+    @cached_property
+    def thickness(self) -> list[float]:
+        return [float(surface.thickness.detach()) for surface in self.lens.surfaces]
+
+    @cached_property
+    def curvature(self) -> list[float]:
+        return [
+            0.0 if surface.curvature is None else float(surface.curvature.detach()) for surface in self.lens.surfaces
+        ]
+
+    @cached_property
+    def further_power(self) -> np.ndarray:
+        """Power (W, S) in 1/mm that surfaces have beside c Δn: by a term of r², by a phase."""
+        found = np.zeros_like(self.indices)
+        for k, surface in enumerate(self.lens.surfaces):
+            if k == 0 or surface.is_break:
+                continue
+            bend = float(vertex_curvature(surface).detach()) - self.curvature[k]
+            found[:, k] = bend * (self.indices[:, k] - self.indices[:, k - 1])
+            if surface.phase is not None:
+                found[:, k] += power_of(surface.phase, self.lens.wavelengths)[1].detach().numpy()
+        return found
+
+    @cached_property
+    def is_symmetric(self) -> bool:
+        """Whether all of it is round about one axis."""
+        return all(is_round(surface) and not is_posed(surface) for surface in self.lens.surfaces)
+
+    @cached_property
+    def is_plain(self) -> bool:
+        """Whether all first-order data follow from thicknesses and curvatures alone."""
+        with torch.enable_grad():
+            numbers, lens = self.leaves()
+            powers = [vertex_curvature(s).reshape(()) for s in lens.surfaces if s.curvature is not None or s.is_plane]
+            phases = [power_of(s.phase, lens.wavelengths)[1].sum() for s in lens.surfaces if s.phase is not None]
+            others = [n for (_, quantity), n in numbers.items() if quantity not in ("curvature", "thickness")]
+            total = sum([p for p in (*powers, *phases) if p.requires_grad], torch.zeros((), dtype=torch.float64))
+            if not others or not total.requires_grad:
+                return True
+            found = torch.autograd.grad(total, others, allow_unused=True)
+        return all(g is None or not bool(g.any()) for g in found)
+
+    def leaves(self, values: dict[Address, float] | None = None) -> tuple[dict[Address, Tensor], Lens]:
+        """What moves, as tensors that require a gradient, and the lens that holds them."""
+        values = self.stored if values is None else values
+        numbers = {at: torch.tensor(float(n), dtype=torch.float64, requires_grad=True) for at, n in values.items()}
+        return numbers, self.held(numbers)
+
+    def held(self, numbers: dict[Address, Tensor]) -> Lens:
+        """The lens with other numbers."""
+        return with_numbers_of(self.lens, numbers)
+
+    def table_of(self, last: int, numbers: dict[Address, Tensor], lens: Lens):
+        """The structure of the surfaces 1 to `last`, and the table (W, K) of their numbers."""
+        wavelength = lens.wavelengths[:, None]
+        surfaces = sequence_of(lens)[:last]
+        indices = media(lens, wavelength)[: last + 1]
+        gap = gap_behind(lens.surfaces[0]) if lens.surfaces[0].after is not None else None
+        structure, table = structure_of(surfaces, indices, 1, gap, wavelength)
+        rows = [torch.broadcast_to(n[..., 0] if n.dim() else n, wavelength.shape[:1]) for n in table]
+        return surfaces, structure, torch.stack(rows, -1)
+
+    def moment(self, variables) -> Moment:
+        return Moment(self, variables)
+
+
+def _overridden(lens: Lens) -> set[Address]:
+    """What operands of the configurations hold: there the surface's own variable or solve is void."""
+    found = set()
+    for operand in lens.operands:
+        for place in operand.places:
+            if place.path[0] == "surfaces" and operand.numbers is not None:
+                found |= {(place.path[1], name) for name in _names(lens.surfaces[place.path[1]], place.path[2:])}
+    return found
+
+
+def _names(surface: Surface, path: tuple) -> list[str]:
+    """The names by which a surface's number at a path of `configurations` is known."""
+    known = {"thickness": Place(("thickness",)), **places(surface)}
+    entry = path[-1] if isinstance(path[-1], tuple) else None
+    fields = path[:-1] if entry is not None else path
+    flat = None if entry is None else entry[0] if len(entry) == 1 else None
+    return [name for name, place in known.items() if place.path == fields and place.entry == flat]
+
+
+def _open(lens: Lens) -> Lens:
+    """The lens without apertures: a ray that a merit function names counts also where it is clipped."""
+    return dataclasses.replace(lens, surfaces=tuple(dataclasses.replace(s, apertures=()) for s in lens.surfaces))
+
+
+def _modelled(lens: Lens, moved: Sequence[Address]) -> Lens:
+    """The lens with what moves modelled, also where it is 0 now."""
+    surfaces = list(lens.surfaces)
+    for surface, quantity in moved:
+        if quantity in _AT_ZERO and getattr(surfaces[surface], quantity) is None:
+            zero = torch.zeros_like(surfaces[surface].thickness)
+            surfaces[surface] = dataclasses.replace(surfaces[surface], **{quantity: zero})
+    return dataclasses.replace(lens, surfaces=tuple(surfaces))

@@ -1,0 +1,223 @@
+"""Moment: a lens in one configuration at given variables: its numbers and first-order data, with their derivatives.
+
+Numbers are plain ones, or dual ones (`maths.dual`) where derivatives are asked for; the formulas are the same.
+"""
+
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.maths.dual import Dual, value_of
+from raytrace.merit.solves import SOLVES
+from raytrace.optics.paraxial import brackets, power, signed
+from raytrace.optics.sequence import media
+from raytrace.system.lens import Lens
+
+_PASSES = 60  # through solves that depend on one another
+_STILL = 1e-15  # relative
+
+
+class Gaussian(NamedTuple):
+    """First-order data at one wavelength, signed as in `optics.paraxial`: y′ = A y + B ω, ω′ = C y + D ω, ω = n u.
+
+    A to D: from surface 1 to behind the last one before the image; front: A and B to the stop; rear: B and D from the
+    stop; n_object, n_image: signed indices.
+    """
+
+    A: Dual
+    B: Dual
+    C: Dual
+    D: Dual
+    front: tuple[Dual, Dual]
+    rear: tuple[Dual, Dual]
+    n_object: float
+    n_image: float
+
+    @property
+    def effective_focal_length(self):
+        return -abs(self.n_image) / self.C
+
+    @property
+    def entrance_pupil_position(self):
+        """mm from surface 1."""
+        return self.n_object * self.front[1] / self.front[0]
+
+
+class Moment:
+    """view: `model.View`; variables: (n,) numbers, or a Dual of them."""
+
+    def __init__(self, view, variables):
+        self.view, self.lens, self.variables = view, view.lens, variables
+        self.numbers: dict = {at: variables[number] for at, number in view.variables.items()}
+        self._gaussian: dict[int, Gaussian] = {}
+        self._solve()
+
+    @property
+    def count(self) -> int:
+        """How many variables there are derivatives by; 0 where none are asked for."""
+        return len(self.variables.slope) if isinstance(self.variables, Dual) else 0
+
+    def number(self, surface: int, quantity: str):
+        """A number of a surface, solved, picked up, varied or as it is stored."""
+        found = self.numbers.get((surface, quantity))
+        return self.view.number((surface, quantity)) if found is None else found
+
+    @cached_property
+    def thickness(self) -> list:
+        """mm behind every surface, the object's first."""
+        return self._listed("thickness", self.view.thickness)
+
+    @cached_property
+    def curvature(self) -> list:
+        """1/mm of every surface, terms of r² left out."""
+        return self._listed("curvature", self.view.curvature)
+
+    def _listed(self, quantity: str, stored: list[float]) -> list:
+        found = list(stored)
+        for (surface, name), number in self.numbers.items():
+            if name == quantity:
+                found[surface] = number
+        return found
+
+    def index(self, wavelength: int) -> np.ndarray:
+        """Signed index (S,) behind every surface at a wavelength, counted from 0."""
+        return self.view.indices[wavelength]
+
+    def power(self, k: int, wavelength: int):
+        """Power in 1/mm of a surface."""
+        n = self.index(wavelength)
+        return self.curvature[k] * (n[k] - n[k - 1]) + self.view.further_power[wavelength, k]
+
+    def matrix(self, first: int, last: int, wavelength: int, *, to_next: bool = False):
+        """(A, B, C, D) from the vertex of a surface, before it, to behind another, or to the vertex after that."""
+        n = self.index(wavelength)
+        steps = range(first, last + 1)
+        gaps = [self.thickness[k] / n[k] for k in (steps if to_next else steps[:-1])]
+        return brackets([self.power(k, wavelength) for k in steps], gaps)
+
+    def gaussian(self, wavelength: int) -> Gaussian:
+        if wavelength not in self._gaussian:
+            self._gaussian[wavelength] = self._found(wavelength)
+        return self._gaussian[wavelength]
+
+    @property
+    def primary(self) -> int:
+        return self.lens.primary_wavelength
+
+    def _found(self, wavelength: int) -> Gaussian:
+        n, stop, last = self.index(wavelength), self.lens.stop, len(self.lens.surfaces) - 2
+        if self.view.is_plain:
+            front = self.matrix(1, stop - 1, wavelength, to_next=True)
+            A1, B1, C1, D1, A2, B2, C2, D2 = *front, *self.matrix(stop, last, wavelength)
+        else:
+            A1, B1, C1, D1, A2, B2, C2, D2 = self.through_torch(lambda lens: _halves(lens, wavelength))
+        whole = A2 * A1 + B2 * C1, A2 * B1 + B2 * D1, C2 * A1 + D2 * C1, C2 * B1 + D2 * D1
+        return Gaussian(*whole, (A1, B1), (B2, D2), float(n[0]), float(n[last]))
+
+    # -- the beam ------------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def vergence(self):
+        """n / object distance at the primary wavelength, 0 for an object at infinity."""
+        return self.index(self.primary)[0] / self.object_distance
+
+    @property
+    def object_distance(self):
+        distance = self.thickness[0]
+        return np.finfo(float).tiny ** 0.5 if not isinstance(distance, Dual) and distance == 0 else distance
+
+    @cached_property
+    def entrance_pupil_diameter(self):
+        """mm, as the aperture of the lens means it, at the primary wavelength."""
+        kind, number = self.lens.aperture.kind, float(self.lens.aperture.value)
+        data = self.gaussian(self.primary)
+        if kind == "entrance_pupil_diameter":
+            return number
+        if kind == "image_f_number":
+            return np.abs(data.effective_focal_length) / number
+        if kind == "float_by_stop":
+            return 2 * number / np.abs(data.front[0])
+        if kind == "working_f_number":
+            slope, omega = 0.5 / (number * abs(data.n_image)), data.C + data.D * self.vergence
+            pupil = data.entrance_pupil_position
+            return 2 * np.abs(slope * data.n_image / omega * (1 + pupil * self.vergence / data.n_object))
+        return 2 * np.abs((self.thickness[0] + data.entrance_pupil_position) * np.tan(self.cone_angle))
+
+    @property
+    def cone_angle(self) -> float:
+        """Half angle of the cone at the object, radians, of an aperture that is given as one."""
+        kind, number = self.lens.aperture.kind, float(self.lens.aperture.value)
+        return np.arcsin(number / self.index(self.primary)[0]) if kind == "object_na" else np.deg2rad(number)
+
+    @cached_property
+    def marginal_height(self):
+        """mm at surface 1 of the paraxial marginal ray."""
+        data = self.gaussian(self.primary)
+        reach = 1 + data.entrance_pupil_position * self.vergence / data.n_object
+        if self.lens.aperture.kind in ("object_na", "object_cone_angle"):
+            height = np.abs(self.thickness[0] * np.tan(self.cone_angle))
+            return -height if value_of(reach) < 0 else height
+        return 0.5 * self.entrance_pupil_diameter / reach
+
+    # -- what follows --------------------------------------------------------------------------------------------------
+
+    def _solve(self) -> None:
+        """Solves and pickups in the order of surfaces, again until they stand still where one waits for another."""
+        solves = self.view.solves
+        if not solves:
+            return
+        self.numbers |= {(one.surface, one.quantity): self.view.stored[one.surface, one.quantity] for one in solves}
+        for _ in range(_PASSES):
+            before = dict(self.numbers)
+            for one in solves:
+                self.numbers[one.surface, one.quantity] = SOLVES[one.kind](self, one)
+                self._forget()
+            if not self.view.waits or self._is_still(before):
+                break
+
+    def _is_still(self, before: dict) -> bool:
+        def far(one, other) -> float:
+            a, b = value_of(one), value_of(other)
+            return abs(a - b) / max(abs(a), abs(b), 1e-300) if a != b else 0.0
+
+        return all(far(number, before[at]) <= _STILL for at, number in self.numbers.items())
+
+    def _forget(self) -> None:
+        for name in ("thickness", "curvature", "vergence", "entrance_pupil_diameter", "marginal_height"):
+            self.__dict__.pop(name, None)
+        self._gaussian.clear()
+
+    # -- anything else, by torch ---------------------------------------------------------------------------------------
+
+    def through_torch(self, function) -> list:
+        """Numbers () that a function takes from a lens with torch, with their derivatives by the variables."""
+        with torch.enable_grad():
+            leaves, lens = self.view.leaves({at: value_of(n) for at, n in self.numbers.items()})
+            found = function(lens)
+            if not self.count:
+                return [float(number.detach()) for number in found]
+            return [self.chained(number, leaves) for number in found]
+
+    def chained(self, number: Tensor, leaves: dict) -> Dual:
+        """A number () that was computed from leaves, with its derivatives by the variables."""
+        value, slope = float(number.detach()), np.zeros(self.count)
+        if number.requires_grad:
+            by = torch.autograd.grad(number, list(leaves.values()), retain_graph=True, allow_unused=True)
+            for at, derivative in zip(leaves, by, strict=True):
+                moved = self.numbers[at]
+                if derivative is not None and isinstance(moved, Dual):
+                    slope = slope + float(derivative) * moved.slope
+        return Dual(value, slope)
+
+
+def _halves(lens: Lens, wavelength: int) -> list[Tensor]:
+    """(A, B, C, D) from surface 1 to the stop, and from there to behind the last surface before the image."""
+    at, surfaces = lens.wavelengths[wavelength], lens.surfaces[1:-1]
+    n = signed(surfaces, media(lens, at)[:-1])
+    powers = [power(s, n1, n2, at) for s, n1, n2 in zip(surfaces, n[:-1], n[1:], strict=True)]
+    gaps, stop = [surface.thickness / behind for surface, behind in zip(surfaces, n[1:], strict=True)], lens.stop - 1
+    halves = *brackets(powers[:stop], gaps[:stop]), *brackets(powers[stop:], gaps[stop:-1])
+    return [torch.as_tensor(number, dtype=torch.float64) for number in halves]

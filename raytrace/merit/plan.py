@@ -1,0 +1,103 @@
+"""Plan: what the rows of a merit function need, found once; `Now` gives it at variables.
+
+An operand is a row of a table (`operands.OPERANDS`); all rows of one operand in one configuration are evaluated
+together.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from raytrace.merit.bundle import Bundle, Hits
+from raytrace.merit.model import Model, View
+from raytrace.merit.moment import Moment
+from raytrace.system.intent import Row
+
+
+class Line(NamedTuple):
+    """A row of a merit function where it stands: its number, from 1, its wavelength from 0, and the configuration's."""
+
+    number: int
+    row: Row
+    wavelength: int
+
+    @property
+    def field(self) -> tuple[float, float]:
+        return self.row.numbers[0], self.row.numbers[1]
+
+    @property
+    def pupil(self) -> tuple[float, float]:
+        return self.row.numbers[2], self.row.numbers[3]
+
+
+class Found(NamedTuple):
+    """What rows come to: values (R,), an array or dual numbers, nan where a ray is lost.
+
+    parts: several (R,), whose squares sum up to the square of the value, and which are smooth where it is 0.
+    """
+
+    values: object
+    parts: tuple = ()
+
+
+#: Values of rows at a moment; rows of arithmetic take those found so far, by their number.
+Evaluate = Callable[["Now"], Found]
+
+
+@dataclasses.dataclass(frozen=True)
+class Operand:
+    """One operand of merit functions.
+
+    plan: from its rows in one configuration and a `Planner` to their `Evaluate`. text: what it is, with its arguments.
+    length: the power of length in its unit, as -1 of a curvature; values are in mm, and become those of `Intent.unit`.
+    reading: where the field's own program is not settled, which reading is taken.
+    """
+
+    plan: Callable[[Sequence[Line], "Planner"], Evaluate]
+    text: str
+    length: int = 0
+    reading: str = ""
+
+
+class Planner:
+    """What operands may ask for, of a lens in one configuration."""
+
+    def __init__(self, view: View, primary: int):
+        self.view, self.lens, self.primary = view, view.lens, primary
+        self.bundles: dict[int, Bundle] = {}
+
+    @property
+    def image(self) -> int:
+        return len(self.lens.surfaces) - 1
+
+    def ray(self, line: Line, *, surface: int | None = None, pupil=None, wavelength: int | None = None) -> int:
+        """The number of the ray of a row behind a surface, the image by default."""
+        last = self.image if surface is None else surface
+        bundle = self.bundles.setdefault(last, Bundle(self.view, last))
+        return bundle.ask(
+            line.wavelength if wavelength is None else wavelength, line.field, line.pupil if pupil is None else pupil
+        )
+
+    def rays(self, lines: Sequence[Line], **which) -> np.ndarray:
+        return np.array([self.ray(line, **which) for line in lines])
+
+
+class Now:
+    """The lens in one configuration at given variables: its moment and its rays, traced when they are first needed."""
+
+    def __init__(self, planner: Planner, moment: Moment, values: dict[int, object]):
+        self.planner, self.moment, self.values = planner, moment, values
+        self._hits: dict[int, Hits] = {}
+
+    def hits(self, rays: np.ndarray, *, surface: int | None = None) -> Hits:
+        """Rays by their numbers behind a surface, the image by default."""
+        last = self.planner.image if surface is None else surface
+        if last not in self._hits:
+            self._hits[last] = self.planner.bundles[last].hits(self.moment)
+        return self._hits[last].at(rays)
+
+
+def planner_of(model: Model, configuration: int, primary: int) -> Planner:
+    return Planner(model.views[configuration - 1], primary)

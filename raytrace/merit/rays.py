@@ -1,0 +1,127 @@
+"""Operands of rays: where they land, and in which direction they go."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from raytrace.maths.dual import Dual, value_of
+from raytrace.merit.plan import Evaluate, Found, Line, Now, Operand, Planner
+
+
+def from_centroid(component: int | None) -> Callable[[Sequence[Line], Planner], Evaluate]:
+    """The distance on the image, or its x or y, from the centroid of the rows' rays of one field, all wavelengths.
+
+    The centroid is weighted as the rows are. In a lens that is symmetric about its axis it is that of the rays and
+    their mirror images, of which rows leave out half.
+    """
+
+    def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
+        rays, mean = planner.rays(lines), _means(lines)
+        on_y = np.array([planner.view.is_symmetric and line.field[0] == 0 for line in lines])
+        on_axis = on_y & np.array([line.field[1] == 0 for line in lines])
+
+        def evaluate(now: Now) -> Found:
+            hits = now.hits(rays)
+            weights = mean * hits.valid
+            weights = weights / np.maximum(weights.sum(-1, keepdims=True), 1e-300)
+            x, y, _ = hits.position
+            x = x - np.where(on_y, 0.0, 1.0) * (weights @ x)
+            y = y - np.where(on_axis, 0.0, 1.0) * (weights @ y)
+            return _told(hits.valid, x, y, component)
+
+        return evaluate
+
+    return plan
+
+
+def from_chief(component: int | None) -> Callable[[Sequence[Line], Planner], Evaluate]:
+    """The distance on the image, or its x or y, from the chief ray of the primary wavelength."""
+
+    def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
+        rays = planner.rays(lines)
+        chief = planner.rays(lines, pupil=(0.0, 0.0), wavelength=planner.primary)
+
+        def evaluate(now: Now) -> Found:
+            hits, centre = now.hits(rays), now.hits(chief)
+            x, y = (hits.position[k] - centre.position[k] for k in range(2))
+            return _told(hits.valid & centre.valid, x, y, component)
+
+        return evaluate
+
+    return plan
+
+
+def _means(lines: Sequence[Line]) -> np.ndarray:
+    """(R, R): the weights of the rows of the same field as each."""
+    fields = np.array([line.field for line in lines])
+    same = (fields[:, None] == fields[None]).all(-1)
+    weights = np.array([max(line.row.weight, 0.0) for line in lines])
+    return same * weights
+
+
+def _told(valid: np.ndarray, x, y, component: int | None) -> Found:
+    x, y = known(valid, x), known(valid, y)
+    if component is not None:
+        return Found((x, y)[component])
+    return Found(np.sqrt(x * x + y * y), (x, y))
+
+
+def known(valid: np.ndarray, number):
+    """nan where a ray is lost."""
+    if isinstance(number, Dual):
+        return Dual(np.where(valid, value_of(number), np.nan), number.slope)
+    return np.where(valid, number, np.nan)
+
+
+def at_surface(tell: Callable) -> Callable[[Sequence[Line], Planner], Evaluate]:
+    """A number of the ray on the surface that the row names, in the axes of its vertex, behind it."""
+
+    def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
+        surfaces = np.array([line.row.integers[0] for line in lines])
+        rays = {
+            s: planner.rays([l for l in lines if l.row.integers[0] == s], surface=s) for s in set(surfaces.tolist())
+        }
+
+        def evaluate(now: Now) -> Found:
+            found = np.full(len(lines), np.nan)
+            slopes = np.zeros((now.moment.count, len(lines)))
+            for surface, asked in rays.items():
+                hits = now.hits(asked, surface=surface)
+                number = known(hits.valid, tell(hits))
+                found[surfaces == surface] = value_of(number)
+                if isinstance(number, Dual):
+                    slopes[:, surfaces == surface] = number.full()
+            return Found(Dual(found, slopes) if now.moment.count else found)
+
+        return evaluate
+
+    return plan
+
+
+def _axial_angle(hits):
+    """Radians between the ray and z."""
+    L, M, N = hits.direction
+    return np.arctan(np.sqrt(L * L + M * M) / np.abs(N))
+
+
+def _radius(hits):
+    x, y, _ = hits.position
+    return np.sqrt(x * x + y * y)
+
+
+RAYS = {
+    "TRAC": Operand(from_centroid(None), "distance on the image from the centroid of its field, Hx Hy Px Py", length=1),
+    "TRCX": Operand(from_centroid(0), "its x", length=1),
+    "TRCY": Operand(from_centroid(1), "its y", length=1),
+    "TRAR": Operand(from_chief(None), "distance on the image from the chief ray of the primary wavelength", length=1),
+    "TRAX": Operand(from_chief(0), "its x", length=1),
+    "TRAY": Operand(from_chief(1), "its y", length=1),
+    "REAX": Operand(at_surface(lambda hits: hits.position[0]), "x of a ray on a surface", length=1),
+    "REAY": Operand(at_surface(lambda hits: hits.position[1]), "y of a ray on a surface", length=1),
+    "REAZ": Operand(at_surface(lambda hits: hits.position[2]), "z of a ray on a surface", length=1),
+    "REAR": Operand(at_surface(_radius), "distance of a ray on a surface from its axis", length=1),
+    "REAA": Operand(at_surface(lambda hits: hits.direction[0]), "cosine of a ray behind a surface to x"),
+    "REAB": Operand(at_surface(lambda hits: hits.direction[1]), "cosine of a ray behind a surface to y"),
+    "REAC": Operand(at_surface(lambda hits: hits.direction[2]), "cosine of a ray behind a surface to z"),
+    "RANG": Operand(at_surface(_axial_angle), "angle of a ray behind a surface to z, radians"),
+}
