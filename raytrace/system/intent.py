@@ -57,7 +57,7 @@ class Row:
         field's programs write them: surfaces, a wavelength (from 1, 0 the primary one) or rows; Hx, Hy, Px, Py or data.
     target, weight: the merit is the weighted mean square of value - target; a weight of 0 shows the value alone.
     text: what a line of text says; further: what else stands in the line.
-    Lengths in `Intent.unit`: a merit of lengths and pure numbers depends on the unit, so rows stay as they were written.
+    Lengths in `Intent.unit`: a merit of lengths and pure numbers depends on the unit, so rows stay as written.
     """
 
     operand: str
