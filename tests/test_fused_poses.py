@@ -12,7 +12,8 @@ from torch.testing import assert_close
 
 import raytrace as rt
 from raytrace.fused import tracing
-from raytrace.fused.run import push, task_of, trace_compiled
+from raytrace.fused.run import push, push_everywhere, task_of, trace_compiled
+from raytrace.fused.structure import rows_of
 from raytrace.maths.value import to
 from raytrace.media.glass import MIRROR
 from raytrace.optics.jacobian import hit_jacobian
@@ -185,6 +186,39 @@ def test_forward_derivatives_are_the_gradients_of_torch(name):
     assert_close((hits * weights[:2]).sum((1, 2, 3)), expected, rtol=1e-10, atol=1e-10)
     found = (weights[3:6] * pushed.by_direction[:, 0]).sum() + (weights[6] * pushed.by_opl[0]).sum()
     assert_close(found, sum((g * step).sum() for g, step in zip(by_rest, steps, strict=True) if g is not None))
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_rays_behind_all_surfaces_at_once_are_those_behind_each(name):
+    """Positions, paths, validity and forward derivatives, lost rays included, where axes turn on the way too."""
+    surfaces, rays, how = given(name, count=40)
+    indices, wavelength = how["indices"], WAVELENGTHS
+    task = task_of(surfaces, rays, indices=indices, wavelength=wavelength)
+    change = drawn(2, *task.given[3].shape, size=0.01, seed=3) * task.given[3].abs()
+    with tracing("fused"):
+        found = push_everywhere(task, change)
+        bare = push_everywhere(task, change[:0])
+        for number, row in enumerate(rows_of(task.structure, surfaces), 1):
+            part = task_of(surfaces[:number], rays, indices=indices[: number + 1], wavelength=wavelength)
+            columns = _columns_of(part, task)
+            one = push(part, change[..., columns])
+            for name in ("position", "direction", "by_position", "by_direction"):
+                assert_close(getattr(found, name)[:, row], getattr(one, name), rtol=0, atol=0, equal_nan=True)
+            for name in ("opl", "by_opl", "valid"):
+                assert_close(getattr(found, name)[row], getattr(one, name), rtol=0, atol=0, equal_nan=True)
+            assert torch.equal(bare.position[:, row], one.position)
+    assert row == len(task.structure.layout) - 1
+
+
+def _columns_of(part, whole) -> list[int]:
+    """Where the numbers of the first surfaces stand in the table of all of them."""
+    found = {}
+    for own, other in zip(part.structure.layout.tolist(), whole.structure.layout.tolist(), strict=False):
+        for places in ((6,), (7,), (8,), (10,), (11,)):
+            found |= {own[k]: other[k] for k in places}
+        found |= {own[9] + j: other[9] + j for j in range(own[3])}
+        found |= {own[15] + j: other[15] + j for j in range(own[14])}
+    return [found[k] for k in range(part.given[3].shape[-1])]
 
 
 @pytest.mark.parametrize("glass", [1.0, 1.5, MIRROR])

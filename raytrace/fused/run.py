@@ -37,6 +37,7 @@ class _Call(ctypes.Structure):
         ("change", ctypes.c_void_p),
         ("changed", ctypes.c_void_p * 7),
         ("at_start", ctypes.c_void_p * 7),
+        ("everywhere", ctypes.c_int64),
     )
 
 
@@ -218,15 +219,29 @@ def push(task: Task, changes: Tensor, start: tuple[Tensor, Tensor, Tensor | None
     changes: (V, rows, K), that of the table for each of V variables; start: those of position (3, V, ...), direction
     (3, V, ...) and path (V, ...) before the first surface, or None where these rays stay. A lost ray does not change.
     """
+    return _pushed(task, changes, start, ())
+
+
+def push_everywhere(task: Task, changes: Tensor, start: tuple[Tensor, Tensor, Tensor | None] | None = None) -> Pushed:
+    """`push` for the rays behind every row of the structure, K of them, not the last alone.
+
+    The rays have a first axis more: position (3, K, ...), opl and valid (K, ...), by_position (3, K, V, ...). V may be
+    0. A ray is valid up to where it is lost.
+    """
+    return _pushed(task, changes, start, (len(task.structure.layout),))
+
+
+def _pushed(task: Task, changes: Tensor, start, pages: tuple[int, ...]) -> Pushed:
     position, direction, opl, table = task.given
     call = _call(task.structure, task.valid, *task.given)
-    changes = changes.contiguous()
-    call.changes, call.change = len(changes), changes.data_ptr()
-    ends = torch.empty_like(position), torch.empty_like(direction), None if opl is None else torch.empty_like(opl)
-    valid = torch.empty_like(task.valid)
+    changes, shape = changes.contiguous(), task.valid.shape
+    call.changes, call.change, call.everywhere = len(changes), changes.data_ptr(), len(pages)
+    ends = [part.new_empty(3, *pages, *shape) for part in (position, direction)]
+    ends.append(None if opl is None else opl.new_empty(*pages, *shape))
+    valid = task.valid.new_empty(*pages, *shape)
     call.rays_out, call.valid_out = _pointers(*ends), valid.data_ptr()
-    by = [changes.new_empty(3, len(changes), *task.valid.shape) for _ in range(2)]
-    by_opl = None if opl is None else changes.new_empty(len(changes), *task.valid.shape)
+    by = [changes.new_empty(3, *pages, len(changes), *shape) for _ in range(2)]
+    by_opl = None if opl is None else changes.new_empty(*pages, len(changes), *shape)
     call.changed = _pointers(*by, by_opl)
     if start is not None:
         start = [None if part is None else part.contiguous() for part in start]

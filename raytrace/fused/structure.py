@@ -120,6 +120,17 @@ def structure_of(
     return Structure(np.array(rows, dtype=np.int32), np.array(table.constants, dtype=np.float64)), table.numbers
 
 
+def rows_of(structure: Structure, surfaces: Sequence[Surface]) -> list[int]:
+    """The row of the structure behind which rays have passed each of its surfaces, in their own axes."""
+    found, row = [], -1
+    for surface in surfaces:
+        row += 1
+        if not surface.is_break and structure.layout[row, 0] == _TURN:
+            row += 1
+        found.append(row)
+    return found
+
+
 def _row(
     table: _Table, surface: Surface, gap: Tensor | None, side: int, n1: Tensor, n2: Tensor, wavelength: Tensor | None
 ) -> _Row:

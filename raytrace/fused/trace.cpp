@@ -32,6 +32,7 @@ struct Call {
   const void* change;  // (changes, rows, numbers), of the rays' type
   void* changed[7];    // (changes, rows, rays) each: how the rays behind the last surface change; null: not wanted
   const void* at_start[7];  // (changes, rows, rays) each: how the rays before the first change; null: not at all
+  int64_t everywhere;  // 1: `out`, `valid_out` and `changed` of forward derivatives have all surfaces as a first axis
 };
 
 template <typename T>
@@ -141,16 +142,15 @@ class Trace {
     for (const void* part : call_.at_start) started |= part != nullptr;
     each(first, last, [&](int64_t at, int count, int n) {
       load(rays[0], *notes, at, count, n, path_);
-      for (size_t k = 0; k < steps_.size(); k++) cross(k, rays[k], rays[k + 1], *notes, n, path_);
-      store(call_.out, rays[steps_.size()], at, count);
-      if (call_.valid_out) std::memcpy(call_.valid_out + at, notes->valid, count);
+      for (size_t k = 0; k < steps_.size(); k++) {
+        cross(k, rays[k], rays[k + 1], *notes, n, path_);
+        if (!is_told(k)) continue;
+        store(call_.out, rays[k + 1], page(k) * all + at, count);
+        if (call_.valid_out) std::memcpy(call_.valid_out + page(k) * all + at, notes->valid, count);
+      }
       for (int64_t number = 0; number < call_.changes; number++) {
         set_off(*d, number * all + at, count, n);
-        push_all(number, at / call_.rays, rays.get(), *d, *notes, n, started);
-        void* to[7];
-        for (int p = 0; p < 7; p++)
-          to[p] = call_.changed[p] ? static_cast<T*>(call_.changed[p]) + number * all : nullptr;
-        store(to, *d, at, count);
+        push_all(number, at, rays.get(), *d, *notes, count, n, started);
       }
     });
   }
@@ -166,9 +166,15 @@ class Trace {
     }
   }
 
+  // Whether the rays behind a surface are asked for, and which page of the results they are.
+  bool is_told(size_t k) const { return call_.everywhere || k + 1 == steps_.size(); }
+  int64_t page(size_t k) const { return call_.everywhere ? int64_t(k) : 0; }
+
   // One change, from the first surface that it touches on, or from the rays before the first if they change
-  // (`begun`). A ray lost at a surface starts anew behind it.
-  void push_all(int64_t number, int64_t row, const Rays<T>* rays, Rays<T>& d, Notes<T>& notes, int n, bool begun) {
+  // (`begun`), to the results. A ray lost at a surface starts anew behind it.
+  void push_all(int64_t number, int64_t at, const Rays<T>* rays, Rays<T>& d, Notes<T>& notes, int count, int n,
+                bool begun) {
+    const int64_t row = at / call_.rays, all = call_.rows * call_.rays;
     const T* changes = static_cast<const T*>(call_.change) + (number * call_.rows + row) * call_.numbers;
     for (size_t k = 0; k < steps_.size(); k++) {
       const Surface<T>& s = steps_[k].surface;
@@ -182,6 +188,7 @@ class Trace {
       for (int i = 0; i < n && notes.any_lost; i++)
         if (notes.lost[i] == int32_t(k))
           for (int p = 0; p < 7; p++) part(d, p)[i] = 0;
+      if (is_told(k)) store(call_.changed, d, (page(k) * call_.changes + number) * all + at, count);
     }
   }
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from raytrace.fused.choice import is_fused
-from raytrace.fused.run import Pushed, Task, forward, push, task_of
+from raytrace.fused.run import Pushed, Task, forward, push, push_everywhere, task_of
 from raytrace.fused.structure import is_expressible, with_numbers
 from raytrace.optics.trace import trace_surfaces
 from raytrace.system.rays import Rays
@@ -55,6 +55,14 @@ def pushed(
     if is_fused(rays, changes, len(surfaces)):
         return push(task, changes, start)
     return _pushed_by_torch(surfaces, task, changes, start)
+
+
+def pushed_everywhere(
+    surfaces: Sequence[Surface], task: Task, changes: Tensor, start: tuple[Tensor, Tensor, Tensor | None] | None = None
+) -> Pushed | None:
+    """`run.push_everywhere` where the compiled trace carries these rays; None where torch has to."""
+    rays = Rays(*task.given[:2], task.valid, task.given[2])
+    return push_everywhere(task, changes, start) if is_fused(rays, task.given[3], len(surfaces)) else None
 
 
 def ends(surfaces: Sequence[Surface], task: Task) -> Rays:
