@@ -11,12 +11,15 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from raytrace.fused.run import Task
 from raytrace.fused.structure import is_expressible
 from raytrace.maths.dual import Dual, value_of
+from raytrace.merit.aim import aimed
+from raytrace.merit.by_torch import rays_by_torch
+from raytrace.merit.launch import launched
 from raytrace.merit.moment import Moment
+from raytrace.optics.axis import is_bent
 from raytrace.optics.jacobian import ends, pushed
 from raytrace.optics.launch import rays_of_field
 from raytrace.optics.sequence import media, sequence_of
@@ -114,7 +117,25 @@ class Bundle:
         source = lens.surfaces[0]
         plane = source.is_plane and source.after is None
         usual = lens.fields.kind in ("angle", "object_height", "paraxial_image_height") and not lens.fields.telecentric
-        return plane and usual and lens.ray_aiming == "off"
+        return plane and usual and (lens.ray_aiming == "off" or not is_bent(lens))
+
+    @cached_property
+    def _aims(self) -> bool:
+        return self.view.lens.ray_aiming != "off"
+
+    @cached_property
+    def _at_stop(self) -> "Bundle":
+        """The same rays on the stop."""
+        found = Bundle(self.view, self.view.lens.stop)
+        found.rays = self.rays
+        return found
+
+    @cached_property
+    def _marginal(self) -> "Bundle":
+        """The axial ray through the edge of the paraxial entrance pupil, on the stop."""
+        found = Bundle(self.view, self.view.lens.stop)
+        found.ask(self.view.lens.primary_wavelength, (0.0, 0.0), (0.0, 1.0))
+        return found
 
     # -- at a moment ---------------------------------------------------------------------------------------------------
 
@@ -122,17 +143,22 @@ class Bundle:
         """All rays on surface `last`, in the order in which they were asked for."""
         if not self.is_expressible:
             return self._hits_by_torch(moment)
+        return self._told(*self._traced(moment, *self.launched(moment)))
+
+    def _traced(self, moment: Moment, position, direction, opl, valid: np.ndarray):
+        """Rays behind surface `last` as a table, and by how many variables they change, if any."""
         surfaces, structure, *_ = self._template
         table, changes = self.table(moment)
-        position, direction, opl, valid = self.launched(moment)
+        moving = [part for part in (*position, *direction, opl) if isinstance(part, Dual)]
         given = [np.stack([value_of(p) for p in part]) for part in (position, direction)] + [value_of(opl)]
         given = [torch.from_numpy(np.ascontiguousarray(part)) for part in given]
         task = Task(structure, torch.from_numpy(valid), (*given, torch.from_numpy(table)))
-        if not moment.count:
-            return self._told(ends(surfaces, task), None)
-        moves = any(isinstance(part, Dual) for part in (*position, *direction, opl))
-        start = self._start(moment.count, position, direction, opl) if moves else None
-        return self._told(pushed(surfaces, task, torch.from_numpy(changes), start), moment.count)
+        count = moment.count or max((len(part.slope) for part in moving), default=0)
+        if not count:
+            return ends(surfaces, task), None
+        start = self._start(count, position, direction, opl) if moving else None
+        changes = changes if moment.count else np.zeros((count, *table.shape))
+        return pushed(surfaces, task, torch.from_numpy(changes), start), count
 
     def _start(self, count: int, position, direction, opl) -> tuple[Tensor, Tensor, Tensor]:
         shape = count, *self.field.shape[1:]
@@ -192,17 +218,60 @@ class Bundle:
         """Position and direction (three of (W, R) each), path (W, R) and validity of the rays before surface 1."""
         if not self._launches_itself:
             return self._launched_by_torch(moment)
+        if not self._aims:
+            return self._through(moment, self.pupil)
+        pupil, found = self._aimed(moment)
+        *rays, valid = self._through(moment, pupil)
+        return *rays, valid & found
+
+    def _through(self, moment: Moment, pupil):
         shape = self.field.shape[1:]
-        position, direction, opl = _launched(moment, self.field, self.pupil)
+        position, direction, opl = launched(moment, self.field, pupil)
         filled = [part + np.zeros(shape) for part in (*position, *direction, opl)]
         return filled[:3], filled[3:6], filled[6], np.ones(shape, dtype=bool)
+
+    def _aimed(self, moment: Moment):
+        """Pupil points, two of (W, R), whose rays pass the stop where the pupil points say, and which were found."""
+        stop, shape = self._at_stop, self.field.shape[1:]
+
+        def at_stop(moment: Moment, pupil):
+            end, count = stop._traced(moment, *self._through(moment, pupil))
+            x, y = end.position[:2].numpy()
+            if count is None:
+                return (x, y), end.valid.numpy()
+            by = end.by_position.numpy()
+            return (Dual(x, by[0]), Dual(y, by[1])), end.valid.numpy()
+
+        last = self.__dict__.get("_last")
+        begin = self.pupil if last is None else last
+        radius = self._stop_radius(moment)
+        pupil, found, points = aimed(moment, at_stop, self.pupil, radius, begin)
+        if not found.all() and last is not None:
+            pupil, found, points = aimed(moment, at_stop, self.pupil, radius, self.pupil)
+        self._last = np.where(found, points, self.pupil)
+        return tuple(part + np.zeros(shape) for part in pupil), found
+
+    def _stop_radius(self, moment: Moment):
+        """mm, negative where the entrance pupil is an inverted image of the stop."""
+        lens = self.view.lens
+        paraxial = 0.5 * moment.entrance_pupil_diameter * moment.gaussian(moment.primary).front[0]
+        if lens.aperture.kind == "float_by_stop":
+            return float(lens.aperture.value) * np.sign(value_of(paraxial))
+        if lens.ray_aiming == "paraxial":
+            return paraxial
+        marginal = self._marginal
+        hits = marginal._told(*marginal._traced(moment, *marginal._through(moment, marginal.pupil)))
+        height = hits.position[1][np.array([0])]
+        real = np.abs(height) * np.sign(value_of(paraxial))
+        return real[0] if hits.valid[0] else paraxial
 
     def _launched_by_torch(self, moment: Moment):
         def start(lens) -> Rays:
             field, pupil = torch.from_numpy(self.field), torch.from_numpy(self.pupil)
             return rays_of_field(lens, field, pupil, wavelength=lens.wavelengths[:, None])
 
-        parts, valid = self._forward(moment, start)
+        bent = self._aims and is_bent(self.view.lens)
+        parts, valid = rays_by_torch(moment, start, self.field.shape[1:], backward=bent)
         return parts[:3], parts[3:6], parts[6], valid
 
     def _hits_by_torch(self, moment: Moment) -> Hits:
@@ -212,71 +281,11 @@ class Bundle:
             indices = media(lens, wavelength[:, None])[: self.last + 1]
             return trace_surfaces(sequence_of(lens)[: self.last], rays, indices=indices, wavelength=wavelength[:, None])
 
-        parts, valid = self._forward(moment, end)
+        bent = self._aims and is_bent(self.view.lens)
+        parts, valid = rays_by_torch(moment, end, self.field.shape[1:], backward=bent)
         places = self._places[0]
         parts = [part.reshape(-1)[places] for part in parts]
         return Hits(tuple(parts[:3]), tuple(parts[3:6]), parts[6], valid.reshape(-1)[places])
-
-    def _forward(self, moment: Moment, function) -> tuple[list, np.ndarray]:
-        """x, y, z, L, M, N and path (W, R) of the rays that a function takes from a lens, and their validity."""
-        shape = self.field.shape[1:]
-
-        def told(rays: Rays) -> list[Tensor]:
-            return [part.expand(shape) for part in (*rays.position, *rays.direction, rays.opl)]
-
-        with torch.no_grad():
-            numbers, lens = self.view.leaves({at: value_of(n) for at, n in moment.numbers.items()})
-            rays = function(lens)
-            values, valid = [part.numpy().copy() for part in told(rays)], rays.valid.expand(shape).numpy().copy()
-        if not moment.count:
-            return values, valid
-        slopes = np.zeros((7, moment.count, *shape))
-        for variable in range(moment.count):
-            with forward_ad.dual_level():
-                moved = {
-                    at: forward_ad.make_dual(leaf.detach(), torch.tensor(float(number.slope[variable])).double())
-                    for (at, leaf), number in zip(numbers.items(), moment.numbers.values(), strict=True)
-                    if isinstance(number, Dual)
-                }
-                for part, number in zip(slopes, told(function(self.view.held(numbers | moved))), strict=True):
-                    tangent = forward_ad.unpack_dual(number).tangent
-                    if tangent is not None:
-                        part[variable] = tangent.numpy()
-        return [Dual(value, np.where(valid, slope, 0.0)) for value, slope in zip(values, slopes, strict=True)], valid
-
-
-def _launched(moment: Moment, field: np.ndarray, pupil: np.ndarray):
-    """Rays through the paraxial entrance pupil, as `optics.launch` starts them: position, direction and path."""
-    data = moment.gaussian(moment.primary)
-    kind, distance = moment.lens.fields.kind, moment.thickness[0]
-    index = np.abs(moment.view.indices[:, :1])
-    radius, depth = 0.5 * moment.entrance_pupil_diameter, data.entrance_pupil_position
-    at_infinity = np.isinf(value_of(distance))
-    if kind == "angle":
-        slope = np.tan(np.deg2rad(field))
-        x, y = slope if at_infinity else (-(distance + depth) * part for part in slope)
-    elif kind == "object_height":
-        x, y = field
-    else:
-        scale = -data.C / data.n_object if at_infinity else (data.C + data.D * moment.vergence) / moment.vergence
-        x, y = (scale * part for part in field)
-    aim = radius * pupil[0], radius * pupil[1], depth
-    if at_infinity:
-        length = np.sqrt(x * x + y * y + 1.0)
-        direction = x / length, y / length, 1.0 / length
-        return aim, direction, index * _dot(aim, direction)
-    source = x, y, -distance
-    chord = tuple(a - o for a, o in zip(aim, source, strict=True))
-    length, far = np.sqrt(_dot(chord, chord)), np.sqrt(_dot(source, source))
-    direction = tuple(part / length for part in chord)
-    if abs(value_of(distance)) < abs(value_of(depth)):
-        return source, direction, -index * far
-    path = (_dot(aim, aim) - 2 * _dot(aim, source)) / (length + far)
-    return aim, direction, index * path
-
-
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _by_leaves(table: Tensor, leaves: dict) -> dict:

@@ -60,6 +60,10 @@ class Moment:
         """How many variables there are derivatives by; 0 where none are asked for."""
         return len(self.variables.slope) if isinstance(self.variables, Dual) else 0
 
+    def fixed(self) -> "Moment":
+        """The same moment without derivatives."""
+        return Moment(self.view, value_of(self.variables)) if self.count else self
+
     def number(self, surface: int, quantity: str):
         """A number of a surface, solved, picked up, varied or as it is stored."""
         found = self.numbers.get((surface, quantity))
