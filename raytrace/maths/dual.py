@@ -14,7 +14,10 @@ import numpy as np
 
 
 class Dual:
-    """value: a number, or an array (...); slope: (n, ...), its derivatives by n variables, which broadcasts with it."""
+    """value: a number, or an array (...); slope: its derivatives by n variables, n and an axis for each of the value's.
+
+    Axes of the slope behind the first may have length 1 where the derivatives are alike (`full` has them all).
+    """
 
     __slots__ = ("slope", "value")
     __array_priority__ = 1000
@@ -51,20 +54,20 @@ class Dual:
 
     def __mul__(self, other):
         if isinstance(other, Dual):
-            dim = _dim(self.value, other.value)
+            dim = _dim(self, other)
             slope = _under(self.slope, dim) * other.value + _under(other.slope, dim) * self.value
             return Dual(self.value * other.value, slope)
-        return Dual(self.value * other, _under(self.slope, _dim(self.value, other)) * other)
+        return Dual(self.value * other, _under(self.slope, _dim(self, other)) * other)
 
     def __truediv__(self, other):
         if isinstance(other, Dual):
-            dim, ratio = _dim(self.value, other.value), self.value / other.value
+            dim, ratio = _dim(self, other), self.value / other.value
             return Dual(ratio, (_under(self.slope, dim) - _under(other.slope, dim) * ratio) / other.value)
-        return Dual(self.value / other, _under(self.slope, _dim(self.value, other)) / other)
+        return Dual(self.value / other, _under(self.slope, _dim(self, other)) / other)
 
     def __rtruediv__(self, other):
         ratio = other / self.value
-        return Dual(ratio, _under(self.slope, _dim(self.value, other)) * (-ratio / self.value))
+        return Dual(ratio, _under(self.slope, _dim(self, other)) * (-ratio / self.value))
 
     def __pow__(self, power: float):
         return self._through(self.value**power, power * self.value ** (power - 1))
@@ -111,8 +114,10 @@ def slope_of(number, variables: int) -> np.ndarray:
     return number.full() if isinstance(number, Dual) else np.zeros((variables, *np.shape(number)))
 
 
-def _dim(one, other) -> int:
-    return max(np.ndim(value_of(one)), np.ndim(value_of(other)))
+def _dim(one: Dual, other) -> int:
+    """How many axes the two have together."""
+    other = other.slope.ndim - 1 if isinstance(other, Dual) else other.ndim if isinstance(other, np.ndarray) else 0
+    return max(one.slope.ndim - 1, other)
 
 
 def _under(slope: np.ndarray, dim: int) -> np.ndarray:
@@ -122,6 +127,8 @@ def _under(slope: np.ndarray, dim: int) -> np.ndarray:
 
 
 def _sum(one: Dual, other: Dual) -> np.ndarray:
+    if one.slope.ndim == other.slope.ndim:
+        return one.slope + other.slope
     dim = _dim(one, other)
     return _under(one.slope, dim) + _under(other.slope, dim)
 

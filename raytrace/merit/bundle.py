@@ -5,6 +5,7 @@ focal length, they are launched here, by the same formulas in numpy; in every ot
 heights, telecentric objects, curved ones) by `optics.launch` itself, a forward derivative for every variable.
 """
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -36,25 +37,47 @@ class Ray(NamedTuple):
     pupil: tuple[float, float]
 
 
-class Hits(NamedTuple):
-    """Rays (R,) behind a surface: x, y, z mm in the axes of its vertex; L, M, N; path; valid: bool.
+class Hits:
+    """Rays (R,) behind a surface: `position` x, y, z mm in the axes of its vertex; `direction` L, M, N; `opl`; `valid`.
 
-    Components are arrays or dual numbers.
+    Components are arrays or dual numbers, each taken from the table of the trace when it is first asked for.
     """
 
-    position: tuple
-    direction: tuple
-    opl: object
-    valid: np.ndarray
+    def __init__(self, parts: Sequence, slopes: Sequence | None, valid: np.ndarray, places: np.ndarray):
+        """parts: x, y, z, L, M, N and path (W, R) each; slopes: (n, W, R) each; places: in the flat table."""
+        self._parts, self._slopes, self._valid, self._places = parts, slopes, valid, places
+        self.valid = valid.reshape(-1)[places]
+        self.position, self.direction = _Components(self, 0), _Components(self, 3)
 
-    def at(self, places: np.ndarray) -> "Hits":
+    def component(self, k: int):
+        value = self._parts[k].reshape(-1)[self._places]
+        if self._slopes is None:
+            return value
+        slope = self._slopes[k]
+        slope = slope.reshape(len(slope), -1)[:, self._places]
+        return Dual(value, slope if self.valid.all() else np.where(self.valid, slope, 0.0))
+
+    @cached_property
+    def opl(self):
+        return self.component(6)
+
+    def at(self, rays: np.ndarray) -> "Hits":
         """Those of some rays."""
-        return Hits(
-            tuple(part[places] for part in self.position),
-            tuple(part[places] for part in self.direction),
-            self.opl[places],
-            self.valid[places],
-        )
+        return Hits(self._parts, self._slopes, self._valid, self._places[rays])
+
+
+class _Components:
+    """Three components of rays, each found once."""
+
+    def __init__(self, hits: Hits, first: int):
+        self._hits, self._first, self._found = hits, first, {}
+
+    def __getitem__(self, k: int):
+        if not 0 <= k < 3:
+            raise IndexError(k)
+        if k not in self._found:
+            self._found[k] = self._hits.component(self._first + k)
+        return self._found[k]
 
 
 class Bundle:
@@ -171,22 +194,11 @@ class Bundle:
 
     def _told(self, end, count: int | None) -> Hits:
         """The rays of a table as those that were asked for."""
-        places = self._places[0]
-        valid = end.valid.numpy().reshape(-1)[places]
-
-        def picked(value: Tensor, slope: Tensor | None):
-            value = value.detach().numpy().reshape(-1)[places]
-            if count is None:
-                return value
-            return Dual(value, np.where(valid, slope.numpy().reshape(count, -1)[:, places], 0.0))
-
-        by = (end.by_position, end.by_direction, end.by_opl) if count is not None else ([None] * 3, [None] * 3, None)
-        return Hits(
-            tuple(map(picked, end.position, by[0])),
-            tuple(map(picked, end.direction, by[1])),
-            picked(end.opl, by[2]),
-            valid,
-        )
+        parts = [*end.position.numpy(), *end.direction.numpy(), end.opl.numpy()]
+        slopes = None
+        if count is not None:
+            slopes = [*end.by_position.numpy(), *end.by_direction.numpy(), end.by_opl.numpy()]
+        return Hits(parts, slopes, end.valid.numpy(), self._places[0])
 
     def table(self, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
         """The table (W, K) of the lens at a moment, and its derivatives (n, W, K)."""
@@ -283,9 +295,8 @@ class Bundle:
 
         bent = self._aims and is_bent(self.view.lens)
         parts, valid = rays_by_torch(moment, end, self.field.shape[1:], backward=bent)
-        places = self._places[0]
-        parts = [part.reshape(-1)[places] for part in parts]
-        return Hits(tuple(parts[:3]), tuple(parts[3:6]), parts[6], valid.reshape(-1)[places])
+        slopes = [part.full() for part in parts] if moment.count else None
+        return Hits([value_of(part) for part in parts], slopes, valid, self._places[0])
 
 
 def _by_leaves(table: Tensor, leaves: dict) -> dict:

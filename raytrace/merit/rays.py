@@ -16,7 +16,7 @@ def from_centroid(component: int | None) -> Callable[[Sequence[Line], Planner], 
     """
 
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
-        rays, mean = planner.rays(lines), _means(lines)
+        rays, (mean, of_field) = planner.rays(lines), _means(lines)
         on_y = np.array([planner.view.is_symmetric and line.field[0] == 0 for line in lines])
         on_axis = on_y & np.array([line.field[1] == 0 for line in lines])
 
@@ -24,9 +24,11 @@ def from_centroid(component: int | None) -> Callable[[Sequence[Line], Planner], 
             hits = now.hits(rays)
             weights = mean * hits.valid
             weights = weights / np.maximum(weights.sum(-1, keepdims=True), 1e-300)
-            x, y, _ = hits.position
-            x = x - np.where(on_y, 0.0, 1.0) * (weights @ x)
-            y = y - np.where(on_axis, 0.0, 1.0) * (weights @ y)
+            x, y = hits.position[0], hits.position[1]
+            if not on_y.all():
+                x = x - np.where(on_y, 0.0, 1.0) * (weights @ x)[of_field]
+            if not on_axis.all():
+                y = y - np.where(on_axis, 0.0, 1.0) * (weights @ y)[of_field]
             return _told(hits.valid, x, y, component)
 
         return evaluate
@@ -51,12 +53,11 @@ def from_chief(component: int | None) -> Callable[[Sequence[Line], Planner], Eva
     return plan
 
 
-def _means(lines: Sequence[Line]) -> np.ndarray:
-    """(R, R): the weights of the rows of the same field as each."""
-    fields = np.array([line.field for line in lines])
-    same = (fields[:, None] == fields[None]).all(-1)
+def _means(lines: Sequence[Line]) -> tuple[np.ndarray, np.ndarray]:
+    """(F, R): the weights of the rows of every field; and the field (R,) of each row."""
+    fields, of_field = np.unique([line.field for line in lines], axis=0, return_inverse=True)
     weights = np.array([max(line.row.weight, 0.0) for line in lines])
-    return same * weights
+    return (of_field.reshape(-1) == np.arange(len(fields))[:, None]) * weights, of_field.reshape(-1)
 
 
 def _told(valid: np.ndarray, x, y, component: int | None) -> Found:
