@@ -345,7 +345,8 @@ def test_report_sorts_every_keyword():
     report = read(text)[1]
     status = {keyword.name: keyword.status for keyword in report.keywords}
     assert status["SURF"] == status["VERS"] == "read"
-    assert status["PFIL"] == status["COAT"] == status["EFFL"] == "ignored"
+    assert status["PFIL"] == status["COAT"] == "ignored"
+    assert status["BLNK"] == status["EFFL"] == "read"
     assert status["XYZW"] == status["QQQQ"] == "unknown"
     assert all(keyword.reason for keyword in report.keywords if keyword.status == "ignored")
     assert len(report.warnings) == 2

@@ -16,9 +16,12 @@ def _words(text: str) -> frozenset[str]:
 #: Keywords of the system and of a surface that are read; an aperture's are in the rows of `aperture.SHAPES`.
 SYSTEM_READ = _words(
     "VERS MODE NAME NOTE UNIT GCAT ENVD GFAC RAIM FTYP PWAV MNUM ENPD FNUM OBNA FLOA XFLN YFLN FWGN XFLD YFLD FWGT"
-    " VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN VDX VDY VCX VCY VAN WAVM WAVL WAVN WWGT WWGN"
+    " SDMA VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN VDX VDY VCX VCY VAN WAVM WAVL WAVN WWGT WWGN"
 )
-_SURFACE_READ = _words("SURF TYPE CURV CONI DISZ GLAS DIAM STOP PARM COMM FLAP OBDC USAP USOB UDAD SCBD IGNR XDAT")
+_SURFACE_READ = _words(
+    "SURF TYPE CURV CONI DISZ GLAS DIAM STOP PARM COMM FLAP OBDC USAP USOB UDAD SCBD IGNR XDAT VCON VDSZ VPAR PPAR PZUP"
+    " MAZH TOLE EDGE"
+)
 
 #: Keywords that may stand more than once in the system or in one surface.
 REPEATED = ("NOTE", "WAVM", "PARM", "UDAD", "XDAT", "PPAR", "VPAR", "SCBD")
@@ -32,7 +35,6 @@ def _left_out(rows: dict[str, str]) -> dict[str, str]:
 SYSTEM_IGNORED = _left_out(
     {
         "setting of the program, says nothing about the lens": "PFIL LANG HYPR ROPD PICB EERA LUID IWDP STUD FSVY",
-        "how semi-diameters are recomputed; the stored ones are read": "SDMA",
         "how mechanical semi-diameters are recomputed": "OMMA",
         "shift of the pupil for the program's own ray aiming": "PUSH",
         "global coordinate reference: changes no ray": "GLRS",
@@ -55,16 +57,13 @@ SURFACE_IGNORED = _left_out(
         "sampling of wave propagation": "POPS",
         "mechanical semi-diameter: for drawing and mounting, never clips a ray": "MEMA",
         "edge of the mechanical part": "OEMA",
-        "edge of the part, for drawing": "EDGE",
         "coatings do not bend rays": "COAT",
         "coefficient of thermal expansion": "TCED",
-        "tolerance": "TOLE",
-        "solve or variable: the file stores the solved value, which is read": "VCON VDSZ VPAR PZUP PPAR MAZH",
     }
 )
 
 #: What follows the last surface belongs to these, and not to the lens.
-TAIL_REASON = "merit function or tolerances: not part of the lens"
+TAIL_REASON = "behind the surfaces, and no line of a merit function, of tolerances or of configurations"
 
 #: Types of surface that are not modelled, by what OpticStudio calls them; those that are, are rows of `zemax_types`.
 _TYPES = (
@@ -198,7 +197,7 @@ def sections(text: str, file: str, report: Draft) -> Sections:
 
     A surface's records are indented in files of OpticStudio; in files that lost the indentation the keyword decides.
     After the last surface come merit function, tolerances and configurations, whose operands have names of their own;
-    those after MNUM, the configurations, are left to be reported by who reads them.
+    they are left to be reported by who reads them.
     """
     found, of_surface = list(records(text, file)), surface_read()
     start = next((position for position, record in enumerate(found, 1) if record.keyword == "SURF"), None)
@@ -220,19 +219,11 @@ def sections(text: str, file: str, report: Draft) -> Sections:
         elif word not in SYSTEM_READ and (after_surfaces or (surfaces and word not in SYSTEM_IGNORED)):
             block, after_surfaces = system, True
             tail.append(record)
-            if not _follows_head(system, surfaces):
-                report.met(word, IGNORED, record.place, TAIL_REASON)
         else:
             block = system
             _classify(record, system, SYSTEM_READ, SYSTEM_IGNORED, report)
     _warn_of_repeats([system, *surfaces], report)
     return Sections(system, surfaces, tail)
-
-
-def _follows_head(system: Block, surfaces: list[Block]) -> bool:
-    """Whether MNUM, which heads the multi-configuration operands, has been met behind the surfaces."""
-    head = system.last("MNUM")
-    return bool(head and surfaces) and head.place.line > surfaces[-1].place.line
 
 
 def _next_surface(record: Record, surfaces: list[Block]) -> Block:

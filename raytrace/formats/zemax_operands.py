@@ -110,6 +110,7 @@ class Cell(NamedTuple):
     """One line of the table: an operand's value in one configuration, as text.
 
     covered: of a temperature or pressure that only some surfaces have, which; None of the lens's.
+    rule: the words behind the value: its status (1 variable, 2 a pickup) …
     """
 
     name: str
@@ -119,6 +120,7 @@ class Cell(NamedTuple):
     value: str
     record: Record
     covered: tuple[int, ...] | None = None
+    rule: tuple[str, ...] = ()
 
     @property
     def key(self) -> tuple[str, int, int]:
@@ -143,7 +145,7 @@ def cell(record: Record) -> Cell | None:
         parameter = int(record.keyword[3])
     elif record.keyword not in ("PRAM", "EDVA") and record.keyword in ROWS:
         parameter = 0
-    return Cell(record.keyword, int(found[1]), parameter, int(found[2]), found[3].strip('"'), record)
+    return Cell(record.keyword, int(found[1]), parameter, int(found[2]), found[3].strip('"'), record, None, tuple(rest))
 
 
 # -- the records of a file with an operand applied ---------------------------------------------------------------------

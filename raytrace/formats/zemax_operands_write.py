@@ -9,6 +9,7 @@ from raytrace.formats import zemax_environment
 from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, Place
 from raytrace.formats.spelling import exact, is_infinite, one_line
+from raytrace.formats.zemax_intent_write import statuses
 from raytrace.formats.zemax_keywords import Record, Sections, sections
 from raytrace.formats.zemax_operands import FAR, ROWS, Cell, word
 from raytrace.system.configurations import Operand, count, same, with_operands
@@ -20,15 +21,16 @@ def operand_lines(lens: Lens, body: Callable[[Lens], list[str]], file: str) -> l
 
     body: the lines of system and surfaces of a lens. Raises LensFileError for what they cannot tell.
     """
-    lens = zemax_environment.with_operands(lens, Place(file))
+    own, lens = lens, zemax_environment.with_operands(lens, Place(file))
     if not lens.operands:
         return ["MNUM 1 1", 'MOFF   0   1 "" 0 0 0 1 1 0 0.0 ""']
     numbers = range(1, count(lens.operands) + 1)
     texts = [sections("\n".join(body(with_operands(lens, k))) + "\n", file, Draft(file, "zmx")) for k in numbers]
     lines = [f"MNUM {len(numbers)} {lens.current_configuration}"]
-    for operand in lens.operands:
+    rules = statuses(own, lens.operands)
+    for position, operand in enumerate(lens.operands):
         _refuse_alike(operand, texts, Place(file))
-        lines += [_line(operand, k, texts[k - 1], Place(file)) for k in numbers]
+        lines += [_line(operand, k, texts[k - 1], rules.get((position, k), ()), Place(file)) for k in numbers]
     return lines
 
 
@@ -45,6 +47,8 @@ def with_pickups(lines: list[str], lens: Lens, number: int, place: Place) -> lis
             name = "PRAM" if operand.name.startswith("PAR") else operand.name
             if name not in ("PRAM", "THIC", "CRVT", "GLSS") or path[2:] != first[2:] or path[2] == "phase":
                 raise LensFileError(f"follows {operand} by a rule that is not written", place)
+            if _is_told(lines, name, operand.parameter):
+                continue
             if name == "CRVT" and offset:
                 raise LensFileError(f"follows {operand} with an offset, which is not written", place)
             rule = f"{operand.number} {factor!r} {offset!r} 0"
@@ -55,6 +59,15 @@ def with_pickups(lines: list[str], lens: Lens, number: int, place: Place) -> lis
     return lines
 
 
+def _is_told(lines: list[str], name: str, parameter: int) -> bool:
+    """Whether the lines of a surface tell a rule of its own for what an operand of a name moves."""
+    starts = {"PRAM": f"  PPAR {parameter} ", "THIC": "  PZUP "}
+    if name in starts:
+        return any(line.startswith(starts[name]) for line in lines)
+    keyword = {"CRVT": "CURV", "GLSS": "GLAS"}[name]
+    return any(line.split()[0] == keyword and line.split()[2] not in ("0", "1") for line in lines)
+
+
 def _picking(line: str, name: str, source: int, factor: float) -> str:
     """A line of a surface; that of its curvature or glass, by the name of the operand, with its pickup."""
     words = line.split()
@@ -63,13 +76,15 @@ def _picking(line: str, name: str, source: int, factor: float) -> str:
     return "  " + " ".join([*words[:2], "2", str(source), *words[4:]]) if (name, words[0]) == ("GLSS", "GLAS") else line
 
 
-def _line(operand: Operand, configuration: int, text: Sections, place: Place) -> str:
+def _line(operand: Operand, configuration: int, text: Sections, rule: tuple[str, ...], place: Place) -> str:
     value = _word(operand, configuration, text, place)
     parameter = operand.parameter if operand.name in ("PRAM", "EDVA") else 0
     head = f"{operand.name:<4} {operand.number:>3} {configuration:>3}"
-    if operand.numbers is None and not _is_told(value):
-        return f'{head} "{value}" 0 {parameter} 0 1 1 0 0.0 ""'
-    return f"{head} {value} 0 {parameter} 0 1 1 1.0 0.0 0"
+    if operand.numbers is None and not _is_number(value):
+        status, words = rule or ("0", '0 1 1 0 0.0 ""')
+        return f'{head} "{value}" {status} {parameter} {words}'
+    status, words = rule or ("0", "0 1 1 1.0 0.0 0")
+    return f"{head} {value} {status} {parameter} {words}"
 
 
 def _word(operand: Operand, configuration: int, text: Sections, place: Place) -> str:
@@ -83,7 +98,7 @@ def _word(operand: Operand, configuration: int, text: Sections, place: Place) ->
     return one_line(str(operand.values()[configuration - 1]), str(operand), place).replace('"', "'")
 
 
-def _is_told(value: str) -> bool:
+def _is_number(value: str) -> bool:
     return bool(value) and all(character in "0123456789+-.eE" for character in value)
 
 

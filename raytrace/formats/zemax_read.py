@@ -19,7 +19,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from raytrace.formats import zemax_configurations, zemax_environment, zemax_surface
+from raytrace.formats import zemax_configurations, zemax_environment, zemax_intent, zemax_surface
 from raytrace.formats.media import AtHand, catalogs_at_hand
 from raytrace.formats.report import Draft, ImportReport
 from raytrace.formats.source import LensFileError, UnsupportedSurface, shown
@@ -80,6 +80,7 @@ def read(
         return changed
 
     lens = zemax_configurations.read(found, lens, rebuild, report, configuration)
+    lens = zemax_intent.read(found, lens, unit, report)
     zemax_environment.tell(found, lens, report)
     return lens, report.finished(strict=strict)
 

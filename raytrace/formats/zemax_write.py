@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from raytrace.formats import zemax_environment
+from raytrace.formats import zemax_environment, zemax_intent_write, zemax_merit
 from raytrace.formats.media import catalogs_needed, is_code, is_left_out, listed_name
 from raytrace.formats.source import LensFileError, Place
 from raytrace.formats.spelling import exact, exact_list, one_line, thickness
@@ -13,6 +13,7 @@ from raytrace.formats.zemax_numbers import INVERSE, SurfaceType, numbers_of, spe
 from raytrace.formats.zemax_operands_write import operand_lines, with_pickups
 from raytrace.formats.zemax_sags import stands_in_parameters
 from raytrace.formats.zemax_types import type_of, types
+from raytrace.formats.zemax_units import in_unit
 from raytrace.media.glass import Glass, mil_glass
 from raytrace.system.aperture import SHAPES, Aperture
 from raytrace.system.lens import RAY_AIMING, Lens
@@ -25,16 +26,23 @@ _WAVELENGTHS = 24
 
 
 def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
-    """The content of a .zmx file of the lens, in mm: ASCII, or UTF-16 where a text needs it.
+    """The content of a .zmx file of the lens, in mm, or in the unit of its merit: ASCII, or UTF-16 where a text needs it.
 
     file: its name, for messages. catalogs: the user's glass catalogs that the lens was read with.
     Raises LensFileError for what a .zmx file cannot hold: a batch of lenses, nan, two apertures on one surface, more
     than 8 aspheric terms or 24 wavelengths, a glass whose figures are not those of its catalog.
     """
     body = partial(_body, file=file, catalogs=catalogs)
-    lines = [*body(lens), "TOL TOFF   0   0 0 0   0 0 0 0 0", *operand_lines(lens, body, file)]
+    lines = [*body(lens), *_merit(lens, Place(file)), *operand_lines(lens, body, file)]
     text = "\n".join(lines) + "\n"
     return text.encode("ascii") if text.isascii() else b"\xff\xfe" + text.encode("utf-16-le")
+
+
+def _merit(lens: Lens, place: Place) -> list[str]:
+    """Merit function and tolerances; the line that there are none of these."""
+    merit, tolerances = ((), ()) if lens.intent is None else (lens.intent.merit, lens.intent.tolerances)
+    told = [one_line(line, "a tolerance", place) for line in tolerances]
+    return [*zemax_merit.lines(merit, place), *(told or ["TOL TOFF   0   0 0 0   0 0 0 0 0"])]
 
 
 def _body(lens: Lens, file: str, catalogs: Sequence[Path]) -> list[str]:
@@ -42,8 +50,9 @@ def _body(lens: Lens, file: str, catalogs: Sequence[Path]) -> list[str]:
     lines = _system(lens, Place(file), catalogs)
     for number, surface in enumerate(lens.surfaces):
         place = Place(file, None, number)
-        lines += with_pickups(_surface(lens, number, surface, place), lens, number, place)
-    return lines
+        own = zemax_intent_write.with_rules(_surface(lens, number, surface, place), lens, number, place)
+        lines += with_pickups(own, lens, number, place)
+    return in_unit(lines, 1.0 if lens.intent is None else lens.intent.unit, Place(file))
 
 
 def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
@@ -72,7 +81,7 @@ def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
         f"GCAT {' '.join(catalogs_needed(lens, catalogs, place.file))}".rstrip(),
         f"RAIM 0 {list(RAY_AIMING).index(lens.ray_aiming)} 1 1 0 0 0 0 0",
         "PUSH 0 0 0 0 0 0",
-        "SDMA 0 1 0",
+        zemax_intent_write.margin(lens.intent),
         f"FTYP {kind} {int(fields.telecentric)} {len(fields.x)} {len(lens.wavelengths)} 0 0 0",
         "ROPD 2",
         "PICB 1",

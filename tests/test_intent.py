@@ -1,0 +1,277 @@
+"""What a .zmx file says about how its lens is to be optimised: read, kept, written again; by real files and by hand."""
+
+import dataclasses
+import json
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import torch
+from test_zemax import file, lens
+from test_zemax import read as read_text
+
+import raytrace as rt
+from raytrace.formats import read_lens_with_report, write_lens
+from raytrace.formats.source import LensFileError
+from raytrace.formats.zemax_merit import read_merit
+from raytrace.media.catalog import UnknownGlass
+from raytrace.system.dimensions import DIMENSION, powers
+from raytrace.system.intent import Intent, Row, Solve, Vary
+from raytrace.system.places import number_at, places
+
+SHARED = Path(__file__).parents[2] / "shared"
+MERIT = SHARED / "merit" / "dev"
+FOLDERS = (SHARED / "corpus" / "zmx", SHARED / "tier2" / "dev", MERIT, Path(__file__).parents[1] / "lenses")
+FILES = sorted(path for folder in FOLDERS for path in folder.glob("*") if path.suffix.lower() == ".zmx")
+UNITS = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "METER": 1e3}
+
+
+def again(found: rt.Lens, folder: Path) -> rt.Lens:
+    """A lens written and read."""
+    write_lens(found, folder / "again.zmx")
+    return read_lens_with_report(folder / "again.zmx")[0]
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_the_intent_of_every_real_file_comes_back(path, tmp_path):
+    try:
+        original = read_lens_with_report(path)[0]
+    except (LensFileError, UnknownGlass):
+        pytest.skip("refused by name")
+    found = again(original, tmp_path)
+    assert found.intent == original.intent
+    assert again(found, tmp_path).intent == original.intent
+
+
+def of_oracle(name: str, number: str, surface: rt.Surface) -> tuple[int, str]:
+    """Surface and name of a variable of the oracle, which writes p:2/4 for parameter 4 of surface 2."""
+    if name != "p":
+        return int(number), name
+    surface_number, j = number.split("/")
+    row = {"EVENASPH": f"a{2 * int(j)}", "PARAXIAL": "power_x"}
+    return int(surface_number), row["PARAXIAL" if surface.phase is not None else "EVENASPH"]
+
+
+@pytest.mark.skipif(not MERIT.is_dir(), reason="the merit functions of real files are not at hand")
+def test_variables_and_rows_are_those_of_an_independent_reader():
+    met = 0
+    for case in json.loads((MERIT / "oracle.json").read_text())["files"]:
+        path = next((folder / case["file"] for folder in FOLDERS if (folder / case["file"]).exists()), None)
+        if path is None:
+            continue
+        original, report = read_lens_with_report(path)
+        told = [one.split(":") for one in case["variables"]]
+        surfaces = [original.surfaces[int(number.split("/")[0])] for _, number in told]
+        expected = [of_oracle(*one, surface) for one, surface in zip(told, surfaces, strict=True)]
+        assert [(one.surface, one.quantity) for one in original.intent.variables] == expected
+        in_mm = not any("converted to mm" in note for note in report.notes)
+        for value, (surface, quantity) in zip(case.get("x_stored", ()) if in_mm else (), expected, strict=False):
+            held = original.surfaces[surface]
+            number = held.thickness if quantity == "thickness" else number_at(held, places(held)[quantity])
+            assert float(number) == pytest.approx(value, rel=1e-15, abs=0)
+        counts = Counter(row.operand for row in original.intent.merit)
+        assert all(counts[name] == count for name, count in case.get("operand_counts", {}).items())
+        for one in case.get("values", ()):
+            row = original.intent.merit[one["row"] - 1]
+            assert row.operand == one["op"]
+            assert row.weight == pytest.approx(one["weight"], rel=1e-15)
+        met += 1
+    assert met >= 17
+
+
+RULES = """TYPE EVENASPH
+CURV 0.02 1 0 0 0 ""
+VDSZ 0 0
+VCON
+PARM 2 1e-5
+VPAR 2
+PARM 3 0
+VPAR 3"""
+MERIT_LINES = """DMFS 0 0 0 0 0 0 0 0 0 0
+BLNK A text,  with blanks.
+TRAC 0 1 0 0.7 3.35E-1 0 0 7.27E-2 0 0
+EFFL 0 2 0 0 0 0 2.5 1 0 0
+MXCV 1 2 0 0 0 0 0.05 1 0 0
+CONS 0 0 0 0 0 0 1.5 0 0 0
+DIFF 4 6 0 0 0 0 1 1 0 0
+DIVI 4 6 0 0 0 0 1 1 0 0
+RECI 4 0 0 0 0 0 0.4 1 0 0
+SSAG 1 2 0.5 0.25 0 0 0.125 1 0 0
+PMVA 1 2 0 0 0 0 1e-5 1 0 0
+QQQQ 1 2 3 4 5 6 7 8 9 10 AUTO
+TOL TOFF   0   0              0              0   0 0 0
+TOL TTHI   1   2 -0.25 0.5   0 0 0
+TCMM A comment.
+MNUM 1 1"""
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_lengths_of_rules_rows_and_tolerances_are_in_mm_and_come_back(unit, tmp_path):
+    mm = UNITS[unit]
+    rules = {"surface": RULES, "stop": "MAZH 0.125 0.7\nPZUP 1 -1 0.5 0\nDIAM 5.5 0 0 0 1", "tail": MERIT_LINES}
+    original = lens(UNIT=f"UNIT {unit} X W X CM MR CPMM\nSDMA 5 1 0.25", **rules)
+    intent = original.intent
+    names = ["curvature", "thickness", "conic", "a4", "a6"]
+    assert [(one.surface, one.quantity) for one in intent.variables] == [(1, name) for name in names]
+    assert intent.solves == (
+        Solve(2, "thickness", "marginal_height", (0.125 * mm, 0.7)),
+        Solve(2, "thickness", "pickup", source=1, scale=-1.0, offset=0.5 * mm),
+    )
+    assert intent.semi_diameter_margin == (5, 0.25 * mm)
+    assert intent.semi_diameters == ()
+    targets = {row.operand: row.target for row in intent.merit}
+    assert targets == {
+        **{"DMFS": 0, "BLNK": 0, "TRAC": 0, "EFFL": 2.5 * mm, "MXCV": 0.05 / mm, "CONS": 1.5 * mm, "DIFF": mm},
+        **{"DIVI": 1, "RECI": 0.4 / mm, "SSAG": 0.125 * mm, "PMVA": 1e-5 / mm**3, "QQQQ": 7},
+    }
+    assert intent.merit[1].text == "A text,  with blanks."
+    assert intent.merit[2].integers == (0, 1)
+    assert intent.merit[2].numbers == (0, 0.7, 0.335, 0)
+    assert intent.merit[2].further == (0, 0)
+    assert intent.merit[9].numbers == (0.5 * mm, 0.25 * mm, 0, 0)
+    assert intent.merit[11] == Row("QQQQ", (1, 2), (3, 4, 5, 6), 7, 8, "AUTO", (9, 10))
+    assert [float(word) for word in intent.tolerances[1].split()[4:6]] == [-0.25 * mm, 0.5 * mm]
+    assert again(original, tmp_path).intent == intent
+    assert again(again(original, tmp_path), tmp_path).intent == intent
+
+
+def test_what_varies_is_modelled_and_a_row_is_not_traced():
+    found = lens(surface=RULES)
+    first = found.surfaces[1]
+    assert float(first.conic) == 0
+    assert first.coefficients.tolist() == [0, 1e-5, 0]
+    plain = dataclasses.replace(found, intent=None)
+    assert len(torch.utils._pytree.tree_leaves(found)) == len(torch.utils._pytree.tree_leaves(plain))
+
+
+def test_a_lens_without_an_intent_is_written_as_before(tmp_path):
+    given = lens(object_="DIAM 9 1 0 0 1").replace(1, thickness=4.5)
+    given = dataclasses.replace(given, intent=None)
+    write_lens(given, tmp_path / "lens.zmx")
+    text = (tmp_path / "lens.zmx").read_text()
+    assert "SDMA 0 1 0\n" in text
+    assert "DIAM 6.0 1 0 0 1" in text
+    assert not [word for word in ("VDSZ", "VCON", "BLNK", "MAZH") if word in text]
+    assert again(given, tmp_path).intent is None
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"surface": "VPAR x"},
+        {"surface": "PPAR 1 0 nan"},
+        {"surface": "MAZH 0 1e999"},
+        {"surface": "TOLE 1.5 2"},
+        {"surface": "CURV 0.02 1.5"},
+        {"surface": "DIAM 6 x"},
+        {"surface": "GLAS N-BK7 2 x"},
+        {"tail": "TRAC 0 1 0 0 x 0 0 1"},
+        {"tail": "TRAC 0.5 1"},
+        {"tail": "EFFL 0 2 0 0 0 0 1,5 1"},
+        {"UNIT": "UNIT METER", "tail": "EFFL 0 2 0 0 0 0 1e308 1"},
+        {"UNIT": "UNIT IN", "tail": "TOL TTHI 1 2 x 1"},
+        {"UNIT": "UNIT METER", "surface": "MAZH 1e308 0"},
+    ],
+    ids=lambda changes: list(changes.values())[-1],
+)
+def test_a_wrong_word_in_a_rule_or_a_row_is_one_error_with_file_and_line(changes):
+    with pytest.raises(LensFileError, match=r"^lens\.zmx:\d+") as caught:
+        lens(**changes)
+    assert "\n" not in str(caught.value)
+    assert caught.value.surface == (1 if "surface" in changes else None)
+
+
+def test_rules_that_are_not_followed_are_kept_named_and_come_back(tmp_path):
+    rules = {
+        "surface": 'CURV 0.02 8 0.01 0 0 ""\nTOLE 3 51.5\nGLAS N-BK7 3 0 1.5 40\nPPAR 2 -1 1 0\nDIAM 6 3 0 0 1',
+        "stop": "EDGE 0.5 3\nDIAM 5.5 2 1 0 1\nCURV -0.02 99 1 2 3",
+    }
+    original, report = read_text(file(**rules))
+    assert original.intent.solves == ()
+    kinds = [(one.surface, one.quantity, one.kind, one.numbers, one.source) for one in original.intent.kept]
+    assert kinds == [
+        (1, "PARM 2", "PPAR", (-1, 1, 0), 0),
+        (1, "curvature", "power", (0.01,), 0),
+        (1, "thickness", "position", (51.5,), 3),
+        (1, "glass", "substitute", (), 0),
+        (1, "semi_diameter", "maximum", (), 0),
+        (2, "curvature", "code 99", (1, 2, 3), 0),
+        (2, "thickness", "edge_thickness", (0.5, 3), 0),
+        (2, "semi_diameter", "pickup", (), 1),
+    ]
+    for one in original.intent.kept:
+        assert any(note.endswith(f"not followed when the lens is optimised: {one}") for note in report.notes)
+    assert again(original, tmp_path).intent == original.intent
+
+
+CONFIGURED = """MNUM 2 1
+MOFF   0   1 "" 0 0 0 1 1 0 0.0 ""
+MOFF   0   2 "" 0 0 0 1 1 0 0.0 ""
+THIC   1   1 4 1 0 0 1 1 1.0 0.0 0
+THIC   1   2 5 1 0 0 1 1 1.0 0.0 0
+CRVT   2   1 -0.02 0 0 0 1 1 1.0 0.0 0
+CRVT   2   2 -0.04 2 0 0 1 3 2.0 0.0 0
+PRAM   1   1 1E-5 1 2 0 1 1 1.0 0.0 0
+PRAM   1   2 2E-5 0 2 0 1 1 1.0 0.0 0"""
+
+
+def test_numbers_of_configurations_vary_one_by_one_and_void_the_variable_of_the_surface(tmp_path):
+    original = lens(surface=RULES, tail=CONFIGURED)
+    assert original.intent.variables == (
+        *(Vary(1, name) for name in ("curvature", "conic", "a6")),
+        Vary(1, "thickness", 1, 0),
+        Vary(1, "thickness", 2, 0),
+        Vary(1, "a4", 1, 2),
+    )
+    (rule,) = (one for one in original.intent.kept if one.operand is not None)
+    assert rule == Solve(2, "curvature", "pickup", (1.0,), 1, 2.0, configuration=2, operand=1)
+    found = again(original, tmp_path)
+    assert found.intent == original.intent
+    assert [one.values() for one in found.operands] == [one.values() for one in original.operands]
+
+
+def test_the_intent_stays_with_the_lens_under_other_conditions():
+    original = lens(surface=RULES, tail=f"{MERIT_LINES.rpartition('MNUM')[0]}{CONFIGURED}")
+    for other in (original.at(f_number=8), original.replace(1, thickness=3), original.configuration(2)):
+        assert other.intent is original.intent
+    assert rt.to(original, dtype=torch.float32).intent is original.intent
+
+
+def test_one_number_of_the_file_that_is_two_of_the_lens_varies_both(tmp_path):
+    original = lens(surface="TYPE PARAXIAL\nCURV 0\nPARM 1 50\nVPAR 1\nPARM 2 1").replace(1, glass=rt.AIR)
+    assert original.intent.variables == (Vary(1, "power_x"),)
+    assert original.intent.solves == (Solve(1, "power_y", "pickup", source=1, quantity_of_source="power_x"),)
+    assert again(original, tmp_path).intent == original.intent
+
+
+def test_bounds_of_a_thickness_are_kept_and_those_of_the_program_are_none(tmp_path):
+    original = lens(surface="VDSZ 1 2.5", stop="VDSZ -1.E+10 1.0E+10", UNIT="UNIT CM")
+    assert original.intent.variables == (Vary(1, "thickness", bounds=(10.0, 25.0)), Vary(2, "thickness"))
+    assert again(original, tmp_path).intent == original.intent
+
+
+def test_a_merit_function_file_has_two_numbers_more_before_the_target(tmp_path):
+    path = tmp_path / "spot.MF"
+    path.write_text("VERS 120229\nBLNK spot\nTRAC 0 1 0 0.7 0.5 0 0 0 0.25 0.125\nEFFL 0 2 0 0 0 0 0 0 2 1\n", "utf-16")
+    text, ray, length = read_merit(path, millimetres=25.4)
+    assert text.text == "spot"
+    assert (ray.numbers, ray.target, ray.weight) == ((0, 0.7, 0.5, 0), 0.25 * 25.4, 0.125)
+    assert (length.target, length.weight, length.further) == (50.8, 1, ())
+    (tmp_path / "other.MF").write_text("nothing of a merit\n")
+    with pytest.raises(LensFileError, match=r"other\.MF: no operand of a merit function in 1 lines"):
+        read_merit(tmp_path / "other.MF")
+
+
+def test_rows_that_refer_to_each_other_have_no_dimension_and_take_no_time():
+    rows = [Row("DIFF", (k + 2, k + 3)) for k in range(3000)] + [Row("DIFF", (1, 2)), Row("EFFL")]
+    assert len(powers(rows, lambda row: 0)) == len(rows)
+    assert powers([Row("DIVI", (2, 3)), Row("EFFL"), Row("MXCV")], lambda row: 0) == [2, 1, -1]
+
+
+def test_an_intent_says_what_it_holds():
+    shown = str(lens(surface=RULES, stop="PZUP 1 -1 0.5 0", tail=MERIT_LINES).intent)
+    assert "varies: a4 of surface 1" in shown
+    assert "follows: thickness of surface 2 = -1 × thickness of surface 1 + 0.5" in shown
+    assert "merit function of 12 lines: DMFS x1, BLNK x1, TRAC x1" in shown
+    assert str(Intent()) == "nothing varies, nothing follows, no merit function"
+    assert {"TRAC", "MTFT", "CONF"} <= DIMENSION.keys()
