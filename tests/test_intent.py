@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from test_formats import leaves
 from test_zemax import file, lens
 from test_zemax import read as read_text
 
@@ -14,8 +15,9 @@ import raytrace as rt
 from raytrace.formats import read_lens_with_report, write_lens
 from raytrace.formats.source import LensFileError
 from raytrace.formats.zemax_merit import read_merit
+from raytrace.formats.zemax_units import in_file
 from raytrace.media.catalog import UnknownGlass
-from raytrace.system.dimensions import DIMENSION, powers
+from raytrace.system.dimensions import DIMENSION
 from raytrace.system.intent import Intent, Row, Solve, Vary
 from raytrace.system.places import number_at, places
 
@@ -106,7 +108,7 @@ MNUM 1 1"""
 
 
 @pytest.mark.parametrize("unit", UNITS)
-def test_lengths_of_rules_rows_and_tolerances_are_in_mm_and_come_back(unit, tmp_path):
+def test_lengths_of_rules_are_in_mm_and_rows_stay_as_written_and_come_back(unit, tmp_path):
     mm = UNITS[unit]
     rules = {"surface": RULES, "stop": "MAZH 0.125 0.7\nPZUP 1 -1 0.5 0\nDIAM 5.5 0 0 0 1", "tail": MERIT_LINES}
     original = lens(UNIT=f"UNIT {unit} X W X CM MR CPMM\nSDMA 5 1 0.25", **rules)
@@ -119,20 +121,42 @@ def test_lengths_of_rules_rows_and_tolerances_are_in_mm_and_come_back(unit, tmp_
     )
     assert intent.semi_diameter_margin == (5, 0.25 * mm)
     assert intent.semi_diameters == ()
-    targets = {row.operand: row.target for row in intent.merit}
-    assert targets == {
-        **{"DMFS": 0, "BLNK": 0, "TRAC": 0, "EFFL": 2.5 * mm, "MXCV": 0.05 / mm, "CONS": 1.5 * mm, "DIFF": mm},
-        **{"DIVI": 1, "RECI": 0.4 / mm, "SSAG": 0.125 * mm, "PMVA": 1e-5 / mm**3, "QQQQ": 7},
-    }
+    assert intent.unit == mm
+    assert [row.target for row in intent.merit[3:]] == [2.5, 0.05, 1.5, 1, 1, 0.4, 0.125, 1e-5, 7]  # as they stand
     assert intent.merit[1].text == "A text,  with blanks."
-    assert intent.merit[2].integers == (0, 1)
-    assert intent.merit[2].numbers == (0, 0.7, 0.335, 0)
-    assert intent.merit[2].further == (0, 0)
-    assert intent.merit[9].numbers == (0.5 * mm, 0.25 * mm, 0, 0)
+    assert intent.merit[2] == Row("TRAC", (0, 1), (0, 0.7, 0.335, 0), 0, 0.727e-1, further=(0, 0))
     assert intent.merit[11] == Row("QQQQ", (1, 2), (3, 4, 5, 6), 7, 8, "AUTO", (9, 10))
-    assert [float(word) for word in intent.tolerances[1].split()[4:6]] == [-0.25 * mm, 0.5 * mm]
-    assert again(original, tmp_path).intent == intent
-    assert again(again(original, tmp_path), tmp_path).intent == intent
+    assert intent.tolerances[1:] == ("TOL TTHI   1   2 -0.25 0.5   0 0 0", "TCMM A comment.")
+    found = again(original, tmp_path)
+    assert f"UNIT {unit} " in (tmp_path / "again.zmx").read_text()
+    assert found.intent == intent
+    assert leaves(found) == leaves(original)
+
+
+@pytest.mark.parametrize("unit", [10.0, 25.4, 1e3])
+@pytest.mark.parametrize("power", [1, -1, -3, -15])
+def test_a_number_of_a_file_is_written_in_its_unit_such_that_it_comes_back(unit, power):
+    random = torch.Generator().manual_seed(3)
+    for one in torch.randn(500, dtype=torch.float64, generator=random).tolist():
+        in_mm = one * unit**power if power >= 0 else one / unit**-power
+        told = float(in_file(repr(in_mm), power, unit))
+        assert (told * unit**power if power >= 0 else told / unit**-power) == in_mm
+        other = float(in_file(repr(one), power, unit))
+        assert (other * unit**power if power >= 0 else other / unit**-power) == pytest.approx(one, rel=5e-16, abs=0)
+
+
+def test_a_focal_length_comes_back_in_every_unit(tmp_path):
+    ideal = "TYPE PARAXIAL\nCURV 0\nPARM 1 37.723137702602429\nVPAR 1\nPARM 2 1\nGLAS AIR"
+    for unit in UNITS:
+        original = lens(UNIT=f"UNIT {unit} X", surface=ideal, tail="EFFL 0 2 0 0 0 0 50 1 0 0")
+        assert leaves(again(original, tmp_path)) == leaves(original)
+
+
+def test_a_unit_that_no_file_has_is_refused_by_name(tmp_path):
+    original = lens(tail="EFFL 0 2 0 0 0 0 50 1 0 0")
+    other = dataclasses.replace(original, intent=dataclasses.replace(original.intent, unit=3.0))
+    with pytest.raises(LensFileError, match=r"a unit of 3\.0 mm, expected 1, 10, 25\.4 or 1000"):
+        write_lens(other, tmp_path / "lens.zmx")
 
 
 def test_what_varies_is_modelled_and_a_row_is_not_traced():
@@ -168,8 +192,6 @@ def test_a_lens_without_an_intent_is_written_as_before(tmp_path):
         {"tail": "TRAC 0 1 0 0 x 0 0 1"},
         {"tail": "TRAC 0.5 1"},
         {"tail": "EFFL 0 2 0 0 0 0 1,5 1"},
-        {"UNIT": "UNIT METER", "tail": "EFFL 0 2 0 0 0 0 1e308 1"},
-        {"UNIT": "UNIT IN", "tail": "TOL TTHI 1 2 x 1"},
         {"UNIT": "UNIT METER", "surface": "MAZH 1e308 0"},
     ],
     ids=lambda changes: list(changes.values())[-1],
@@ -253,19 +275,13 @@ def test_bounds_of_a_thickness_are_kept_and_those_of_the_program_are_none(tmp_pa
 def test_a_merit_function_file_has_two_numbers_more_before_the_target(tmp_path):
     path = tmp_path / "spot.MF"
     path.write_text("VERS 120229\nBLNK spot\nTRAC 0 1 0 0.7 0.5 0 0 0 0.25 0.125\nEFFL 0 2 0 0 0 0 0 0 2 1\n", "utf-16")
-    text, ray, length = read_merit(path, millimetres=25.4)
+    text, ray, length = read_merit(path)
     assert text.text == "spot"
-    assert (ray.numbers, ray.target, ray.weight) == ((0, 0.7, 0.5, 0), 0.25 * 25.4, 0.125)
-    assert (length.target, length.weight, length.further) == (50.8, 1, ())
+    assert (ray.numbers, ray.target, ray.weight) == ((0, 0.7, 0.5, 0), 0.25, 0.125)
+    assert (length.target, length.weight, length.further) == (2, 1, ())
     (tmp_path / "other.MF").write_text("nothing of a merit\n")
     with pytest.raises(LensFileError, match=r"other\.MF: no operand of a merit function in 1 lines"):
         read_merit(tmp_path / "other.MF")
-
-
-def test_rows_that_refer_to_each_other_have_no_dimension_and_take_no_time():
-    rows = [Row("DIFF", (k + 2, k + 3)) for k in range(3000)] + [Row("DIFF", (1, 2)), Row("EFFL")]
-    assert len(powers(rows, lambda row: 0)) == len(rows)
-    assert powers([Row("DIVI", (2, 3)), Row("EFFL"), Row("MXCV")], lambda row: 0) == [2, 1, -1]
 
 
 def test_an_intent_says_what_it_holds():

@@ -26,7 +26,7 @@ _WAVELENGTHS = 24
 
 
 def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
-    """The content of a .zmx file of the lens, in mm, or in the unit of its merit: ASCII, or UTF-16 where a text needs it.
+    """The content of a .zmx file of the lens, in mm or the unit of its merit: ASCII, or UTF-16 where a text needs it.
 
     file: its name, for messages. catalogs: the user's glass catalogs that the lens was read with.
     Raises LensFileError for what a .zmx file cannot hold: a batch of lenses, nan, two apertures on one surface, more
