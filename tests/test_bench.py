@@ -70,6 +70,39 @@ def test_other_systems_stand_beside_plain_conics(capsys):
     assert "beyond" not in json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.parametrize("name", beyond.SYSTEMS)
+@pytest.mark.parametrize("backend", ["torch", "numpy"])
+def test_a_second_program_traces_the_same_systems(name, backend):
+    """Rays, paths and slopes of toroids, tilts and gratings agree with Optiland's, but for what it is said to lack."""
+    peers = pytest.importorskip("raytrace.bench.peers", reason="needs the extra [bench]", exc_type=ImportError)
+    lens = beyond.SYSTEMS[name]()
+    own, peer = Own(lens, torch.float64, with_path=True), peers.PosedOptiland(lens, torch.float64, backend=backend)
+    rays = field_rays(lens, 200)
+    assert beyond.error_of(peer) < 1e-3  # nm
+    (points, path), (_, found) = own.forward(rays), peer.forward(rays)
+    paths = [1e3 * (one - one[0]) / peer.wavelength for one in (path, found)]
+    differ = float((paths[0] - paths[1]).abs().max())
+    assert differ > 1 if "grating's path" in peer.lacks else differ < 1e-7  # waves
+    if peer.has_gradient:
+        slopes, others = (torch.stack(list(one.gradient(rays, points.mean(1)))) for one in (own, peer))
+        known = others != 0
+        assert (len(known) == known.sum()) == ("slopes" not in peer.lacks)
+        assert torch.allclose(slopes[known], others[known], rtol=1e-9, atol=1e-12)
+        assert peer.forward(rays)[1].requires_grad is False
+
+
+def test_other_systems_stand_beside_their_peer():
+    peers = pytest.importorskip("raytrace.bench.peers", reason="needs the extra [bench]", exc_type=ImportError)
+    steps = []
+    rows = beyond.measure(100, repeats=1, threads=1, peers_of=peers.posed_peers, progress=steps.append)
+    assert len(rows) == len(steps) == beyond.calls(1, with_peers=True) == 9 * len(beyond.SYSTEMS)
+    for row in rows:
+        assert (row.over_peer is None) == (row.tracer != "raytrace")
+        assert row.error < (1e-3 if row.dtype == "float64" else 100.0)  # nm
+        assert row.ratio == 1 if row.system == "conics" else row.ratio > 0
+    assert "| tilted grating spectrometer | 6 | 100 | forward | float64 | Optiland, numpy |" in beyond.report(rows)[-1]
+
+
 def test_the_spectrometer_disperses_as_its_grating_says():
     """All light arrives, and the image of the slit moves by f · order · frequency · Δλ/cos θ, to aberrations."""
     lens = beyond.spectrometer()

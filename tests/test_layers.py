@@ -51,7 +51,7 @@ RESERVED = {
     "matplotlib": (r"plot", r"studies\.(\w+\.)?figures", r"bench\.figures"),
     "pandas": (r"formats\.(frame|ray_table)", r"cli", r"bench"),
     "tqdm": (r"cli", r"studies\.codesign\.setup", r"bench"),
-    "optiland": (r"bench\.peers",),
+    "optiland": (r"bench\.peers(_\w+)?",),
 }
 
 

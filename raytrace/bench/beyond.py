@@ -11,8 +11,20 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.bench.measure import DTYPES, SAMPLE, Own, field_rays, in_turns, name_of, nothing
-from raytrace.bench.report import table
+from raytrace.bench.measure import (
+    DTYPES,
+    PIECES,
+    SAMPLE,
+    Job,
+    Own,
+    Tracer,
+    field_rays,
+    in_best_pieces,
+    in_turns,
+    name_of,
+    nothing,
+)
+from raytrace.bench.report import digits, table
 from raytrace.files import shipped
 from raytrace.formats import read_lens
 from raytrace.fused import tracing
@@ -22,6 +34,7 @@ from raytrace.optics.trace import trace_lens
 from raytrace.system.lens import Fields, Lens, SystemAperture
 from raytrace.system.phases import Grating
 from raytrace.system.pose import Pose
+from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface
 
 MOST = 100_000  # rays
@@ -85,7 +98,10 @@ SYSTEMS = {"conics": conics, "toroids": toroids, "tilted grating spectrometer": 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One figure. seconds: median; error: nm, largest distance from the eager float64 trace of the same numbers."""
+    """One figure. seconds: median; ratio: speed over that of the same tracer on conics; error: nm, largest distance
+    from the eager float64 trace of the same numbers; over_peer: speed over that of Optiland's torch back end at the
+    same task, None for Optiland itself or without it; lacks: what a tracer leaves out of the task.
+    """
 
     system: str
     dtype: str
@@ -96,38 +112,55 @@ class Row:
     speed: float
     ratio: float
     error: float
+    tracer: str = "raytrace"
+    over_peer: float | None = None
+    lacks: str = ""
 
 
-def calls(repeats: int) -> int:
+def calls(repeats: int, *, with_peers: bool = False) -> int:
     """How many steps of progress `measure` makes."""
-    return repeats * len(SYSTEMS) * len(DTYPES) * len(WORK)
+    own = len(DTYPES) * len(WORK)
+    return repeats * len(SYSTEMS) * (own + (own + 1 if with_peers else 0))
 
 
-def measure(count: int, *, repeats: int, threads: int, progress: Callable[[int], object] = nothing) -> list[Row]:
-    """Time every system with the optical path; progress: of `calls(repeats)`."""
+def measure(
+    count: int,
+    *,
+    repeats: int,
+    threads: int,
+    peers_of: Callable[[Lens], Sequence[Tracer] | None] = nothing,
+    progress: Callable[[int], object] = nothing,
+) -> list[Row]:
+    """Time every system with the optical path, in turns. peers_of: peers with a lens; progress: of `calls(…)`."""
     count = min(count, MOST)
     lenses = {name: make() for name, make in SYSTEMS.items()}
-    tracers = {(name, dtype): Own(lenses[name], dtype, with_path=True) for name in SYSTEMS for dtype in DTYPES}
-    jobs = {}
-    for (name, dtype), tracer in tracers.items():
-        rays = to(field_rays(lenses[name], count), dtype=dtype)
-        jobs[name, dtype, WORK[0]] = (lambda tracer=tracer, rays=rays: tracer.forward(rays)), nothing
-        centroid = tracer.forward(rays)[0].mean(1)
-        jobs[name, dtype, WORK[1]] = (
-            (lambda tracer=tracer, rays=rays, centroid=centroid: tracer.gradient(rays, centroid)),
-            nothing,
-        )
-    errors = {key: error_of(tracer) for key, tracer in tracers.items()}
+    tracers = {}
+    for name, lens in lenses.items():
+        for one in (*(Own(lens, dtype, with_path=True) for dtype in DTYPES), *(peers_of(lens) or ())):
+            tracers[name, one.name, one.dtype] = one
+    jobs = {
+        (*key, what): _job(one, what, to(field_rays(lenses[key[0]], count), dtype=one.dtype), threads)
+        for key, one in tracers.items()
+        for what in WORK[: 1 + one.has_gradient]
+    }
+    errors = {key: error_of(one) for key, one in tracers.items()}
     seconds = in_turns(jobs, repeats=repeats, threads=threads, progress=progress)
-    return [_row(key, lenses, count, seconds, errors) for key in jobs]
+    return [_row(key, lenses, count, seconds, errors[key[:3]], tracers[key[:3]]) for key in jobs]
 
 
-def _row(key: tuple, lenses: dict, count: int, seconds: dict, errors: dict) -> Row:
-    name, dtype, what = key
-    plain = next(iter(SYSTEMS))
-    each = {one: _met(lenses[one]) * count / statistics.median(seconds[one, dtype, what]) for one in (name, plain)}
-    # Turn by turn, for what else the machine does changes from one to the next.
-    over = [b / a for a, b in zip(seconds[name, dtype, what], seconds[plain, dtype, what], strict=True)]
+def _job(tracer: Tracer, what: str, rays: Rays, threads: int) -> Job:
+    """A call on all rays: by this package at once, which divides them itself; a peer's in the pieces that suit it."""
+    tracer.prepare()
+    centroid = tracer.forward(rays)[0].mean(1)
+    work = tracer.forward if what == WORK[0] else lambda rays: tracer.gradient(rays, centroid)
+    if isinstance(tracer, Own):
+        return (lambda: work(rays)), tracer.prepare
+    return in_best_pieces(work, rays, tracer.prepare, sizes=PIECES, threads=threads)[0]
+
+
+def _row(key: tuple, lenses: dict, count: int, seconds: dict, error: float, tracer: Tracer) -> Row:
+    name, who, dtype, what = key
+    others = [one for one in seconds if (one[0], *one[2:]) == (name, dtype, what) and one[1].endswith("torch")]
     return Row(
         name,
         name_of(dtype),
@@ -135,21 +168,32 @@ def _row(key: tuple, lenses: dict, count: int, seconds: dict, errors: dict) -> R
         count,
         _met(lenses[name]),
         statistics.median(seconds[key]),
-        each[name],
-        statistics.median(over) * _met(lenses[name]) / _met(lenses[plain]),
-        errors[name, dtype],
+        _met(lenses[name]) * count / statistics.median(seconds[key]),
+        _over(seconds, (next(iter(SYSTEMS)), *key[1:]), key, lenses),
+        error,
+        who,
+        _over(seconds, others[0], key, lenses) if others and who == "raytrace" else None,
+        getattr(tracer, "lacks", ""),
     )
+
+
+def _over(seconds: dict, other: tuple, key: tuple, lenses: dict) -> float:
+    """Speed of one over another's, turn by turn, for what else the machine does changes from one to the next."""
+    over = [b / a for a, b in zip(seconds[key], seconds[other], strict=True)]
+    return statistics.median(over) * _met(lenses[key[0]]) / _met(lenses[other[0]])
 
 
 def _met(lens: Lens) -> int:
     return sum(not surface.is_break for surface in lens.surfaces[1:])
 
 
-def error_of(tracer: Own) -> float:
+def error_of(tracer: Tracer) -> float:
     """nm between the tracer and the eager trace in float64 of the same numbers, the largest of a few rays."""
     rays = to(field_rays(tracer.lens, SAMPLE), dtype=tracer.dtype)
+    wavelength = tracer.lens.wavelengths[tracer.lens.primary_wavelength].double()
+    tracer.prepare()
     with torch.no_grad(), tracing("eager"):
-        exact = trace_lens(*(to(x, dtype=torch.float64) for x in (tracer.lens, rays)), tracer.wavelength)
+        exact = trace_lens(*(to(x, dtype=torch.float64) for x in (tracer.lens, rays)), wavelength)
     return 1e6 * _largest(tracer.forward(rays)[0].double() - exact.position[:2])
 
 
@@ -165,15 +209,20 @@ def report(rows: Sequence[Row]) -> list[str]:
         "rays": lambda row: f"{row.rays:,}",
         "what": lambda row: row.what,
         "dtype": lambda row: row.dtype,
+        "tracer": lambda row: row.tracer,
         "M/s": lambda row: f"{row.speed / 1e6:.1f}",
         "× conics": lambda row: f"{row.ratio:.2f}",
+        "× Optiland": lambda row: digits(row.over_peer, ".1f"),
         "difference, nm": lambda row: f"{row.error:.2g}",
+        "without": lambda row: row.lacks,
     }
+    if all(row.over_peer is None for row in rows):
+        del columns["tracer"], columns["× Optiland"], columns["without"]
     return [
         "",
         "Other systems, with path, by the trace that the program chooses: speed in millions of rays × surfaces per "
-        "second, and over that of conics turn by turn, the median. Difference: the largest from the eager trace in "
-        f"float64 of the same numbers, over {SAMPLE} rays.",
+        "second, and over that of the same tracer on conics turn by turn, the median. Difference: the largest from the "
+        f"eager trace in float64 of the same numbers, over {SAMPLE} rays. Without: what a tracer leaves out.",
         "",
         *table(columns, rows),
     ]

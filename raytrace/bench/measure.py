@@ -27,6 +27,7 @@ from raytrace.system.surface import Surface, is_even
 
 DTYPES = (torch.float32, torch.float64)
 SAMPLE = 24  # rays of the check against the reference
+PIECES = (2**15, 2**16)  # numbers of rays traced at a time that are tried, beside all at once
 SHORTEST = 0.02  # s: shorter calls are timed many at a time
 _MOST_CALLS = 200
 

@@ -9,6 +9,7 @@ import torch
 from raytrace.bench import beyond
 from raytrace.bench.measure import (
     DTYPES,
+    PIECES,
     SAMPLE,
     Errors,
     Job,
@@ -30,7 +31,6 @@ from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
 
 LENS, COUNTS = "double_gauss", (10**3, 10**4, 10**5, 10**6)
-PIECES = (2**15, 2**16)  # numbers of rays traced at a time that are tried, beside all at once
 LARGEST_GRAPH = 200_000  # rays whose graph is held at once
 WORK = ("forward", "forward+backward")
 
@@ -60,10 +60,11 @@ def bench(asked: Asked) -> Measured:
         raise CommandError(f"{name}: not every ray of the middle field starts; choose another lens")
     tracers = tracers_of(lens, asked.peers.peers(lens) if asked.peers else [])
     how = {"repeats": repeats, "threads": asked.threads}
-    others = 0 if asked.arguments.lens else beyond.calls(repeats)
+    peers_of = asked.peers.posed_peers if asked.peers else nothing
+    others = 0 if asked.arguments.lens else beyond.calls(repeats, with_peers=bool(asked.peers))
     with progress(calls(tracers, counts, repeats) + others, "call", what="measuring") as bar:
         rows = measure(lens, tracers, counts, **how, progress=bar.update)
-        beside = beyond.measure(max(counts), **how, progress=bar.update) if others else []
+        beside = beyond.measure(max(counts), **how, peers_of=peers_of, progress=bar.update) if others else []
     about = {"lens": name, "surfaces": surfaces_of(lens), "repeats": repeats, "machine": asked.about()}
     lines = report(rows, **about) + (beyond.report(beside) if others else [])
     told = about | ({"beyond": [dataclasses.asdict(row) for row in beside]} if others else {})
