@@ -173,7 +173,7 @@ def _row(key: tuple, lenses: dict, count: int, seconds: dict, error: float, trac
         error,
         who,
         _over(seconds, others[0], key, lenses) if others and who == "raytrace" else None,
-        getattr(tracer, "lacks", ""),
+        "" if isinstance(tracer, Own) else tracer.lacks(gradient=what != WORK[0]),
     )
 
 

@@ -31,7 +31,8 @@ from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface
 
 _RAY_OPTICS_MOST = 1024  # rays: it traces one at a time in Python
-_CLOSE = 1e-10  # mm, where Optiland's search for a toroid ends
+# mm, where Optiland's search for a toroid ends: what float32 does not reach it would try in vain a hundred times
+_CLOSE = {torch.float32: 1e-4, torch.float64: 1e-10}
 
 
 class Optiland:
@@ -156,8 +157,7 @@ class Optiland:
 class PosedOptiland(Optiland):
     """A lens of toroids, gratings and tilts in Optiland: every surface where its frame stands, in one system of axes.
 
-    lacks: what Optiland leaves out of the task, in a few words: its gratings add no path to light, and a plane there
-    has no curvature to differentiate by, so that slope is told as 0.
+    Its gratings add no path to light, and a plane there has no curvature to differentiate by: that slope is told as 0.
     """
 
     def __init__(self, lens: Lens, dtype: torch.dtype, *, backend: str):
@@ -169,13 +169,12 @@ class PosedOptiland(Optiland):
         self.steps = to(torch.func.jacfwd(self._origins)(first), dtype=dtype)  # origins are linear in thicknesses
         self.start = to(self._origins(torch.zeros_like(first)), dtype=dtype)
 
-    @property
-    def lacks(self) -> str:
+    def lacks(self, *, gradient: bool) -> str:
+        """What Optiland leaves out of the task, in a few words."""
         gratings = any(surface.phase is not None for surface in self.lens.surfaces)
-        planes = any(
-            float(self.lens.surfaces[i].curvature) == 0 for i, name in variables(self.lens) if name == "curvature"
-        )
-        missing = ["the grating's path"] * gratings + ["slopes by planes' curvature"] * (planes and self.has_gradient)
+        curved = [number for number, name in variables(self.lens) if name == "curvature"]
+        planes = any(float(self.lens.surfaces[number].curvature) == 0 for number in curved)
+        missing = ["the grating's path"] * gratings + ["slopes by planes' curvature"] * (planes and gradient)
         return ", ".join(missing)
 
     def forward(self, rays: Rays) -> tuple[Tensor, Tensor | None]:
@@ -225,7 +224,7 @@ class PosedOptiland(Optiland):
                 index=number,
                 is_stop=number == self.lens.stop,
                 material="mirror" if surface.is_mirror else IdealMaterial(float(self.indices[number])),
-                **(_standing(frame) | _shaped(surface) if number else {"z": -1.0}),
+                **(_standing(frame) | _shaped(surface, self.dtype) if number else {"z": -1.0}),
             )
         return optic
 
@@ -242,15 +241,15 @@ def _standing(frame: Frame) -> dict[str, float]:
     return {"x": x, "y": y, "z": z} | {name: float(turn) for name, turn in turns.items()}
 
 
-def _shaped(surface: Surface) -> dict:
+def _shaped(surface: Surface, dtype: torch.dtype) -> dict:
     """Shape and phase in Optiland's words. Raises ValueError for what is not handed over."""
     c, k = (0.0 if one is None else float(one) for one in (surface.curvature, surface.conic))
     radius = 1 / c if c else math.inf
     if surface.kind == "toroidal" and surface.phase is None:
         across, *terms = surface.coefficients.tolist()
         radii = {"radius_x": 1 / across if across else math.inf, "radius_y": radius}
-        exact = {"tol": _CLOSE}  # mm; 1e-6 unless told
-        return {"surface_type": "toroidal", "conic": k, "toroidal_coeffs_poly_y": terms} | radii | exact
+        numbers = {"conic": k, "toroidal_coeffs_poly_y": terms, "tol": _CLOSE[dtype]}
+        return {"surface_type": "toroidal"} | numbers | radii
     if surface.coefficients is not None or surface.departure is not None:
         raise ValueError("this shape is not handed over")
     if isinstance(surface.phase, Grating):

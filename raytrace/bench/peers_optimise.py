@@ -1,0 +1,370 @@
+"""Optiland as an optimiser: its sample lenses with one merit function that is told alike in both programs.
+
+    M² = Σ w (v - t)² / Σ w
+
+over rows of lens files: TRAC, the distance of a ray on the image from the centroid of its field, at the points of a
+Gaussian quadrature of the pupil and of half of it off the axis, and EFFL. Optiland has no such operand: it is told by
+its own registry of operands, so that all rays of a wavelength are traced in one call of `trace_generic`, and
+posed in two ways whose squares sum up to the same M²:
+
+    "rays": a residual for x and y of every ray, what least squares does best with;
+    "spots": the root mean square of every field and wavelength, as Optiland's tutorials pose it.
+
+Variables, their scales, the focal length, the solvers and their derivatives (differences in least squares, autograd in
+Adam) are Optiland's own. What it ends at is brought back as a lens, whose merit is told by this package's rays as well.
+
+Importing this file imports Optiland: it needs the extra [bench].
+"""
+
+import dataclasses
+import math
+import time
+import warnings
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import optiland.backend as be
+import torch
+from optiland.optic import Optic
+from optiland.optimization import LeastSquares, OptimizationProblem, TorchAdamOptimizer
+from optiland.optimization.operand.operand import operand_registry
+from optiland.samples.objectives import CookeTriplet, DoubleGauss
+from torch import Tensor
+
+from raytrace.bench.report import table
+from raytrace.maths.pupil import gauss_legendre
+from raytrace.media.glass import AIR, Glass, from_table
+from raytrace.optics.launch import launch
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.trace import trace_lens
+from raytrace.system.intent import Intent, Row, Vary
+from raytrace.system.lens import Fields, Lens, SystemAperture
+from raytrace.system.surface import Surface
+
+RINGS, ARMS = 3, 6
+AGREE = 1e-9  # of the merits of both programs, relative
+_POSED = ("rays", "spots")
+_APERTURES = {"EPD": "entrance_pupil_diameter", "imageFNO": "image_f_number"}
+
+#: Optiland's sample, its variable radii and thicknesses by surface, and the focal length to be held, mm.
+PROBLEMS: dict[str, tuple[type[Optic], tuple[int, ...], tuple[int, ...], float]] = {
+    "cooke triplet": (CookeTriplet, (1, 2, 3, 4, 5, 6), (6,), 50.0),
+    "double Gauss": (DoubleGauss, (1, 2, 3, 5, 7, 9, 10, 11), (5, 6, 11), 100.0),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """What both programs are given.
+
+    lens: Optiland's at the start, with variables and rows as its intent; moved: by how much, as a part of itself, every
+    variable was moved up and down in turn from the sample. merit_in_optiland: M² at the start.
+    """
+
+    name: str
+    moved: float
+    lens: Lens
+    variables: tuple[Vary, ...]
+    rows: tuple[Row, ...]
+    merit_in_optiland: float
+
+    def optic(self) -> Optic:
+        """Optiland's lens at the start, in the back end that is set."""
+        sample, radii, thicknesses, _ = PROBLEMS[self.name]
+        return _moved(sample(), radii, thicknesses, self.moved)
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What an optimiser did.
+
+    history: (processor seconds since the start, M²) of every evaluation, differences included; seconds: processor time,
+    wall: time of day; start, end: M²; lens: where it ended; end_here: M² there by this package's rays.
+    """
+
+    problem: Problem
+    method: str
+    history: tuple[tuple[float, float], ...]
+    seconds: float
+    wall: float
+    start: float
+    end: float
+    lens: Lens
+    end_here: float
+
+    @property
+    def evaluations(self) -> int:
+        return len(self.history)
+
+    def seconds_to(self, merit: float) -> float:
+        """Processor seconds until M² was first at most this; inf if never."""
+        return next((seconds for seconds, found in self.history if found <= merit), math.inf)
+
+
+# -- what is told to both ----------------------------------------------------------------------------------------------
+
+
+def problem(name: str, *, moved: float = 0.0) -> Problem:
+    """A row of PROBLEMS. Raises ValueError if the two programs do not find the same merit at its start."""
+    sample, radii, thicknesses, focal_length = PROBLEMS[name]
+    be.set_backend("numpy")
+    optic = _moved(sample(), radii, thicknesses, moved)
+    lens = lens_of(optic)
+    rows = (Row("EFFL", (0, lens.primary_wavelength + 1), target=focal_length, weight=1.0), *spot_rows(lens))
+    variables = tuple(
+        Vary(number, quantity)
+        for quantity, numbers in (("curvature", radii), ("thickness", thicknesses))
+        for number in numbers
+    )
+    theirs, ours = float(posed(optic, rows, variables, "rays").sum_squared()), float(merit_of(lens, rows))
+    if not abs(theirs - ours) <= AGREE * ours:
+        raise ValueError(f"{name}: M² is {ours:.12g} here and {theirs:.12g} in Optiland")
+    lens = dataclasses.replace(lens, intent=Intent(variables=variables, merit=rows))
+    return Problem(name, moved, lens, variables, rows, theirs)
+
+
+def spot_rows(lens: Lens, rings: int = RINGS, arms: int = ARMS) -> tuple[Row, ...]:
+    """TRAC of every field, wavelength and point of the pupil, one arm of it on the axis and half of it elsewhere.
+
+    Weights are those of the field's programs: π times the ring's, over fields, wavelengths and arms.
+    """
+    nodes, weights = gauss_legendre(rings)
+    counts = len(lens.fields.y) * len(lens.wavelengths)
+    rows = []
+    for height in (lens.fields.y / lens.fields.y.abs().max()).tolist():
+        angles = [math.pi * (2 * arm / arms - 0.5) for arm in range(arms)] if height else [math.pi / 2]
+        angles = [angle for angle in angles if math.cos(angle) > 1e-9] or angles
+        for wavelength in range(len(lens.wavelengths)):
+            for node, ring in zip(nodes.tolist(), weights.tolist(), strict=True):
+                radius, weight = math.sqrt(0.5 * (1 + node)), math.pi * 0.5 * ring / counts / len(angles)
+                points = [(radius * math.cos(angle), radius * math.sin(angle)) for angle in angles]
+                rows += [Row("TRAC", (0, wavelength + 1), (0.0, height, *point), weight=weight) for point in points]
+    return tuple(rows)
+
+
+def lens_of(optic: Optic) -> Lens:
+    """Optiland's centred lens of spheres, with its indices at its wavelengths and the primary one's place."""
+    wavelengths = [float(one.value) for one in optic.wavelengths.wavelengths]
+    last = len(optic.surfaces) - 1
+    surfaces = []
+    for number, surface in enumerate(optic.surfaces):
+        radius = float(surface.geometry.radius)
+        if number in (0, last):
+            thickness = math.inf if number == 0 else 0.0
+        else:
+            thickness = float(optic.surfaces[number + 1].geometry.cs.z) - float(surface.geometry.cs.z)
+        curvature = None if math.isinf(radius) else _real(1 / radius)
+        surfaces.append(Surface(_real(thickness), curvature=curvature, glass=_glass_of(surface, wavelengths)))
+    heights = _real([float(field.y) for field in optic.fields.fields])
+    return Lens(
+        surfaces=tuple(surfaces),
+        stop=next(number for number, surface in enumerate(optic.surfaces) if surface.is_stop),
+        aperture=SystemAperture(_APERTURES[optic.aperture.ap_type], _real(float(optic.aperture.value))),
+        fields=Fields("angle", torch.zeros_like(heights), heights, torch.ones_like(heights)),
+        wavelengths=_real(wavelengths),
+        wavelength_weights=torch.ones(len(wavelengths), dtype=torch.float64),
+        primary_wavelength=int(optic.wavelengths.primary_index),
+        name=type(optic).__name__,
+    )
+
+
+def _glass_of(surface, wavelengths: Sequence[float]) -> Glass:
+    indices = [float(np.asarray(be.to_numpy(surface.material_post.n(one))).item()) for one in wavelengths]
+    return AIR if all(index == 1 for index in indices) else from_table(wavelengths, indices)
+
+
+def merit_of(lens: Lens, rows: Sequence[Row]) -> Tensor:
+    """M² of EFFL and TRAC rows by this package's rays; in fields on y rows stand for their mirror images, too."""
+    total, merit = sum(row.weight for row in rows), torch.zeros((), dtype=torch.float64)
+    for row in rows:
+        if row.operand == "EFFL":
+            merit = merit + row.weight * (first_order(lens).effective_focal_length - row.target) ** 2
+    rays = [row for row in rows if row.operand == "TRAC"]
+    for height in dict.fromkeys(row.numbers[1] for row in rays):
+        hits = [
+            _hits(lens, [row for row in rays if row.numbers[1] == height and row.integers[1] == 1 + k])
+            for k in range(len(lens.wavelengths))
+        ]
+        x, y, weight = (torch.cat(part) for part in zip(*hits, strict=True))
+        centre = (weight * y).sum() / weight.sum() if height else 0.0
+        merit = merit + (weight * (x**2 + (y - centre) ** 2)).sum()
+    return merit / total
+
+
+def _hits(lens: Lens, rows: Sequence[Row]) -> tuple[Tensor, Tensor, Tensor]:
+    """x, y (R,) mm on the image of rows of one field and wavelength, and their weights."""
+    wavelength = lens.wavelengths[rows[0].integers[1] - 1]
+    field = lens.fields.y.abs().max() * _real(rows[0].numbers[:2])[:, None]
+    points = _real([row.numbers[2:] for row in rows]).T
+    rays = trace_lens(lens, launch(lens, points, fields=field, wavelengths=wavelength[None]), wavelength)
+    return (*rays.position[:2, 0, 0], _real([row.weight for row in rows]))
+
+
+def _moved(optic: Optic, radii: Sequence[int], thicknesses: Sequence[int], part: float) -> Optic:
+    factors = [1 + part * (-1) ** place for place in range(len(radii) + len(thicknesses))]
+    for number, factor in zip(radii, factors, strict=False):
+        optic.updater.set_radius(factor * float(optic.surfaces[number].geometry.radius), number)
+    for number, factor in zip(thicknesses, factors[len(radii) :], strict=True):
+        gap = optic.surfaces[number + 1].geometry.cs.z - optic.surfaces[number].geometry.cs.z
+        optic.updater.set_thickness(factor * float(gap), number)
+    return optic
+
+
+def _real(numbers) -> Tensor:
+    return torch.as_tensor(numbers, dtype=torch.float64)
+
+
+# -- what Optiland makes of it -----------------------------------------------------------------------------------------
+
+
+class _Shared:
+    """The rays of all rows in Optiland, traced once for a state of the lens, a call a wavelength."""
+
+    def __init__(self, optic: Optic, rows: Sequence[Row], how: str):
+        self.optic = optic
+        rays = [row for row in rows if row.operand == "TRAC"]
+        self.rays = sorted(rays, key=lambda row: row.integers[1])
+        weight = np.array([row.weight for row in self.rays])
+        height = np.array([row.numbers[1] for row in self.rays])
+        colour = np.array([row.integers[1] for row in self.rays])
+        same = (height[:, None] == height) & (height != 0)
+        mean = same * weight / np.maximum((same * weight).sum(1, keepdims=True), 1e-300)
+        self.bundles = [
+            (float(optic.wavelengths.wavelengths[k - 1].value), np.array([r.numbers for r in self.rays])[colour == k].T)
+            for k in np.unique(colour)
+        ]
+        spots = [(h, k) for h in np.unique(height) for k in np.unique(colour)]
+        share = np.array([weight * (height == h) * (colour == k) for h, k in spots])
+        self.mean, self.share = be.array(mean), be.array(share / sum(row.weight for row in rows))
+        self.tell = {"rays": self._rays, "spots": self._spots}[how]
+        total = sum(row.weight for row in rows)
+        self.weights = [1.0] * len(spots) if how == "spots" else np.tile(np.sqrt(weight / total), 2).tolist()
+        self.values: object = None
+
+    def at(self, place: int):
+        """One number of them, traced anew with the first: Optiland evaluates operands in order."""
+        if place == 0:
+            self.values = self.tell()
+        return self.values[place]
+
+    def _on_image(self):
+        ends = [
+            self.optic.ray_tracer.trace_generic(*(be.array(part) for part in numbers), wavelength, record=False)
+            for wavelength, numbers in self.bundles
+        ]
+        x, y = (be.concatenate([getattr(end, axis) for end in ends]) for axis in "xy")
+        return x, y - self.mean @ y
+
+    def _rays(self):
+        return be.concatenate(self._on_image())
+
+    def _spots(self):
+        x, y = self._on_image()
+        return be.sqrt(self.share @ (x**2 + y**2))
+
+
+operand_registry.register("shared_rays", lambda rays, place: rays.at(place), overwrite=True)
+
+
+def posed(optic: Optic, rows: Sequence[Row], variables: Sequence[Vary], how: str) -> OptimizationProblem:
+    """The problem in Optiland's terms, by "rays" or by "spots"; its `sum_squared()` is M²."""
+    found, shared = OptimizationProblem(), _Shared(optic, rows, how)
+    total = sum(row.weight for row in rows)
+    for place, weight in enumerate(shared.weights):
+        found.add_operand("shared_rays", target=0.0, weight=weight, input_data={"rays": shared, "place": place})
+    for row in rows:
+        if row.operand == "EFFL":
+            weight = math.sqrt(row.weight / total)
+            found.add_operand("f2", target=row.target, weight=weight, input_data={"optic": optic})
+    for vary in variables:
+        kind = {"curvature": "radius", "thickness": "thickness"}[vary.quantity]
+        found.add_variable(optic, kind, surface_number=vary.surface)
+    return found
+
+
+class _Followed(LeastSquares):
+    """Optiland's least squares, with what every evaluation found and when."""
+
+    def __init__(self, problem: OptimizationProblem):
+        super().__init__(problem)
+        self.history: list[tuple[float, float]] = []
+        self.began = time.process_time()
+
+    def _compute_residuals_vector(self, x):
+        found = super()._compute_residuals_vector(x)
+        self.history.append((time.process_time() - self.began, float(found @ found)))
+        return found
+
+
+def least_squares(
+    problem: Problem, how: str = "rays", *, tolerance: float = 1e-3, scaled: bool = False, most: int | None = None
+) -> Run:
+    """Optiland's Levenberg-Marquardt (MINPACK's, by differences), numpy back end.
+
+    tolerance: of the sum of squares, 1e-3 by its default; scaled: whether variables are scaled by their columns of the
+    Jacobian; most: steps, as many as it likes by default.
+    """
+    be.set_backend("numpy")
+    optic = problem.optic()
+    asked = posed(optic, problem.rows, problem.variables, how)
+    start = float(asked.sum_squared())  # warms its compiled loops as well
+
+    def solve() -> list[tuple[float, float]]:
+        solver = _Followed(asked)
+        solver.optimize(tol=tolerance, x_scale="jac" if scaled else None, maxiter=most)
+        return solver.history
+
+    name = f"least squares, {how}, tolerance {tolerance:g}{', scaled' * scaled}"
+    return _run(problem, name, optic, start, solve, lambda: float(asked.sum_squared()))
+
+
+def adam(problem: Problem, steps: int, how: str = "spots", *, rate: float = 1e-2, decay: float = 0.99) -> Run:
+    """Optiland's Adam on its torch back end in float64; rate and decay: 1e-2 and 0.99 are its defaults."""
+    be.set_backend("torch")
+    be.set_precision("float64")
+    be.grad_mode.disable()
+    optic = problem.optic()
+    be.grad_mode.enable()
+    try:
+        asked = posed(optic, problem.rows, problem.variables, how)
+        start = float(asked.sum_squared())
+
+        def solve() -> list[tuple[float, float]]:
+            history, began = [], time.process_time()
+            note = lambda _, merit: history.append((time.process_time() - began, merit))  # noqa: E731
+            TorchAdamOptimizer(asked).optimize(n_steps=steps, lr=rate, gamma=decay, disp=False, callback=note)
+            return history
+
+        name = f"Adam, {how}, {steps} steps of {rate:g} · {decay:g}ⁿ"
+        return _run(problem, name, optic, start, solve, lambda: float(asked.sum_squared()))
+    finally:
+        be.grad_mode.disable()
+        be.set_backend("numpy")
+
+
+def _run(problem: Problem, name: str, optic: Optic, start: float, solve: Callable, merit: Callable) -> Run:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        began, processor = time.perf_counter(), time.process_time()
+        history = solve()
+        seconds, wall = time.process_time() - processor, time.perf_counter() - began
+    lens = lens_of(optic)
+    end_here = float(merit_of(lens, problem.rows))
+    return Run(problem, name, tuple(history), seconds, wall, start, merit(), lens, end_here)
+
+
+def report(runs: Sequence[Run]) -> list[str]:
+    """A table of them."""
+    columns = {
+        "lens": lambda run: run.problem.name,
+        "variables": lambda run: str(len(run.problem.variables)),
+        "start": lambda run: f"sample ± {run.problem.moved:.0%}" if run.problem.moved else "sample",
+        "Optiland's": lambda run: run.method,
+        "M² before": lambda run: f"{run.start:.5g}",
+        "M² after": lambda run: f"{run.end:.6g}",
+        "the same here": lambda run: f"{run.end_here:.6g}",
+        "evaluations": lambda run: str(run.evaluations),
+        "processor s": lambda run: f"{run.seconds:.2f}",
+        "wall s": lambda run: f"{run.wall:.2f}",
+    }
+    return table(columns, runs)
