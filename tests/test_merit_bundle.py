@@ -9,6 +9,7 @@ import torch
 import raytrace as rt
 from raytrace.files import shipped
 from raytrace.maths.dual import Dual
+from raytrace.media.glass import model_glass
 from raytrace.merit.bundle import Bundle
 from raytrace.merit.model import Model
 from raytrace.optics.launch import launch
@@ -20,6 +21,10 @@ pytestmark = pytest.mark.usefixtures("compiler")
 
 PUPIL = [(0.0, 0.0), (0.3, 0.7), (-0.5, 0.4), (0.0, -0.9), (0.9, 0.1)]
 FIELDS = [(0.0, 0.0), (0.0, 0.7), (0.4, -0.6)]
+
+
+def with_model_glasses(lens):
+    return lens.replace(1, glass=model_glass(1.62, 60.0, 0.01)).replace(3, glass=model_glass(1.64, 35.0))
 
 
 def lenses():
@@ -40,6 +45,7 @@ def lenses():
         "cooke": rt.read_lens("cooke_triplet"),
         "mirrors": rt.read_lens("hubble"),
         "aspheres": rt.read_lens("phone"),
+        "glasses": with_model_glasses(gauss.at(wavelengths=[0.48, 0.53, 0.6])),
         "tilted": rt.read_lens(shipped("lenses") / "examples" / "folded_relay.zmx"),
     }
 
@@ -47,6 +53,7 @@ def lenses():
 VARY = {
     "mirrors": (Vary(2, "curvature"), Vary(2, "conic"), Vary(2, "thickness"), Vary(3, "curvature")),
     "aspheres": (Vary(3, "a4"), Vary(3, "a6"), Vary(4, "curvature"), Vary(5, "thickness")),
+    "glasses": (Vary(1, "index"), Vary(1, "abbe_number"), Vary(1, "partial_dispersion"), Vary(3, "index")),
     "tilted": (Vary(3, "thickness"),),
 }
 #: Launched by torch, variable by variable or ray by ray.

@@ -19,6 +19,7 @@ from raytrace.maths.dual import Dual, value_of
 from raytrace.merit.aim import aimed
 from raytrace.merit.by_torch import rays_by_torch
 from raytrace.merit.launch import launched
+from raytrace.merit.model import GLASS
 from raytrace.merit.moment import Moment
 from raytrace.optics.axis import is_bent
 from raytrace.optics.jacobian import ends, pushed
@@ -122,12 +123,15 @@ class Bundle:
     @cached_property
     def _template(self):
         """Surfaces, structure and table (W, K) as stored, and where the table holds what moves (`_Columns`)."""
+        view = self.view
         with torch.enable_grad():
-            leaves, lens = self.view.leaves()
-            surfaces, structure, table = self.view.table_of(self.last, leaves, lens)
-            columns = _columns(table, leaves)
-        surfaces = self.view.table_of(self.last, {}, self.view.lens)[0]
-        return surfaces, structure, table.detach().numpy().copy(), columns
+            shapes = {at: n for at, n in view.stored.items() if at[1] not in GLASS}
+            leaves, lens = view.leaves(shapes)
+            n = torch.from_numpy(np.abs(view.indices))
+            media = {k: n[:, k].clone().requires_grad_() for k in view.glasses}
+            _, structure, table = view.table_of(self.last, lens, media)
+            columns = _columns(table, leaves | media)
+        return view.table_of(self.last, view.lens)[0], structure, table.detach().numpy().copy(), columns
 
     @cached_property
     def is_expressible(self) -> bool:
@@ -213,12 +217,17 @@ class Bundle:
             table[:, columns[at]] = value_of(number)
             if isinstance(number, Dual):
                 changes[:, :, columns[at]] = number.slope[:, None, None]
+        for surface, index in moment.media.items():
+            if surface in columns:
+                table[:, columns[surface]] = value_of(index)[:, None]
+                if isinstance(index, Dual):
+                    changes[:, :, columns[surface]] = index.slope[:, :, None]
         return table, changes
 
     def _table_by_torch(self, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
         with torch.enable_grad():
             leaves, lens = self.view.leaves({at: value_of(n) for at, n in moment.numbers.items()})
-            table = self.view.table_of(self.last, leaves, lens)[2]
+            table = self.view.table_of(self.last, lens)[2]
             by = _by_leaves(table, leaves) if moment.count else {}
         changes = np.zeros((moment.count, *table.shape))
         for at, derivative in by.items():
@@ -300,22 +309,30 @@ class Bundle:
 
 
 def _by_leaves(table: Tensor, leaves: dict) -> dict:
-    """∂table/∂leaf (W, K) of every leaf that it depends on."""
+    """∂table/∂leaf (W, K), or (W, K, W) of a leaf (W,), of every leaf that it depends on."""
     every = torch.eye(table.numel(), dtype=table.dtype)
     if not leaves or not table.requires_grad:
         return {}
     found = torch.autograd.grad(
         table.reshape(-1), list(leaves.values()), every, is_grads_batched=True, allow_unused=True
     )
-    return {at: g.reshape(table.shape).numpy() for at, g in zip(leaves, found, strict=True) if g is not None}
+    return {
+        at: g.reshape(*table.shape, *leaves[at].shape).numpy()
+        for at, g in zip(leaves, found, strict=True)
+        if g is not None
+    }
 
 
 def _columns(table: Tensor, leaves: dict) -> dict | None:
     """The columns that hold what moves just as it is, by address; None where anything stands in it changed."""
     found = {}
     for at, derivative in _by_leaves(table, leaves).items():
-        held = table.detach().numpy() == float(leaves[at].detach())
-        if not ((derivative == 0) | ((derivative == 1) & held)).all() or (derivative != derivative[:1]).any():
+        leaf = leaves[at].detach().numpy()
+        held = (table.detach().numpy() == (leaf if leaf.ndim == 0 else leaf[:, None])).all(0)
+        as_it_is = np.eye(len(table)) if leaf.ndim else np.ones(len(table))
+        columns = derivative.swapaxes(0, 1)  # (K, W, …)
+        moving = (columns != 0).reshape(len(columns), -1).any(-1)
+        if not (held[moving].all() and (columns[moving] == as_it_is).all()):
             return None
-        found[at] = np.nonzero(derivative[0])[0]
+        found[at] = np.flatnonzero(moving)
     return found

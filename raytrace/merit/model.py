@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from raytrace.fused.structure import structure_of
+from raytrace.media.glass import is_air
 from raytrace.merit.moment import Moment
 from raytrace.optics.paraxial import signed
 from raytrace.optics.sequence import media, sequence_of
@@ -28,6 +29,9 @@ Address = tuple[int, str]
 #: Numbers that a surface keeps at 0 as None.
 _AT_ZERO = ("curvature", "conic")
 
+#: Numbers of the medium behind a surface, where it is a model glass or a constant index.
+GLASS = {"index": 0, "abbe_number": 1, "partial_dispersion": 2}
+
 
 class UnknownNumber(ValueError):
     """A variable, solve or pickup of a number that the lens does not have."""
@@ -36,6 +40,9 @@ class UnknownNumber(ValueError):
 def place_of(surface: Surface, quantity: str, where: str = "") -> Place:
     """Where a surface holds a number. Raises UnknownNumber."""
     known = {"thickness": Place(("thickness",)), **places(surface)}
+    if surface.glass.formula in ("model", "constant") and not is_air(surface.glass):
+        entries = list(GLASS.items())[: surface.glass.coefficients.numel()]
+        known |= {name: Place(("glass", "coefficients"), entry) for name, entry in entries}
     if quantity not in known:
         raise UnknownNumber(f"{where}no {quantity!r}; it has {', '.join(known)}")
     return known[quantity]
@@ -157,6 +164,23 @@ class View:
         return np.stack([x.detach().numpy() for x in n], -1)
 
     @cached_property
+    def media(self) -> list[int]:
+        """Which surface the medium behind each one is told by: its own, but for mirrors and coordinate breaks."""
+        found: list[int] = []
+        for k, surface in enumerate(self.lens.surfaces):
+            found.append(found[-1] if k and (surface.is_mirror or surface.is_break) else k)
+        return found
+
+    @cached_property
+    def glasses(self) -> dict[int, list[Address]]:
+        """What moves of the media, by the surface that tells them."""
+        found: dict[int, list[Address]] = {}
+        for surface, quantity in self.moved:
+            if quantity in GLASS:
+                found.setdefault(surface, []).append((surface, quantity))
+        return found
+
+    @cached_property
     def thickness(self) -> list[float]:
         return [float(surface.thickness.detach()) for surface in self.lens.surfaces]
 
@@ -167,17 +191,16 @@ class View:
         ]
 
     @cached_property
-    def further_power(self) -> np.ndarray:
-        """Power (W, S) in 1/mm that surfaces have beside c Δn: by a term of r², by a phase."""
-        found = np.zeros_like(self.indices)
+    def further_power(self) -> tuple[np.ndarray, np.ndarray]:
+        """What bends light beside the curvature: the vertex by terms of r² (S,) in 1/mm, phases (W, S) in 1/mm."""
+        bend, phase = np.zeros(len(self.lens.surfaces)), np.zeros_like(self.indices)
         for k, surface in enumerate(self.lens.surfaces):
             if k == 0 or surface.is_break:
                 continue
-            bend = float(vertex_curvature(surface).detach()) - self.curvature[k]
-            found[:, k] = bend * (self.indices[:, k] - self.indices[:, k - 1])
+            bend[k] = float(vertex_curvature(surface).detach()) - self.curvature[k]
             if surface.phase is not None:
-                found[:, k] += power_of(surface.phase, self.lens.wavelengths)[1].detach().numpy()
-        return found
+                phase[:, k] = power_of(surface.phase, self.lens.wavelengths)[1].detach().numpy()
+        return bend, phase
 
     @cached_property
     def is_symmetric(self) -> bool:
@@ -191,7 +214,8 @@ class View:
             numbers, lens = self.leaves()
             powers = [vertex_curvature(s).reshape(()) for s in lens.surfaces if s.curvature is not None or s.is_plane]
             phases = [power_of(s.phase, lens.wavelengths)[1].sum() for s in lens.surfaces if s.phase is not None]
-            others = [n for (_, quantity), n in numbers.items() if quantity not in ("curvature", "thickness")]
+            plain = "curvature", "thickness", *GLASS
+            others = [n for (_, quantity), n in numbers.items() if quantity not in plain]
             total = sum([p for p in (*powers, *phases) if p.requires_grad], torch.zeros((), dtype=torch.float64))
             if not others or not total.requires_grad:
                 return True
@@ -208,11 +232,18 @@ class View:
         """The lens with other numbers."""
         return with_numbers_of(self.lens, numbers)
 
-    def table_of(self, last: int, numbers: dict[Address, Tensor], lens: Lens):
-        """The structure of the surfaces 1 to `last`, and the table (W, K) of their numbers."""
+    def table_of(self, last: int, lens: Lens, indices: dict[int, Tensor] | None = None):
+        """The structure of the surfaces 1 to `last`, and the table (W, K) of their numbers.
+
+        indices: (W,) of media, by the surface that tells them, in place of those of the lens.
+        """
         wavelength = lens.wavelengths[:, None]
         surfaces = sequence_of(lens)[:last]
-        indices = media(lens, wavelength)[: last + 1]
+        given = indices or {}
+        indices = [
+            given[told][:, None] if told in given else n
+            for told, n in zip(self.media[: last + 1], media(lens, wavelength), strict=False)
+        ]
         gap = gap_behind(lens.surfaces[0]) if lens.surfaces[0].after is not None else None
         structure, table = structure_of(surfaces, indices, 1, gap, wavelength)
         rows = [torch.broadcast_to(n[..., 0] if n.dim() else n, wavelength.shape[:1]) for n in table]

@@ -3,6 +3,7 @@
 Numbers are plain ones, or dual ones (`maths.dual`) where derivatives are asked for; the formulas are the same.
 """
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ from raytrace.maths.dual import Dual, value_of
 from raytrace.merit.solves import SOLVES
 from raytrace.optics.paraxial import brackets, power, signed
 from raytrace.optics.sequence import media
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, index_behind
 
 _PASSES = 60  # through solves that depend on one another
 _STILL = 1e-15  # relative
@@ -86,14 +87,41 @@ class Moment:
                 found[surface] = number
         return found
 
-    def index(self, wavelength: int) -> np.ndarray:
-        """Signed index (S,) behind every surface at a wavelength, counted from 0."""
-        return self.view.indices[wavelength]
+    def index(self, wavelength: int) -> Sequence:
+        """Signed index behind every surface at a wavelength, counted from 0."""
+        stored = self.view.indices[wavelength]
+        if not self.view.glasses:
+            return stored
+        told = zip(stored, self.view.media, strict=True)
+        return [np.sign(n) * self.media[k][wavelength] if k in self.media else n for n, k in told]
+
+    @cached_property
+    def media(self) -> dict:
+        """Indices (W,) of the media that move, by the surface that tells them."""
+        return {surface: self._medium(surface, moved) for surface, moved in self.view.glasses.items()}
+
+    def _medium(self, surface: int, moved: list):
+        leaves = {at: torch.tensor(float(value_of(self.numbers[at])), dtype=torch.float64) for at in moved}
+        leaves = {at: leaf.requires_grad_() for at, leaf in leaves.items()}
+        with torch.enable_grad():
+            n = index_behind(self.view.held(leaves), surface, self.lens.wavelengths)
+            if not self.count:
+                return n.detach().numpy()
+            each = [self.chained(one, leaves) for one in n]
+        return Dual(np.array([one.value for one in each]), np.stack([one.slope for one in each], -1))
 
     def power(self, k: int, wavelength: int):
         """Power in 1/mm of a surface."""
         n = self.index(wavelength)
-        return self.curvature[k] * (n[k] - n[k - 1]) + self.view.further_power[wavelength, k]
+        return self.curvature[k] * (n[k] - n[k - 1]) + self.further_power(k, wavelength)
+
+    def further_power(self, k: int, wavelength: int):
+        """Power in 1/mm of a surface beside c Δn."""
+        bend, phase = self.view.further_power
+        if bend[k] == 0:
+            return phase[wavelength, k]
+        n = self.index(wavelength)
+        return bend[k] * (n[k] - n[k - 1]) + phase[wavelength, k]
 
     def matrix(self, first: int, last: int, wavelength: int, *, to_next: bool = False):
         """(A, B, C, D) from the vertex of a surface, before it, to behind another, or to the vertex after that."""
@@ -119,7 +147,7 @@ class Moment:
         else:
             A1, B1, C1, D1, A2, B2, C2, D2 = self.through_torch(lambda lens: _halves(lens, wavelength))
         whole = A2 * A1 + B2 * C1, A2 * B1 + B2 * D1, C2 * A1 + D2 * C1, C2 * B1 + D2 * D1
-        return Gaussian(*whole, (A1, B1), (B2, D2), float(n[0]), float(n[last]))
+        return Gaussian(*whole, (A1, B1), (B2, D2), n[0], n[last])
 
     # -- the beam ------------------------------------------------------------------------------------------------------
 
@@ -190,7 +218,7 @@ class Moment:
         return all(far(number, before[at]) <= _STILL for at, number in self.numbers.items())
 
     def _forget(self) -> None:
-        for name in ("thickness", "curvature", "vergence", "entrance_pupil_diameter", "marginal_height"):
+        for name in ("thickness", "curvature", "media", "vergence", "entrance_pupil_diameter", "marginal_height"):
             self.__dict__.pop(name, None)
         self._gaussian.clear()
 

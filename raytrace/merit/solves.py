@@ -23,7 +23,7 @@ def _bent_to(moment, solve: Solve, omega_behind):
     """The curvature behind which the marginal ray has ω′: c = (ω - ω′ - K y)/(y (n′ - n)), K the power beside it."""
     k, n = solve.surface, moment.index(moment.primary)
     y, omega = _ray_before(moment, k)
-    return ((omega - omega_behind) / y - moment.view.further_power[moment.primary, k]) / (n[k] - n[k - 1])
+    return ((omega - omega_behind) / y - moment.further_power(k, moment.primary)) / (n[k] - n[k - 1])
 
 
 def _marginal_angle(moment, solve: Solve):
