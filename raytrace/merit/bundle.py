@@ -187,6 +187,13 @@ class Bundle:
         changes = changes if moment.count else np.zeros((count, *table.shape))
         return pushed(surfaces, task, torch.from_numpy(changes), start), count
 
+    def starts(self, moment: Moment) -> Hits:
+        """All rays where they set out, before surface 1 and in its axes, in the order in which they were asked for."""
+        position, direction, opl, valid = self.launched(moment)
+        places = self._places[0]
+        parts = [part.reshape(-1)[places] for part in (*position, *direction, opl)]
+        return Hits(tuple(parts[:3]), tuple(parts[3:6]), parts[6], valid.reshape(-1)[places])
+
     def _start(self, count: int, position, direction, opl) -> tuple[Tensor, Tensor, Tensor]:
         shape = count, *self.field.shape[1:]
         found = np.zeros((7, *shape))

@@ -15,6 +15,7 @@ from raytrace.maths.dual import Dual, slope_of, value_of
 from raytrace.merit.model import Model
 from raytrace.merit.operands import OPERANDS, SETTINGS
 from raytrace.merit.plan import Evaluate, Found, Line, Now, Planner, planner_of
+from raytrace.merit.readings import Readings
 from raytrace.system.intent import Row
 
 #: Error of a row whose ray is lost, in the row's unit: as the stored merits of other programs are judged here.
@@ -47,9 +48,17 @@ class Evaluated:
 class Evaluation:
     """The rows of a merit function over a model: planned once, then called with variables (n,)."""
 
-    def __init__(self, model: Model, rows: Sequence[Row], *, unit: float = 1.0, skip_unknown: bool = False):
-        """unit: mm in the unit of length of the rows. Raises UnknownOperand."""
-        self.model, self.rows = model, tuple(rows)
+    def __init__(
+        self,
+        model: Model,
+        rows: Sequence[Row],
+        *,
+        unit: float = 1.0,
+        skip_unknown: bool = False,
+        readings: Readings | None = None,
+    ):
+        """unit: mm in the unit of length of the rows; readings: where operands are open. Raises UnknownOperand."""
+        self.model, self.rows, self.readings = model, tuple(rows), readings or Readings()
         self.groups: list[tuple[Planner, tuple[Line, ...], Evaluate]] = []
         self.planners: list[tuple[int, Planner]] = []
         self.skipped = tuple(self._plan(skip_unknown))
@@ -76,7 +85,7 @@ class Evaluation:
             elif row.operand in OPERANDS:
                 settings = configuration, primary
                 if settings not in planners:
-                    planners[settings] = planner_of(self.model, *settings)
+                    planners[settings] = planner_of(self.model, *settings, self.readings)
                 wavelength = row.integers[1] - 1 if row.integers[1] > 0 else primary
                 groups.setdefault((settings, row.operand), []).append(Line(number, row, wavelength))
             elif row.operand not in SETTINGS:

@@ -1,10 +1,11 @@
 """The table of operands, by name."""
 
 from raytrace.merit.paraxial import PARAXIAL
+from raytrace.merit.path import PATH
 from raytrace.merit.plan import Operand
 from raytrace.merit.rays import RAYS
 
-OPERANDS: dict[str, Operand] = {**RAYS, **PARAXIAL}
+OPERANDS: dict[str, Operand] = {**RAYS, **PARAXIAL, **PATH}
 
 #: Rows that say something about the rows below them, or to the reader.
 SETTINGS = {

@@ -13,6 +13,7 @@ import numpy as np
 from raytrace.merit.bundle import Bundle, Hits
 from raytrace.merit.model import Model, View
 from raytrace.merit.moment import Moment
+from raytrace.merit.readings import Readings
 from raytrace.system.intent import Row
 
 
@@ -30,6 +31,13 @@ class Line(NamedTuple):
     @property
     def pupil(self) -> tuple[float, float]:
         return self.row.numbers[2], self.row.numbers[3]
+
+
+class BadRow(ValueError):
+    """A row that names what the lens does not have."""
+
+    def __init__(self, line: Line, words: str):
+        super().__init__(f"row {line.number} of the merit function: {line.row.operand} {words}")
 
 
 class Found(NamedTuple):
@@ -64,8 +72,8 @@ class Operand:
 class Planner:
     """What operands may ask for, of a lens in one configuration."""
 
-    def __init__(self, view: View, primary: int):
-        self.view, self.lens, self.primary = view, view.lens, primary
+    def __init__(self, view: View, primary: int, readings: Readings):
+        self.view, self.lens, self.primary, self.readings = view, view.lens, primary, readings
         self.bundles: dict[int, Bundle] = {}
 
     @property
@@ -74,11 +82,19 @@ class Planner:
 
     def ray(self, line: Line, *, surface: int | None = None, pupil=None, wavelength: int | None = None) -> int:
         """The number of the ray of a row behind a surface, the image by default."""
+        at = line.pupil if pupil is None else pupil
+        return self.ask(line.wavelength if wavelength is None else wavelength, line.field, at, surface=surface)
+
+    def ask(self, wavelength: int, field, pupil, *, surface: int | None = None) -> int:
+        """The number of any ray behind a surface, the image by default."""
         last = self.image if surface is None else surface
-        bundle = self.bundles.setdefault(last, Bundle(self.view, last))
-        return bundle.ask(
-            line.wavelength if wavelength is None else wavelength, line.field, line.pupil if pupil is None else pupil
-        )
+        return self.bundles.setdefault(last, Bundle(self.view, last)).ask(wavelength, field, pupil)
+
+    def checked(self, line: Line, surface: int) -> int:
+        """The number of a surface that a row names. Raises BadRow."""
+        if not 0 <= surface <= self.image:
+            raise BadRow(line, f"names surface {surface}: this lens has surfaces 0 to {self.image}")
+        return surface
 
     def rays(self, lines: Sequence[Line], **which) -> np.ndarray:
         return np.array([self.ray(line, **which) for line in lines])
@@ -98,6 +114,10 @@ class Now:
             self._hits[last] = self.planner.bundles[last].hits(self.moment)
         return self._hits[last].at(rays)
 
+    def starts(self, rays: np.ndarray, *, surface: int | None = None) -> Hits:
+        """The same rays where they set out, before surface 1 and in its axes."""
+        return self.planner.bundles[self.planner.image if surface is None else surface].starts(self.moment).at(rays)
 
-def planner_of(model: Model, configuration: int, primary: int) -> Planner:
-    return Planner(model.views[configuration - 1], primary)
+
+def planner_of(model: Model, configuration: int, primary: int, readings: Readings) -> Planner:
+    return Planner(model.views[configuration - 1], primary, readings)

@@ -1,0 +1,30 @@
+"""Readings: how operands are taken whose meaning the field's own program leaves open."""
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True)
+class Readings:
+    """Which reading of an operand counts; the first choice of each is the default. Raises ValueError for another.
+
+    opd_tilt: of OPDX, whether a tilt is fitted for every wavelength of a field, or one that all have in common.
+    opd_chief: whose chief ray the reference sphere is about, that of the row's own wavelength or of the primary one.
+    opd_sign: whether a longer or a shorter path than the chief ray's is a positive OPD.
+    """
+
+    opd_tilt: str = "per wavelength"
+    opd_chief: str = "own"
+    opd_sign: str = "longer"
+
+    def __post_init__(self):
+        for name, known in CHOICES.items():
+            if getattr(self, name) not in known:
+                raise ValueError(f"reading `{name}` {getattr(self, name)!r}: expected one of {', '.join(known)}")
+
+
+#: The readings of each name, the one that is taken by itself first.
+CHOICES = {
+    "opd_tilt": ("per wavelength", "common"),
+    "opd_chief": ("own", "primary"),
+    "opd_sign": ("longer", "shorter"),
+}
