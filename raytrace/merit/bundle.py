@@ -15,7 +15,7 @@ from torch import Tensor
 
 from raytrace.fused.run import Task
 from raytrace.fused.structure import is_expressible
-from raytrace.maths.dual import Dual, value_of
+from raytrace.maths.dual import Dual, slope_of, value_of
 from raytrace.merit.aim import aimed
 from raytrace.merit.by_torch import rays_by_torch
 from raytrace.merit.launch import launched
@@ -190,9 +190,9 @@ class Bundle:
     def starts(self, moment: Moment) -> Hits:
         """All rays where they set out, before surface 1 and in its axes, in the order in which they were asked for."""
         position, direction, opl, valid = self.launched(moment)
-        places = self._places[0]
-        parts = [part.reshape(-1)[places] for part in (*position, *direction, opl)]
-        return Hits(tuple(parts[:3]), tuple(parts[3:6]), parts[6], valid.reshape(-1)[places])
+        parts = *position, *direction, opl
+        slopes = [slope_of(part, moment.count) for part in parts] if moment.count else None
+        return Hits([value_of(part) for part in parts], slopes, valid, self._places[0])
 
     def _start(self, count: int, position, direction, opl) -> tuple[Tensor, Tensor, Tensor]:
         shape = count, *self.field.shape[1:]
