@@ -13,15 +13,13 @@ from torch import Tensor
 
 from raytrace.media.glass import Glass, is_air
 from raytrace.system.lens import Lens
+from raytrace.system.naming import BadLimits as BadLimits
+from raytrace.system.naming import parse_range as parse_range
 from raytrace.system.surface import Surface, sag
 
 #: Least thickness over the largest diameter of the lens, where none is given: of glass at its centre (a 50 mm lens:
 #: 1 mm) and at its edge, and of air. A phone's cover glass is as thin; who knows the workshop gives its numbers.
 _GLASS, _EDGE, _AIR = 1 / 50, 1 / 100, 1 / 2000
-
-
-class BadLimits(ValueError):
-    """Limits that cannot be read, or that nothing can keep to."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,18 +46,6 @@ def limits_of(
         air=(_AIR * diameter, math.inf) if air is None else air,
         edge=_EDGE * diameter if edge is None else edge,
     )
-
-
-def parse_range(text: str) -> tuple[float, float]:
-    """Least and greatest of "2:15", or of "2" (nothing at most). Raises BadLimits saying what is wrong."""
-    least, colon, most = text.partition(":")
-    try:
-        low, high = float(least), float(most) if colon else math.inf
-    except ValueError:
-        raise BadLimits(f"{text!r}: expected the least thickness in mm, or least and greatest like 2:15") from None
-    if not 0 <= low < high:
-        raise BadLimits(f"{text!r}: expected 0 ≤ least < greatest, found {low:g} and {high:g} mm")
-    return low, high
 
 
 def violation(lens: Lens, limits: Limits | None = None) -> Tensor:

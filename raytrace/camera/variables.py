@@ -6,7 +6,6 @@ changed = variables()          # the lens with its variables, differentiable
 
 import dataclasses
 import math
-import re
 from collections.abc import Mapping
 
 import torch
@@ -15,14 +14,13 @@ from torch import Tensor, nn
 from raytrace.camera.limits import limits_of, violation
 from raytrace.optics.paraxial import first_order
 from raytrace.system.lens import Lens
-from raytrace.system.places import Place, number_at, places, with_number
+from raytrace.system.naming import BadVariables as BadVariables
+from raytrace.system.naming import counted, place_named, sensor
+from raytrace.system.naming import parse_bounds as parse_bounds
+from raytrace.system.places import Place, number_at, with_number
 from raytrace.system.surface import Surface, sag_at
 
 _KINDS = "thickness, curvature, conic, or a number of its kind of shape as a4"
-
-
-class BadVariables(ValueError):
-    """A list of variables that the lens does not have, or that cannot be read."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,8 +111,7 @@ def parse(lens: Lens, vary: str) -> tuple[Variable, ...]:
         kind, _, numbers = word.partition(":")
         if bool(numbers) == (kind == "sensor"):
             raise BadVariables(f"{word!r}: expected sensor, or one of {_KINDS} with surfaces: thickness:5,6")
-        last = len(lens.surfaces) - 2
-        for number in [last] if kind == "sensor" else _numbers(word, numbers):
+        for number in [sensor(lens)] if kind == "sensor" else counted(word, numbers):
             variable = _variable(lens, kind, number, word)
             found[f"{'thickness' if kind == 'sensor' else kind}_{number}"] = variable
     if not found:
@@ -122,43 +119,12 @@ def parse(lens: Lens, vary: str) -> tuple[Variable, ...]:
     return tuple(found.values())
 
 
-def parse_bounds(text: str) -> dict[str, tuple[float, float]]:
-    """Bounds by name of a list like "sensor:57.5,58 curvature_3:-0.1,0". Raises BadVariables saying what is wrong."""
-    found = {}
-    for word in text.split():
-        name, _, ends = word.partition(":")
-        try:
-            low, high = (float(end) for end in ends.split(","))
-        except ValueError as error:
-            raise BadVariables(f"{word!r}: expected a variable and its bounds, like thickness_5:8,12") from error
-        if not low < high:
-            raise BadVariables(f"{word!r}: {low:g} is not less than {high:g}")
-        found[name] = (low, high)
-    return found
-
-
-def _numbers(word: str, numbers: str) -> list[int]:
-    found: list[int] = []
-    for part in numbers.split(","):
-        match = re.fullmatch(r"(\d+)(?:-(\d+))?", part)
-        if not match:
-            raise BadVariables(f"{word!r}: {part!r} is no surface number; expected numbers and ranges like 1,3-5")
-        first, last = int(match[1]), int(match[2] or match[1])
-        found += range(first, last + 1)
-    return found
-
-
 def _variable(lens: Lens, kind: str, number: int, word: str) -> Variable:
-    if not 1 <= number <= len(lens.surfaces) - 2:
-        raise BadVariables(f"{word!r}: surface {number}; this lens has surfaces 1 to {len(lens.surfaces) - 2} to vary")
-    surface = lens.surfaces[number]
-    known = {"sensor": Place(("thickness",)), "thickness": Place(("thickness",)), **places(surface)}
-    if kind not in known:
-        raise BadVariables(f"{word!r}: surface {number} has no {kind}; it has {', '.join(list(known)[1:])}")
-    start = number_at(surface, known[kind])
+    place, surface = place_named(lens, kind, number, word), lens.surfaces[number]
+    start = number_at(surface, place)
     start = torch.zeros_like(surface.thickness) if start is None else start.detach()
-    unit = 1.0 if known[kind].path == ("thickness",) else 1 / _sag_moved(lens, surface, kind, known[kind], start, word)
-    return Variable(kind, number, float(start), unit, known[kind])
+    unit = 1.0 if place.path == ("thickness",) else 1 / _sag_moved(lens, surface, kind, place, start, word)
+    return Variable(kind, number, float(start), unit, place)
 
 
 def _sag_moved(lens: Lens, surface: Surface, kind: str, place: Place, start: Tensor, word: str) -> float:

@@ -15,13 +15,14 @@ from torch import Tensor
 from raytrace.fused.structure import structure_of
 from raytrace.media.glass import is_air
 from raytrace.merit.moment import Moment
+from raytrace.optics.axis import is_round_about_axis
 from raytrace.optics.paraxial import signed
 from raytrace.optics.sequence import media, sequence_of
 from raytrace.system.intent import Solve, Vary
 from raytrace.system.lens import Lens
 from raytrace.system.phases import power_of
 from raytrace.system.places import Place, number_at, places, with_number
-from raytrace.system.surface import Surface, gap_behind, is_posed, is_round, vertex_curvature
+from raytrace.system.surface import Surface, gap_behind, vertex_curvature
 
 #: A number of a lens: of which surface, and which.
 Address = tuple[int, str]
@@ -205,7 +206,7 @@ class View:
     @cached_property
     def is_symmetric(self) -> bool:
         """Whether all of it is round about one axis."""
-        return all(is_round(surface) and not is_posed(surface) for surface in self.lens.surfaces)
+        return is_round_about_axis(self.lens)
 
     @cached_property
     def is_plain(self) -> bool:
@@ -259,11 +260,11 @@ def _overridden(lens: Lens) -> set[Address]:
     for operand in lens.operands:
         for place in operand.places:
             if place.path[0] == "surfaces" and operand.numbers is not None:
-                found |= {(place.path[1], name) for name in _names(lens.surfaces[place.path[1]], place.path[2:])}
+                found |= {(place.path[1], name) for name in names_at(lens.surfaces[place.path[1]], place.path[2:])}
     return found
 
 
-def _names(surface: Surface, path: tuple) -> list[str]:
+def names_at(surface: Surface, path: tuple) -> list[str]:
     """The names by which a surface's number at a path of `configurations` is known."""
     known = {"thickness": Place(("thickness",)), **places(surface)}
     entry = path[-1] if isinstance(path[-1], tuple) else None

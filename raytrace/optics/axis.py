@@ -16,6 +16,11 @@ from raytrace.words import named
 _STRAIGHT = 1e-9  # mm and direction cosines: an axial ray that leaves the axis by less has not left it
 
 
+def is_round_about_axis(lens: Lens) -> bool:
+    """Whether all of the lens is of revolution about one axis, by its kinds and poses, whatever their numbers are."""
+    return all(is_round(surface) and not is_posed(surface) for surface in lens.surfaces)
+
+
 def is_bent(lens: Lens) -> bool:
     """Whether the axis bends: a surface is tilted or decentred, a coordinate break, or takes an axial ray off it."""
     if any(map(is_posed, lens.surfaces)):

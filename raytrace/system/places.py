@@ -1,13 +1,17 @@
 """Places: the numbers of a surface by name, whatever its kind is: of its shape, its phase and its pose."""
 
 import dataclasses
+import re
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from raytrace.system.shapes import KINDS, Kind
+from raytrace.system.pose import Pose
+from raytrace.system.shapes import EVEN, KINDS, Kind
 from raytrace.system.surface import SHAPE, Surface
+
+_POSED = ("x", "y", "z", "tilt_x", "tilt_y", "tilt_z")
 
 
 class Place(NamedTuple):
@@ -68,3 +72,26 @@ def with_number(part, place: Place, number: Tensor):
         flat = old.reshape(-1)
         number = torch.cat([flat[: place.entry], number[None], flat[place.entry + 1 :]]).reshape(old.shape)
     return dataclasses.replace(part, **{name: number})
+
+
+def modelled(surface: Surface, name: str) -> Surface:
+    """The surface with a number modelled, at 0 where it was not; the surface itself where it cannot have that number.
+
+    Curvature and conic, the terms a2, a4, … of an even asphere, and the fields of the pose before the surface or, with
+    "_after", behind it.
+    """
+    zero = torch.zeros_like(surface.thickness)
+    if name in ("curvature", "conic"):
+        return surface if getattr(surface, name) is not None else dataclasses.replace(surface, **{name: zero})
+    if name in places(surface):
+        return surface
+    term = re.fullmatch(r"a(\d+)", name)
+    if term and surface.kind == EVEN and 2 <= int(term[1]) <= 2 * KINDS[EVEN].parameters and not int(term[1]) % 2:
+        own = zero.new_zeros(0) if surface.coefficients is None else surface.coefficients
+        further = zero.new_zeros((int(term[1]) // 2 - len(own), *own.shape[1:]))
+        return dataclasses.replace(surface, coefficients=torch.cat([own, further]))
+    field, side = name.removesuffix("_after"), "after" if name.endswith("_after") else "before"
+    pose = getattr(surface, side) or Pose()
+    if field in _POSED and isinstance(pose, Pose):
+        return dataclasses.replace(surface, **{side: dataclasses.replace(pose, **{field: zero})})
+    return surface
