@@ -54,7 +54,7 @@ def with_leaves(surfaces, indices):
         leaves.append(number.detach().clone().requires_grad_())
         return leaves[-1]
 
-    names = ("thickness", "curvature", "conic", "coefficients", "phase", "before", "after")
+    names = ("thickness", "curvature", "conic", "coefficients", "departure", "phase", "before", "after")
     own = [
         dataclasses.replace(s, **{n: pytree.tree_map(leaf, getattr(s, n)) for n in names if getattr(s, n) is not None})
         for s in surfaces

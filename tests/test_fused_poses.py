@@ -18,6 +18,8 @@ from raytrace.maths.value import to
 from raytrace.media.glass import MIRROR
 from raytrace.optics.jacobian import hit_jacobian
 from raytrace.optics.trace import media, trace_surfaces
+from raytrace.system.departure import FringeSag
+from raytrace.system.polynomials import PolynomialSag, TiltSag
 from raytrace.system.pose import Gap, Pose, direction_in, passage, point_in
 from raytrace.system.rays import Rays, start
 from raytrace.system.shapes import EVEN
@@ -241,6 +243,12 @@ def test_whether_an_order_is_evanescent_is_not_left_to_rounding(glass):
 
 
 SHAPES = [("plane", None), ("sphere", None), ("conic", None), ("free", EVEN), ("free", "toroidal"), ("free", "biconic")]
+SHAPES += [("departed", None), ("departed", EVEN)]
+DEPARTURES = [
+    TiltSag(scalar(0.1), scalar(-0.05)),
+    PolynomialSag(drawn(9, size=0.1), scalar(20.0)),
+    FringeSag(drawn(20, size=0.01), scalar(20.0), scalar(1.0), scalar(-2.0)),
+]
 
 
 def drawn_system(seed: int) -> list[Surface]:
@@ -265,6 +273,7 @@ def drawn_system(seed: int) -> list[Surface]:
                 conic=chance.uniform(-2.0, 1.0) if shape == "conic" else None,
                 coefficients=[1e-3, chance.uniform(-1e-6, 1e-6)] if kind else None,
                 kind=kind or EVEN,
+                departure=chance.choice(DEPARTURES) if shape == "departed" else None,
                 phase=chance.choice(phases),
                 before=poses[0],
                 after=poses[1],

@@ -7,6 +7,7 @@ import torch
 from fused_rays import CLOSE, assert_same_rays, both, some_rays, with_leaves
 from problems import scalar, vector
 from torch.autograd import gradcheck, gradgradcheck
+from torch.utils._pytree import tree_flatten, tree_leaves, tree_unflatten
 
 from raytrace.fused import tracing
 from raytrace.fused.structure import is_expressible
@@ -14,13 +15,25 @@ from raytrace.maths.value import to
 from raytrace.media.glass import MIRROR
 from raytrace.optics.jacobian import hit_jacobian
 from raytrace.optics.trace import trace_surfaces
+from raytrace.system.departure import FringeSag, GridSag, ZernikeSag
+from raytrace.system.polynomials import IrregularSag, PolynomialSag, PowerSag, TiltSag
 from raytrace.system.rays import Rays
+from raytrace.system.shapes import DEPARTURES
 from raytrace.system.surface import Surface
 
 
 def freeform(kind: str, curvature, conic, *coefficients: float, thickness: float = 4.0, **others) -> Surface:
     c, k = (None if number is None else scalar(number) for number in (curvature, conic))
     return Surface(scalar(thickness), c, k, vector(*coefficients), kind=kind, **others)
+
+
+def departed(departure, curvature=None, conic=None, *coefficients: float) -> Surface:
+    c, k = (None if number is None else scalar(number) for number in (curvature, conic))
+    return Surface(scalar(4.0), c, k, vector(*coefficients) if coefficients else None, departure=departure)
+
+
+def drawn(count: int, size: float, seed: int = 3) -> torch.Tensor:
+    return size * torch.randn(count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 #: Each with what it stands in: indices before and behind. Steep enough for rays of `some_rays` to miss some of them.
@@ -31,6 +44,13 @@ FACES = {
     "cylinder along y": freeform("toroidal", 1 / 14, None, 0.0),
     "biconic": freeform("biconic", 1 / 12, -1.0, -1 / 15, 0.5),
     "biconic of positive curvatures": freeform("biconic", 1 / 12, 0.3, 1 / 9, -2.5),
+    "tilted plane": departed(TiltSag(scalar(0.3), scalar(-0.2))),
+    "polynomial": departed(PolynomialSag(drawn(20, 0.3), scalar(6.0)), 1 / 14, -0.7),
+    "polynomial on an asphere": departed(PolynomialSag(drawn(5, 0.3), scalar(6.0)), 1 / 14, None, 1e-3, 2e-5, -1e-7),
+    "polynomial without terms": departed(PolynomialSag(vector(), scalar(6.0)), 1 / 14),
+    "irregular": departed(IrregularSag(*map(scalar, (0.2, -0.3, 0.1, 30.0, 7.0))), -1 / 20),
+    "fringe": departed(FringeSag(drawn(37, 0.02), *map(scalar, (14.0, 0.5, -0.7))), 1 / 20, None, 1e-4),
+    "Zernike": departed(ZernikeSag(drawn(28, 0.02), scalar(9.0)), 1 / 20, 0.4),
 }
 each = pytest.mark.parametrize("name", FACES)
 END = Surface(scalar(0.0))
@@ -101,16 +121,22 @@ def test_gradients_by_differences_and_their_gradients_with_lost_rays(name):
     face = FACES[name]
     rays = Rays(*(part[..., 46:54] for part in (some_rays().position, some_rays().direction, some_rays().valid)))
 
-    def hits(*numbers):
-        changed = dict(zip(("curvature", "conic", "coefficients"), numbers, strict=True))
-        changed["coefficients"] = changed["coefficients"] * share
+    def hits(curvature, conic, *others):
+        coefficients, departure = tree_unflatten(list(others), kinds)
+        if coefficients is not None:
+            coefficients = coefficients * share
+        changed = {"curvature": curvature, "conic": conic, "coefficients": coefficients, "departure": departure}
         surfaces = [dataclasses.replace(face, **changed), END]
         end = trace_surfaces(surfaces, rays, indices=[*indices()[:2], indices()[1]])
         return torch.where(end.valid, end.position[:2], 0.0)
 
-    numbers = [scalar(0.03) if n is None else n for n in (face.curvature, face.conic, face.coefficients)]
-    share = 3.0 ** (-2 * torch.arange(len(face.coefficients), dtype=torch.float64))  # so that all weigh alike
-    numbers = tuple((number / share if number.dim() else number).requires_grad_() for number in numbers)
+    numbers = [scalar(0.03) if n is None else n for n in (face.curvature, face.conic)]
+    coefficients = face.coefficients
+    if coefficients is not None:
+        share = 3.0 ** (-2 * torch.arange(len(coefficients), dtype=torch.float64))  # so that all weigh alike
+        coefficients = coefficients / share
+    others, kinds = tree_flatten((coefficients, face.departure))
+    numbers = tuple(number.clone().requires_grad_() for number in (*numbers, *others))
     with tracing("fused"):
         assert gradcheck(hits, numbers, atol=1e-6)
         assert gradgradcheck(hits, numbers, atol=1e-5, fast_mode=True)
@@ -138,3 +164,33 @@ def test_rays_do_not_depend_on_their_neighbours_nor_gradients_on_threads(name):
         alone, among = (trace_surfaces(systems(name), given, indices=indices()) for given in (few, rays))
     assert torch.equal(alone.position, among.position[:, some])
     assert torch.equal(alone.direction, among.direction[:, some])
+
+
+@pytest.mark.parametrize("name", [name for name, face in FACES.items() if face.departure is not None])
+def test_powers_are_the_departure(name):
+    """At points all over and beyond its disc, with slopes and second derivatives."""
+    departure = FACES[name].departure
+    kind = DEPARTURES[type(departure).__name__]
+    powers = kind.powers(departure)
+    x, y = drawn(200, 6.0, seed=1), drawn(200, 6.0, seed=2)
+    given, expected = (
+        row.sag(tree_leaves(row.prepare(of)), x, y, 2)
+        for row, of in ((DEPARTURES["PowerSag"], powers), (kind, departure))
+    )
+    for g, e in zip(given, expected, strict=True):
+        assert float((g - e).abs().max()) <= 1e-11 * (1.0 + float(e.abs().max()))
+    bound = DEPARTURES["PowerSag"].size(tree_leaves(powers), torch.hypot(x, y))
+    assert bool((expected.z.abs() <= bound * (1 + 1e-12)).all())
+
+
+def test_what_stays_with_torch():
+    """Heights on a grid, terms of a degree whose powers would lose digits, odd bases, and powers that differ by ray."""
+    faces = [
+        departed(GridSag(torch.zeros(4, 4, dtype=torch.float64), scalar(5.0))),
+        departed(ZernikeSag(drawn(92, 1e-3), scalar(9.0))),
+        departed(PowerSag(*(scalar(n) for n in (0.0, 0.0, 1.0, 0.0)), torch.zeros(2, 3, 1, dtype=torch.float64))),
+        dataclasses.replace(departed(TiltSag(scalar(0.1), scalar(0.0)), 0.01, None, 1e-3), kind="odd asphere"),
+    ]
+    assert not any(is_expressible(face) for face in faces)
+    with pytest.raises(ValueError, match="no Jacobian for height maps"):
+        hit_jacobian(faces[:1], some_rays(5), [faces[0].thickness.clone().requires_grad_()], indices=indices()[:2])

@@ -13,7 +13,7 @@ namespace raytrace {
 constexpr int kBlock = 256;   // rays
 constexpr int kVector = 16;   // rays: whole vectors of either type
 constexpr int kTerms = 16;    // of an asphere, at most
-constexpr int kFields = 16;   // integers that tell of a surface, see structure.py
+constexpr int kFields = 18;   // integers that tell of a surface, see structure.py
 
 enum Bend { kNone, kRefract, kReflect, kPhase };
 
@@ -23,8 +23,9 @@ struct Layout {
   int32_t gap, curvature, conic, coefficients, before, behind;
   int32_t rim;  // place in the constants
   int32_t phase, phase_terms, phase_numbers;  // form of phases.h, 0 for none; how many numbers, and the first of them
+  int32_t departure_terms, departure_numbers;  // powers of departures.h, and the first of its numbers
 };
-static_assert(sizeof(Layout) == kFields * sizeof(int32_t), "structure.py writes 16 integers");
+static_assert(sizeof(Layout) == kFields * sizeof(int32_t), "structure.py writes 18 integers");
 
 // The same surface with the numbers of one row.
 template <typename T>
@@ -33,6 +34,7 @@ struct Surface {
   T gap, c, k, n1, n2;  // 0 where not modelled; n1, n2 before and behind
   T a[kTerms];
   const T* phase;  // numbers of the phase
+  const T* departure;  // and of the departure
   double rim;
 };
 
@@ -48,6 +50,7 @@ Surface<T> surface_of(const Layout& at, const T* row, const double* constants) {
   s.n2 = number(at.behind);
   for (int j = 0; j < at.terms; j++) s.a[j] = row[at.coefficients + j];
   s.phase = row + at.phase_numbers;
+  s.departure = row + at.departure_numbers;
   s.rim = constants[at.rim];
   return s;
 }
@@ -64,10 +67,12 @@ struct alignas(64) Normals {
   T x[kBlock], y[kBlock], z[kBlock], w[kBlock];
 };
 
-// A path p(x, y) at `size` points, its slopes and second derivatives; q: a polynomial on the way there.
+// A path or a sag p(x, y) at `size` points, its slopes and second derivatives; q: a polynomial on the way there; u, v: the
+// points as a departure counts them.
 template <typename T, int size>
 struct alignas(64) Added {
   T p[size], x[size], y[size], xx[size], xy[size], yy[size], q[size], dq[size], d2q[size];
+  T u[size], v[size];
 };
 
 // What the loops note of a block beside its rays. valid: neither lost nor vignetted; lost: number of the last surface

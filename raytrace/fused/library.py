@@ -24,7 +24,18 @@ import torch
 from raytrace.fused.trust import check_file, open_folder, private_folder
 
 SOURCES = (
-    *("block.h", "sags.h", "freeform.h", "apertures.h", "paths.h", "loops.h", "phases.h", "search.h", "careful.h"),
+    *(
+        "block.h",
+        "sags.h",
+        "freeform.h",
+        "apertures.h",
+        "paths.h",
+        "departures.h",
+        "loops.h",
+        "phases.h",
+        "search.h",
+        "careful.h",
+    ),
     *("adjoint.h", "tangent.h", "phase_slopes.h", "turns.h", "trace.cpp"),
 )
 FLAGS = ("-O3", "-std=c++17", "-fPIC", "-fopenmp-simd", "-fno-math-errno", "-fno-trapping-math")

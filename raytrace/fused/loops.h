@@ -1,5 +1,6 @@
 // The surfaces as loops over a block: the algebra of raytrace/system/surface.py and trace.py where nothing can go wrong.
 #pragma once
+#include "departures.h"
 #include "freeform.h"
 
 namespace raytrace {
@@ -154,6 +155,7 @@ void newton(const Rays<T>& from, Notes<T>& notes, int n, const Surface<T>& s) {
   }
   for (int step = 0; step < kSteps; step++) {
     int going = 0;
+    if constexpr (is_departed(kind)) departure_along(from, notes, n, s);
 #pragma omp simd reduction(+ : going)
     for (int i = 0; i < n; i++) {
       T L = from.L[i], M = from.M[i], N = from.N[i], t = notes.t[i];
@@ -170,6 +172,7 @@ void newton(const Rays<T>& from, Notes<T>& notes, int n, const Surface<T>& s) {
           sag<kind, false>(s, terms, u, S, dS, d2S);
           dF = N - T(2) * dS * (x * L + y * M);
         }
+        if constexpr (is_departed(kind)) S += notes.added.p[i], dF -= notes.added.x[i] * L + notes.added.y[i] * M;
         change = (z - S) / dF;
       }
       bool active = notes.active[i] > 0;
@@ -185,6 +188,7 @@ void newton(const Rays<T>& from, Notes<T>& notes, int n, const Surface<T>& s) {
 template <typename T, int kind, int bend, bool path, int terms>
 int cross_asphere(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, const Surface<T>& s) {
   newton<T, kind, terms>(from, notes, n, s);
+  if constexpr (is_departed(kind)) departure_along(from, notes, n, s);
   const Law<T, bend> law(s);
   const bool has_gap = s.at->gap >= 0;
   const T gap = s.gap, side = T(s.at->side), rim_squared = T(s.rim) * T(s.rim);
@@ -212,6 +216,10 @@ int cross_asphere(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, cons
       nx = -slope * hx, ny = -slope * hy, cosine = N - slope * (hx * L + hy * M);
       w = T(1) + slope * slope * u;
     }
+    if constexpr (is_departed(kind)) {
+      nx -= notes.added.x[i], ny -= notes.added.y[i];
+      cosine = N + nx * L + ny * M, w = T(1) + nx * nx + ny * ny;
+    }
     // `active` is 1 where Newton's method has not arrived, and NaN compares as false.
     good &= (notes.active[i] < T(0.5)) & (u <= rim_squared) & (cosine * N > 0);
     good &= cosine * cosine > kGrazing<T> * T(0.1) * w;
@@ -223,10 +231,12 @@ int cross_asphere(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, cons
   return flagged;
 }
 
-// The normals of a surface where rays stand on it, and their squared lengths.
+// The normals of a surface where rays stand on it, and their squared lengths, in notes.normal.
 template <typename T, int kind, int terms>
-void normals(const Rays<T>& at, Normals<T>& to, int n, const Surface<T>& s) {
+void normals(const Rays<T>& at, Notes<T>& notes, int n, const Surface<T>& s) {
   const T c = s.c, shape = T(1) + s.k;
+  Normals<T>& to = notes.normal;
+  if constexpr (is_departed(kind)) departure_on<false>(at, notes, n, s);
 #pragma omp simd
   for (int i = 0; i < n; i++) {
     T x = at.x[i], y = at.y[i], u = x * x + y * y, nx = 0, ny = 0, nz = 1, w = 1;
@@ -237,6 +247,10 @@ void normals(const Rays<T>& at, Normals<T>& to, int n, const Surface<T>& s) {
       T S, dS, d2S;
       sag<kind, false>(s, terms, u, S, dS, d2S);
       nx = T(-2) * dS * x, ny = T(-2) * dS * y, w = T(1) + T(4) * dS * dS * u;
+    } else if constexpr (is_departed(kind)) {
+      T S, dS, d2S;
+      sag<kind, false>(s, terms, u, S, dS, d2S);
+      nx = T(-2) * dS * x - notes.added.x[i], ny = T(-2) * dS * y - notes.added.y[i], w = T(1) + nx * nx + ny * ny;
     } else if constexpr (is_freeform(kind)) {
       const auto sheet = sheet_at<kind, terms, false>(s, x, y);
       nx = -sheet.x, ny = -sheet.y, w = T(1) + nx * nx + ny * ny;

@@ -98,13 +98,13 @@ void path_at(const Layout& at, const C* numbers, const T* x, const T* y, int n, 
 // Adds what each number of a polynomial gets from the cotangents p̄, x̄, ȳ of the path and its slopes. `to.q` holds x^k,
 // `to.dq` its derivative, `to.xx` and `to.xy` what stands with each of them.
 template <typename T>
-void sum_polynomial(int count, const Rays<T>& at, const T* gp, const T* gx, const T* gy, int n, Added<T, kBlock>& to,
-                    double* sums) {
+void sum_polynomial(int count, const T* x, const T* y, const T* gp, const T* gx, const T* gy, int n,
+                    Added<T, kBlock>& to, double* sums) {
   const int top = degree(count);
   for (int j = 0; j <= top; j++) {
 #pragma omp simd
     for (int i = 0; i < n; i++) {
-      const T y_j = j == 0 ? T(1) : to.d2q[i] * at.y[i], slope = j == 0 ? T(0) : T(j) * to.d2q[i];
+      const T y_j = j == 0 ? T(1) : to.d2q[i] * y[i], slope = j == 0 ? T(0) : T(j) * to.d2q[i];
       to.d2q[i] = y_j, to.xx[i] = gp[i] * y_j + gy[i] * slope, to.xy[i] = gx[i] * y_j;
       to.q[i] = T(1), to.dq[i] = T(0);
     }
@@ -114,7 +114,7 @@ void sum_polynomial(int count, const Rays<T>& at, const T* gp, const T* gx, cons
 #pragma omp simd reduction(+ : sum)
       for (int i = 0; i < n; i++) {
         sum += to.q[i] * to.xx[i] + to.dq[i] * to.xy[i];
-        to.dq[i] = T(k + 1) * to.q[i], to.q[i] *= at.x[i];
+        to.dq[i] = T(k + 1) * to.q[i], to.q[i] *= x[i];
       }
       if (k + j > 0 && place < count) sums[place] += sum;
     }
@@ -142,7 +142,7 @@ template <typename T>
 void sum_path(const Layout& at, const Rays<T>& hit, const T* gp, const T* gx, const T* gy, int n, Added<T,
               kBlock>& to, double* sums) {
   if (at.phase == kRadial) sum_radial(at.phase_terms, hit, gp, gx, gy, n, to, sums);
-  else sum_polynomial(at.phase_terms, hit, gp, gx, gy, n, to, sums);
+  else sum_polynomial(at.phase_terms, hit.x, hit.y, gp, gx, gy, n, to, sums);
 }
 
 }  // namespace raytrace

@@ -2,6 +2,7 @@
 // base quadric, accepted by a residual relative to the size of the terms, and a bracketed search for the rays that fail.
 #pragma once
 #include <algorithm>
+#include <utility>
 
 #include "loops.h"
 
@@ -121,21 +122,33 @@ struct AsphereSearch : Search<AsphereSearch> {
   }
 
   Stretch stretch() const {
-    const double infinity = std::numeric_limits<double>::infinity();
+    const double within = radius();
+    auto [low, high] = heights(within);
+    return between(low, high, 0.05, cylinder(within));
+  }
+
+  // How far out a crossing is looked for.
+  double radius() const {
     double closed = (1 + s.k) * s.c * s.c, edge = closed > 0 ? 1 / std::sqrt(closed) : big();
     double radius = edge < big() ? std::fmin(edge, s.rim) : s.rim;
-    if (!(radius < big())) radius = reach();
+    return radius < big() ? radius : reach();
+  }
 
+  // Where the ray is in the cylinder of a radius.
+  Stretch cylinder(double radius) const {
     double A = L * L + M * M, B = x * L + y * M, C = x * x + y * y - radius * radius;
     double discriminant = B * B - A * C, width = std::sqrt(std::fmax(discriminant, 0.0));
-    Stretch of{A > 0 ? (-B - width) / A : -big(), A > 0 ? (-B + width) / A : big(), A > 0 ? discriminant >= 0 : C <= 0};
+    return {A > 0 ? (-B - width) / A : -big(), A > 0 ? (-B + width) / A : big(), A > 0 ? discriminant >= 0 : C <= 0};
+  }
 
-    double low = infinity, high = -infinity;
+  // The lowest and the highest sag within a radius.
+  std::pair<double, double> heights(double radius) const {
+    double low = std::numeric_limits<double>::infinity(), high = -low;
     for (int i = 0; i <= 64; i++) {
       double at = i / 64.0 * radius, S = slope_at(s, at * at * (1 - 1e-7)).S;
       low = std::fmin(low, S), high = std::fmax(high, S);
     }
-    return between(low, high, 0.05, of);
+    return {low, high};
   }
 };
 
@@ -160,6 +173,13 @@ inline Height height_at(const Surface<double>& s, double x, double y) {
   return found;
 }
 
+// The same of a round sag with a departure.
+[[gnu::noinline]] inline Height departed_at(const Surface<double>& s, double x, double y) {
+  const Slope base = slope_at(s, x * x + y * y);
+  const Added<double, 1> D = departure_at(s, x, y);
+  return {base.S + D.p[0], 2 * base.dS * x + D.x[0], 2 * base.dS * y + D.y[0], base.size, base.inside};
+}
+
 // How far the sheet of the vertex goes along x and y, at most to a limit.
 struct Extent { double x, y; };
 
@@ -179,6 +199,34 @@ inline Extent extent_of(const Surface<double>& s, double limit) {
   }
   return {std::fmin(widest / std::fabs(c_x), limit), y};
 }
+
+// A round sag with a departure: that of the sag alone, and what the departure adds.
+struct DepartedSearch : Search<DepartedSearch> {
+  static constexpr bool inside_only = false;
+  const AsphereSearch round;
+  const Surface<double>& s;
+  double x, y, z, L, M, N;
+  DepartedSearch(const Surface<double>& s, double x, double y, double z, double L, double M, double N)
+      : round(s, x, y, z, L, M, N), s(s), x(x), y(y), z(z), L(L), M(M), N(N) {}
+
+  Residual residual(double t) const {
+    Residual found = round.residual(t);
+    const double hx = x + t * L, hy = y + t * M;
+    const Added<double, 1> D = departure_at(s, hx, hy);
+    found.F -= D.p[0], found.dF -= D.x[0] * L + D.y[0] * M;
+    found.scale += departure_size(s, std::sqrt(found.u));
+    found.scale += (std::fabs(D.x[0]) + std::fabs(D.y[0])) * (std::fabs(hx) + std::fabs(hy) + std::fabs(t));
+    return found;
+  }
+
+  double start() const { return round.start(); }
+
+  Stretch stretch() const {
+    double radius = round.radius(), beside = departure_size(s, radius);
+    auto [low, high] = round.heights(radius);
+    return between(low - beside, high + beside, 0.05, round.cylinder(radius));
+  }
+};
 
 struct FreeformSearch : Search<FreeformSearch> {
   static constexpr bool inside_only = true;

@@ -12,14 +12,17 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_leaves
 
 from raytrace.system.aperture import SHAPES
 from raytrace.system.phases import IdealLens, Phase, PolynomialPath, RadialPath, kind_of, path_of
+from raytrace.system.polynomials import PowerSag
 from raytrace.system.pose import Gap, Turn, passage
-from raytrace.system.shapes import KINDS
+from raytrace.system.shapes import DEPARTURES, EVEN, KINDS, Departure
 from raytrace.system.surface import Surface, gap_behind
 
 _TURN, _PLANE, _SPHERE, _CONIC = range(-1, 3)  # and the codes of shapes.KINDS
+_DEPARTED, _FRAME = 7, 4  # kDeparted of sags.h; kFrame of departures.h, its numbers before the coefficients
 _NONE, _REFRACT, _REFLECT = range(3)
 
 #: What a phase becomes before it is traced, by `Form` of paths.h.
@@ -45,13 +48,15 @@ class _Row(NamedTuple):
     phase: int = 0
     phase_terms: int = 0
     phase_numbers: int = 0
+    departure_terms: int = 0
+    departure_numbers: int = 0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Structure:
     """Surfaces without their numbers.
 
-    layout: (S, 16) int32, a `_Row` each; constants: (C,) float64, what no derivative is asked for: rims and apertures.
+    layout: (S, 18) int32, a `_Row` each; constants: (C,) float64, what no derivative is asked for: rims and apertures.
     """
 
     layout: np.ndarray
@@ -59,15 +64,24 @@ class Structure:
 
 
 def is_expressible(surface: Surface) -> bool:
-    """Whether the compiled trace knows the surface: kind, phase and apertures compiled, no departure, few terms."""
+    """Whether the compiled trace knows the surface: kind, departure, phase and apertures compiled, few terms."""
     if surface.is_break:
         return True
     if surface.phase is not None and not (kind_of(surface.phase).slopes or kind_of(surface.phase).path):
         return False
-    if surface.departure is not None or any(SHAPES[aperture.shape].code is None for aperture in surface.apertures):
+    if any(SHAPES[aperture.shape].code is None for aperture in surface.apertures):
+        return False
+    if surface.departure is not None and not (surface.kind == EVEN and _has_powers(surface.departure)):
         return False
     kind = KINDS[surface.kind]
     return surface.coefficients is None or (kind.code is not None and len(surface.coefficients) <= kind.compiled)
+
+
+def _has_powers(departure: Departure) -> bool:
+    """Whether the compiled trace knows a departure: as powers of x and y, not too many, the same for all rays."""
+    kind, numbers = DEPARTURES[type(departure).__name__], tree_leaves(departure)
+    few = kind.compiled is None or all(number.numel() <= kind.compiled for number in numbers)
+    return kind.powers is not None and few and all(number.dim() <= 1 for number in numbers)
 
 
 class _Table:
@@ -137,6 +151,7 @@ def _row(
     terms = () if surface.coefficients is None else surface.coefficients.unbind(0)
     first_term, rim = table.place_all(terms), table.place_rim(surface)
     form, phase = _form_of(surface.phase, wavelength)
+    departure = _numbers_of(surface.departure)
     return _Row(
         kind=_kind(surface),
         bend=_REFLECT if surface.is_mirror else _NONE if n2 is n1 else _REFRACT,
@@ -154,7 +169,17 @@ def _row(
         phase=form,
         phase_terms=len(phase),
         phase_numbers=table.place_all(phase),
+        departure_terms=max(len(departure) - _FRAME, 0),
+        departure_numbers=table.place_all(departure),
     )
+
+
+def _numbers_of(departure: Departure | None) -> Sequence[Tensor]:
+    """Those of a departure as departures.h has them."""
+    if departure is None:
+        return ()
+    *frame, coefficients = tree_leaves(DEPARTURES[type(departure).__name__].powers(departure))
+    return *frame, *coefficients.unbind(0)
 
 
 def _turn(table: _Table, surface: Surface, gap: Tensor | Gap | None, side: int, n1: Tensor) -> _Row:
@@ -210,6 +235,7 @@ def _rebuilt(row: _Row, surface: Surface, numbers: Sequence[Tensor]) -> Surface:
         conic=number(row.conic),
         coefficients=surface.coefficients if not terms else torch.stack(list(terms)),
         phase=_phase_of(row, numbers),
+        departure=_departure_of(row, numbers),
         before=None,
         after=None,
     )
@@ -223,6 +249,15 @@ def _phase_of(row: _Row, numbers: Sequence[Tensor]) -> Phase | None:
     return FORMS[row.phase](torch.stack(torch.broadcast_tensors(*own)) if own else none)
 
 
+def _departure_of(row: _Row, numbers: Sequence[Tensor]) -> PowerSag | None:
+    """Its numbers are the same in every row of a table: those of the first one are taken."""
+    if row.kind != _DEPARTED:
+        return None
+    last = row.departure_numbers + _FRAME + row.departure_terms
+    own = torch.stack([number.reshape(-1)[0] for number in numbers[row.departure_numbers : last]])
+    return PowerSag(*own[:_FRAME].unbind(0), own[_FRAME:])
+
+
 def _turned(row: _Row, numbers: Sequence[Tensor]) -> Surface:
     own = numbers[row.coefficients : row.coefficients + row.terms]
     rotation = torch.stack([torch.stack(list(own[3 * i : 3 * i + 3])) for i in range(3)])
@@ -230,6 +265,8 @@ def _turned(row: _Row, numbers: Sequence[Tensor]) -> Surface:
 
 
 def _kind(surface: Surface) -> int:
+    if surface.departure is not None:
+        return _DEPARTED
     if surface.coefficients is not None:
         return KINDS[surface.kind].code
     if surface.curvature is None:

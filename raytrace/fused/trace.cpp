@@ -42,7 +42,7 @@ using Pushes = void (*)(const Rays<T>&, const Rays<T>&, Rays<T>&, Notes<T>&, int
 template <typename T>
 using Pulls = Sums<T> (*)(const Rays<T>&, const Rays<T>&, Cotangents<T>&, Notes<T>&, int, const Surface<T>&);
 template <typename T>
-using Stands = void (*)(const Rays<T>&, Normals<T>&, int, const Surface<T>&);
+using Stands = void (*)(const Rays<T>&, Notes<T>&, int, const Surface<T>&);
 
 // The functions for one kind of surface. Where it has a phase, `crosses` carries rays to it, and phases.h does the rest.
 template <typename T, int kind, int bend, bool path, int terms>
@@ -124,10 +124,11 @@ class Trace {
         const Step<T>& step = steps_[k];
         forget(k, *g, rays.get(), *notes, n);
         if (step.surface.at->phase != kNoPhase) {
-          step.stands(rays[k + 1], notes->normal, n, step.surface);
+          step.stands(rays[k + 1], *notes, n, step.surface);
           pull_phase(rays[k], rays[k + 1], *g, *notes, n, step.surface, row);
         }
         add(row, *step.surface.at, step.pulls(rays[k], rays[k + 1], *g, *notes, n, step.surface));
+        if (is_departed(step.surface.at->kind)) sum_departure(*notes, n, step.surface, row);
       }
       store(call_.by_rays, *g, at, count);
     });
@@ -182,7 +183,7 @@ class Trace {
       begun |= change.any;
       if (begun) steps_[k].pushes(rays[k], rays[k + 1], d, notes, n, s, change);
       if (begun && s.at->phase != kNoPhase) {
-        steps_[k].stands(rays[k + 1], notes.normal, n, s);
+        steps_[k].stands(rays[k + 1], notes, n, s);
         push_phase(rays[k], rays[k + 1], d, notes, n, s, change, path_);
       }
       for (int i = 0; i < n && notes.any_lost; i++)
@@ -250,7 +251,7 @@ class Trace {
     notes.surface = int32_t(k);
     int flagged = (path ? step.crosses : step.silently)(from, to, notes, n, s);
     if (s.at->phase != kNoPhase) {
-      step.stands(to, notes.normal, n, s);
+      step.stands(to, notes, n, s);
       flagged = through_phase(to, notes, n, s, path);
     }
     if (flagged)

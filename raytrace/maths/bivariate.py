@@ -85,24 +85,31 @@ def fringe(number: int) -> tuple[int, int]:
     return 2 * half - m, m if place % 2 == 0 else -m
 
 
-@functools.lru_cache(maxsize=4)
 def fringe_to_powers(count: int) -> np.ndarray:
-    """Matrix (K, count) from coefficients of the first fringe terms, not normalised, to those of x^i y^j; no constant.
+    """Matrix (K, count) from coefficients of the first fringe terms, 1 at the rim, to those of x^i y^j; no constant."""
+    return zernike_to_powers(tuple(fringe(number) for number in range(1, count + 1)))[0]
+
+
+@functools.lru_cache(maxsize=8)
+def zernike_to_powers(orders: tuple[tuple[int, int], ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix (K, J) from coefficients of terms (n, m), 1 at the rim, to those of x^i y^j; and the constants (J,).
 
     R_n^m(ρ) cos mφ = Σ_s (-1)^s (n-s)!/(s! ((n+m)/2 - s)! ((n-m)/2 - s)!) ρ^(n-2s-m) · Re (x + iy)^m
     """
-    top = max((fringe(number)[0] for number in range(1, count + 1)), default=0)
+    top = max((n for n, _ in orders), default=0)
     order = powers(top * (top + 3) // 2)
     place = {power: k for k, power in enumerate(order)}
-    matrix = np.zeros((len(order), count))
-    for column in range(count):
-        for power, c in _fringe_terms(*fringe(column + 1)).items():
-            if power != (0, 0):
+    matrix, constants = np.zeros((len(order), len(orders))), np.zeros(len(orders))
+    for column, (n, m) in enumerate(orders):
+        for power, c in _terms(n, m).items():
+            if power == (0, 0):
+                constants[column] += c
+            else:
                 matrix[place[power], column] += c
-    return matrix
+    return matrix, constants
 
 
-def _fringe_terms(n: int, m: int) -> dict[tuple[int, int], float]:
+def _terms(n: int, m: int) -> dict[tuple[int, int], float]:
     size, found = abs(m), {}
     for s in range((n - size) // 2 + 1):
         plus, minus = (n + size) // 2 - s, (n - size) // 2 - s

@@ -4,7 +4,10 @@
     IrregularSag    D = Z_s ρ⁴ + Z_a v² + Z_c ρ² v,  ρ = r/R,  v = (y cos θ - x sin θ)/R
     TiltSag         D = x tan_x + y tan_y
 
-The other two are made into the first (`as_polynomial`), by linear maps that autograd follows.
+The other two are made into the first (`as_polynomial`), by linear maps that autograd follows. For the compiled trace
+all three, and Zernike's polynomials, are made into powers about a centre:
+
+    PowerSag        D = h + Σ_k c_k E_k(u, v),  u = (x - x_0)/R,  v = (y - y_0)/R
 """
 
 from collections.abc import Sequence
@@ -12,10 +15,11 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from raytrace.maths.bivariate import polynomial_xy, powers
+from raytrace.maths.bivariate import polynomial_xy, powers, zernike_to_powers
 from raytrace.maths.numerics import polynomial
 from raytrace.maths.value import value
-from raytrace.system.departure import Sag
+from raytrace.maths.zernike import Order, fringe, noll, norm
+from raytrace.system.departure import FringeSag, Sag, ZernikeSag
 from raytrace.system.pose import cos_sin
 
 
@@ -49,6 +53,17 @@ class TiltSag:
     tan_y: Tensor
 
 
+@value
+class PowerSag:
+    """A height and powers about a centre, all in mm; coefficients: (J,) of u, v, u², uv, v², …"""
+
+    centre_x: Tensor
+    centre_y: Tensor
+    radius: Tensor
+    height: Tensor
+    coefficients: Tensor
+
+
 def as_polynomial(departure: IrregularSag | TiltSag) -> PolynomialSag:
     """The same as a sum of powers."""
     if isinstance(departure, TiltSag):
@@ -77,3 +92,45 @@ def polynomial_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
     for degree, a in zip(degrees, c.abs().unbind(0), strict=True):
         sums[degree] = sums[degree] + a
     return polynomial(torch.stack(sums), radius / unit.abs())
+
+
+def powers_of_polynomial(departure: PolynomialSag | IrregularSag | TiltSag) -> PowerSag:
+    """The same as powers about the vertex."""
+    given = departure if isinstance(departure, PolynomialSag) else as_polynomial(departure)
+    zero = torch.zeros_like(given.radius)
+    return PowerSag(zero, zero, given.radius, zero, given.coefficients)
+
+
+def powers_of_fringe(departure: FringeSag) -> PowerSag:
+    """The same as powers about its centre."""
+    orders = [fringe(j) for j in range(1, len(departure.coefficients) + 1)]
+    height, powers_ = _powers_of(orders, departure.coefficients)
+    return PowerSag(departure.centre_x, departure.centre_y, departure.radius, height, powers_)
+
+
+def powers_of_zernike(departure: ZernikeSag) -> PowerSag:
+    """The same as powers about the vertex."""
+    orders = [noll(j) for j in range(1, len(departure.coefficients) + 1)]
+    norms = departure.coefficients.new_tensor([norm(*order) for order in orders])
+    height, powers_ = _powers_of(orders, norms * departure.coefficients)
+    zero = torch.zeros_like(departure.radius)
+    return PowerSag(zero, zero, departure.radius, height, powers_)
+
+
+def _powers_of(orders: Sequence[Order], coefficients: Tensor) -> tuple[Tensor, Tensor]:
+    """The height and the coefficients of powers of a sum of Zernike's terms, 1 at the rim."""
+    matrix, constants = (coefficients.new_tensor(part) for part in zernike_to_powers(tuple(orders)))
+    return (constants * coefficients).sum(), matrix @ coefficients
+
+
+def power_sag(numbers: Sequence[Tensor], x: Tensor, y: Tensor, highest: int) -> Sag:
+    """The height and the powers at points (...) mm."""
+    centre_x, centre_y, radius, height, coefficients = (number.to(x.dtype) for number in numbers)
+    found = polynomial_sag((coefficients, radius), x - centre_x, y - centre_y, highest)
+    return found._replace(z=found.z + height)
+
+
+def power_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
+    """A bound on |D| up to a radius (...) mm of the vertex."""
+    centre_x, centre_y, unit, height, coefficients = numbers
+    return height.abs() + polynomial_size((coefficients, unit), radius + centre_x.abs() + centre_y.abs())

@@ -20,10 +20,16 @@ from raytrace.system.departure import FringeSag, GridSag, Sag, SplineSag, Zernik
 from raytrace.system.polynomials import (
     IrregularSag,
     PolynomialSag,
+    PowerSag,
     TiltSag,
     as_polynomial,
     polynomial_sag,
     polynomial_size,
+    power_sag,
+    power_size,
+    powers_of_fringe,
+    powers_of_polynomial,
+    powers_of_zernike,
 )
 from raytrace.system.terms import Terms, conic_terms, even_terms, odd_terms
 
@@ -109,6 +115,8 @@ class DepartureKind:
     sag: numbers, x, y (...) mm, highest derivative -> `Sag`; size: numbers, radius (...) mm -> bound on |D| mm within
     it, by which a crossing is bracketed and rounding is judged; covers: numbers, x, y -> where there is a surface;
     prepare: to the departure whose tensors are the numbers; is_round: about the axis.
+    powers: to the same as powers about a centre, which the compiled trace takes, up to `compiled` coefficients; None:
+    traced by torch alone.
     """
 
     sag: Callable[[Sequence[Tensor], Tensor, Tensor, int], Sag]
@@ -118,19 +126,22 @@ class DepartureKind:
     )
     prepare: Callable = lambda departure: departure
     is_round: bool = False
+    powers: Callable | None = None
+    compiled: int | None = None
 
 
 DEPARTURES = {
     "GridSag": DepartureKind(own.spline_sag, own.spline_size, own.spline_covers, prepare=own.spline),
     "SplineSag": DepartureKind(own.spline_sag, own.spline_size, own.spline_covers),
-    "ZernikeSag": DepartureKind(own.zernike_sag, own.zernike_size),
-    "FringeSag": DepartureKind(own.fringe_sag, own.fringe_size),
-    "PolynomialSag": DepartureKind(polynomial_sag, polynomial_size),
-    "IrregularSag": DepartureKind(polynomial_sag, polynomial_size, prepare=as_polynomial),
-    "TiltSag": DepartureKind(polynomial_sag, polynomial_size, prepare=as_polynomial),
+    "ZernikeSag": DepartureKind(own.zernike_sag, own.zernike_size, powers=powers_of_zernike, compiled=91),
+    "FringeSag": DepartureKind(own.fringe_sag, own.fringe_size, powers=powers_of_fringe, compiled=37),
+    "PolynomialSag": DepartureKind(polynomial_sag, polynomial_size, powers=powers_of_polynomial),
+    "IrregularSag": DepartureKind(polynomial_sag, polynomial_size, prepare=as_polynomial, powers=powers_of_polynomial),
+    "TiltSag": DepartureKind(polynomial_sag, polynomial_size, prepare=as_polynomial, powers=powers_of_polynomial),
+    "PowerSag": DepartureKind(power_sag, power_size, powers=lambda departure: departure),
 }
 
-Departure = GridSag | SplineSag | ZernikeSag | FringeSag | PolynomialSag | IrregularSag | TiltSag
+Departure = GridSag | SplineSag | ZernikeSag | FringeSag | PolynomialSag | IrregularSag | TiltSag | PowerSag
 
 
 @dataclasses.dataclass(frozen=True)
