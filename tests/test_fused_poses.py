@@ -48,6 +48,7 @@ GRATING = rt.Grating(scalar(0.15), scalar(1.0))
 RADIAL = rt.RadialPhase(vector(-40.0, 12.0, 3.0), scalar(10.0), scalar(1.0))
 FREE = rt.PolynomialPhase(drawn(14, size=60.0), scalar(20.0), scalar(-1.0))
 FRINGE = rt.FringePhase(drawn(37, size=0.5), scalar(30.0), scalar(1.0))
+HOLOGRAM = rt.Hologram(vector(3.0, -2.0, -40.0), vector(-5.0, 4.0, 60.0), scalar(0.55), scalar(1.0))
 ROUND, UNLIKE = (rt.IdealLens(scalar(0.01), scalar(power), scalar(0.002)) for power in (0.01, -0.004))
 
 #: Each is entered by rays of a wide cone; between them stand all kinds, mirrors, breaks, and rays lost in every way.
@@ -79,6 +80,13 @@ SYSTEMS = {
         surface(0.004, 6.0, kind="odd asphere", coefficients=[1e-3, 1e-4], phase=RADIAL, semi_diameter=40.0),
         surface(-0.004, -20.0, MIRROR, phase=GRATING, before=posed(tilt_x=12.0), after=posed(tilt_x=-3.0)),
         surface(0.01, -7.0, MIRROR, phase=FRINGE),
+    ],
+    "holograms": [
+        surface(None, 5.0, 1.6, phase=HOLOGRAM),
+        surface(-0.01, 8.0, conic=0.3, phase=HOLOGRAM, before=posed(tilt_x=9.0)),
+        surface(0.004, -20.0, MIRROR, phase=HOLOGRAM, before=posed(tilt_x=12.0), after=posed(tilt_x=-3.0)),
+        surface(None, -7.0, departure=FringeSag(drawn(37, size=0.01), scalar(30.0), scalar(1.0), scalar(-2.0))),
+        surface(None, -7.0, departure=TiltSag(scalar(0.1), scalar(-0.2)), phase=GRATING),
     ],
     "ideal": [
         surface(None, 12.0, phase=ROUND),
@@ -254,7 +262,7 @@ DEPARTURES = [
 def drawn_system(seed: int) -> list[Surface]:
     """Surfaces of any kind in any order, tilted and decentred anyhow, breaks and mirrors among them."""
     chance = random.Random(seed)
-    phases = [None, None, GRATING, RADIAL, FREE, FRINGE, ROUND, UNLIKE]
+    phases = [None, None, GRATING, RADIAL, FREE, FRINGE, HOLOGRAM, ROUND, UNLIKE]
     surfaces, side = [], 1
     for _ in range(8):
         poses = [None if chance.random() < 0.5 else any_pose(chance) for _ in range(2)]

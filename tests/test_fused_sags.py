@@ -45,12 +45,12 @@ FACES = {
     "biconic": freeform("biconic", 1 / 12, -1.0, -1 / 15, 0.5),
     "biconic of positive curvatures": freeform("biconic", 1 / 12, 0.3, 1 / 9, -2.5),
     "tilted plane": departed(TiltSag(scalar(0.3), scalar(-0.2))),
-    "polynomial": departed(PolynomialSag(drawn(20, 0.3), scalar(6.0)), 1 / 14, -0.7),
+    "polynomial": departed(PolynomialSag(drawn(9, 0.3), scalar(6.0)), 1 / 14, -0.7),
     "polynomial on an asphere": departed(PolynomialSag(drawn(5, 0.3), scalar(6.0)), 1 / 14, None, 1e-3, 2e-5, -1e-7),
     "polynomial without terms": departed(PolynomialSag(vector(), scalar(6.0)), 1 / 14),
     "irregular": departed(IrregularSag(*map(scalar, (0.2, -0.3, 0.1, 30.0, 7.0))), -1 / 20),
-    "fringe": departed(FringeSag(drawn(37, 0.02), *map(scalar, (14.0, 0.5, -0.7))), 1 / 20, None, 1e-4),
-    "Zernike": departed(ZernikeSag(drawn(28, 0.02), scalar(9.0)), 1 / 20, 0.4),
+    "fringe": departed(FringeSag(drawn(11, 0.02), *map(scalar, (14.0, 0.5, -0.7))), 1 / 20, None, 1e-4),
+    "Zernike": departed(ZernikeSag(drawn(11, 0.02), scalar(9.0)), 1 / 20, 0.4),
 }
 each = pytest.mark.parametrize("name", FACES)
 END = Surface(scalar(0.0))
@@ -122,20 +122,19 @@ def test_gradients_by_differences_and_their_gradients_with_lost_rays(name):
     rays = Rays(*(part[..., 46:54] for part in (some_rays().position, some_rays().direction, some_rays().valid)))
 
     def hits(curvature, conic, *others):
-        coefficients, departure = tree_unflatten(list(others), kinds)
-        if coefficients is not None:
-            coefficients = coefficients * share
-        changed = {"curvature": curvature, "conic": conic, "coefficients": coefficients, "departure": departure}
-        surfaces = [dataclasses.replace(face, **changed), END]
+        changed = tree_unflatten(list(others), kinds)
+        if "coefficients" in changed:
+            changed["coefficients"] = changed["coefficients"] * share
+        surfaces = [dataclasses.replace(face, curvature=curvature, conic=conic, **changed), END]
         end = trace_surfaces(surfaces, rays, indices=[*indices()[:2], indices()[1]])
         return torch.where(end.valid, end.position[:2], 0.0)
 
     numbers = [scalar(0.03) if n is None else n for n in (face.curvature, face.conic)]
-    coefficients = face.coefficients
-    if coefficients is not None:
-        share = 3.0 ** (-2 * torch.arange(len(coefficients), dtype=torch.float64))  # so that all weigh alike
-        coefficients = coefficients / share
-    others, kinds = tree_flatten((coefficients, face.departure))
+    more = {name: getattr(face, name) for name in ("coefficients", "departure") if getattr(face, name) is not None}
+    if "coefficients" in more:
+        share = 3.0 ** (-2 * torch.arange(len(more["coefficients"]), dtype=torch.float64))  # so that all weigh alike
+        more["coefficients"] = more["coefficients"] / share
+    others, kinds = tree_flatten(more)
     numbers = tuple(number.clone().requires_grad_() for number in (*numbers, *others))
     with tracing("fused"):
         assert gradcheck(hits, numbers, atol=1e-6)

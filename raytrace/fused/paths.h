@@ -1,14 +1,15 @@
 // Paths p(x, y) that a phase adds, with their derivatives, over a block or at one point: raytrace/system/phases.py.
 //
 //     polynomial  Σ c_k x^i y^j in the order x, y, x², xy, y², x³, …        radial  Σ a_j u^j, u = r², j = 1, 2, …
+//     hologram    s Σ (|P - Q| - |Q|) over two points Q = (a, b, c); the numbers are theirs, and s
 //
-// A new form is one more `Form`, in the order of FORMS in structure.py, and a case of `add_path` and `sum_path`.
+// A new form is one more `Form`, in the order of FORMS in structure.py, and a case of `path_at`, `path_change` and `sum_path`.
 #pragma once
 #include "block.h"
 
 namespace raytrace {
 
-enum Form { kNoPhase, kPolynomial, kRadial, kSlopes };
+enum Form { kNoPhase, kPolynomial, kRadial, kSlopes, kHologram };
 
 // Least degree n whose n(n + 3)/2 terms are `count` or more.
 inline int degree(int count) {
@@ -88,11 +89,67 @@ void radial(const C* a, int count, const T* x, const T* y, int n, Added<T, size>
   }
 }
 
+// The way from one point of a hologram to P: its direction e, and how much longer it is than to the vertex.
+template <typename T>
+struct FromPoint {
+  T x, y, z, over, longer;  // over: 1/|P - Q|
+  FromPoint(T a, T b, T c, T far, T px, T py) {
+    T dx = px - a, dy = py - b, r = root(dx * dx + dy * dy + c * c);
+    over = T(1) / r, x = dx * over, y = dy * over, z = -c * over;
+    longer = (px * (px - T(2) * a) + py * (py - T(2) * b)) / (r + far);
+  }
+};
+
+template <bool second, typename C, typename T, int size>
+void hologram(const C* numbers, const T* x, const T* y, int n, Added<T, size>& to) {
+  clear(to, n);
+  const T s = T(numbers[6]);
+  for (int point = 0; point < 2; point++, numbers += 3) {
+    const T a = T(numbers[0]), b = T(numbers[1]), c = T(numbers[2]), far = root(a * a + b * b + c * c);
+#pragma omp simd
+    for (int i = 0; i < n; i++) {
+      const FromPoint<T> e(a, b, c, far, x[i], y[i]);
+      to.p[i] += s * e.longer, to.x[i] += s * e.x, to.y[i] += s * e.y;
+      if (second) {
+        to.xx[i] += s * (T(1) - e.x * e.x) * e.over, to.yy[i] += s * (T(1) - e.y * e.y) * e.over;
+        to.xy[i] -= s * e.x * e.y * e.over;
+      }
+    }
+  }
+}
+
+// How the path and its slopes change with the numbers.
+template <typename T>
+void hologram_change(const T* numbers, const T* change, const T* x, const T* y, int n, Added<T, kBlock>& to) {
+  clear(to, n);
+  const T s = numbers[6], ds = change[6];
+  for (int point = 0; point < 2; point++, numbers += 3, change += 3) {
+    const T a = numbers[0], b = numbers[1], c = numbers[2], da = change[0], db = change[1], dc = change[2];
+    const T far = root(a * a + b * b + c * c), further = (a * da + b * db + c * dc) / far;
+#pragma omp simd
+    for (int i = 0; i < n; i++) {
+      const FromPoint<T> e(a, b, c, far, x[i], y[i]);
+      const T along = e.x * da + e.y * db + e.z * dc;
+      to.p[i] += ds * e.longer - s * (along + further);
+      to.x[i] += ds * e.x + s * e.over * (e.x * along - da);
+      to.y[i] += ds * e.y + s * e.over * (e.y * along - db);
+    }
+  }
+}
+
 // The path of a form with these numbers.
 template <bool second, typename C, typename T, int size>
 void path_at(const Layout& at, const C* numbers, const T* x, const T* y, int n, Added<T, size>& to) {
   if (at.phase == kRadial) radial<second>(numbers, at.phase_terms, x, y, n, to);
+  else if (at.phase == kHologram) hologram<second>(numbers, x, y, n, to);
   else polynomial<second>(numbers, at.phase_terms, x, y, n, to);
+}
+
+// How it and its slopes change with the numbers; other forms are linear in them.
+template <typename T>
+void path_change(const Layout& at, const T* numbers, const T* change, const T* x, const T* y, int n, Added<T, kBlock>& to) {
+  if (at.phase == kHologram) hologram_change(numbers, change, x, y, n, to);
+  else path_at<false>(at, change, x, y, n, to);
 }
 
 // Adds what each number of a polynomial gets from the cotangents p̄, x̄, ȳ of the path and its slopes. `to.q` holds x^k,
@@ -138,10 +195,32 @@ void sum_radial(int count, const Rays<T>& at, const T* gp, const T* gx, const T*
   }
 }
 
+// And of a hologram.
 template <typename T>
-void sum_path(const Layout& at, const Rays<T>& hit, const T* gp, const T* gx, const T* gy, int n, Added<T,
-              kBlock>& to, double* sums) {
-  if (at.phase == kRadial) sum_radial(at.phase_terms, hit, gp, gx, gy, n, to, sums);
+void sum_hologram(const T* numbers, const Rays<T>& at, const T* gp, const T* gx, const T* gy, int n, double* sums) {
+  const T s = numbers[6];
+  T sum_s = 0;
+  for (int point = 0; point < 2; point++, numbers += 3, sums += 3) {
+    const T a = numbers[0], b = numbers[1], c = numbers[2], far = root(a * a + b * b + c * c);
+    T sum_a = 0, sum_b = 0, sum_c = 0, sum_p = 0;
+#pragma omp simd reduction(+ : sum_a, sum_b, sum_c, sum_p, sum_s)
+    for (int i = 0; i < n; i++) {
+      const FromPoint<T> e(a, b, c, far, at.x[i], at.y[i]);
+      const T turn = (gx[i] * e.x + gy[i] * e.y) * e.over, along = turn - gp[i];
+      sum_a += e.x * along - gx[i] * e.over, sum_b += e.y * along - gy[i] * e.over, sum_c += e.z * along;
+      sum_p += gp[i], sum_s += gp[i] * e.longer + gx[i] * e.x + gy[i] * e.y;
+    }
+    const T each = sum_p / far;
+    sums[0] += s * (sum_a - each * a), sums[1] += s * (sum_b - each * b), sums[2] += s * (sum_c - each * c);
+  }
+  sums[0] += sum_s;
+}
+
+template <typename T>
+void sum_path(const Layout& at, const T* numbers, const Rays<T>& hit, const T* gp, const T* gx, const T* gy, int n,
+              Added<T, kBlock>& to, double* sums) {
+  if (at.phase == kHologram) sum_hologram(numbers, hit, gp, gx, gy, n, sums);
+  else if (at.phase == kRadial) sum_radial(at.phase_terms, hit, gp, gx, gy, n, to, sums);
   else sum_polynomial(at.phase_terms, hit.x, hit.y, gp, gx, gy, n, to, sums);
 }
 

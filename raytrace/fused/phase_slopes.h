@@ -44,7 +44,7 @@ void pull_diffract(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Not
     g.y[i] += bx * added.xy[i] + by * added.yy[i] + R * gy;
     added.x[i] = bx, added.y[i] = by;
   }
-  sum_path(*s.at, to, g.path, added.x, added.y, n, added, row + s.at->phase_numbers);
+  sum_path(*s.at, s.phase, to, g.path, added.x, added.y, n, added, row + s.at->phase_numbers);
   row[s.at->before] += sum_n1, row[s.at->behind] += sum_n2;
 }
 
@@ -112,7 +112,7 @@ void push_diffract(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, Notes<T>&
   Added<T, kBlock>& added = notes.added;
   const T n1 = s.n1, n2 = s.n2, dn1 = change.n1, dn2 = change.n2, over_n2 = T(1) / n2, apart = (n2 - n1) * (n2 + n1);
   // What its numbers do to the path, kept in arrays that the path itself leaves alone.
-  path_at<false>(*s.at, change.phase, to.x, to.y, n, added);
+  path_change(*s.at, s.phase, change.phase, to.x, to.y, n, added);
   T *dp = notes.px, *dpx = notes.py, *dpy = notes.pz;
   for (int i = 0; i < n; i++) dp[i] = added.p[i], dpx[i] = added.x[i], dpy[i] = added.y[i];
   path_at<true>(*s.at, s.phase, to.x, to.y, n, added);

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
 from raytrace.system.aperture import SHAPES
-from raytrace.system.phases import IdealLens, Phase, PolynomialPath, RadialPath, kind_of, path_of
+from raytrace.system.phases import HologramPath, IdealLens, Phase, PolynomialPath, RadialPath, kind_of, path_of
 from raytrace.system.polynomials import PowerSag
 from raytrace.system.pose import Gap, Turn, passage
 from raytrace.system.shapes import DEPARTURES, EVEN, KINDS, Departure
@@ -26,7 +26,7 @@ _DEPARTED, _FRAME = 7, 4  # kDeparted of sags.h; kFrame of departures.h, its num
 _NONE, _REFRACT, _REFLECT = range(3)
 
 #: What a phase becomes before it is traced, by `Form` of paths.h.
-FORMS = (None, PolynomialPath, RadialPath, IdealLens)
+FORMS = (None, PolynomialPath, RadialPath, IdealLens, HologramPath)
 
 
 class _Row(NamedTuple):
@@ -202,6 +202,8 @@ def _form_of(phase: Phase | None, wavelength: Tensor | None) -> tuple[int, Seque
         vergence = torch.zeros_like(phase.power_x) if phase.vergence is None else phase.vergence
         return FORMS.index(IdealLens), (phase.power_x, phase.power_y, vergence)
     path = path_of(phase, wavelength)
+    if isinstance(path, HologramPath):
+        return FORMS.index(HologramPath), (*path.first.unbind(0), *path.second.unbind(0), path.scale)
     return FORMS.index(type(path)), path.coefficients.unbind(0)
 
 
@@ -245,6 +247,9 @@ def _phase_of(row: _Row, numbers: Sequence[Tensor]) -> Phase | None:
     own = numbers[row.phase_numbers : row.phase_numbers + row.phase_terms]
     if FORMS[row.phase] in (None, IdealLens):
         return IdealLens(*own) if row.phase else None
+    if FORMS[row.phase] is HologramPath:
+        first, second = (torch.stack(torch.broadcast_tensors(*own[i : i + 3])) for i in (0, 3))
+        return HologramPath(first, second, own[6])
     none = numbers[row.before].new_zeros(0)
     return FORMS[row.phase](torch.stack(torch.broadcast_tensors(*own)) if own else none)
 

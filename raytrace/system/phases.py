@@ -44,6 +44,18 @@ class RadialPath:
 
 
 @value
+class HologramPath:
+    """The path itself, p = scale (|P - first| + |P - second|) less that of the vertex; first, second: (3, ...) mm."""
+
+    first: Tensor
+    second: Tensor
+    scale: Tensor
+
+
+Path = PolynomialPath | RadialPath | HologramPath
+
+
+@value
 class Grating:
     """Straight grooves along x, equally spaced in the projection on the x-y plane: p = order · frequency · λ y.
 
@@ -117,23 +129,20 @@ class Facets:
     """A Fresnel lens: rays meet the plane of the vertex, and are bent as by the curved surface above that point."""
 
 
-Phase = (
-    Grating | RadialPhase | PolynomialPhase | FringePhase | Hologram | IdealLens | Facets | PolynomialPath | RadialPath
-)
+Phase = Grating | RadialPhase | PolynomialPhase | FringePhase | Hologram | IdealLens | Facets | Path
 
 
 @dataclasses.dataclass(frozen=True)
 class PhaseKind:
-    """A kind of phase; λ is (...) µm, and any of the first three is None for a kind that does not have it.
+    """A kind of phase; λ is (...) µm, and either of the first two is None for a kind that does not have it.
 
-    path: phase, λ -> the path as a polynomial; added: phase, x, y (...) mm, λ -> what is added, of a path that is none.
+    path: phase, λ -> the path itself.
     power: phase, λ -> -∂²p/∂x² and -∂²p/∂y² at the vertex in 1/mm: its paraxial power.
     slopes: whether it bends slopes by that power, in place of Snell's law; flat: whether rays meet the plane of the
     vertex, whatever the shape of the surface is; is_round: about the axis; chromatic: whether λ makes a difference.
     """
 
     path: Callable | None = None
-    added: Callable | None = None
     power: Callable | None = None
     slopes: bool = False
     flat: bool = False
@@ -175,10 +184,14 @@ def _scaled(terms: Tensor, radius: Tensor, orders: list[int], scale: Tensor) -> 
     return torch.stack([c * scale / radius**n for c, n in zip(terms.unbind(0), orders, strict=True)])
 
 
-def _hologram(phase: Hologram, x: Tensor, y: Tensor, wavelength: Tensor) -> Added:
-    scale = -phase.order * wavelength / phase.wavelength
+def _hologram(phase: Hologram, wavelength: Tensor) -> HologramPath:
+    return HologramPath(phase.first, phase.second, -phase.order * wavelength / phase.wavelength)
+
+
+def _hologram_added(hologram: HologramPath, x: Tensor, y: Tensor) -> Added:
+    scale = hologram.scale
     path = slope_x = slope_y = torch.zeros_like(x)
-    for point in (phase.first, phase.second):
+    for point in (hologram.first, hologram.second):
         a, b, c = point.unbind(0)
         from_vertex, from_point = torch.sqrt(dot(point, point)), torch.sqrt((x - a) ** 2 + (y - b) ** 2 + c * c)
         path = path + (x * (x - 2 * a) + y * (y - 2 * b)) / (from_point + from_vertex)
@@ -186,14 +199,14 @@ def _hologram(phase: Hologram, x: Tensor, y: Tensor, wavelength: Tensor) -> Adde
     return Added(scale * path, scale * slope_x, scale * slope_y)
 
 
-def _hologram_power(phase: Hologram, wavelength: Tensor) -> tuple[Tensor, Tensor]:
-    powers = []
+def _hologram_power(phase: Hologram | HologramPath, wavelength: Tensor) -> tuple[Tensor, Tensor]:
+    path, powers = path_of(phase, wavelength), []
     for axis in (0, 1):
-        total = torch.zeros_like(phase.order)
+        total = torch.zeros_like(path.scale)
         for point in (phase.first, phase.second):
             squared = dot(point, point)
             total = total + (squared - point[axis] ** 2) / squared**1.5
-        powers.append(phase.order * wavelength / phase.wavelength * total)
+        powers.append(-path.scale * total)
     return powers[0], powers[1]
 
 
@@ -203,11 +216,12 @@ PHASES = {
     "RadialPhase": PhaseKind(path=_radial, is_round=True),
     "PolynomialPhase": PhaseKind(path=_polynomial),
     "FringePhase": PhaseKind(path=_fringe),
-    "Hologram": PhaseKind(added=_hologram, power=_hologram_power),
+    "Hologram": PhaseKind(path=_hologram, power=_hologram_power),
     "IdealLens": PhaseKind(power=lambda lens, _: (lens.power_x, lens.power_y), slopes=True, chromatic=False),
     "Facets": PhaseKind(flat=True, is_round=True, chromatic=False),
     "PolynomialPath": PhaseKind(path=lambda path, _: path, chromatic=False),
     "RadialPath": PhaseKind(path=lambda path, _: path, is_round=True, chromatic=False),
+    "HologramPath": PhaseKind(path=lambda path, _: path, power=_hologram_power, chromatic=False),
 }
 
 
@@ -216,8 +230,8 @@ def kind_of(phase: Phase) -> PhaseKind:
     return PHASES[type(phase).__name__]
 
 
-def path_of(phase: Phase, wavelength: Tensor | None) -> PolynomialPath | RadialPath | None:
-    """The path that a phase adds, as a polynomial; None for one that is none. wavelength: (...) µm."""
+def path_of(phase: Phase, wavelength: Tensor | None) -> Path | None:
+    """The path that a phase adds; None for one that adds none. wavelength: (...) µm."""
     kind = kind_of(phase)
     if kind.chromatic and wavelength is None:
         raise ValueError(f"a surface with a phase ({type(phase).__name__}) bends light by its wavelength: give it")
@@ -226,10 +240,9 @@ def path_of(phase: Phase, wavelength: Tensor | None) -> PolynomialPath | RadialP
 
 def added_path(phase: Phase, x: Tensor, y: Tensor, wavelength: Tensor | None) -> Added:
     """The path that is added at points (...) mm, of any kind that adds one; wavelength: (...) µm."""
-    wavelength = None if wavelength is None else wavelength.to(x.dtype)
-    path = path_of(phase, wavelength)
-    if path is None:
-        return kind_of(phase).added(phase, x, y, wavelength)
+    path = path_of(phase, None if wavelength is None else wavelength.to(x.dtype))
+    if isinstance(path, HologramPath):
+        return _hologram_added(path, x, y)
     if isinstance(path, RadialPath):
         return _radial_added(path.coefficients, x, y)
     z, slope_x, slope_y, *_ = polynomial_xy(path.coefficients, x, y, highest=1)
