@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from bends import folded
+from differences import slopes_by_differences
 from problems import lens as lens_of
 from problems import surface, vector
 
@@ -284,21 +285,6 @@ def test_a_surface_that_is_not_there_is_named():
 
 
 # -- derivatives -------------------------------------------------------------------------------------------------------
-
-
-def slopes_by_differences(evaluation: Evaluation, start: np.ndarray) -> np.ndarray:
-    """∂values/∂x (R, n) by central differences of fourth order."""
-    found = []
-    for k, number in enumerate(start):
-        step = 1e-4 * max(abs(number), 1e-2 if abs(number) > 1e-6 else 1e-6)
-
-        def at(times, k=k, step=step):
-            moved = start.copy()
-            moved[k] += times * step
-            return evaluation(moved).values
-
-        found.append((8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * step))
-    return np.stack(found, 1)
 
 
 VARIABLES = (Vary(1, "curvature"), Vary(4, "thickness"), Vary(6, "curvature"), Vary(6, "thickness"))

@@ -118,9 +118,11 @@ class Model:
 class View:
     """A lens in one configuration: what of it moves, and what stays."""
 
-    def __init__(self, model: Model, configuration: int):
+    def __init__(self, model: Model, configuration: int, *, clips: bool = False):
+        """clips: whether apertures clip rays; else those that a merit function names count wherever they go."""
         self.model, self.configuration = model, configuration
-        lens = _open(model.lens.configuration(configuration) if model.lens.operands else model.lens)
+        lens = model.lens.configuration(configuration) if model.lens.operands else model.lens
+        lens = lens if clips else _open(lens)
         overridden = _overridden(lens)
         self.variables: dict[Address, int] = {}
         for number, one in enumerate(model.variables):
@@ -135,6 +137,11 @@ class View:
         self.moved: tuple[Address, ...] = tuple(dict.fromkeys(moved))
         self.lens = _modelled(lens, self.moved)
         self.stored = {at: self.number(at) for at in self.moved}
+
+    @cached_property
+    def clipping(self) -> "View":
+        """The same with its apertures."""
+        return View(self.model, self.configuration, clips=True)
 
     @cached_property
     def waits(self) -> bool:

@@ -224,14 +224,16 @@ class Moment:
 
     # -- anything else, by torch ---------------------------------------------------------------------------------------
 
-    def through_torch(self, function) -> list:
-        """Numbers () that a function takes from a lens with torch, with their derivatives by the variables."""
-        with torch.enable_grad():
-            leaves, lens = self.view.leaves({at: value_of(n) for at, n in self.numbers.items()})
+    def through_torch(self, function, *, clips: bool = False) -> list:
+        """Numbers () that a function takes from a lens with torch, with their derivatives by the variables.
+
+        clips: whether the lens has its apertures.
+        """
+        view = self.view.clipping if clips else self.view
+        with torch.set_grad_enabled(self.count > 0):
+            leaves, lens = view.leaves({at: value_of(n) for at, n in self.numbers.items()})
             found = function(lens)
-            if not self.count:
-                return [float(number.detach()) for number in found]
-            return [self.chained(number, leaves) for number in found]
+        return [self.chained(number, leaves) if self.count else float(number) for number in found]
 
     def chained(self, number: Tensor, leaves: dict) -> Dual:
         """A number () that was computed from leaves, with its derivatives by the variables."""

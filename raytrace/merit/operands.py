@@ -3,9 +3,10 @@
 from raytrace.merit.paraxial import PARAXIAL
 from raytrace.merit.path import PATH
 from raytrace.merit.plan import Operand
+from raytrace.merit.quality import QUALITY
 from raytrace.merit.rays import RAYS
 
-OPERANDS: dict[str, Operand] = {**RAYS, **PARAXIAL, **PATH}
+OPERANDS: dict[str, Operand] = {**RAYS, **PARAXIAL, **PATH, **QUALITY}
 
 #: Rows that say something about the rows below them, or to the reader.
 SETTINGS = {

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raytrace.maths.dual import value_of
+from raytrace.maths.dual import Dual, value_of
 from raytrace.merit.bundle import Hits
 from raytrace.merit.paraxial import listed
 from raytrace.merit.plan import BadRow, Evaluate, Found, Line, Now, Operand, Planner
@@ -80,10 +80,12 @@ def dot(a, b):
 # -- the wavefront -----------------------------------------------------------------------------------------------------
 
 
-def opd_of(rays: np.ndarray, beams: Sequence[tuple], planner: Planner) -> Callable[[Now], tuple[np.ndarray, object]]:
+def opd_of(
+    rays: np.ndarray, beams: Sequence[tuple], planner: Planner, *, clips: bool = False
+) -> Callable[[Now], tuple[np.ndarray, object]]:
     """OPD (R,) in waves of rays by their numbers, and which of them and their chief rays arrive.
 
-    beams: (wavelength from 0, field) of each.
+    beams: (wavelength from 0, field) of each; clips: whether apertures stop rays, though not chief rays.
     """
     every = {beam: number for number, beam in enumerate(dict.fromkeys(beams))}
     of = np.array([every[beam] for beam in beams])
@@ -92,19 +94,24 @@ def opd_of(rays: np.ndarray, beams: Sequence[tuple], planner: Planner) -> Callab
     if planner.readings.opd_chief == "primary":
         about = np.array([planner.ask(planner.primary, field, (0.0, 0.0)) for _, field in every])
     wavelength = np.array([w for w, _ in every])
-    index = np.abs(planner.view.indices[wavelength, -2])
     waves = 1e-3 * np.array(planner.view.wavelengths)[wavelength]
     waves = waves if planner.readings.opd_sign == "longer" else -waves
     bent = is_bent(planner.lens)
 
     def opd(now: Now) -> tuple[np.ndarray, object]:
-        hits, chiefs, centres = now.hits(rays), now.hits(chief), now.hits(about)
-        sphere = sphere_of(now, centres, bent)
+        hits, chiefs, centres = now.hits(rays, clips=clips), now.hits(chief), now.hits(about)
+        sphere, index = sphere_of(now, centres, bent), _image_index(now, wavelength)
         zero = path_to(sphere, chiefs, index)
         found = (path_to(sphere.at(of), hits, index[of]) - zero[of]) / waves[of]
         return hits.valid & (chiefs.valid & centres.valid)[of], found
 
     return opd
+
+
+def _image_index(now: Now, wavelengths: np.ndarray):
+    """Index in front of the image at wavelengths, counted from 0."""
+    found = [np.abs(now.moment.index(w)[-2]) for w in wavelengths]
+    return listed(found, now.moment.count) if any(isinstance(n, Dual) for n in found) else np.array(found)
 
 
 def opd_less(terms: Callable[[Sequence[Line], Planner], np.ndarray]):

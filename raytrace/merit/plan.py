@@ -74,7 +74,7 @@ class Planner:
 
     def __init__(self, view: View, primary: int, readings: Readings):
         self.view, self.lens, self.primary, self.readings = view, view.lens, primary, readings
-        self.bundles: dict[int, Bundle] = {}
+        self.bundles: dict[tuple[int, bool], Bundle] = {}
 
     @property
     def image(self) -> int:
@@ -85,10 +85,12 @@ class Planner:
         at = line.pupil if pupil is None else pupil
         return self.ask(line.wavelength if wavelength is None else wavelength, line.field, at, surface=surface)
 
-    def ask(self, wavelength: int, field, pupil, *, surface: int | None = None) -> int:
-        """The number of any ray behind a surface, the image by default."""
+    def ask(self, wavelength: int, field, pupil, *, surface: int | None = None, clips: bool = False) -> int:
+        """The number of any ray behind a surface, the image by default; clips: of those that apertures may stop."""
         last = self.image if surface is None else surface
-        return self.bundles.setdefault(last, Bundle(self.view, last)).ask(wavelength, field, pupil)
+        if (last, clips) not in self.bundles:
+            self.bundles[last, clips] = Bundle(self.view.clipping if clips else self.view, last)
+        return self.bundles[last, clips].ask(wavelength, field, pupil)
 
     def checked(self, line: Line, surface: int) -> int:
         """The number of a surface that a row names. Raises BadRow."""
@@ -105,18 +107,19 @@ class Now:
 
     def __init__(self, planner: Planner, moment: Moment, values: dict[int, object]):
         self.planner, self.moment, self.values = planner, moment, values
-        self._hits: dict[int, Hits] = {}
+        self._hits: dict[tuple[int, bool], Hits] = {}
 
-    def hits(self, rays: np.ndarray, *, surface: int | None = None) -> Hits:
-        """Rays by their numbers behind a surface, the image by default."""
-        last = self.planner.image if surface is None else surface
-        if last not in self._hits:
-            self._hits[last] = self.planner.bundles[last].hits(self.moment)
-        return self._hits[last].at(rays)
+    def hits(self, rays: np.ndarray, *, surface: int | None = None, clips: bool = False) -> Hits:
+        """Rays by their numbers behind a surface, the image by default; clips: as they were asked for."""
+        at = self.planner.image if surface is None else surface, clips
+        if at not in self._hits:
+            self._hits[at] = self.planner.bundles[at].hits(self.moment)
+        return self._hits[at].at(rays)
 
     def starts(self, rays: np.ndarray, *, surface: int | None = None) -> Hits:
         """The same rays where they set out, before surface 1 and in its axes."""
-        return self.planner.bundles[self.planner.image if surface is None else surface].starts(self.moment).at(rays)
+        last = self.planner.image if surface is None else surface
+        return self.planner.bundles[last, False].starts(self.moment).at(rays)
 
 
 def planner_of(model: Model, configuration: int, primary: int, readings: Readings) -> Planner:
