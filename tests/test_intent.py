@@ -13,7 +13,7 @@ from test_zemax import read as read_text
 
 import raytrace as rt
 from raytrace.formats import read_lens_with_report, write_lens
-from raytrace.formats.source import LensFileError
+from raytrace.formats.source import LensFileError, LensFileWarning
 from raytrace.formats.zemax_merit import read_merit
 from raytrace.formats.zemax_units import in_file
 from raytrace.media.catalog import UnknownGlass
@@ -89,6 +89,7 @@ PARM 2 1e-5
 VPAR 2
 PARM 3 0
 VPAR 3"""
+STOP_RULES = "MAZH 0.125 0.7\nPZUP 1 -1 0.5 0\nDIAM 5.5 0 0 0 1\nTOLE 1 5\nEDGE 0.5 3\nCURV -0.02 4 1 -1 0"
 MERIT_LINES = """DMFS 0 0 0 0 0 0 0 0 0 0
 BLNK A text,  with blanks.
 TRAC 0 1 0 0.7 3.35E-1 0 0 7.27E-2 0 0
@@ -291,3 +292,31 @@ def test_an_intent_says_what_it_holds():
     assert "merit function of 12 lines: DMFS x1, BLNK x1, TRAC x1" in shown
     assert str(Intent()) == "nothing varies, nothing follows, no merit function"
     assert {"TRAC", "MTFT", "CONF"} <= DIMENSION.keys()
+
+
+def test_check_lists_what_varies_and_which_operands_are_evaluated(tmp_path):
+    path = tmp_path / "lens.zmx"
+    path.write_text(file(surface=RULES, stop=STOP_RULES, tail=MERIT_LINES))
+    found = rt.check(path)
+    status = {one.name: (one.count, one.weighted, one.status) for one in found.operands}
+    assert status["TRAC"] == (1, 1, "evaluated")
+    assert status["BLNK"] == (1, 0, "evaluated")
+    assert status["QQQQ"] == (1, 1, "unknown")
+    assert {one.status for one in rt.formats.check(path, evaluated=["TRAC"]).operands if one.name == "EFFL"} == {
+        "known, not evaluated"
+    }
+    document = found.document()
+    assert document["variables"][0] == "curvature of surface 1"
+    assert document["tolerances"] == 3
+    assert "curvature of surface 2 = -1 × curvature of surface 1" in document["solves"]
+    assert "thickness of surface 2: position 5" in document["kept"]
+    shown = str(found)
+    assert "5 variables:\n    curvature of surface 1, thickness of surface 1" in shown
+    assert "unknown:\n    QQQQ x1" in shown
+    plain = read_lens_with_report("singlet")[1].document()
+    assert not {"variables", "solves", "kept", "operands", "tolerances"} & plain.keys()
+
+
+def test_a_table_says_that_it_does_not_hold_what_is_to_be_optimised(tmp_path):
+    with pytest.warns(LensFileWarning, match=r"what is to be optimised \('12 rows of a merit function'\)"):
+        write_lens(lens(surface=RULES, tail=MERIT_LINES), tmp_path / "lens.csv")

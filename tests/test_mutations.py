@@ -14,6 +14,8 @@ from PIL import Image
 from problems import number
 from test_configurations import CASES as CONFIGURED
 from test_configurations import scan
+from test_intent import CONFIGURED as VARIED
+from test_intent import MERIT_LINES, RULES, STOP_RULES
 from test_oslo import CONIC, FAR, SINGLET, double_gauss
 from test_oslo import text as oslo_text
 from test_prescriptions import LOWENTHAL, NOCTILUX, summilux
@@ -113,7 +115,8 @@ def lenses(suffix: str, folder: Path) -> Reader:
     elif suffix == ".zmx":
         originals += [text(name).encode() for name in CASES]
         configured = (file(**changes, tail=tail) for tail, changes, _ in CONFIGURED.values())
-        originals += [one.encode() for one in (scan(), *configured)]
+        meant = (file(surface=RULES, stop=STOP_RULES, tail=tail) for tail in (MERIT_LINES, VARIED))
+        originals += [one.encode() for one in (scan(), *configured, *meant)]
     else:
         originals += [text.encode() for text in (summilux("No.,R,Nd,νd,d", "No R n V d"), NOCTILUX, LOWENTHAL)]
 

@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from raytrace.formats import (
     zemax_write,
 )
 from raytrace.formats.report import ImportReport as ImportReport
-from raytrace.formats.report import Varied
+from raytrace.formats.report import Varied, operand_uses
 from raytrace.formats.source import LensFileError as LensFileError
 from raytrace.formats.source import LensFileWarning as LensFileWarning
 from raytrace.formats.source import Place, decode, read_text, shown
@@ -29,6 +29,7 @@ from raytrace.maths.result import Result
 from raytrace.maths.value import value
 from raytrace.media.catalog import UnknownGlass
 from raytrace.media.glass import check_unit
+from raytrace.system.intent import Intent
 from raytrace.system.lens import Lens, check_media
 from raytrace.system.lens import check as check_lens
 
@@ -89,8 +90,12 @@ def read_lens_with_report(
     catalogs: Sequence[str | Path] = (),
     strict: bool = False,
     configuration: int | None = None,
+    evaluated: Collection[str] | None = None,
 ) -> tuple[Lens, ImportReport]:
-    """As `read_lens`, with the report of what became of every keyword; its warnings are in it, and not issued."""
+    """As `read_lens`, with the report of what became of every keyword; its warnings are in it, and not issued.
+
+    evaluated: the names of merit operands that are evaluated, to be told from those that are only known.
+    """
     path = Path(path)
     if not path.exists():
         path = shipped_lens(path) or path
@@ -102,9 +107,17 @@ def read_lens_with_report(
         raise LensFileError(f"has no configuration {configuration}; {there}", Place(str(path)))
     _refuse_other_units(lens, path)
     varied = [Varied(str(operand), tuple(operand.values())) for operand in lens.operands if operand.name != "MOFF"]
-    return lens, dataclasses.replace(
-        report, surfaces=len(lens.surfaces), stop_surface=lens.stop, configurations=tuple(varied)
+    intent = Intent() if lens.intent is None else lens.intent
+    report = dataclasses.replace(
+        report,
+        surfaces=len(lens.surfaces),
+        stop_surface=lens.stop,
+        configurations=tuple(varied),
+        **{name: tuple(map(str, getattr(intent, name))) for name in ("variables", "solves", "kept")},
+        operands=operand_uses(intent.merit, evaluated),
+        tolerances=len(intent.tolerances),
     )
+    return lens, report
 
 
 def check(
@@ -113,13 +126,15 @@ def check(
     catalogs: Sequence[str | Path] = (),
     strict: bool = False,
     configuration: int | None = None,
+    evaluated: Collection[str] | None = None,
 ) -> ImportReport:
     """What was read from a lens file, what was not, and where each glass came from.
 
-    strict: raise where something was assumed. configuration: which one has to be such that it can be traced. Raises as
-    `read_lens`, and LensFileError for what cannot be traced.
+    strict: raise where something was assumed. configuration: which one has to be such that it can be traced. evaluated:
+    as for `read_lens_with_report`. Raises as `read_lens`, and LensFileError for what cannot be traced.
     """
-    lens, report = read_lens_with_report(path, catalogs=catalogs, strict=strict, configuration=configuration)
+    options = {"catalogs": catalogs, "strict": strict, "configuration": configuration, "evaluated": evaluated}
+    lens, report = read_lens_with_report(path, **options)
     try:
         check_lens(lens)
     except ValueError as error:
@@ -215,7 +230,14 @@ def _changed_texts(lens: Lens, content: bytes, form: Format, path: Path, catalog
         pairs.append((f"the other configurations, {len(lens.configurations)} in all", lens.current_configuration, 0))
     else:
         pairs += [(str(a), a.values(), b.values()) for a, b in zip(lens.operands, again.operands, strict=False)]
+    if _asks(lens.intent) and again.intent != lens.intent:
+        pairs.append(("what is to be optimised", f"{len(lens.intent.merit)} rows of a merit function", ""))
     return [f"{what} ({shown(str(before))})" for what, before, after in pairs if before != after]
+
+
+def _asks(intent: Intent | None) -> bool:
+    """Whether an intent says more than which semi-diameters are given."""
+    return intent is not None and any((intent.variables, intent.solves, intent.merit, intent.tolerances, intent.kept))
 
 
 def _format(path: Path, known: Sequence[str] = tuple(FORMATS)) -> Format:

@@ -1,6 +1,6 @@
 """The import report: what a reader did with every keyword of a lens file."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 
 import torch
@@ -9,6 +9,8 @@ from torch import Tensor
 from raytrace.formats.source import LensFileError, Place
 from raytrace.maths.result import Result
 from raytrace.maths.value import value
+from raytrace.system.dimensions import DIMENSION
+from raytrace.system.intent import Row
 
 READ, IGNORED, UNKNOWN = "read", "ignored", "unknown"
 _TITLES = {READ: "read", IGNORED: "known and ignored", UNKNOWN: "unknown"}
@@ -64,8 +66,51 @@ class Varied:
         return f"{self.operand:<12} " + " ".join(f"{_short(one):>14}" for one in self.values)
 
 
+#: What becomes of an operand of a merit function.
+EVALUATED, KNOWN, UNKNOWN_OPERAND = "evaluated", "known, not evaluated", "unknown"
+
+
+@dataclass(frozen=True)
+class OperandUse:
+    """How often an operand stands in the merit function of a file, with a weight and in all, and what becomes of it.
+
+    status: "evaluated", "known, not evaluated" or "unknown"; of a file whose operands nobody evaluates "known".
+    """
+
+    name: str
+    count: int
+    weighted: int
+    status: str
+
+    def __str__(self) -> str:
+        return f"{self.name} x{self.count}" + (f" ({self.weighted} with weight)" if self.weighted < self.count else "")
+
+
+def operand_uses(merit: Sequence[Row], evaluated: Collection[str] | None) -> tuple[OperandUse, ...]:
+    """The operands of a merit function by name; evaluated: the names of those that are."""
+    found: dict[str, list[Row]] = {}
+    for row in merit:
+        found.setdefault(row.operand, []).append(row)
+    return tuple(
+        OperandUse(name, len(rows), sum(row.weight != 0 for row in rows), _status(name, evaluated))
+        for name, rows in found.items()
+    )
+
+
+def _status(name: str, evaluated: Collection[str] | None) -> str:
+    if evaluated is not None and name in evaluated:
+        return EVALUATED
+    if name not in DIMENSION:
+        return UNKNOWN_OPERAND
+    return KNOWN if evaluated is not None else "known"
+
+
 def _short(one: object) -> str:
     return f"{one:.9g}" if isinstance(one, float) else "-" if one is None else str(one)[:14] or '""'
+
+
+#: Keys that a document has only where there is something to say.
+_WHERE_THERE_ARE_SOME = ("configurations", "variables", "solves", "kept", "operands", "tolerances")
 
 
 @value
@@ -75,6 +120,7 @@ class ImportReport(Result):
     A note says what was done where the file leaves a choice; a warning says what was assumed or lost, and is an
     error when the file is read with `strict=True`. surfaces, stop_surface: of the lens that was read.
     configurations: what differs between those of a multi-configuration file.
+    variables, solves, kept: of `Lens.intent`, in words; operands: those of its merit function; tolerances: its lines.
     """
 
     file: str
@@ -86,10 +132,14 @@ class ImportReport(Result):
     surfaces: int = 0
     stop_surface: int = 0
     configurations: tuple[Varied, ...] = ()
+    variables: tuple[str, ...] = ()
+    solves: tuple[str, ...] = ()
+    kept: tuple[str, ...] = ()
+    operands: tuple[OperandUse, ...] = ()
+    tolerances: int = 0
 
     def document(self) -> dict:
-        found = asdict(self)
-        return found if self.configurations else {name: one for name, one in found.items() if name != "configurations"}
+        return {name: one for name, one in asdict(self).items() if one or name not in _WHERE_THERE_ARE_SOME}
 
     def columns(self) -> dict[str, Tensor]:
         """A row for each keyword."""
@@ -110,8 +160,20 @@ class ImportReport(Result):
         if self.configurations:
             numbers = " ".join(f"{k:>14}" for k in range(1, len(self.configurations[0].values) + 1))
             lines += ["  configurations:", f"    {'':<12} {numbers}", *(f"    {one}" for one in self.configurations)]
+        lines += self._intent()
         lines += ["  glasses:", *(f"    {use}" for use in self.glasses)] if self.glasses else []
         return "\n".join(lines)
+
+    def _intent(self) -> list[str]:
+        """What the lens is to become, and the operands of its merit function by what becomes of them."""
+        titled = {f"{len(self.variables)} variables": self.variables, "solves and pickups": self.solves}
+        titled["rules that are kept and not followed"] = self.kept
+        lines = [line for title, one in titled.items() if one for line in (f"  {title}:", *_wrapped(one))]
+        if self.operands:
+            lines.append(f"  merit function of {sum(one.count for one in self.operands)} lines:")
+        for status in dict.fromkeys(one.status for one in self.operands):
+            lines += [f"    {status}:", *_wrapped([str(one) for one in self.operands if one.status == status])]
+        return [*lines, *([f"  tolerances: {self.tolerances} lines, kept"] if self.tolerances else [])]
 
 
 def _wrapped(words: Iterable[str], width: int = 100) -> list[str]:

@@ -130,13 +130,23 @@ class View:
             if own or (one.operand is not None and one.configuration == configuration):
                 self.variables[one.surface, one.quantity] = number
         self.solves = sorted(
-            (one for one in model.solves if (one.surface, one.quantity) not in overridden),
+            (
+                one
+                for one in model.solves
+                if (one.surface, one.quantity) not in overridden and not self._is_idle(one, lens)
+            ),
             key=lambda one: (one.surface, one.quantity == "thickness"),
         )
         moved = (*self.variables, *((one.surface, one.quantity) for one in self.solves))
         self.moved: tuple[Address, ...] = tuple(dict.fromkeys(moved))
         self.lens = _modelled(lens, self.moved)
         self.stored = {at: self.number(at) for at in self.moved}
+
+    def _is_idle(self, one: Solve, lens: Lens) -> bool:
+        """Whether a pickup is of a number that does not vary, and that the lens does not model, for it is 0."""
+        at = [(one.source, one.quantity_of_source or one.quantity), (one.surface, one.quantity)]
+        known = all(quantity in ("thickness", *places(lens.surfaces[surface])) for surface, quantity in at)
+        return one.kind == "pickup" and not known and at[0] not in self.variables
 
     @cached_property
     def clipping(self) -> "View":

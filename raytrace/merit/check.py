@@ -1,0 +1,25 @@
+"""What was read from a lens file, the operands of its merit function that are evaluated among it."""
+
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+
+from raytrace import formats
+from raytrace.formats import ImportReport
+from raytrace.merit.operands import OPERANDS, SETTINGS
+
+
+def check(
+    path: str | PathLike,
+    *,
+    catalogs: Sequence[str | Path] = (),
+    strict: bool = False,
+    configuration: int | None = None,
+) -> ImportReport:
+    """What was read from a lens file, what was not, and where each glass came from; what of its merit is evaluated.
+
+    strict: raise where something was assumed. configuration: which one has to be such that it can be traced. Raises as
+    `read_lens`, and LensFileError for what cannot be traced.
+    """
+    evaluated = (*OPERANDS, *SETTINGS)
+    return formats.check(path, catalogs=catalogs, strict=strict, configuration=configuration, evaluated=evaluated)
