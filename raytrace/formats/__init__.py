@@ -29,6 +29,7 @@ from raytrace.maths.result import Result
 from raytrace.maths.value import value
 from raytrace.media.catalog import UnknownGlass
 from raytrace.media.glass import check_unit
+from raytrace.system.configurations import count
 from raytrace.system.intent import Intent
 from raytrace.system.lens import Lens, check_media
 from raytrace.system.lens import check as check_lens
@@ -226,8 +227,8 @@ def _changed_texts(lens: Lens, content: bytes, form: Format, path: Path, catalog
     pairs += [(f"the catalog {name}", name, "") for name in lost]
     comments = zip(lens.surfaces, again.surfaces, strict=True)
     pairs += [(f"the comment of surface {k}", a.comment, b.comment) for k, (a, b) in enumerate(comments)]
-    if len(lens.configurations) != len(again.configurations):
-        pairs.append((f"the other configurations, {len(lens.configurations)} in all", lens.current_configuration, 0))
+    if count(lens.operands) != count(again.operands):
+        pairs.append((f"the other configurations, {count(lens.operands)} in all", lens.current_configuration, 0))
     else:
         pairs += [(str(a), a.values(), b.values()) for a, b in zip(lens.operands, again.operands, strict=False)]
     if _asks(lens.intent) and again.intent != lens.intent:

@@ -209,5 +209,5 @@ def _status(one: Vary | Solve, at: Sequence[int | None]) -> tuple[str, str]:
     if isinstance(one, Vary) or one.kind == "variable":
         return str(VARIABLE), "0 1 1 1.0 0.0 0"
     row = at[int(one.numbers[0])] if one.numbers else None
-    words = f"0 {one.source} {1 if row is None else row + 1} {one.scale!r} {one.offset!r} 0"
+    words = f"0 {one.source} {0 if row is None else row + 1} {one.scale!r} {one.offset!r} 0"
     return str(_code_of(one.kind, CONFIGURATION_RULES)), words

@@ -114,7 +114,7 @@ def code_of(block: Block, keyword: str) -> int:
 
 def rules_of(one: Told, told: list[Told], report: Draft) -> Iterator[Vary | Solve]:
     """In the order in which they are evaluated: parameters, curvature, thickness; then conic, extra data and glass."""
-    for record in one.block.all("PPAR"):
+    for record in _numbered(one, "PPAR"):
         yield from _parameter_pickup(one, record, told)
     yield from _curvature(one, report)
     yield from _thickness(one)
@@ -129,6 +129,11 @@ def rules_of(one: Told, told: list[Told], report: Draft) -> Iterator[Vary | Solv
         yield one.solve("semi_diameter", SEMI_DIAMETER_RULES[code], source=source)
     elif code not in (0, GIVEN):
         yield one.solve("semi_diameter", f"code {code}")
+
+
+def _numbered(one: Told, keyword: str) -> list[Record]:
+    """The records of a keyword by their numbers."""
+    return sorted(one.block.all(keyword), key=lambda record: record.integer(0, "number"))
 
 
 def _holds(one: Told, name: str, record: Record, report: Draft) -> bool:
@@ -235,9 +240,9 @@ def _followers(one: Told, own: tuple[Named, ...]) -> Iterator[Solve]:
 
 
 def _variable_numbers(one: Told) -> Iterator[tuple[str, Record, int]]:
-    for record in one.block.all("VPAR"):
+    for record in _numbered(one, "VPAR"):
         yield "PARM", record, record.integer(0, "number of the parameter")
-    for record in one.block.all("XDAT"):
+    for record in _numbered(one, "XDAT"):
         if record.integer(2, "code", 0):
             yield "XDAT", record, record.integer(0, "number of the datum")
 
