@@ -1,6 +1,7 @@
 """The floors of the package: a file imports only files on lower floors, and nothing inside functions."""
 
 import ast
+import functools
 import re
 import subprocess
 import sys
@@ -93,8 +94,14 @@ def imported(node: ast.AST) -> list[str]:
     return [name.removeprefix("raytrace.") if name.startswith("raytrace.") else name for name in names]
 
 
+@functools.cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@functools.cache
 def imports(path: Path) -> list[str]:
-    return [name for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) for name in imported(node)]
+    return [name for node in ast.walk(parsed(path)) for name in imported(node)]
 
 
 def folder_of(name: str) -> str | None:
@@ -134,7 +141,7 @@ def _folders(name: str, others: list[str]) -> list[str]:
 @pytest.mark.parametrize("name", [name for name in MODULES if not COMMANDS.match(name)])
 def test_imports_stand_at_the_top_of_the_file(name):
     """An import inside a function, a condition or a class hides a dependency; commands alone defer them, for speed."""
-    tree = ast.parse(MODULES[name].read_text(encoding="utf-8"))
+    tree = parsed(MODULES[name])
     at_top = {id(node) for node in tree.body}
     hidden = [node.lineno for node in ast.walk(tree) if imported(node) and id(node) not in at_top]
     assert not hidden, f"{MODULES[name]}: imports on lines {hidden}"
@@ -184,7 +191,7 @@ PHYSICS = [
 
 @pytest.mark.parametrize("name", PHYSICS)
 def test_physics_stays_in_torch(name):
-    tree = ast.parse(MODULES[name].read_text(encoding="utf-8"))
+    tree = parsed(MODULES[name])
     for node in ast.walk(tree):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             called = node.func.attr
