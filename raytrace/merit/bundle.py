@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.fused.run import Task
-from raytrace.fused.structure import is_expressible
+from raytrace.fused.run import Pushed, Task
+from raytrace.fused.structure import is_expressible, rows_of
 from raytrace.maths.dual import Dual, slope_of, value_of
 from raytrace.merit.aim import aimed
 from raytrace.merit.by_torch import rays_by_torch
@@ -22,7 +22,7 @@ from raytrace.merit.launch import launched
 from raytrace.merit.model import GLASS
 from raytrace.merit.moment import Moment
 from raytrace.optics.axis import is_bent
-from raytrace.optics.jacobian import ends, pushed
+from raytrace.optics.jacobian import ends, pushed, pushed_everywhere
 from raytrace.optics.launch import rays_of_field
 from raytrace.optics.sequence import media, sequence_of
 from raytrace.optics.trace import trace_surfaces
@@ -79,6 +79,20 @@ class _Components:
         if k not in self._found:
             self._found[k] = self._hits.component(self._first + k)
         return self._found[k]
+
+
+class Marks(NamedTuple):
+    """Rays (R,) on the surfaces 1 to `last` (S,) of a bundle.
+
+    x, y: (S, R) mm in the axes of the vertices; valid: (S, R) bool, up to there; by_x, by_y: (S, V, R), their
+    derivatives by V variables, or None.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    valid: np.ndarray
+    by_x: np.ndarray | None = None
+    by_y: np.ndarray | None = None
 
 
 class Bundle:
@@ -172,8 +186,47 @@ class Bundle:
             return self._hits_by_torch(moment)
         return self._told(*self._traced(moment, *self.launched(moment)))
 
+    def marks(self, moment: Moment) -> Marks:
+        """All rays on all surfaces from 1 to `last`, in the order in which they were asked for."""
+        if self.is_expressible:
+            surfaces, task, changes, start, count = self._task(moment, *self.launched(moment))
+            found = pushed_everywhere(surfaces, task, changes[: count or 0], start)
+            if found is not None:
+                return self._marked(found, rows_of(task.structure, surfaces), count)
+        hits = [bundle.hits(moment) for bundle in self._each]
+        x, y = ([hit.position[k] for hit in hits] for k in range(2))
+        by = (
+            [np.stack([slope_of(one, moment.count) for one in part]) for part in (x, y)]
+            if moment.count
+            else (None,) * 2
+        )
+        x, y = (np.stack([value_of(one) for one in part]) for part in (x, y))
+        return Marks(x, y, np.stack([hit.valid for hit in hits]), *by)
+
+    @cached_property
+    def _each(self) -> list["Bundle"]:
+        """The same rays on one surface each."""
+        found = [Bundle(self.view, last) for last in range(1, self.last + 1)]
+        for bundle in found:
+            bundle.rays = self.rays
+        return found
+
+    def _marked(self, found: Pushed, rows: list[int], count: int | None) -> Marks:
+        places, size = self._places[0], self.field[0].size
+
+        def picked(part: Tensor) -> np.ndarray:
+            return part.numpy().reshape(*part.shape[:-2], size)[rows][..., places]
+
+        by = () if count is None else map(picked, found.by_position[:2])
+        return Marks(*map(picked, found.position[:2]), picked(found.valid), *by)
+
     def _traced(self, moment: Moment, position, direction, opl, valid: np.ndarray):
         """Rays behind surface `last` as a table, and by how many variables they change, if any."""
+        surfaces, task, changes, start, count = self._task(moment, position, direction, opl, valid)
+        return (ends(surfaces, task) if count is None else pushed(surfaces, task, changes, start)), count
+
+    def _task(self, moment: Moment, position, direction, opl, valid: np.ndarray):
+        """Surfaces, what to trace, how table and rays change, and by how many variables, if any."""
         surfaces, structure, *_ = self._template
         table, changes = self.table(moment)
         moving = [part for part in (*position, *direction, opl) if isinstance(part, Dual)]
@@ -182,10 +235,10 @@ class Bundle:
         task = Task(structure, torch.from_numpy(valid), (*given, torch.from_numpy(table)))
         count = moment.count or max((len(part.slope) for part in moving), default=0)
         if not count:
-            return ends(surfaces, task), None
+            return surfaces, task, torch.from_numpy(changes), None, None
         start = self._start(count, position, direction, opl) if moving else None
         changes = changes if moment.count else np.zeros((count, *table.shape))
-        return pushed(surfaces, task, torch.from_numpy(changes), start), count
+        return surfaces, task, torch.from_numpy(changes), start, count
 
     def starts(self, moment: Moment) -> Hits:
         """All rays where they set out, before surface 1 and in its axes, in the order in which they were asked for."""

@@ -58,7 +58,8 @@ class Evaluation:
         readings: Readings | None = None,
     ):
         """unit: mm in the unit of length of the rows; readings: where operands are open. Raises UnknownOperand."""
-        self.model, self.rows, self.readings = model, tuple(rows), readings or Readings()
+        self.model, self.rows, self.unit = model, tuple(rows), unit
+        self.readings = readings or Readings()
         self.groups: list[tuple[Planner, tuple[Line, ...], Evaluate]] = []
         self.planners: list[tuple[int, Planner]] = []
         self.skipped = tuple(self._plan(skip_unknown))
@@ -85,7 +86,7 @@ class Evaluation:
             elif row.operand in OPERANDS:
                 settings = configuration, primary
                 if settings not in planners:
-                    planners[settings] = planner_of(self.model, *settings, self.readings)
+                    planners[settings] = planner_of(self.model, *settings, self.readings, self.unit)
                 wavelength = row.integers[1] - 1 if row.integers[1] > 0 else primary
                 groups.setdefault((settings, row.operand), []).append(Line(number, row, wavelength))
             elif row.operand not in SETTINGS:

@@ -72,9 +72,11 @@ class Operand:
 class Planner:
     """What operands may ask for, of a lens in one configuration."""
 
-    def __init__(self, view: View, primary: int, readings: Readings):
-        self.view, self.lens, self.primary, self.readings = view, view.lens, primary, readings
+    def __init__(self, view: View, primary: int, readings: Readings, unit: float = 1.0):
+        """unit: mm in the unit of length of the rows."""
+        self.view, self.lens, self.primary, self.readings, self.unit = view, view.lens, primary, readings, unit
         self.bundles: dict[tuple[int, bool], Bundle] = {}
+        self._shared: dict = {}
 
     @property
     def image(self) -> int:
@@ -101,6 +103,12 @@ class Planner:
     def rays(self, lines: Sequence[Line], **which) -> np.ndarray:
         return np.array([self.ray(line, **which) for line in lines])
 
+    def shared(self, kind: type):
+        """What rows of several operands share, of some class: made once, of the planner."""
+        if kind not in self._shared:
+            self._shared[kind] = kind(self)
+        return self._shared[kind]
+
 
 class Now:
     """The lens in one configuration at given variables: its moment and its rays, traced when they are first needed."""
@@ -108,6 +116,14 @@ class Now:
     def __init__(self, planner: Planner, moment: Moment, values: dict[int, object]):
         self.planner, self.moment, self.values = planner, moment, values
         self._hits: dict[tuple[int, bool], Hits] = {}
+        self._once: dict = {}
+
+    def once(self, function: Callable, *arguments):
+        """What a function makes of it and of arguments, found once."""
+        key = function, *arguments
+        if key not in self._once:
+            self._once[key] = function(self, *arguments)
+        return self._once[key]
 
     def hits(self, rays: np.ndarray, *, surface: int | None = None, clips: bool = False) -> Hits:
         """Rays by their numbers behind a surface, the image by default; clips: as they were asked for."""
@@ -121,6 +137,5 @@ class Now:
         last = self.planner.image if surface is None else surface
         return self.planner.bundles[last, False].starts(self.moment).at(rays)
 
-
-def planner_of(model: Model, configuration: int, primary: int, readings: Readings) -> Planner:
-    return Planner(model.views[configuration - 1], primary, readings)
+def planner_of(model: Model, configuration: int, primary: int, readings: Readings, unit: float = 1.0) -> Planner:
+    return Planner(model.views[configuration - 1], primary, readings, unit)
