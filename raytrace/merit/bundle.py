@@ -194,14 +194,10 @@ class Bundle:
             if found is not None:
                 return self._marked(found, rows_of(task.structure, surfaces), count)
         hits = [bundle.hits(moment) for bundle in self._each]
-        x, y = ([hit.position[k] for hit in hits] for k in range(2))
-        by = (
-            [np.stack([slope_of(one, moment.count) for one in part]) for part in (x, y)]
-            if moment.count
-            else (None,) * 2
-        )
-        x, y = (np.stack([value_of(one) for one in part]) for part in (x, y))
-        return Marks(x, y, np.stack([hit.valid for hit in hits]), *by)
+        parts = [[hit.position[k] for hit in hits] for k in range(2)]
+        values = (np.stack([value_of(one) for one in part]) for part in parts)
+        slopes = (np.stack([slope_of(one, moment.count) for one in part]) for part in parts if moment.count)
+        return Marks(*values, np.stack([hit.valid for hit in hits]), *slopes)
 
     @cached_property
     def _each(self) -> list["Bundle"]:

@@ -137,5 +137,6 @@ class Now:
         last = self.planner.image if surface is None else surface
         return self.planner.bundles[last, False].starts(self.moment).at(rays)
 
+
 def planner_of(model: Model, configuration: int, primary: int, readings: Readings, unit: float = 1.0) -> Planner:
     return Planner(model.views[configuration - 1], primary, readings, unit)
