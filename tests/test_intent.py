@@ -19,7 +19,9 @@ from raytrace.formats.zemax_units import in_file
 from raytrace.media.catalog import UnknownGlass
 from raytrace.system.dimensions import DIMENSION
 from raytrace.system.intent import Intent, Row, Solve, Vary
+from raytrace.system.lens import index_behind
 from raytrace.system.places import number_at, places
+from raytrace.system.surface import sag
 
 SHARED = Path(__file__).parents[2] / "shared"
 MERIT = SHARED / "merit" / "dev"
@@ -320,3 +322,46 @@ def test_check_lists_what_varies_and_which_operands_are_evaluated(tmp_path):
 def test_a_table_says_that_it_does_not_hold_what_is_to_be_optimised(tmp_path):
     with pytest.warns(LensFileWarning, match=r"what is to be optimised \('12 rows of a merit function'\)"):
         write_lens(lens(surface=RULES, tail=MERIT_LINES), tmp_path / "lens.csv")
+
+
+def edge(surfaces, k: int, height: float) -> float:
+    """Thickness behind surface k at a height, of spheres and conics."""
+    sags = [float(sag(surfaces[j], torch.tensor(height**2, dtype=torch.float64))) for j in (k, k + 1)]
+    return float(surfaces[k].thickness) + sags[1] - sags[0]
+
+
+def test_kept_rules_give_back_what_the_program_stored():
+    met = Counter()
+    for path in FILES:
+        try:
+            found = read_lens_with_report(path)[0]
+        except (LensFileError, UnknownGlass):
+            continue
+        for one in found.intent.kept if found.intent else ():
+            surfaces, k = found.surfaces, one.surface
+            if one.kind == "position":
+                run = range(one.source, k + 1) if one.source <= k else range(k, one.source)
+                value = sum(float(surfaces[j].thickness) for j in run)
+            elif one.kind == "edge_thickness":
+                value = edge(surfaces, k, one.numbers[1])
+            elif one.kind == "power":
+                primary = found.wavelengths[found.primary_wavelength]
+                before, behind = (float(index_behind(found, j, primary)) for j in (k - 1, k))
+                value = (behind - before) * float(surfaces[k].curvature)
+            else:
+                continue
+            assert value == pytest.approx(one.numbers[0], rel=2e-8, abs=1e-9)
+            met[one.kind] += 1
+    if MERIT.is_dir():
+        assert met["position"] >= 8
+        assert met["power"]
+        assert met["edge_thickness"]
+
+
+def test_offsets_of_rules_that_are_kept_come_back_in_every_unit(tmp_path):
+    for unit in UNITS:
+        original = lens(
+            UNIT=f"UNIT {unit} X", surface=f"{RULES}\nPPAR 2 -1 1 0.3", stop="PZUP 2 1 0.7 0", tail="EFFL 0 2"
+        )
+        assert {one.kind for one in original.intent.kept} == {"PPAR", "PZUP"}
+        assert again(original, tmp_path).intent == original.intent

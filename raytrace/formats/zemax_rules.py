@@ -207,8 +207,13 @@ def _thickness_pickup(one: Told, record: Record) -> Solve:
     source = _surface(record.number(0, "surface"), one.number)
     scale, offset = record.number(1, "factor", 1.0), record.number(2, "offset", 0.0)
     if source is None or record.number(3, "column", 0.0):
-        return one.solve("thickness", "PZUP", *_figures(record, 0))
+        return one.solve("thickness", "PZUP", *_with_offset(_figures(record, 0), 1, one.millimetres))
     return Solve(one.number, "thickness", "pickup", source=source, scale=scale, offset=offset * one.millimetres)
+
+
+def _with_offset(figures: list[float], power: int, millimetres: float) -> list[float]:
+    """Surface, factor, offset and what follows them, with the offset in mm."""
+    return [_in_mm(one, power, millimetres) if k == 2 else one for k, one in enumerate(figures)]
 
 
 def _parameter_pickup(one: Told, record: Record, told: list[Told]) -> Iterator[Solve]:
@@ -220,7 +225,7 @@ def _parameter_pickup(one: Told, record: Record, told: list[Told]) -> Iterator[S
     power = one.row.parameters.get(j)
     alike = own and there and power is not INVERSE and own[0].is_plain and there[0].is_plain
     if not alike or any(figures[3:]) or len(figures) < 2:
-        yield one.solve(f"PARM {j}", "PPAR", *figures)
+        yield one.solve(f"PARM {j}", "PPAR", *_with_offset(figures, power or 0, one.millimetres))
         return
     offset = _in_mm(figures[2] if len(figures) > 2 else 0.0, power, one.millimetres)
     named = there[0].name if there[0].name != own[0].name else ""

@@ -74,7 +74,9 @@ def _powers(words: list[str], row: SurfaceType, angles: bool) -> dict[int, int |
     keyword = words[0] if words else ""
     if keyword in ("PARM", "PPAR"):
         power = row.parameters.get(int(words[1]), 0)
-        return {2 if keyword == "PARM" else 4: power} if power != 0 and len(words) > 4 - 2 * (keyword == "PARM") else {}
+        position = 2 if keyword == "PARM" else 4
+        power = 0 if power is INVERSE and keyword == "PPAR" else power
+        return {position: power} if power != 0 and len(words) > position else {}
     if keyword == "XDAT":
         power = {1: 0, 2: 1}.get(int(words[1]), row.terms or 0)
         return {2: power} if power else {}
