@@ -88,6 +88,11 @@ SYSTEMS = {
         surface(None, -7.0, departure=FringeSag(drawn(37, size=0.01), scalar(30.0), scalar(1.0), scalar(-2.0))),
         surface(None, -7.0, departure=TiltSag(scalar(0.1), scalar(-0.2)), phase=GRATING),
     ],
+    "facets": [
+        surface(0.03, 5.0, 1.6, phase=rt.Facets(), conic=-0.5),
+        surface(-0.02, 8.0, coefficients=[1e-3, 2e-5, -1e-7], phase=rt.Facets(), before=posed(tilt_x=9.0)),
+        surface(None, 8.0, 1.5, phase=rt.Facets()),
+    ],
     "ideal": [
         surface(None, 12.0, phase=ROUND),
         surface(None, 5.0, 1.5, phase=UNLIKE, before=posed(**ANGLES)),

@@ -11,6 +11,7 @@ paths.h     the paths that phases add, as polynomials; departures.h: the powers 
 apertures.h the shapes of apertures, as rows of aperture.py
 loops.h     the surfaces as loops over a block, where nothing can go wrong
 search.h    the first crossing of one ray with what is more than a conic, as search.py finds it
+facets.h    the facets of Fresnel lenses
 careful.h   one ray at one surface, with every case that surface.py and search.py know
 phases.h    what gratings, diffractive and ideal lenses do to rays; phase_slopes.h: differentiated
 turns.h     axes that turn between two surfaces

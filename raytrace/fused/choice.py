@@ -31,7 +31,7 @@ def tracing(engine: str) -> Iterator[None]:
     "auto", the default, takes the compiled trace for tensors on the CPU where it has been compiled already, compiles
     it for a batch that is worth it, and else falls back to eager. "fused" raises NoCompiler where it cannot be had,
     but still leaves to torch what it has no form for: other devices, forward derivatives, transforms of torch.func,
-    height maps, kinds of sag that are not compiled, and Fresnel lenses.
+    height maps, kinds of sag that are not compiled, and Fresnel lenses but of even aspheres.
     Raises ValueError for another name.
     """
     token = _engine.set(_checked(engine, "tracing"))

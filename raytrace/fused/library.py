@@ -24,19 +24,8 @@ import torch
 from raytrace.fused.trust import check_file, open_folder, private_folder
 
 SOURCES = (
-    *(
-        "block.h",
-        "sags.h",
-        "freeform.h",
-        "apertures.h",
-        "paths.h",
-        "departures.h",
-        "loops.h",
-        "phases.h",
-        "search.h",
-        "careful.h",
-    ),
-    *("adjoint.h", "tangent.h", "phase_slopes.h", "turns.h", "trace.cpp"),
+    *("block.h", "sags.h", "freeform.h", "apertures.h", "paths.h", "departures.h", "loops.h", "facets.h", "phases.h"),
+    *("search.h", "careful.h", "adjoint.h", "tangent.h", "phase_slopes.h", "turns.h", "trace.cpp"),
 )
 FLAGS = ("-O3", "-std=c++17", "-fPIC", "-fopenmp-simd", "-fno-math-errno", "-fno-trapping-math")
 #: Flags that not every compiler, processor or torch knows: tried in this order, the last none. With -fopenmp, which

@@ -9,7 +9,7 @@
 
 namespace raytrace {
 
-enum Form { kNoPhase, kPolynomial, kRadial, kSlopes, kHologram };
+enum Form { kNoPhase, kPolynomial, kRadial, kSlopes, kHologram, kFacets };
 
 // Least degree n whose n(n + 3)/2 terms are `count` or more.
 inline int degree(int count) {
@@ -141,6 +141,7 @@ void hologram_change(const T* numbers, const T* change, const T* x, const T* y, 
 template <bool second, typename C, typename T, int size>
 void path_at(const Layout& at, const C* numbers, const T* x, const T* y, int n, Added<T, size>& to) {
   if (at.phase == kRadial) radial<second>(numbers, at.phase_terms, x, y, n, to);
+  else if (at.phase == kFacets) clear(to, n);
   else if (at.phase == kHologram) hologram<second>(numbers, x, y, n, to);
   else polynomial<second>(numbers, at.phase_terms, x, y, n, to);
 }
@@ -149,6 +150,7 @@ void path_at(const Layout& at, const C* numbers, const T* x, const T* y, int n, 
 template <typename T>
 void path_change(const Layout& at, const T* numbers, const T* change, const T* x, const T* y, int n, Added<T, kBlock>& to) {
   if (at.phase == kHologram) hologram_change(numbers, change, x, y, n, to);
+  else if (at.phase == kFacets) clear(to, n);
   else path_at<false>(at, change, x, y, n, to);
 }
 
@@ -219,6 +221,7 @@ void sum_hologram(const T* numbers, const Rays<T>& at, const T* gp, const T* gx,
 template <typename T>
 void sum_path(const Layout& at, const T* numbers, const Rays<T>& hit, const T* gp, const T* gx, const T* gy, int n,
               Added<T, kBlock>& to, double* sums) {
+  if (at.phase == kFacets) return;
   if (at.phase == kHologram) sum_hologram(numbers, hit, gp, gx, gy, n, sums);
   else if (at.phase == kRadial) sum_radial(at.phase_terms, hit, gp, gx, gy, n, to, sums);
   else sum_polynomial(at.phase_terms, hit.x, hit.y, gp, gx, gy, n, to, sums);

@@ -99,8 +99,9 @@ void pull_slopes(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes
 template <typename T>
 void pull_phase(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>& notes, int n,
                 const Surface<T>& s, double* row) {
-  if (s.at->phase == kSlopes) pull_slopes(from, to, g, notes, n, s, row);
-  else pull_diffract(from, to, g, notes, n, s, row);
+  if (s.at->phase == kSlopes) return pull_slopes(from, to, g, notes, n, s, row);
+  pull_diffract(from, to, g, notes, n, s, row);
+  if (s.at->phase == kFacets) pull_facets(to, g, notes, n, s, row + s.at->phase_numbers);
 }
 
 // Forward; d: the changes of the hit, and of the rays before the surface elsewhere; notes.turn: those of the normal.
@@ -181,8 +182,9 @@ void push_slopes(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, Notes<T>&, 
 template <typename T>
 void push_phase(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, Notes<T>& notes, int n, const Surface<T>& s,
                 const Change<T>& change, bool path) {
-  if (s.at->phase == kSlopes) push_slopes(from, to, d, notes, n, s, change, path);
-  else push_diffract(from, to, d, notes, n, s, change, path);
+  if (s.at->phase == kSlopes) return push_slopes(from, to, d, notes, n, s, change, path);
+  if (s.at->phase == kFacets) push_facets(to, d, notes, n, s, change.phase);
+  push_diffract(from, to, d, notes, n, s, change, path);
 }
 
 }  // namespace raytrace

@@ -1,6 +1,7 @@
 // What a phase on a surface does to light there: raytrace/optics/trace.py, `diffract` and `bend_slopes`, and the path through
 // an ideal lens of raytrace/system/phases.py. Where rays meet the surface is the business of loops.h.
 #pragma once
+#include "facets.h"
 #include "paths.h"
 
 namespace raytrace {
@@ -129,6 +130,12 @@ bool through_phase(const Surface<double>& s, const C* numbers, double x, double 
   }
   Added<double, 1> added;
   path_at<false>(*s.at, numbers, &x, &y, 1, added);
+  if (s.at->phase == kFacets) {
+    const double u = x * x + y * y, dS = Facet<double>(numbers, s.at->phase_terms - kShape, u).dS;
+    const double facet[] = {-2 * dS * x, -2 * dS * y, 1};
+    path = 0;
+    return diffract(s, added, L, M, N, facet, 1 + 4 * dS * dS * u);
+  }
   path = added.p[0];
   return diffract(s, added, L, M, N, normal, norm_squared);
 }

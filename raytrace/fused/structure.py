@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
 from raytrace.system.aperture import SHAPES
-from raytrace.system.phases import HologramPath, IdealLens, Phase, PolynomialPath, RadialPath, kind_of, path_of
+from raytrace.system.phases import Facets, HologramPath, IdealLens, Phase, PolynomialPath, RadialPath, kind_of, path_of
 from raytrace.system.polynomials import PowerSag
 from raytrace.system.pose import Gap, Turn, passage
 from raytrace.system.shapes import DEPARTURES, EVEN, KINDS, Departure
@@ -26,7 +26,7 @@ _DEPARTED, _FRAME = 7, 4  # kDeparted of sags.h; kFrame of departures.h, its num
 _NONE, _REFRACT, _REFLECT = range(3)
 
 #: What a phase becomes before it is traced, by `Form` of paths.h.
-FORMS = (None, PolynomialPath, RadialPath, IdealLens, HologramPath)
+FORMS = (None, PolynomialPath, RadialPath, IdealLens, HologramPath, Facets)
 
 
 class _Row(NamedTuple):
@@ -67,7 +67,7 @@ def is_expressible(surface: Surface) -> bool:
     """Whether the compiled trace knows the surface: kind, departure, phase and apertures compiled, few terms."""
     if surface.is_break:
         return True
-    if surface.phase is not None and not (kind_of(surface.phase).slopes or kind_of(surface.phase).path):
+    if surface.phase is not None and not _is_known(surface):
         return False
     if any(SHAPES[aperture.shape].code is None for aperture in surface.apertures):
         return False
@@ -75,6 +75,14 @@ def is_expressible(surface: Surface) -> bool:
         return False
     kind = KINDS[surface.kind]
     return surface.coefficients is None or (kind.code is not None and len(surface.coefficients) <= kind.compiled)
+
+
+def _is_known(surface: Surface) -> bool:
+    """Whether the compiled trace knows the phase of a surface; facets only of an even asphere that light passes."""
+    kind = kind_of(surface.phase)
+    if kind.flat:
+        return surface.kind == EVEN and surface.departure is None and not surface.is_mirror
+    return kind.slopes or kind.path is not None
 
 
 def _has_powers(departure: Departure) -> bool:
@@ -148,9 +156,11 @@ def rows_of(structure: Structure, surfaces: Sequence[Surface]) -> list[int]:
 def _row(
     table: _Table, surface: Surface, gap: Tensor | None, side: int, n1: Tensor, n2: Tensor, wavelength: Tensor | None
 ) -> _Row:
+    form, phase = _form_of(surface.phase, wavelength) if not _is_faceted(surface) else _facets_of(surface, n1)
+    if _is_faceted(surface):
+        surface = dataclasses.replace(surface, curvature=None, conic=None, coefficients=None)
     terms = () if surface.coefficients is None else surface.coefficients.unbind(0)
     first_term, rim = table.place_all(terms), table.place_rim(surface)
-    form, phase = _form_of(surface.phase, wavelength)
     departure = _numbers_of(surface.departure)
     return _Row(
         kind=_kind(surface),
@@ -172,6 +182,16 @@ def _row(
         departure_terms=max(len(departure) - _FRAME, 0),
         departure_numbers=table.place_all(departure),
     )
+
+
+def _is_faceted(surface: Surface) -> bool:
+    return isinstance(surface.phase, Facets)
+
+
+def _facets_of(surface: Surface, n1: Tensor) -> tuple[int, Sequence[Tensor]]:
+    """The shape of a Fresnel lens as the numbers of its phase: its surface is a plane."""
+    shape = [n1.new_zeros(()) if number is None else number for number in (surface.curvature, surface.conic)]
+    return FORMS.index(Facets), (*shape, *(() if surface.coefficients is None else surface.coefficients.unbind(0)))
 
 
 def _numbers_of(departure: Departure | None) -> Sequence[Tensor]:
@@ -231,6 +251,10 @@ def _rebuilt(row: _Row, surface: Surface, numbers: Sequence[Tensor]) -> Surface:
         return None if place < 0 else numbers[place]
 
     terms = numbers[row.coefficients : row.coefficients + row.terms]
+    if _is_faceted(surface):
+        curvature, conic, *terms = numbers[row.phase_numbers : row.phase_numbers + row.phase_terms]
+        shape = {"curvature": curvature, "conic": conic, "coefficients": torch.stack(terms) if terms else None}
+        return dataclasses.replace(surface, **shape, before=None, after=None)
     return dataclasses.replace(
         surface,
         curvature=number(row.curvature),

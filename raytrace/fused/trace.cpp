@@ -124,7 +124,7 @@ class Trace {
         const Step<T>& step = steps_[k];
         forget(k, *g, rays.get(), *notes, n);
         if (step.surface.at->phase != kNoPhase) {
-          step.stands(rays[k + 1], *notes, n, step.surface);
+          stand(step, rays[k + 1], *notes, n);
           pull_phase(rays[k], rays[k + 1], *g, *notes, n, step.surface, row);
         }
         add(row, *step.surface.at, step.pulls(rays[k], rays[k + 1], *g, *notes, n, step.surface));
@@ -183,7 +183,7 @@ class Trace {
       begun |= change.any;
       if (begun) steps_[k].pushes(rays[k], rays[k + 1], d, notes, n, s, change);
       if (begun && s.at->phase != kNoPhase) {
-        steps_[k].stands(rays[k + 1], notes, n, s);
+        stand(steps_[k], rays[k + 1], notes, n);
         push_phase(rays[k], rays[k + 1], d, notes, n, s, change, path_);
       }
       for (int i = 0; i < n && notes.any_lost; i++)
@@ -251,7 +251,7 @@ class Trace {
     notes.surface = int32_t(k);
     int flagged = (path ? step.crosses : step.silently)(from, to, notes, n, s);
     if (s.at->phase != kNoPhase) {
-      step.stands(to, notes, n, s);
+      stand(step, to, notes, n);
       flagged = through_phase(to, notes, n, s, path);
     }
     if (flagged)
@@ -261,6 +261,12 @@ class Trace {
         else cross_carefully<T, false>(from, to, notes, i, s);
       }
     clip(to, notes.valid, n, call_.constants + s.at->first_aperture, s.at->apertures);
+  }
+
+  // The normals that a phase turns light about: of the surface, or of facets on it.
+  static void stand(const Step<T>& step, const Rays<T>& at, Notes<T>& notes, int n) {
+    if (step.surface.at->phase == kFacets) facet_normals(at, notes.normal, n, step.surface);
+    else step.stands(at, notes, n, step.surface);
   }
 
   void pick(Cotangents<T>& g, int64_t at, int count, int n) {

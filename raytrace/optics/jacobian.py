@@ -31,14 +31,14 @@ def hit_jacobian(
     variables: tensors that require a gradient and that numbers of the surfaces or indices were computed from, or are;
     V counts all their entries. surfaces, rays, indices, wavelength: as for `trace.steps`, the rays before surfaces[0]
     held fixed. Rays that are lost do not move. Raises ValueError for surfaces that the compiled trace does not know
-    (height maps, more than 16 terms, Fresnel lenses), and for numbers of a lens that differ from ray to ray
+    (height maps, more than 16 terms), and for numbers of a lens that differ from ray to ray
     of the last axis.
     """
     known = all(map(is_expressible, surfaces))
     task = task_of(surfaces, rays, indices=indices, wavelength=wavelength) if known else None
     if task is None:
         raise ValueError(
-            "no Jacobian for height maps, more than 16 terms, Fresnel lenses, numbers of another dtype than "
+            "no Jacobian for height maps, more than 16 terms, numbers of another dtype than "
             "the rays, or numbers that differ along the last axis of the rays: use torch.func.jacfwd on the trace"
         )
     return pushed(surfaces, task, _changes(task.given[3], variables)).by_position[:2].transpose(0, 1)
