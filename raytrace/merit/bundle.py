@@ -19,7 +19,7 @@ from raytrace.maths.dual import Dual, slope_of, value_of
 from raytrace.merit.aim import aimed
 from raytrace.merit.by_torch import rays_by_torch
 from raytrace.merit.launch import launched
-from raytrace.merit.model import GLASS
+from raytrace.merit.model import GLASS, unbent
 from raytrace.merit.moment import Moment
 from raytrace.optics.axis import is_bent
 from raytrace.optics.jacobian import ends, pushed, pushed_everywhere
@@ -181,10 +181,21 @@ class Bundle:
     # -- at a moment ---------------------------------------------------------------------------------------------------
 
     def hits(self, moment: Moment) -> Hits:
-        """All rays on surface `last`, in the order in which they were asked for."""
+        """All rays on surface `last`, in the order in which they were asked for; 0: in front of surface 1."""
+        if self.last == 0:
+            return self._at_object(moment)
         if not self.is_expressible:
             return self._hits_by_torch(moment)
         return self._told(*self._traced(moment, *self.launched(moment)))
+
+    def _at_object(self, moment: Moment) -> Hits:
+        """The rays as they leave the object: on its plane, or nowhere where that is at infinity."""
+        position, direction, opl, valid = self.launched(moment)
+        if np.isinf(value_of(moment.thickness[0])):
+            return self._as_hits(moment, (*[np.full(valid.shape, np.nan)] * 3, *direction, opl), valid)
+        step = (-moment.thickness[0] - position[2]) / direction[2]
+        x, y = (position[k] + step * direction[k] for k in range(2))
+        return self._as_hits(moment, (x, y, 0 * step, *direction, opl), valid)
 
     def marks(self, moment: Moment) -> Marks:
         """All rays on all surfaces from 1 to `last`, in the order in which they were asked for."""
@@ -239,7 +250,9 @@ class Bundle:
     def starts(self, moment: Moment) -> Hits:
         """All rays where they set out, before surface 1 and in its axes, in the order in which they were asked for."""
         position, direction, opl, valid = self.launched(moment)
-        parts = *position, *direction, opl
+        return self._as_hits(moment, (*position, *direction, opl), valid)
+
+    def _as_hits(self, moment: Moment, parts, valid: np.ndarray) -> Hits:
         slopes = [slope_of(part, moment.count) for part in parts] if moment.count else None
         return Hits([value_of(part) for part in parts], slopes, valid, self._places[0])
 
@@ -355,7 +368,7 @@ class Bundle:
         def end(lens) -> Rays:
             field, pupil, wavelength = torch.from_numpy(self.field), torch.from_numpy(self.pupil), lens.wavelengths
             rays = rays_of_field(lens, field, pupil, wavelength=wavelength[:, None])
-            indices = media(lens, wavelength[:, None])[: self.last + 1]
+            indices = unbent(lens, media(lens, wavelength[:, None])[: self.last + 1])
             return trace_surfaces(sequence_of(lens)[: self.last], rays, indices=indices, wavelength=wavelength[:, None])
 
         bent = self._aims and is_bent(self.view.lens)

@@ -7,14 +7,15 @@ over rows with a weight. A row whose ray is lost counts as an error of `LOST` un
 
 import dataclasses
 from collections.abc import Sequence
-from functools import cached_property
 
 import numpy as np
 
 from raytrace.maths.dual import Dual, slope_of, value_of
+from raytrace.merit.arguments import need, need_all
+from raytrace.merit.arithmetic import in_order
 from raytrace.merit.model import Model
-from raytrace.merit.operands import OPERANDS, SETTINGS
-from raytrace.merit.plan import Evaluate, Found, Line, Now, Planner, planner_of
+from raytrace.merit.operands import OPERANDS
+from raytrace.merit.plan import SETTINGS, Evaluate, Found, Line, Now, Planner, planner_of
 from raytrace.merit.readings import Readings
 from raytrace.system.intent import Row
 
@@ -23,7 +24,7 @@ LOST = 10.0
 
 
 class UnknownOperand(ValueError):
-    """A row with weight whose operand is not known, or that names what the lens does not have."""
+    """A row with weight whose operand is not known."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,6 +63,7 @@ class Evaluation:
         self.readings = readings or Readings()
         self.groups: list[tuple[Planner, tuple[Line, ...], Evaluate]] = []
         self.planners: list[tuple[int, Planner]] = []
+        self.needed: frozenset[int] = frozenset()
         self.skipped = tuple(self._plan(skip_unknown))
         self.units = np.array([unit ** OPERANDS[r.operand].length if r.operand in OPERANDS else 1.0 for r in self.rows])
         weights = np.array([row.weight for row in self.rows])
@@ -72,34 +74,68 @@ class Evaluation:
         self.factors = np.sqrt(np.abs(self.weights) / total) if total > 0 else np.zeros(len(self.rows))
         self.targets = np.array([row.target for row in self.rows])
 
-    def _plan(self, skip_unknown: bool):
-        """Plan all rows; yields those that are skipped."""
-        lens = self.model.lens
-        settings = configuration, primary = lens.current_configuration, lens.primary_wavelength
+    def _plan(self, skip_unknown: bool) -> list[int]:
+        """Plan all rows, those of arithmetic last and in the order in which they wait for one another.
+
+        Returns the rows that are skipped.
+        """
+        placed = {line.number: (settings, line) for settings, line in self._lines()}
+        referred, skipped = self._referred(placed, skip_unknown)
         planners: dict[tuple[int, int], Planner] = {}
         groups: dict[tuple, list[Line]] = {}
-        for number, row in enumerate(self.rows, 1):
-            if row.operand == "CONF":
-                configuration = row.integers[0]
-            elif row.operand == "PRIM":
-                primary = row.integers[1] - 1
-            elif row.operand in OPERANDS:
-                settings = configuration, primary
-                if settings not in planners:
-                    planners[settings] = planner_of(self.model, *settings, self.readings, self.unit)
-                wavelength = row.integers[1] - 1 if row.integers[1] > 0 else primary
-                groups.setdefault((settings, row.operand), []).append(Line(number, row, wavelength))
-            elif row.operand not in SETTINGS:
-                if row.weight != 0 and not skip_unknown:
-                    raise UnknownOperand(
-                        f"row {number} of the merit function: operand {row.operand} is not known; "
-                        "`skip_unknown` leaves such rows out"
-                    )
-                yield number
-        for (settings, name), lines in groups.items():
+        order = [number for number in placed if number not in referred] + in_order(referred)
+        for number in (number for number in order if number not in skipped):
+            settings, line = placed[number]
+            operand = OPERANDS[line.row.operand]
+            if settings not in planners:
+                planners[settings] = planner_of(self.model, *settings, self.readings, self.unit, self.rows)
+            need_all(line, operand, planners[settings].lens)
+            groups.setdefault((settings, line.row.operand, number if operand.refers else 0), []).append(line)
+        for (settings, name, _), lines in groups.items():
             planner = planners[settings]
             self.groups.append((planner, tuple(lines), OPERANDS[name].plan(lines, planner)))
         self.planners = [(configuration, planner) for (configuration, _), planner in planners.items()]
+        self.needed = frozenset(row for rows in referred.values() for row in rows)
+        return sorted(skipped)
+
+    def _lines(self):
+        """Rows that have a value, each with the configuration and the primary wavelength that stand above it."""
+        lens = self.model.lens
+        configuration, primary = lens.current_configuration, lens.primary_wavelength
+        for number, row in enumerate(self.rows, 1):
+            line = Line(number, row, row.integers[1] - 1 if row.integers[1] > 0 else primary)
+            if row.operand == "CONF":
+                configuration = need(line, "configuration", row.integers[0], lens)
+            elif row.operand == "PRIM":
+                primary = need(line, "primary", row.integers[1], lens) - 1
+            elif row.operand not in SETTINGS:
+                yield (configuration, primary), line
+
+    def _referred(self, placed: dict, skip_unknown: bool) -> tuple[dict[int, Sequence[int]], set[int]]:
+        """The rows that each row of arithmetic takes values of, and the rows that cannot be evaluated."""
+        referred, skipped = {}, set()
+        for number, (_, line) in placed.items():
+            name = line.row.operand
+            if name not in OPERANDS:
+                self._may_skip(line, f"operand {name} is not known", skip_unknown)
+                skipped.add(number)
+            elif OPERANDS[name].refers:
+                referred[number] = OPERANDS[name].refers(line, self.rows)
+        for number in in_order(referred):
+            missing = skipped.intersection(referred[number])
+            if missing:
+                line = placed[number][1]
+                which = min(missing)
+                why = (
+                    f"{line.row.operand} takes the value of row {which}, {self.rows[which - 1].operand}, which has none"
+                )
+                self._may_skip(line, why, skip_unknown)
+                skipped.add(number)
+        return referred, skipped
+
+    def _may_skip(self, line: Line, why: str, skip_unknown: bool) -> None:
+        if line.row.weight != 0 and not skip_unknown:
+            raise UnknownOperand(f"row {line.number} of the merit function: {why}; `skip_unknown` leaves such rows out")
 
     def __call__(self, variables: np.ndarray, *, derivatives: bool = False) -> Evaluated:
         """All rows there; derivatives: with the Jacobian."""
@@ -115,7 +151,7 @@ class Evaluation:
             units = self.units[places]
             told = Found(told.values / units, tuple(part / units for part in told.parts))
             values[places] = value_of(told.values)
-            found |= {line.number: told.values[k] for k, line in enumerate(lines)} if self._refers else {}
+            found |= {line.number: told.values[k] for k, line in enumerate(lines) if line.number in self.needed}
             counted = self.factors[places] > 0
             in_parts = counted & bool(told.parts) & (self.targets[places] == 0)
             for number, chosen in [(told.values, counted & ~in_parts), *((part, in_parts) for part in told.parts)]:
@@ -129,14 +165,10 @@ class Evaluation:
                 of_row.append(places[chosen])
         return self._evaluated(values, residuals, slopes if derivatives else None, of_row, count)
 
-    @cached_property
-    def _refers(self) -> bool:
-        return False
-
     def _evaluated(self, values, residuals, slopes, of_row, count: int) -> Evaluated:
         of_row = np.concatenate(of_row) if of_row else np.zeros(0, dtype=int)
         residual = np.concatenate(residuals) if residuals else np.zeros(0)
-        gone = np.isnan(residual)
+        gone = ~np.isfinite(residual)
         parts = np.bincount(of_row, minlength=len(self.rows))[of_row]
         residual = np.where(gone, LOST * self.factors[of_row] / np.sqrt(np.maximum(parts, 1)), residual)
         jacobian = None

@@ -253,6 +253,8 @@ class View:
     def table_of(self, last: int, lens: Lens, indices: dict[int, Tensor] | None = None):
         """The structure of the surfaces 1 to `last`, and the table (W, K) of their numbers.
 
+        On the image rays have their direction before it: what stands behind it bends none.
+
         indices: (W,) of media, by the surface that tells them, in place of those of the lens.
         """
         wavelength = lens.wavelengths[:, None]
@@ -262,6 +264,7 @@ class View:
             given[told][:, None] if told in given else n
             for told, n in zip(self.media[: last + 1], media(lens, wavelength), strict=False)
         ]
+        indices = unbent(lens, indices)
         gap = gap_behind(lens.surfaces[0]) if lens.surfaces[0].after is not None else None
         structure, table = structure_of(surfaces, indices, 1, gap, wavelength)
         rows = [torch.broadcast_to(n[..., 0] if n.dim() else n, wavelength.shape[:1]) for n in table]
@@ -269,6 +272,11 @@ class View:
 
     def moment(self, variables) -> Moment:
         return Moment(self, variables)
+
+
+def unbent(lens: Lens, indices: list) -> list:
+    """Indices behind the first surfaces of a lens, the object's first; behind the image as before it."""
+    return [*indices[:-1], indices[-2]] if len(indices) == len(lens.surfaces) else indices
 
 
 def _overridden(lens: Lens) -> set[Address]:

@@ -3,7 +3,7 @@
 Numbers are plain ones, or dual ones (`maths.dual`) where derivatives are asked for; the formulas are the same.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -11,11 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.dual import Dual, value_of
+from raytrace.maths.dual import Dual, slope_of, value_of
 from raytrace.merit.solves import SOLVES
 from raytrace.optics.paraxial import brackets, power, signed
 from raytrace.optics.sequence import media
 from raytrace.system.lens import Lens, index_behind
+from raytrace.system.surface import vertex_curvature
 
 _PASSES = 60  # through solves that depend on one another
 _STILL = 1e-15  # relative
@@ -54,6 +55,7 @@ class Moment:
         self.view, self.lens, self.variables = view, view.lens, variables
         self.numbers: dict = {at: variables[number] for at, number in view.variables.items()}
         self._gaussian: dict[int, Gaussian] = {}
+        self._kept: dict = {}
         self._solve()
 
     @property
@@ -79,6 +81,13 @@ class Moment:
     def curvature(self) -> list:
         """1/mm of every surface, terms of r² left out."""
         return self._listed("curvature", self.view.curvature)
+
+    @cached_property
+    def vertex_curvature(self) -> list:
+        """1/mm of every surface at its vertex, terms of r² included."""
+        if self.view.is_plain:
+            return [c + bend for c, bend in zip(self.curvature, self.view.further_power[0], strict=True)]
+        return self.through_torch(lambda lens: [vertex_curvature(surface).reshape(()) for surface in lens.surfaces])
 
     def _listed(self, quantity: str, stored: list[float]) -> list:
         found = list(stored)
@@ -134,6 +143,13 @@ class Moment:
         if wavelength not in self._gaussian:
             self._gaussian[wavelength] = self._found(wavelength)
         return self._gaussian[wavelength]
+
+    def kept(self, function: Callable, *arguments):
+        """What a function makes of the moment and arguments, found once."""
+        key = function, *arguments
+        if key not in self._kept:
+            self._kept[key] = function(self, *arguments)
+        return self._kept[key]
 
     @property
     def primary(self) -> int:
@@ -218,9 +234,18 @@ class Moment:
         return all(far(number, before[at]) <= _STILL for at, number in self.numbers.items())
 
     def _forget(self) -> None:
-        for name in ("thickness", "curvature", "media", "vergence", "entrance_pupil_diameter", "marginal_height"):
+        for name in (
+            "thickness",
+            "curvature",
+            "vertex_curvature",
+            "media",
+            "vergence",
+            "entrance_pupil_diameter",
+            "marginal_height",
+        ):
             self.__dict__.pop(name, None)
         self._gaussian.clear()
+        self._kept.clear()
 
     # -- anything else, by torch ---------------------------------------------------------------------------------------
 
@@ -234,6 +259,24 @@ class Moment:
             leaves, lens = view.leaves({at: value_of(n) for at, n in self.numbers.items()})
             found = function(lens)
         return [self.chained(number, leaves) if self.count else float(number) for number in found]
+
+    def each_through_torch(self, function: Callable, arrays: Sequence):
+        """Numbers (R,) that a function takes with torch from a lens and the entries of arrays (R,), one from each."""
+        with torch.enable_grad():
+            leaves, lens = self.view.leaves({at: value_of(n) for at, n in self.numbers.items()})
+            given = [torch.tensor(value_of(array), requires_grad=True) for array in arrays]
+            found = function(lens, *given)
+            if not self.count:
+                return found.detach().numpy()
+            by = torch.autograd.grad(found.sum(), given, retain_graph=True, allow_unused=True)
+            slopes = np.zeros((self.count, len(found)))
+            for array, derivative in zip(arrays, by, strict=True):
+                if isinstance(array, Dual) and derivative is not None:
+                    slopes += array.full() * derivative.numpy()
+            own = torch.autograd.grad(found.sum(), list(leaves.values()), retain_graph=True, allow_unused=True)
+            if any(derivative is not None for derivative in own):
+                slopes += np.stack([slope_of(self.chained(number, leaves), self.count) for number in found], -1)
+        return Dual(found.detach().numpy(), slopes)
 
     def chained(self, number: Tensor, leaves: dict) -> Dual:
         """A number () that was computed from leaves, with its derivatives by the variables."""

@@ -16,6 +16,15 @@ from raytrace.merit.moment import Moment
 from raytrace.merit.readings import Readings
 from raytrace.system.intent import Row
 
+#: Rows that say something about the rows below them, or to the reader.
+SETTINGS = {
+    "CONF": "the configuration of the rows below",
+    "PRIM": "the primary wavelength of the rows below",
+    "BLNK": "text",
+    "DMFS": "where the default merit function starts",
+    "USYM": "the lens is taken for symmetric",
+}
+
 
 class Line(NamedTuple):
     """A row of a merit function where it stands: its number, from 1, its wavelength from 0, and the configuration's."""
@@ -61,20 +70,25 @@ class Operand:
     plan: from its rows in one configuration and a `Planner` to their `Evaluate`. text: what it is, with its arguments.
     length: the power of length in its unit, as -1 of a curvature; values are in mm, and become those of `Intent.unit`.
     reading: where the field's own program is not settled, which reading is taken.
+    takes: what the two integers of its rows are, keys of `arguments.ARGUMENTS`; "" for what is not looked at.
+    refers: of an operand of arithmetic, the numbers of the rows that a row takes values of, among all rows.
     """
 
     plan: Callable[[Sequence[Line], "Planner"], Evaluate]
     text: str
     length: int = 0
     reading: str = ""
+    takes: tuple[str, str] = ("", "")
+    refers: Callable[[Line, Sequence[Row]], Sequence[int]] | None = None
 
 
 class Planner:
     """What operands may ask for, of a lens in one configuration."""
 
-    def __init__(self, view: View, primary: int, readings: Readings, unit: float = 1.0):
-        """unit: mm in the unit of length of the rows."""
-        self.view, self.lens, self.primary, self.readings, self.unit = view, view.lens, primary, readings, unit
+    def __init__(self, view: View, primary: int, readings: Readings, unit: float = 1.0, rows: Sequence[Row] = ()):
+        """unit: mm in the unit of length of the rows; rows: of the whole merit function."""
+        self.view, self.lens, self.primary, self.readings = view, view.lens, primary, readings
+        self.unit, self.rows = unit, rows
         self.bundles: dict[tuple[int, bool], Bundle] = {}
         self._shared: dict = {}
 
@@ -82,10 +96,17 @@ class Planner:
     def image(self) -> int:
         return len(self.lens.surfaces) - 1
 
-    def ray(self, line: Line, *, surface: int | None = None, pupil=None, wavelength: int | None = None) -> int:
-        """The number of the ray of a row behind a surface, the image by default."""
-        at = line.pupil if pupil is None else pupil
-        return self.ask(line.wavelength if wavelength is None else wavelength, line.field, at, surface=surface)
+    def ray(
+        self, line: Line, *, surface: int | None = None, field=None, pupil=None, wavelength: int | None = None
+    ) -> int:
+        """The number of the ray of a row behind a surface, the image by default. Raises BadRow."""
+        number = line.wavelength if wavelength is None else wavelength
+        if not 0 <= number < len(self.view.wavelengths):
+            have = len(self.view.wavelengths)
+            raise BadRow(line, f"names wavelength {number + 1}: this lens has wavelengths 1 to {have}")
+        last = self.image if surface is None else self.checked(line, surface)
+        of, at = line.field if field is None else field, line.pupil if pupil is None else pupil
+        return self.ask(number, of, at, surface=last)
 
     def ask(self, wavelength: int, field, pupil, *, surface: int | None = None, clips: bool = False) -> int:
         """The number of any ray behind a surface, the image by default; clips: of those that apertures may stop."""
@@ -138,5 +159,7 @@ class Now:
         return self.planner.bundles[last, False].starts(self.moment).at(rays)
 
 
-def planner_of(model: Model, configuration: int, primary: int, readings: Readings, unit: float = 1.0) -> Planner:
-    return Planner(model.views[configuration - 1], primary, readings, unit)
+def planner_of(
+    model: Model, configuration: int, primary: int, readings: Readings, unit: float = 1.0, rows: Sequence[Row] = ()
+) -> Planner:
+    return Planner(model.views[configuration - 1], primary, readings, unit, rows)

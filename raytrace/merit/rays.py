@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from raytrace.maths.dual import Dual, value_of
+from raytrace.merit.bundle import Hits
 from raytrace.merit.plan import Evaluate, Found, Line, Now, Operand, Planner
 
 
@@ -74,21 +75,35 @@ def known(valid: np.ndarray, number):
     return np.where(valid, number, np.nan)
 
 
-def at_surface(tell: Callable) -> Callable[[Sequence[Line], Planner], Evaluate]:
+def at_surface(tell: Callable[[Hits], object]) -> Callable[[Sequence[Line], Planner], Evaluate]:
     """A number of the ray on the surface that the row names, in the axes of its vertex, behind it."""
 
+    def number(now: Now, rays: dict[int, np.ndarray], surface: int):
+        hits = now.hits(rays[surface], surface=surface)
+        return known(hits.valid, tell(hits))
+
+    return by_surface(number, lambda surface: (surface,))
+
+
+def by_surface(
+    tell: Callable[[Now, dict[int, np.ndarray], int], object], needs: Callable[[int], Sequence[int]]
+) -> Callable[[Sequence[Line], Planner], Evaluate]:
+    """A number of the ray on the surface that the row names; needs: the surfaces on which it is looked at for that.
+
+    tell: of the moment, the rays of all rows on one surface, by where they are looked at, and the surface.
+    """
+
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
-        surfaces = np.array([line.row.integers[0] for line in lines])
-        rays = {
-            s: planner.rays([l for l in lines if l.row.integers[0] == s], surface=s) for s in set(surfaces.tolist())
-        }
+        surfaces, rays = np.array([line.row.integers[0] for line in lines]), {}
+        for surface in set(surfaces.tolist()):
+            here = [line for line in lines if line.row.integers[0] == surface]
+            rays[surface] = {at: planner.rays(here, surface=at) for at in needs(surface)}
 
         def evaluate(now: Now) -> Found:
             found = np.full(len(lines), np.nan)
             slopes = np.zeros((now.moment.count, len(lines)))
             for surface, asked in rays.items():
-                hits = now.hits(asked, surface=surface)
-                number = known(hits.valid, tell(hits))
+                number = tell(now, asked, surface)
                 found[surfaces == surface] = value_of(number)
                 if isinstance(number, Dual):
                     slopes[:, surfaces == surface] = number.full()
@@ -110,19 +125,50 @@ def _radius(hits):
     return np.sqrt(x * x + y * y)
 
 
+_WAVE = "", "wavelength"
+
 RAYS = {
-    "TRAC": Operand(from_centroid(None), "distance on the image from the centroid of its field, Hx Hy Px Py", length=1),
-    "TRCX": Operand(from_centroid(0), "its x", length=1),
-    "TRCY": Operand(from_centroid(1), "its y", length=1),
-    "TRAR": Operand(from_chief(None), "distance on the image from the chief ray of the primary wavelength", length=1),
-    "TRAX": Operand(from_chief(0), "its x", length=1),
-    "TRAY": Operand(from_chief(1), "its y", length=1),
-    "REAX": Operand(at_surface(lambda hits: hits.position[0]), "x of a ray on a surface", length=1),
-    "REAY": Operand(at_surface(lambda hits: hits.position[1]), "y of a ray on a surface", length=1),
-    "REAZ": Operand(at_surface(lambda hits: hits.position[2]), "z of a ray on a surface", length=1),
-    "REAR": Operand(at_surface(_radius), "distance of a ray on a surface from its axis", length=1),
-    "REAA": Operand(at_surface(lambda hits: hits.direction[0]), "cosine of a ray behind a surface to x"),
-    "REAB": Operand(at_surface(lambda hits: hits.direction[1]), "cosine of a ray behind a surface to y"),
-    "REAC": Operand(at_surface(lambda hits: hits.direction[2]), "cosine of a ray behind a surface to z"),
-    "RANG": Operand(at_surface(_axial_angle), "angle of a ray behind a surface to z, radians"),
+    "TRAC": Operand(
+        from_centroid(None), "distance on the image from the centroid of its field, Hx Hy Px Py", length=1, takes=_WAVE
+    ),
+    "TRCX": Operand(from_centroid(0), "its x", length=1, takes=_WAVE),
+    "TRCY": Operand(from_centroid(1), "its y", length=1, takes=_WAVE),
+    "TRAR": Operand(
+        from_chief(None), "distance on the image from the chief ray of the primary wavelength", length=1, takes=_WAVE
+    ),
+    "TRAX": Operand(from_chief(0), "its x", length=1, takes=_WAVE),
+    "TRAY": Operand(from_chief(1), "its y", length=1, takes=_WAVE),
+    "REAX": Operand(
+        at_surface(lambda hits: hits.position[0]), "x of a ray on a surface", length=1, takes=("place", "wavelength")
+    ),
+    "REAY": Operand(
+        at_surface(lambda hits: hits.position[1]), "y of a ray on a surface", length=1, takes=("place", "wavelength")
+    ),
+    "REAZ": Operand(
+        at_surface(lambda hits: hits.position[2]), "z of a ray on a surface", length=1, takes=("place", "wavelength")
+    ),
+    "REAR": Operand(
+        at_surface(_radius), "distance of a ray on a surface from its axis", length=1, takes=("place", "wavelength")
+    ),
+    "REAA": Operand(
+        at_surface(lambda hits: hits.direction[0]),
+        "cosine of a ray behind a surface to x",
+        takes=("surface", "wavelength"),
+    ),
+    "REAB": Operand(
+        at_surface(lambda hits: hits.direction[1]),
+        "cosine of a ray behind a surface to y",
+        takes=("surface", "wavelength"),
+    ),
+    "REAC": Operand(
+        at_surface(lambda hits: hits.direction[2]),
+        "cosine of a ray behind a surface to z",
+        takes=("surface", "wavelength"),
+    ),
+    "RANG": Operand(
+        at_surface(_axial_angle),
+        "angle of a ray behind a surface to z, radians",
+        reading="to the axis of the surface, from 0 to π/2: also where the ray runs towards -z",
+        takes=("surface", "wavelength"),
+    ),
 }
