@@ -65,7 +65,8 @@ def read(found: Sections, lens: Lens, millimetres: float, report: Draft) -> Lens
 def _is_followed(one: Solve) -> bool:
     kinds = [rule.kind for rule in (*CURVATURE_SOLVES.values(), *THICKNESS_SOLVES.values()) if rule.followed]
     is_number = one.quantity not in ("glass", "semi_diameter") and one.operand is None
-    return is_number and one.kind in ("pickup", *kinds)
+    by_real_ray = one.kind == "marginal_height" and any(one.numbers[1:])
+    return is_number and one.kind in ("pickup", *kinds) and not by_real_ray
 
 
 def _says_more(intent: Intent, lens: Lens) -> bool:

@@ -46,7 +46,7 @@ CURVATURE_SOLVES = {
     5: Rule("marginal_normal"),
     6: Rule("chief_normal"),
     7: Rule("aplanatic"),
-    8: Rule("power", (-1,)),
+    8: Rule("power", (-1,), followed=True),
     9: Rule("concentric_with_surface", (0,)),
     10: Rule("concentric_with_radius", (1,)),
     11: Rule("f_number", (0,), followed=True),
@@ -56,7 +56,7 @@ CURVATURE_PICKUP = 4
 #: Solves of the thickness by their keywords; beside them PZUP, a pickup.
 THICKNESS_SOLVES = {
     "MAZH": Rule("marginal_height", (1, 0), followed=True),
-    "TOLE": Rule("position", (1,), from_surface=True),
+    "TOLE": Rule("position", (1,), from_surface=True, followed=True),
     "EDGE": Rule("edge_thickness", (1, 1)),
 }
 

@@ -161,6 +161,8 @@ class View:
         def is_late(position: int, one: Solve) -> bool:
             if one.kind == "pickup":
                 return solved.get((one.source, one.quantity_of_source or one.quantity), -1) >= position
+            if one.kind in ("power", "position"):
+                return one.source > one.surface
             return one.surface < self.lens.stop or self.lens.aperture.kind in ("image_f_number", "working_f_number")
 
         return any(is_late(*found) for found in enumerate(self.solves))

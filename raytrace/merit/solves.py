@@ -41,10 +41,25 @@ def _marginal_height(moment, solve: Solve):
     return moment.index(primary)[k] * (solve.numbers[0] - y) / (omega - moment.power(k, primary) * y)
 
 
+def _power(moment, solve: Solve):
+    """c = P/(n′ - n) of the power that a surface has by its curvature."""
+    k, n = solve.surface, moment.index(moment.primary)
+    return solve.numbers[0] / (n[k] - n[k - 1])
+
+
+def _position(moment, solve: Solve):
+    """The thickness with which those from surface `source` to this one, or from this one on to `source`, have a sum."""
+    k, source = solve.surface, solve.source
+    others = range(source, k) if source <= k else range(k + 1, source)
+    return solve.numbers[0] - sum(moment.thickness[j] for j in others)
+
+
 #: How a number is found, by the kind of its solve: of a moment and the solve.
 SOLVES = {
     "pickup": _pickup,
     "marginal_angle": _marginal_angle,
     "f_number": _f_number,
     "marginal_height": _marginal_height,
+    "power": _power,
+    "position": _position,
 }
