@@ -325,6 +325,28 @@ def test_a_row_switches_without_a_jump_and_stands_still_where_it_complies():
     assert [one.jacobian[0, 0] for one in told] == [1.0, 1.0, 0.0, 0.0, 0.0]
 
 
+def test_other_readings_take_the_largest_lack_and_signed_thicknesses():
+    thick = automatic(lens([surface(None, 3.0, 1.5), surface(None, 1.0, 1.6), surface(None, 20.0)]))
+    model = Model(thick, (Vary(1, "thickness"), Vary(2, "thickness")))
+    rows = [Row("MNCG", (1, 3), target=4.0, weight=1.0), Row("MXCG", (1, 3), target=0.5, weight=1.0)]
+    told = Evaluation(model, rows, readings=Readings(boundary="largest"))(model.start, derivatives=True)
+    assert told.values == pytest.approx([1.0, 3.0])
+    assert told.jacobian == pytest.approx(np.sqrt(0.5) * np.array([[0.0, 1.0], [1.0, 0.0]]))
+    back = automatic(lens([surface(None, 5.0, MIRROR), surface(None, -7.0)]))
+    told = [
+        Evaluation(Model(back), [Row("MNCA", (1, 1), target=1.0)], readings=reading)(np.zeros(0)).values[0]
+        for reading in (Readings(), Readings(behind_mirrors="signed"))
+    ]
+    assert told == [-5.0, 1.0]
+
+
+def test_a_surface_that_is_not_there_is_named():
+    with pytest.raises(
+        ValueError, match=r"row 1 of the merit function: CTGT .* surface 9: this lens has surfaces 0 to 3"
+    ):
+        Evaluation(Model(plate(3.0)), [Row("CTGT", (9, 0), target=4.0, weight=1.0)])
+
+
 def test_rows_that_comply_stay_in_the_sum_of_weights():
     rows = [Row("MNCG", (1, 2), target=4.0, weight=1.0), Row("MXCG", (1, 2), target=9.0, weight=3.0)]
     assert Evaluation(Model(plate(3.0)), rows)(np.zeros(0)).merit == pytest.approx(np.sqrt(1.0 / 4.0))

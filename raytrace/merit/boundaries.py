@@ -1,7 +1,8 @@
 """Operands of boundaries: thicknesses, curvatures, conics and semi-diameters that shall not pass a target.
 
 A row over several surfaces is its target where all of them comply, else less, or more, by the sum of what they lack. So
-its error is 0 and does not move where the boundary is kept, and grows from 0 steadily where it is passed.
+its error is 0 and does not move where the boundary is kept, and grows from 0 steadily where it is passed. Breaks of
+coordinates are no surfaces here, and a gap ends at the next one that is none.
 """
 
 from collections.abc import Callable, Sequence
@@ -48,6 +49,8 @@ def _along_light(prepared: Prepared) -> Prepared:
 
     def prepare(planner: Planner, surfaces: Sequence[int], code: int) -> Amounts:
         amounts, side = prepared(planner, surfaces, 0), planner.shared(Gaps).side
+        if planner.readings.behind_mirrors == "signed" or (side > 0).all():
+            return amounts
         return lambda now: side * amounts(now)
 
     return prepare
@@ -104,8 +107,8 @@ def _of_glass(tell: Callable) -> Prepared:
 
 
 def _single(line: Line, planner: Planner) -> list[tuple[int, int]]:
-    """The surface that a row names, and the side of its edge."""
-    surface, code = line.row.integers
+    """The surface that a row names, and the side of its edge. Raises BadRow."""
+    surface, code = planner.checked(line, line.row.integers[0]), line.row.integers[1]
     return [(surface, code if 0 <= code < len(SIDES) else 0)]
 
 
@@ -142,29 +145,57 @@ class _Places:
             for code in sorted(set(self.codes.tolist()))
         }
 
-    def at(self, now: Now):
+    def values(self, now: Now) -> np.ndarray:
+        """Without derivatives."""
         found = np.zeros(len(self.rows))
         for code, tell in self.amounts.items():
-            own = tell(now)[self.surfaces]
-            found = own if len(self.amounts) == 1 else np.where(self.codes == code, own, found)
+            own = self.codes == code
+            found[own] = value_of(tell(now))[self.surfaces[own]]
+        return found
+
+    def at(self, now: Now, places: np.ndarray):
+        """Those of some places, with derivatives."""
+        found = np.zeros(len(places))
+        for code, tell in self.amounts.items():
+            own = tell(now)[self.surfaces[places]]
+            found = own if len(self.amounts) == 1 else np.where(self.codes[places] == code, own, found)
         return found
 
 
 def within(prepared: Prepared, chosen: Chosen, side: float, length: int):
-    """Rows that are their target where no surface passes it, else off by the sum of what the surfaces lack."""
+    """Rows that are their target where no surface passes it, else off by what the surfaces lack."""
 
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
         places = _Places(prepared, chosen, lines, planner)
         targets = np.array([line.row.target for line in lines]) * planner.unit**length
-        summed = side * (places.rows == np.arange(len(lines))[:, None])
+        counted = LACKS[planner.readings.boundary]
 
         def evaluate(now: Now) -> Found:
-            lacks = side * (targets[places.rows] - places.at(now))
-            return Found(targets - summed @ np.where(value_of(lacks) <= 0, 0.0, lacks))
+            lacks = side * (targets[places.rows] - places.values(now))
+            passed = counted(np.flatnonzero(~(lacks <= 0)), places.rows, lacks)  # nan is none that complies
+            if not passed.size:
+                return Found(targets)
+            rows = places.rows[passed]
+            of_row = (rows == np.arange(len(lines))[:, None]).astype(float)
+            return Found(targets - of_row @ (targets[rows] - places.at(now, passed)))
 
         return evaluate
 
     return plan
+
+
+def _all(passed: np.ndarray, rows: np.ndarray, lacks: np.ndarray) -> np.ndarray:
+    return passed
+
+
+def _largest(passed: np.ndarray, rows: np.ndarray, lacks: np.ndarray) -> np.ndarray:
+    """Of every row the place that lacks most."""
+    order = passed[np.argsort(-lacks[passed], kind="stable")]
+    return order[np.unique(rows[order], return_index=True)[1]]
+
+
+#: Which of the places that pass a target count, by `Readings.boundary`.
+LACKS = {"sum": _all, "largest": _largest}
 
 
 def value(prepared: Prepared):
@@ -172,12 +203,16 @@ def value(prepared: Prepared):
 
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
         places = _Places(prepared, _single, lines, planner)
-        return lambda now: Found(places.at(now))
+        every = np.arange(len(lines))
+        return lambda now: Found(places.at(now, every))
 
     return plan
 
 
-_SUM = "the sum of what the surfaces lack, not the largest; thicknesses behind an odd number of mirrors count reversed"
+_SUM = (
+    "`boundary` sum: of what all surfaces lack, or largest; `behind_mirrors` reversed: thicknesses behind an odd "
+    "number of mirrors are compared along the light, or signed: as the lens has them"
+)
 _SIGNED = "thicknesses behind mirrors as the lens has them, negative"
 _PLACES = {
     "G": (_in_glass, "in glass"),

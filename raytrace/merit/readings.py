@@ -10,11 +10,16 @@ class Readings:
     opd_tilt: of OPDX, whether a tilt is fitted for every wavelength of a field, or one that all have in common.
     opd_chief: whose chief ray the reference sphere is about, that of the row's own wavelength or of the primary one.
     opd_sign: whether a longer or a shorter path than the chief ray's is a positive OPD.
+    boundary: what a row over several surfaces is off by, the sum of what they lack or the largest of it.
+    behind_mirrors: whether least and largest thicknesses are compared with those behind an odd number of mirrors
+        reversed, along the light, or signed, as the lens has them.
     """
 
     opd_tilt: str = "per wavelength"
     opd_chief: str = "own"
     opd_sign: str = "longer"
+    boundary: str = "sum"
+    behind_mirrors: str = "reversed"
 
     def __post_init__(self):
         for name, known in CHOICES.items():
@@ -27,4 +32,6 @@ CHOICES = {
     "opd_tilt": ("per wavelength", "common"),
     "opd_chief": ("own", "primary"),
     "opd_sign": ("longer", "shorter"),
+    "boundary": ("sum", "largest"),
+    "behind_mirrors": ("reversed", "signed"),
 }
