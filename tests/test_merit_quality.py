@@ -8,6 +8,7 @@ from problems import vector, vignetting_aperture
 
 import raytrace as rt
 from raytrace.maths.pupil import gauss_rings, square
+from raytrace.merit.measure import Measure
 from raytrace.merit.merit import Evaluation
 from raytrace.merit.model import Model
 from raytrace.merit.plan import BadRow
@@ -15,7 +16,7 @@ from raytrace.optics.focus import image_rays
 from raytrace.optics.scene import scene
 from raytrace.optics.spot import spot_of, spot_of_points
 from raytrace.optics.wavefront import rms, wavefront_of, without
-from raytrace.system.intent import Row, Vary
+from raytrace.system.intent import Row, Solve, Vary
 
 FIELD = (0.0, 0.7)
 
@@ -144,3 +145,179 @@ def test_a_beam_that_loses_a_ray_is_lost_and_on_a_grid_those_that_arrive_count()
     assert np.isfinite(found.residuals).all()
     assert found.jacobian[found.of_row > 1].any()
     assert not found.jacobian[found.of_row < 2].any()
+
+
+# -- modulation --------------------------------------------------------------------------------------------------------
+
+SECTIONS = {"T": (1.0, 0.0), "S": (0.0, 1.0), "A": (0.5, 0.5)}
+SHARP = "telephoto"
+
+
+def in_columns(operand: str, *, wavelength=0, field=1, frequency=20.0, sampling=2, plain=0.0, weight=1.0) -> Row:
+    return Row(operand, (sampling, wavelength), (field, frequency, plain, 0.0), weight=weight)
+
+
+@pytest.mark.parametrize("name", ["cooke_triplet", "double_gauss_28deg"])
+def test_modulation_is_that_of_the_analysis(name):
+    """To what a grid of 128 points leaves, the least that the analysis takes; rays to what rings leave."""
+    lens = rt.read_lens(name)
+    last, frequencies = len(lens.fields.x), [15.0, 30.0]
+    for prefix, geometric in (("MTF", False), ("GMT", True)):
+        expected = rt.mtf(lens, frequencies, geometric=geometric)
+        for section, shares in SECTIONS.items():
+            for field in (1, last):
+                asked = [
+                    in_columns(prefix + section, field=field, frequency=f, plain=1.0, sampling=3) for f in frequencies
+                ]
+                both = expected.tangential[field - 1], expected.sagittal[field - 1]
+                assert (
+                    np.abs(values(lens, asked) - sum(s * b.numpy() for s, b in zip(shares, both, strict=True))).max()
+                    < 1e-3
+                )
+
+
+def test_one_wavelength_is_that_one_alone():
+    """The analysis makes it the primary one, whose entrance pupil the rays are then aimed at: 1e-5 of its place."""
+    lens = rt.read_lens("cooke_triplet")
+    asked = [in_columns(name, wavelength=3, field=2, plain=1.0, sampling=3) for name in ("MTFT", "GMTT")]
+    how = {"fields": [float(lens.fields.y[1])], "wavelengths": [float(lens.wavelengths[2])]}
+    expected = [float(rt.mtf(lens, [20.0], geometric=g, **how).tangential[0, 0]) for g in (False, True)]
+    assert np.abs(values(lens, asked) - expected).max() < 1e-3
+    assert np.abs(values(lens, [in_columns("MTFT", field=2), in_columns("GMTT", field=2)]) - expected).min() > 1e-2
+
+
+def test_rays_are_scaled_by_a_perfect_lens_unless_told():
+    lens = rt.read_lens("cooke_triplet")
+    scaled, plain = values(lens, [in_columns("GMTS", plain=p) for p in (0.0, 1.0)])
+    assert scaled / plain == pytest.approx(float(rt.mtf(lens, [20.0]).limit[0]), rel=1e-12)
+
+
+def test_strehl_is_that_of_the_wavefront_map():
+    lens = rt.read_lens(SHARP)
+    expected = rt.wavefront(lens, size=9).strehl
+    share = lens.wavelength_weights / lens.wavelength_weights.sum()
+    found = values(lens, [Row("STRH", (1, w), (1, 0, 0, 0)) for w in (0, 1)])
+    assert found[0] == pytest.approx(float((share * expected[0]).sum()), rel=1e-9)
+    assert found[1] == pytest.approx(float(expected[0, 0]), rel=1e-9)
+
+
+@pytest.mark.parametrize("operand", ["MTFT", "MTFS", "MTFA", "GMTT", "GMTS", "GMTA", "STRH"])
+def test_derivatives_of_modulation(operand):
+    """Those of the Strehl ratio hold the best point of the image where it was, which no first derivative feels."""
+    lens = clipped(0.9) if operand != "STRH" else rt.read_lens(SHARP)
+    model = Model(lens, (Vary(1, "curvature"), Vary(len(lens.surfaces) - 2, "thickness")))
+    asked = [
+        in_columns(operand, field=f, wavelength=w)
+        for f, w in ((1, 2 if operand != "STRH" else 1), (len(lens.fields.x), 1))
+    ]
+    evaluation = Evaluation(model, asked)
+    found = evaluation(model.start, derivatives=True)
+    expected = slopes_by_differences(evaluation, model.start, 1e-6)
+    difference = np.abs(found.jacobian / evaluation.factors[:, None] - expected)
+    assert (difference < 1e-5 * np.abs(expected).max(1, keepdims=True)).all()
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        (in_columns("MTFT", field=7), "names field 7: this lens has fields 1 to 3"),
+        (in_columns("MTFT", frequency=0.0), "has the frequency 0"),
+        (in_columns("GMTA", sampling=0), "has the sampling 0: expected 1 to 6"),
+        (in_columns("STRH", field=1.5), "names field 1.5"),
+    ],
+)
+def test_arguments_that_name_nothing(row, words):
+    with pytest.raises(BadRow, match=f"row 1 .*{row.operand} {words}"):
+        values(rt.read_lens("cooke_triplet"), [row])
+
+
+# -- any function of a lens --------------------------------------------------------------------------------------------
+
+
+def spot_sizes(lens: rt.Lens) -> torch.Tensor:
+    """RMS radii (F,) mm at the first wavelength."""
+    return rt.spot(lens, rings=4).rms_radius[:, 0]
+
+
+def sharpness(lens: rt.Lens) -> torch.Tensor:
+    """Σ h² of the kernel of waves: of every pixel the light that falls together."""
+    kernel = rt.psf(lens, model="wave", fields=[0.0], pixel=0.002, size=15).kernel
+    return (kernel * kernel).sum()
+
+
+def seen(lens: rt.Lens) -> torch.Tensor:
+    """RMS contrast of a blurred edge against the sharp one."""
+    edge = torch.zeros(1, 32, 32, dtype=torch.float64)
+    edge[..., 16:] = 1.0
+    kernel = rt.psf(lens, model="gaussian", fields=[0.0], pixel=0.01, size=11).kernel
+    blurred = torch.nn.functional.conv2d(edge[None], kernel[:1, :1], padding=5)
+    return (blurred - edge).square().mean().sqrt()
+
+
+FUNCTIONS = {"spots": spot_sizes, "psf": sharpness, "image": seen}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_any_function_of_a_lens_is_a_row(name):
+    """A spot, a kernel of waves, a blurred picture: value and derivatives, solves and pickups among the numbers."""
+    lens, function = rt.read_lens("cooke_triplet"), FUNCTIONS[name]
+    last = len(lens.surfaces) - 2
+    solves = (Solve(3, "curvature", "pickup", source=1, scale=-1.0),)
+    model = Model(lens, (Vary(1, "curvature"), Vary(last, "thickness")), solves)
+    asked = [Row(Measure(name, function), target=0.1, weight=2.0), Row(function, weight=1.0), Row("EFFL", weight=1.0)]
+    evaluation = Evaluation(model, asked)
+    found = evaluation(model.start, derivatives=True)
+    number = float(torch.linalg.vector_norm(function(model.lens_at(model.start))))
+    assert found.values[:2] == pytest.approx([number, number], rel=1e-12)
+    expected = slopes_by_differences(evaluation, model.start, 1e-6)
+    row = found.of_row == 0
+    by = expected[0] * evaluation.factors[0]
+    assert np.abs(found.jacobian[row] - by).max() < 1e-5 * np.abs(by).max()
+    row = found.of_row == 1
+    slope = found.jacobian[row].T @ found.residuals[row]
+    by = expected[1] * evaluation.factors[1] ** 2 * number
+    assert row.sum() == (3 if name == "spots" else 1)
+    assert np.abs(slope - by).max() < 1e-5 * np.abs(by).max()
+
+
+def test_a_function_sees_the_apertures_and_its_configuration():
+    lens, seen = clipped(0.5), []
+
+    def rays(lens: rt.Lens) -> torch.Tensor:
+        seen.append(sum(len(surface.apertures) for surface in lens.surfaces))
+        return image_rays(lens, square(9)[0], fields=at(lens)).valid.sum().double()
+
+    found = values(lens, [Row(rays, weight=1.0)])
+    assert seen[0] == 1
+    assert found[0] == float(image_rays(lens, square(9)[0], fields=at(lens)).valid.sum())
+
+
+def test_lengths_of_a_measure_are_in_the_unit_of_the_rows():
+    lens = rt.read_lens("cooke_triplet")
+    first = Measure("first spot", lambda lens: spot_sizes(lens)[0], length=1)
+    row = Row(first, weight=1.0)
+    assert str(first) == "first spot"
+    assert values(lens, [row], unit=25.4)[0] == pytest.approx(values(lens, [row])[0] / 25.4, rel=1e-14)
+
+
+def test_a_function_that_has_no_number_at_first_is_an_error_and_later_a_lost_row():
+    lens = rt.read_lens("cooke_triplet")
+    model = Model(lens, (Vary(len(lens.surfaces) - 2, "thickness"),))
+
+    def near(lens: rt.Lens) -> torch.Tensor:
+        if float(lens.surfaces[-2].thickness.detach()) > 60.0:
+            raise ValueError("too far away")
+        return lens.surfaces[-2].thickness
+
+    evaluation = Evaluation(model, [Row(near, weight=1.0)])
+    with pytest.raises(BadRow, match=r"row 1 .*near.* has no value: too far away"):
+        evaluation(np.array([61.0]))
+    assert evaluation(np.array([50.0]), derivatives=True).jacobian.tolist() == [[1.0]]
+    found = evaluation(np.array([61.0]), derivatives=True)
+    assert found.lost.all()
+    assert not found.jacobian.any()
+
+
+def test_a_function_that_gives_no_numbers_is_refused():
+    with pytest.raises(TypeError, match=r"row 1 .*\[2, 2\], expected a tensor \(\) or \(k,\)"):
+        values(rt.read_lens("cooke_triplet"), [Row(lambda lens: torch.ones(2, 2), weight=1.0)])

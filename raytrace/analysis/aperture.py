@@ -40,12 +40,13 @@ class ExitPupil:
     light: Tensor
 
 
-def exit_pupil(scene: Scene, *, size: int | None = None) -> ExitPupil:
+def exit_pupil(scene: Scene, *, size: int | None = None, least: int = _LEAST) -> ExitPupil:
     """Trace the rays of a regular grid of directions, found by a Zernike map from directions to the pupil.
 
     Light is spread evenly over the entrance pupil: |A|² = |∂p/∂(L, M)|. A cell that the rim of the pupil crosses counts
     by its share, so that the grid errs by O(1/N²); one at the rim of another aperture counts or does not.
-    size: N points across, by default as many as keep blurs from overlapping. Raises ValueError where that is too many.
+    size: N points across, by default as many as keep blurs from overlapping, and `least`. Raises ValueError where that
+    is too many.
     """
     like = {"dtype": scene.wavelengths.dtype, "device": scene.wavelengths.device}
     points, weights = gauss_rings(*_PROBE, **like)
@@ -53,7 +54,7 @@ def exit_pupil(scene: Scene, *, size: int | None = None) -> ExitPupil:
     enough = (probe.usable.sum(-1) >= 2 * _TERMS) & probe.valid.any(-1)
     refuse_dark(scene.lens, scene.fields, enough[0], "wave on the sensor")
     waves_per = 1e3 * probe.index / probe.wavelength  # n/λ, 1/mm
-    middle, half = _box(probe.direction[:2].detach(), probe.usable)
+    middle, half = _box(probe.direction[:2], probe.usable)
     narrow = (beam_share(scene)[0, :, 0] == 0) | (half == 0).any(0).any(-1)[0]
     if bool(narrow.any()):
         name = name_of_field(scene.fields[:, int(narrow.to(torch.int8).argmax())])
@@ -61,7 +62,7 @@ def exit_pupil(scene: Scene, *, size: int | None = None) -> ExitPupil:
     if size is None:
         blur = torch.where(probe.usable, torch.linalg.vector_norm(probe.landing, dim=0), 0.0).amax(-1)
         needed = 4 * float((blur * half.amax(0) * waves_per).max().detach())
-        size = max(_LEAST, 64 * math.ceil(needed / 64))
+        size = max(least, 64 * math.ceil(needed / 64))
     if size > _MOST:
         raise ValueError(
             f"the blur needs {size} points across the pupil, more than {_MOST}: focus the lens, or use geometric rays"

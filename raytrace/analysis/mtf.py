@@ -125,7 +125,7 @@ def mtf(
 
 def _mtf(lens: Lens, fields: Tensor, frequencies: Tensor, geometric: bool, *, marked: bool = False) -> Mtf:
     tangential, sagittal = (_geometric if geometric else _diffraction)(lens, fields, frequencies)
-    perfect = _circle(frequencies[:, None] / cutoff(lens, lens.wavelengths)) @ wavelength_shares(lens)
+    perfect = clear_circle(frequencies[:, None] / cutoff(lens, lens.wavelengths)) @ wavelength_shares(lens)
     return Mtf(lens, fields, frequencies, tangential, sagittal, None if geometric else perfect, geometric, marked)
 
 
@@ -161,13 +161,13 @@ def _diffraction(lens: Lens, fields: Tensor, frequencies: Tensor) -> tuple[Tenso
         pupil = exit_pupil(Scene(whole.lens, field, whole.wavelengths))
         shift, weights = _from_primary(lens, pupil.centre), wavelength_shares(lens) * pupil.light
         sections = zip((pupil.amplitude.mT, pupil.amplitude), pupil.step.flip(0), shift.flip(0), strict=True)
-        otfs = ((_along(lines, pupil.energy, frequencies, step), place) for lines, step, place in sections)
-        rows.append([_modulation(otf, frequencies, place, weights) for otf, place in otfs])
+        otfs = ((otf_along(lines, pupil.energy, frequencies, step), place) for lines, step, place in sections)
+        rows.append([modulation(otf, frequencies, place, weights) for otf, place in otfs])
     tangential, sagittal = (torch.cat(parts) for parts in zip(*rows, strict=True))
     return tangential, sagittal
 
 
-def _along(lines: Tensor, energy: Tensor, frequencies: Tensor, step: Tensor) -> Tensor:
+def otf_along(lines: Tensor, energy: Tensor, frequencies: Tensor, step: Tensor) -> Tensor:
     """OTF (F, W, K) of waves (F, W, N, N) shifted along their last axis.
 
     Between whole steps by sin(πt)/(πt), of what is left when a clear circle's OTF, which has the same kink at zero
@@ -180,12 +180,12 @@ def _along(lines: Tensor, energy: Tensor, frequencies: Tensor, step: Tensor) -> 
     overlap = torch.cat([(energy + 0j)[..., None], overlap[..., 1:]], -1) / energy[..., None]
     lag = torch.fft.fftfreq(2 * size, 1 / (2 * size), dtype=step.dtype, device=step.device)
     steps = frequencies / step[..., None]
-    smooth = overlap - _circle(lag.abs() * MARGIN / size)
+    smooth = overlap - clear_circle(lag.abs() * MARGIN / size)
     between = torch.sinc(steps[..., None] - lag)
-    return (between.to(overlap.dtype) @ smooth[..., None])[..., 0] + _circle(steps * MARGIN / size)
+    return (between.to(overlap.dtype) @ smooth[..., None])[..., 0] + clear_circle(steps * MARGIN / size)
 
 
-def _circle(s: Tensor) -> Tensor:
+def clear_circle(s: Tensor) -> Tensor:
     """OTF (2/π)(acos s - s √(1 - s²)) of a clear circle, s the frequency over its cutoff; 0 beyond."""
     passes = s < 1
     s = torch.where(passes, s, 0.5)
@@ -223,7 +223,7 @@ def _of_spots(lens: Lens, fields: Tensor, frequencies: Tensor, points: Tensor, r
     for along in (1, 0):
         offset = torch.where(rays.valid, hits[along] - mean[along][..., None], 0.0)
         otf = [(phasor(-frequency * offset) * energy).sum(-1) / light for frequency in frequencies]
-        result.append(_modulation(torch.stack(otf, -1), frequencies, shift[along], weights))
+        result.append(modulation(torch.stack(otf, -1), frequencies, shift[along], weights))
     return tuple(result)
 
 
@@ -232,7 +232,7 @@ def _from_primary(lens: Lens, place: Tensor) -> Tensor:
     return place - place[..., lens.primary_wavelength, None]
 
 
-def _modulation(otf: Tensor, frequencies: Tensor, shift: Tensor, weights: Tensor) -> Tensor:
+def modulation(otf: Tensor, frequencies: Tensor, shift: Tensor, weights: Tensor) -> Tensor:
     """|OTF| (F, K) of OTFs (F, W, K) at places `shift` (F, W) mm, added by weights (F, W)."""
     weights = safe_divide(weights, weights.sum(-1, keepdim=True))[..., None]
     total = (weights * otf * phasor(-frequencies * shift[..., None])).sum(-2)

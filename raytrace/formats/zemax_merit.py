@@ -81,8 +81,8 @@ def lines(merit: Iterable[Row], place: Place) -> list[str]:
 
 
 def _line(row: Row, place: Place) -> str:
-    if not _OPERAND.fullmatch(row.operand):
-        raise LensFileError(f"{row.operand!r} is no name of an operand of four capital letters", place)
+    if not _OPERAND.fullmatch(str(row.operand)):
+        raise LensFileError(f"{str(row.operand)!r} is no name of an operand of four capital letters", place)
     text = one_line(row.text, "a text of the merit function", place)
     if row.operand == _TEXT:
         return f"{_TEXT} {text}".rstrip()

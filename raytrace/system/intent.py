@@ -6,6 +6,7 @@ are.
 """
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 
 
@@ -89,14 +90,15 @@ def _where(one: Vary | Solve) -> str:
 class Row:
     """One line of a merit function: an operand, its arguments, and what it is meant to be.
 
-    operand: its name, as "TRAC", a key of `merit.OPERANDS` where it is known; integers, numbers: its arguments as the
+    operand: its name, as "TRAC", a key of `merit.OPERANDS` where it is known, or a function from a lens to a tensor
+        () or (k,), which may be a `merit.Measure`; integers, numbers: its arguments as the
         field's programs write them: surfaces, a wavelength (from 1, 0 the primary one) or rows; Hx, Hy, Px, Py or data.
     target, weight: the merit is the weighted mean square of value - target; a weight of 0 shows the value alone.
     text: what a line of text says, and words behind the numbers; further: numbers behind those.
     Lengths in `Intent.unit`: a merit of lengths and pure numbers depends on the unit, so rows stay as written.
     """
 
-    operand: str
+    operand: str | Callable
     integers: tuple[int, int] = (0, 0)
     numbers: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     target: float = 0.0
