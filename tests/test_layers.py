@@ -33,7 +33,7 @@ FLOORS = {
     "wave": 7,
     "camera": 8,
     "merit": 8,
-    "optimize": 9,
+    "optimization": 9,
     # people
     "plot": 10,
     "cli": 11,

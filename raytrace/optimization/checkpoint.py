@@ -1,0 +1,69 @@
+"""Checkpoints and the log of an optimisation: files that tell how far it has come."""
+
+import json
+import time
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from raytrace.files import write_atomically
+from raytrace.optimization.least_squares import Cycle
+
+EVERY = 2.0  # s between two checkpoints
+_COLUMNS = ("cycle", "merit", "missed", "step", "damping", "evaluations", "seconds", "limits")
+
+
+class BadCheckpoint(ValueError):
+    """A checkpoint that is none, or of another lens; the message says what was found and what was expected."""
+
+
+class Checkpoint:
+    """Keeps the best variables in a file, replaced as a whole: {"variables": {name: number}, "merit": …, …}."""
+
+    def __init__(self, path: str | PathLike | None, names: Sequence[str]):
+        self.path, self.names, self.last = path, names, -np.inf
+
+    def keep(self, x: np.ndarray, merit: float, cycle: int, *, now: bool = False) -> None:
+        if self.path is None or (not now and time.monotonic() < self.last + EVERY):
+            return
+        told = {"merit": merit, "cycles": cycle, "variables": dict(zip(self.names, x.tolist(), strict=True))}
+        text = json.dumps(told, indent=1)
+        write_atomically(self.path, lambda file: file.write(text.encode()))
+        self.last = time.monotonic()
+
+
+def resumed(path: str | PathLike, names: Sequence[str]) -> np.ndarray:
+    """The variables (n,) that a checkpoint keeps. Raises BadCheckpoint and OSError."""
+    try:
+        kept = json.loads(Path(path).read_text(encoding="utf-8"))["variables"]
+        found = {str(name): float(number) for name, number in kept.items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise BadCheckpoint(f"{path}: no checkpoint of an optimisation; expected what `checkpoint` wrote") from error
+    if missing := [name for name in names if name not in found]:
+        raise BadCheckpoint(
+            f"{path}: a checkpoint of other variables: {', '.join(found)}; expected {missing[0]} among them"
+        )
+    return np.array([found[name] for name in names])
+
+
+class Log:
+    """A line of comma-separated values for every cycle."""
+
+    def __init__(self, path: str | PathLike | None):
+        self.file = None if path is None else open(path, "w", encoding="utf-8")  # noqa: SIM115
+        self._write(_COLUMNS)
+
+    def tell(self, cycle: Cycle) -> None:
+        numbers = cycle.number, cycle.merit, cycle.missed, cycle.step, cycle.damping, cycle.evaluations
+        self._write([*map(repr, numbers), f"{cycle.seconds:.3f}", cycle.limits.replace(",", ";")])
+
+    def _write(self, words: Sequence[str]) -> None:
+        if self.file is not None:
+            self.file.write(",".join(words) + "\n")
+            self.file.flush()
+
+    def close(self) -> None:
+        if self.file is not None:
+            self.file.close()

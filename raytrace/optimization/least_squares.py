@@ -1,0 +1,265 @@
+"""Damped least squares: variables to where a sum of squares is least, under bounds and conditions.
+
+Every cycle takes the exact Jacobian J of the residuals r, scales variables by its columns and tries the step of the
+damped linear model (`step.py`), bent by the second derivative along it (geodesic acceleration); how much of what the
+model foretold came true sets the damping of the next.
+
+Source: Levenberg 1944, Marquardt 1963, Moré 1978; Nielsen 1999 (damping by the gain); Transtrum & Sethna 2012 (geodesic
+acceleration).
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from raytrace.optimization.step import Linear, NoStep, Sides
+
+_BEND = 0.75  # the longest acceleration beside the velocity
+_PROBE = 0.1  # of the velocity, over which its change is measured
+_ACCEPT = 1e-4  # the least gain of a step, as part of what was foretold
+_TRIES = 40  # of steps in one cycle
+_FLAT = 1e-10  # cosine between the residuals and any column of the Jacobian at a minimum
+_STILL = 1e-13  # a step as part of the variables
+_ROUNDING = 1e-14  # of the merit's square: what a step must at least foretell
+_IDLE = 8  # cycles over which the merit must have changed
+_MET = 1e-11  # conditions as part of their own scale
+
+
+@dataclasses.dataclass(frozen=True)
+class State:
+    """A sum of squares and its conditions at x (n,): residuals (m,), sides, held (h,) = 0 and limits (l,) ≤ 0.
+
+    lost: how many rays are; jacobian, held_slope, limits_slope: derivatives, None where none were asked for.
+    """
+
+    x: np.ndarray
+    residuals: np.ndarray
+    lost: int
+    sides: Sides
+    held: np.ndarray
+    limits: np.ndarray
+    jacobian: np.ndarray | None = None
+    held_slope: np.ndarray | None = None
+    limits_slope: np.ndarray | None = None
+
+    @property
+    def cost(self) -> float:
+        return float(self.residuals @ self.residuals) + self.sides.cost()
+
+    @property
+    def missed(self) -> np.ndarray:
+        """By how much each condition is missed."""
+        return np.concatenate([np.abs(self.held), np.maximum(self.limits, 0.0)])
+
+    @property
+    def is_finite(self) -> bool:
+        return bool(np.isfinite(self.cost) and np.isfinite(self.held).all() and np.isfinite(self.limits).all())
+
+
+@dataclasses.dataclass(frozen=True)
+class Cycle:
+    """What is told of a cycle: its number, the merit, how far conditions are missed, the step, and what limits it."""
+
+    number: int
+    merit: float
+    missed: float
+    step: float
+    damping: float
+    evaluations: int
+    seconds: float
+    limits: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Descent:
+    """Where it ended and why."""
+
+    state: State
+    stopped: str
+    cycles: tuple[Cycle, ...]
+    evaluations: int
+    damping: float
+
+
+Evaluate = Callable[[np.ndarray, bool], State]
+
+
+@dataclasses.dataclass(frozen=True)
+class Manner:
+    """How to descend. damping: at the start; raised, lowered: by how much, as the least; bends: with acceleration;
+    keeps: scales of variables never shrink. A path of its own each, where there are several minima."""
+
+    damping: float = 1e-3
+    raised: float = 2.0
+    lowered: float = 0.2
+    bends: bool = True
+    keeps: bool = False
+    tolerance: float = 1e-8
+
+
+def least_squares(
+    evaluate: Evaluate,
+    x: np.ndarray,
+    *,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    manner: Manner = Manner(),
+    cycles: int = 1000,
+    until: float = np.inf,
+    watch: Callable[[Cycle, State], None] | None = None,
+) -> Descent:
+    """Descend from x, which is within the bounds, so many cycles, or until a time of `time.monotonic`.
+
+    watch: told of every cycle; a KeyboardInterrupt ends with the best state.
+    """
+    return _Run(evaluate, lower, upper, manner, until, watch).descend(x, cycles)
+
+
+class _Run:
+    def __init__(self, evaluate, lower, upper, manner: Manner, until: float, watch):
+        self.evaluate, self.lower, self.upper, self.manner = evaluate, lower, upper, manner
+        self.until, self.watch = until, watch
+        self.evaluations, self.told, self.begun = 0, [], time.monotonic()
+        self.damping, self.share, self.price = manner.damping, 1.0, 0.0
+        self.scale = None
+
+    def at(self, x: np.ndarray, derivatives: bool = False) -> State:
+        self.evaluations += 1
+        return self.evaluate(x, derivatives)
+
+    def descend(self, x: np.ndarray, cycles: int) -> Descent:
+        self.state = self.at(x, True)
+        stopped = "cycles"
+        try:
+            for number in range(1, cycles + 1):
+                if reason := self._cycle(number):
+                    stopped = reason
+                    break
+        except KeyboardInterrupt:
+            stopped = "interrupted"
+        return Descent(self.state, stopped, tuple(self.told), self.evaluations, self.damping)
+
+    def _cycle(self, number: int) -> str:
+        """One accepted step; the reason where there is none to come."""
+        if time.monotonic() > self.until:
+            return "seconds"
+        linear = self._linear()
+        if self._is_flat(linear):
+            return "gradient"
+        for _ in range(_TRIES):
+            if time.monotonic() > self.until:
+                return "seconds"
+            trial, step, foretold = self._try(linear)
+            if step is not None and foretold <= _ROUNDING * self.state.cost and not (self.state.missed > 1e-9).any():
+                return "gradient"
+            if trial is not None and self._takes(trial, foretold):
+                self.state = self.at(trial.x, True)
+                self._tell(number, step)
+                return self._idle()
+            self.damping, self.factor = self.damping * self.factor, 2 * self.factor
+            if step is None or (self.state.missed > 1e-9).any():
+                self.share *= 0.5
+            if step is None:
+                continue
+            if np.linalg.norm(self.scale * step) <= _STILL * (np.linalg.norm(self.scale * self.state.x) + 1e-300):
+                return "step"
+        return "step"
+
+    factor = 2.0
+
+    def _linear(self) -> Linear:
+        state = self.state
+        columns = np.sqrt((state.jacobian**2).sum(0) + (state.sides.slope[state.sides.excess > 0] ** 2).sum(0))
+        columns = np.where(columns > 0, columns, 1.0)
+        self.scale = np.maximum(columns, self.scale) if self.manner.keeps and self.scale is not None else columns
+        return Linear(
+            state.residuals, state.jacobian, sides=state.sides, held=(state.held, state.held_slope),
+            limits=(state.limits, state.limits_slope), lower=self.lower - state.x, upper=self.upper - state.x,
+            scale=self.scale,
+        )  # fmt: skip
+
+    def _try(self, linear: Linear):
+        """The state of a trial step, the step, and what the model foretells; None where there is no step."""
+        try:
+            step = linear.step(self.damping, self.share)
+        except NoStep:
+            return None, None, 0.0
+        bent = self._bent(linear, step) if self.manner.bends else step
+        trial = self.at(np.clip(self.state.x + bent, self.lower, self.upper))
+        if len(self.state.held) and trial.is_finite:
+            trial = self._restored(linear, trial)
+        foretold = linear.value(0 * step) - linear.value(step * self.scale)
+        return trial, step, foretold
+
+    def _bent(self, linear: Linear, step: np.ndarray) -> np.ndarray:
+        """The step with half its acceleration -(JᵀJ + λ D²)⁻¹ Jᵀ r″, r″ the second derivative along it."""
+        ahead = self.at(np.clip(self.state.x + _PROBE * step, self.lower, self.upper))
+        if not ahead.is_finite or ahead.lost > self.state.lost or len(ahead.residuals) != len(self.state.residuals):
+            return step
+        change = (ahead.residuals - self.state.residuals) / _PROBE
+        second = 2 / _PROBE * (change - self.state.jacobian @ step)
+        bend = 0.5 * linear.bend(self.state.jacobian.T @ second / self.scale, self.damping)
+        if 2 * np.linalg.norm(self.scale * bend) > _BEND * np.linalg.norm(self.scale * step):
+            return step
+        return step + bend
+
+    def _restored(self, linear: Linear, trial: State) -> State:
+        """Equalities met again, which curved away beneath the step."""
+        for _ in range(2):
+            if np.abs(trial.held).max() <= _MET * max(np.abs(self.state.held).max(), 1e-3):
+                break
+            x = trial.x - linear.correction((1 - self.share) * -self.state.held + trial.held)
+            again = self.at(np.clip(x, self.lower, self.upper))
+            if not again.is_finite or np.abs(again.held).sum() > np.abs(trial.held).sum():
+                break
+            trial = again
+        return trial
+
+    def _takes(self, trial: State, foretold: float) -> bool:
+        """Whether a trial is taken; sets the damping by how much of what was foretold came true."""
+        state = self.state
+        if not trial.is_finite or trial.lost > state.lost:
+            return False
+        missed, left = state.missed.sum(), trial.missed.sum()
+        if missed > 0 and left < missed:
+            self.price = max(self.price, 2 * abs(min(foretold, 0.0)) / (missed - left))
+        won = state.cost - trial.cost + self.price * (missed - left)
+        foretold = foretold + self.price * missed * self.share
+        if trial.lost < state.lost:
+            return True
+        gain = won / foretold if foretold > 0 else -1.0
+        if not gain > _ACCEPT:
+            return False
+        if gain > 0.25:
+            self.damping = max(self.damping * max(self.manner.lowered, 1 - (2 * min(gain, 1.5) - 1) ** 3), 1e-15)
+        self.factor, self.share = self.manner.raised, min(1.0, 2 * self.share)
+        return True
+
+    def _is_flat(self, linear: Linear) -> bool:
+        size = np.sqrt(self.state.cost)
+        if size == 0:
+            return not self.state.missed.any()
+        return linear.steepness() <= _FLAT * size and not (self.state.missed > 1e-9).any()
+
+    def _idle(self) -> str:
+        """ "merit" where it has not changed over some cycles."""
+        told = self.told[-_IDLE - 1 :]
+        if len(told) <= _IDLE or told[0].missed > max(1e-9, 1.01 * told[-1].missed):
+            return ""
+        fell = told[0].merit - told[-1].merit
+        return "merit" if fell <= self.manner.tolerance * told[0].merit else ""
+
+    def _tell(self, number: int, step: np.ndarray) -> None:
+        state = self.state
+        length = float(np.linalg.norm(self.scale * step))
+        at_bound = int(((state.x <= self.lower) | (state.x >= self.upper)).sum())
+        words = f"{at_bound} at their bounds" if at_bound else ""
+        told = Cycle(
+            number, float(np.sqrt(state.cost)), float(state.missed.max(initial=0.0)), length, self.damping,
+            self.evaluations, time.monotonic() - self.begun, words,
+        )  # fmt: skip
+        self.told.append(told)
+        if self.watch is not None:
+            self.watch(told, state)

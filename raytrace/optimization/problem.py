@@ -1,0 +1,111 @@
+"""Problem: the rows of a merit function over a model, as the sum of squares and conditions that a solver descends on.
+
+Rows of positive weight are squared; rows of negative weight, and what is held, are conditions that are met exactly.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from raytrace.merit.merit import LOST, Evaluated, Evaluation
+from raytrace.merit.model import Model
+from raytrace.optimization.least_squares import State
+from raytrace.optimization.lost import MARGIN, STEEP, Recovery
+from raytrace.optimization.step import Sides
+from raytrace.system.intent import Row
+
+#: Signs by which a relation is a limit ≤ 0; equalities have none.
+RELATIONS = {"=": 0, "<=": 1, ">=": -1}
+
+
+class NoProblem(ValueError):
+    """Nothing that could be optimised; the message says what is missing."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What is held: the value of a row related to its target by a key of RELATIONS."""
+
+    row: Row
+    relation: str = "="
+
+
+class Problem:
+    """The rows of a merit function, and conditions, over a model; `state` is what `least_squares` descends on."""
+
+    def __init__(
+        self,
+        model: Model,
+        rows: Sequence[Row],
+        conditions: Sequence[Condition] = (),
+        *,
+        unit: float = 1.0,
+        skip_unknown: bool = False,
+    ):
+        """unit: mm in the unit of length of rows and conditions. Raises NoProblem and UnknownOperand."""
+        held = tuple(_held(condition.row) for condition in conditions)
+        self.model, self.rows = model, tuple(rows)
+        self.evaluation = Evaluation(model, (*rows, *held), unit=unit, skip_unknown=skip_unknown)
+        weights = self.evaluation.weights
+        if not len(model.variables):
+            raise NoProblem("nothing varies: name variables by `vary`, as 'curvature thickness'")
+        if not (weights > 0).any():
+            raise NoProblem("no row of the merit function has a weight that counts: choose another by `merit`")
+        signs = [0] * len(self.rows) + [RELATIONS[condition.relation] for condition in conditions]
+        self.signs = np.where(weights < 0, signs, 0)
+        self.recovery = Recovery(self.evaluation)
+
+    def evaluated(self, x: np.ndarray, derivatives: bool = False) -> Evaluated:
+        return self.evaluation(x, derivatives=derivatives)
+
+    def state(self, x: np.ndarray, derivatives: bool) -> State:
+        """Residuals of rows of positive weight, and what the others miss, in units of their rows."""
+        found = self._charged(self.evaluated(x, derivatives), x)
+        of_row, weights = found.of_row, self.evaluation.weights
+        squared = weights[of_row] > 0
+        signs, factors = self.signs[of_row], self.evaluation.factors[of_row]
+        equal, limit = ~squared & (signs == 0), ~squared & (signs != 0)
+        slopes = found.jacobian
+        return State(
+            x,
+            found.residuals[squared],
+            int(found.lost[weights != 0].sum()),
+            Sides.none(len(x)),
+            found.residuals[equal] / factors[equal],
+            signs[limit] * found.residuals[limit] / factors[limit],
+            None if slopes is None else slopes[squared],
+            None if slopes is None else slopes[equal] / factors[equal, None],
+            None if slopes is None else signs[limit, None] * slopes[limit] / factors[limit, None],
+        )
+
+    def _charged(self, found: Evaluated, x: np.ndarray) -> Evaluated:
+        """With more charged for a lost ray the earlier it is lost, and as a residual of its own how far it misses.
+
+        The former tells which of two states is better, the latter, of which alone there are derivatives, the way back.
+        """
+        rows = np.unique(found.of_row[found.lost[found.of_row]])
+        if not len(rows):
+            return found
+        missed, slopes, behind = self.recovery.excess(x, rows, derivatives=found.jacobian is not None)
+        fixed = LOST * self.evaluation.factors[rows]
+        residuals, gone = found.residuals.copy(), found.lost[found.of_row]
+        residuals[gone] *= 1 + behind[np.searchsorted(rows, found.of_row[gone])]
+        further = np.concatenate([residuals, STEEP * fixed * np.where(missed > 0, missed + MARGIN, 0.0)])
+        jacobian = found.jacobian
+        if jacobian is not None:
+            jacobian = np.concatenate([jacobian, STEEP * fixed[:, None] * slopes])
+        return dataclasses.replace(
+            found, residuals=further, jacobian=jacobian, of_row=np.concatenate([found.of_row, rows])
+        )
+
+    def merit(self, found: Evaluated) -> float:
+        """M over the rows of the merit function alone."""
+        own = found.residuals[found.of_row < len(self.rows)]
+        return float(np.sqrt(own @ own))
+
+
+def _held(row: Row) -> Row:
+    """A row that does not count among the squares."""
+    return Row(row.operand, row.integers, row.numbers, row.target, -1.0, row.text, row.further)

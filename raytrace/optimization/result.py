@@ -1,0 +1,133 @@
+"""Optimized: the lens that an optimisation ended at, and how it came there."""
+
+from os import PathLike
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.formats import write_lens
+from raytrace.maths.result import Result, number, plain
+from raytrace.maths.value import value
+from raytrace.merit.operands import OPERANDS
+from raytrace.system.intent import Row
+from raytrace.system.lens import Lens
+
+#: Why a descent ends, by what is told of it.
+STOPPED = {
+    "gradient": "no variable makes the merit any less",
+    "step": "no step makes the merit any less",
+    "merit": "the merit hardly changes any more",
+    "cycles": "as many cycles as were asked for",
+    "seconds": "as much time as was asked for",
+    "interrupted": "interrupted; this is the best so far",
+}
+_SHOWN = 12  # rows of the merit function in the text, those that are left most
+
+
+@value
+class Optimized(Result):
+    """The lens at the least merit that was found, and the one before.
+
+    merit: the rows; names (n,) of the variables, before and after in variables: (n,) in mm; values: (R,) of the rows
+    before and after; contributions: (R,) of each to the square of the merit, which add up to 1; history: (cycles, 5)
+    merit, how far conditions are missed, step, damping and seconds of every cycle; stopped: a key of STOPPED.
+    """
+
+    lens: Lens
+    before: Lens
+    merit: tuple[Row, ...]
+    names: tuple[str, ...]
+    variables_before: Tensor
+    variables_after: Tensor
+    values_before: Tensor
+    values_after: Tensor
+    contributions_before: Tensor
+    contributions: Tensor
+    history: Tensor
+    merit_before: float
+    merit_after: float
+    cycles: int
+    evaluations: int
+    seconds: float
+    stopped: str
+
+    FIGURE = "plot.optimize.optimize_report"
+
+    @property
+    def rows(self) -> tuple[int, ...]:
+        """Rows that have a value, counted from 1."""
+        return tuple(i for i, row in enumerate(self.merit, 1) if row.operand in OPERANDS)
+
+    def columns(self) -> dict[str, Tensor]:
+        kept = [i - 1 for i in self.rows]
+        rows = [self.merit[k] for k in kept]
+        kinds = self.words()["operand"]
+        return {
+            "row": torch.tensor(self.rows),
+            "operand": torch.tensor([kinds.index(row.operand) for row in rows]),
+            "target": torch.tensor([row.target for row in rows], dtype=torch.float64),
+            "weight": torch.tensor([row.weight for row in rows], dtype=torch.float64),
+            "before": self.values_before[kept],
+            "after": self.values_after[kept],
+            "contribution": self.contributions[kept],
+        }
+
+    def words(self) -> dict:
+        return {"operand": [*dict.fromkeys(self.merit[i - 1].operand for i in self.rows)]}
+
+    def document(self) -> dict:
+        moved = zip(self.names, self.variables_before.tolist(), self.variables_after.tolist(), strict=True)
+        before, after = self.values_before.tolist(), self.values_after.tolist()
+        return plain(
+            {
+                "merit_before": self.merit_before,
+                "merit_after": self.merit_after,
+                "cycles": self.cycles,
+                "evaluations": self.evaluations,
+                "seconds": round(self.seconds, 3),
+                "stopped": self.stopped,
+                "variables": [{"name": name, "before": start, "after": end} for name, start, end in moved],
+                "operands": [
+                    {
+                        "row": i,
+                        "operand": self.merit[i - 1].operand,
+                        "target": self.merit[i - 1].target,
+                        "weight": self.merit[i - 1].weight,
+                        "before": number(before[i - 1]),
+                        "after": number(after[i - 1]),
+                    }
+                    for i in self.rows
+                ],
+            }
+        )
+
+    def __str__(self) -> str:
+        fell = self.merit_before / self.merit_after if self.merit_after > 0 else np.inf
+        lines = [
+            self.lens.name,
+            f"  merit {self.merit_before:.8g} → {self.merit_after:.8g}"
+            + (f", {fell:.4g} times less" if 1.1 < fell < np.inf else ""),
+            f"  {self.cycles} cycles, {self.evaluations} evaluations, {self.seconds:.1f} s; {STOPPED[self.stopped]}\n",
+            f"  {'variable':<18} {'before':>16} {'after':>16}",
+        ]
+        for name, *ends in zip(self.names, self.variables_before.tolist(), self.variables_after.tolist(), strict=True):
+            lines.append(f"  {name:<18} {ends[0]:>16.8g} {ends[1]:>16.8g}")
+        left = [i for i in sorted(self.rows, key=lambda i: -float(self.contributions[i - 1])) if self._counts(i)]
+        ends = f"{'before':>14} {'after':>14}"
+        lines.append(f"\n  {'row':>5} {'operand':<8} {'target':>12} {'weight':>10} {ends} {'left':>7}")
+        for i in left[:_SHOWN]:
+            row, share = self.merit[i - 1], float(self.contributions[i - 1])
+            ends = f"{float(self.values_before[i - 1]):>14.6g} {float(self.values_after[i - 1]):>14.6g}"
+            lines.append(f"  {i:>5} {row.operand:<8} {row.target:>12.6g} {row.weight:>10.4g} {ends} {share:>7.1%}")
+        if len(left) > _SHOWN:
+            rest = sum(float(self.contributions[i - 1]) for i in left[_SHOWN:])
+            lines.append(f"  and {len(left) - _SHOWN} more rows, {rest:.1%}")
+        return "\n".join(lines)
+
+    def _counts(self, i: int) -> bool:
+        return self.merit[i - 1].weight != 0
+
+    def save(self, path: str | PathLike) -> None:
+        """Write the lens, with its variables and its merit function."""
+        write_lens(self.lens, path)
