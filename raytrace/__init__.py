@@ -72,6 +72,14 @@ PUBLIC = {
     "to": "maths.value",
     "trace": "optics.traced",
     "tracing": "fused",
+    # optimisation
+    "BadMerit": "merit.default",
+    "Condition": "optimization.problem",
+    "NoProblem": "optimization.problem",
+    "Optimized": "optimization.result",
+    "Row": "system.intent",
+    "Vary": "system.intent",
+    "optimize": "optimization.optimize",
     # images and analyses
     "Memo": "optics.reuse",
     "Psf": "kernels",

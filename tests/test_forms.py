@@ -35,6 +35,8 @@ DIFFERENT = {
     "--steps": "quantise may take none",
     "--starts": "superres may take none",
     "--configuration": "layout draws all of them in one figure",
+    "--log": "optimize writes one; elsewhere the scale of a figure",
+    "--resume": "codesign finds its own runs",
     "--depth": "layers of a network, and distances of points",
 }
 

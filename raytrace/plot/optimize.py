@@ -1,0 +1,113 @@
+"""Optimisation report: one page that shows what an optimisation did."""
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from raytrace.optics.paraxial import first_order
+from raytrace.optimization.result import STOPPED, Optimized
+from raytrace.plot import style
+from raytrace.plot.layout import draw_layout
+from raytrace.plot.spots import airy_radius, draw_spot, field_spots, panel_size, wavelength_handles
+from raytrace.system.lens import Lens
+
+_MOST_FIELDS = 5
+_MOST_BARS = 10
+_BEFORE, _AFTER = style.FAINT, style.FIELD_COLOURS[0]
+
+
+@style.styled
+def optimize_report(found: Optimized) -> Figure:
+    """One page: the lens and its spots before and after, the merit by cycle, and the operands that are left."""
+    before, after = style.detached(found.before), style.detached(found.lens)
+    figure = style.new_figure(10.0, 10.2)
+    name = style.fill(after.name, figure.get_figwidth(), 12, bold=True) or "Lens"
+    figure.suptitle(name, fontsize=12, fontweight="bold")
+    top, middle, bottom = figure.subfigures(3, 1, height_ratios=(1.0, 1.45, 1.0), hspace=0.02)
+    for axes, lens, when in zip(top.subplots(1, 2), (before, after), ("Before", "After"), strict=True):
+        merit = found.merit_before if when == "Before" else found.merit_after
+        _draw_lens(axes, lens, f"{when}: merit {style.number_text(merit)}")
+    _draw_spots(middle, before, after)
+    left, right = bottom.subplots(1, 2, width_ratios=(1.0, 1.0))
+    _draw_history(left, found)
+    _draw_left(right, found)
+    return figure
+
+
+def _draw_lens(axes: Axes, lens: Lens, title: str) -> None:
+    draw_layout(axes, lens, fields=_fields(lens), rays=5)
+    axes.set_title(f"{title}\n", fontweight="bold", pad=4)
+    axes.annotate(
+        style.first_order_text(lens, first_order(lens)), (0.5, 1.0), (0, 5), xycoords="axes fraction",
+        textcoords="offset points", ha="center", fontsize=7.5, color=style.GREY,
+    )  # fmt: skip
+
+
+def _fields(lens: Lens):
+    """The fields that are drawn (2, F): all, or as many as stay legible, spread over all."""
+    points = torch.stack([lens.fields.x, lens.fields.y])
+    count = points.shape[1]
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _MOST_FIELDS)).round().astype(int))
+    return points[:, chosen.tolist()]
+
+
+def _draw_spots(page, before: Lens, after: Lens) -> None:
+    """A row of spots before and one after, each on a scale of its own, which its bars tell."""
+    fields = _fields(after)
+    panels = page.subplots(2, fields.shape[1], squeeze=False)
+    wavelengths, airy = style.array(after.wavelengths), float(airy_radius(after))
+    for row, lens, when in zip(panels, (before, after), ("before", "after"), strict=True):
+        whole, dots = field_spots(lens, fields=fields)
+        half = panel_size(style.array(whole.geometric_radius), airy)
+        for f, panel in enumerate(row):
+            draw_spot(panel, whole, dots, f, wavelengths=wavelengths, airy=airy, half=half)
+            if when == "before":
+                colour = style.field_colours(len(row))[f]
+                panel.set_title(style.field_label(lens, style.array(fields)[:, f]), color=colour, fontsize=8.5)
+        row[0].set_ylabel(f"Spots {when}", fontweight="bold")
+    page.legend(handles=wavelength_handles(wavelengths, airy), loc="outside lower center", ncols=6, handletextpad=0.3)
+
+
+def _draw_history(axes: Axes, found: Optimized) -> None:
+    merit = np.concatenate([[found.merit_before], style.array(found.history)[:, 0]])
+    axes.plot(np.arange(len(merit)), merit, color=_AFTER, marker="." if len(merit) < 40 else None, markersize=4)
+    axes.set_yscale("log")
+    axes.set_xlabel(f"cycle ({found.evaluations} evaluations, {found.seconds:.2g} s)")
+    axes.set_ylabel("merit")
+    axes.set_title("Merit function", fontweight="bold")
+    axes.annotate(
+        STOPPED[found.stopped], (0.98, 0.94), xycoords="axes fraction", ha="right", fontsize=7.5, color=style.GREY
+    )
+    axes.grid(alpha=0.25)
+
+
+def _draw_left(axes: Axes, found: Optimized) -> None:
+    """What the square of the merit is made of now, and was."""
+    shares: dict[str, np.ndarray] = {}
+    for i, name in _groups(found):
+        pair = np.array([float(c[i - 1]) for c in (found.contributions_before, found.contributions)])
+        shares[name] = shares.get(name, 0) + pair
+    names = sorted(shares, key=lambda name: -shares[name][1])[:_MOST_BARS]
+    places = np.arange(len(names))
+    axes.barh(places - 0.2, [100 * shares[n][0] for n in names], height=0.36, color=_BEFORE, label="before")
+    axes.barh(places + 0.2, [100 * shares[n][1] for n in names], height=0.36, color=_AFTER, label="after")
+    axes.set_yticks(places, names)
+    axes.invert_yaxis()
+    axes.set_xlabel("part of the square of the merit, %")
+    axes.set_title("What is left", fontweight="bold")
+    axes.legend(loc="lower right")
+
+
+def _groups(found: Optimized) -> list[tuple[int, str]]:
+    """Rows with weight and the names of their bars: each its own, or by operand and field, or by operand, if few."""
+    counts = [i for i in found.rows if found.merit[i - 1].weight != 0]
+    rows = {i: found.merit[i - 1] for i in counts}
+    field = {i: "".join(f" {h:.3g}" for h in row.numbers[:2]) if any(row.numbers) else "" for i, row in rows.items()}
+    names = (
+        {i: f"{row.operand} {i}" for i, row in rows.items()},
+        {i: row.operand + field[i] for i, row in rows.items()},
+        {i: row.operand for i, row in rows.items()},
+    )
+    chosen = next((one for one in names if len(set(one.values())) <= _MOST_BARS), names[-1])
+    return [*chosen.items()]

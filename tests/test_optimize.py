@@ -1,0 +1,300 @@
+"""Optimising: the step, the descent, the verb and its command."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import minimize
+
+import raytrace as rt
+from raytrace.merit.default import rows_of
+from raytrace.merit.model import Model
+from raytrace.merit.vary import freedom
+from raytrace.optimization.least_squares import Manner, State, least_squares
+from raytrace.optimization.lost import Recovery
+from raytrace.optimization.problem import Condition, NoProblem, Problem
+from raytrace.optimization.step import Linear, NoStep, Sides
+from raytrace.system.intent import Intent, Row, Vary
+
+FAR = np.inf
+NONE = np.zeros(0)
+
+
+# -- the step ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_step_is_the_least_of_its_model_under_its_conditions(seed):
+    """Beside a general minimiser; conditions are met to rounding."""
+    draw = np.random.default_rng(seed)
+    n, sides, equalities = int(draw.integers(2, 9)), int(draw.integers(0, 7)), int(draw.integers(0, 2))
+    J, r = draw.normal(size=(n + 5, n)), draw.normal(size=n + 5)
+    one_sided = Sides(draw.normal(size=sides), draw.normal(size=(sides, n)), draw.integers(0, 3, size=sides))
+    A, c = draw.normal(size=(equalities, n)), 0.1 * draw.normal(size=equalities)
+    lower, upper = -draw.uniform(0, 1, n), draw.uniform(0, 1, n)
+    scale, damping = np.sqrt((J**2).sum(0)), 1e-3
+    model = Linear(
+        r, J, sides=one_sided, held=(c, A), limits=(NONE, np.zeros((0, n))), lower=lower, upper=upper, scale=scale
+    )
+
+    def cost(p):
+        return ((J @ p + r) ** 2).sum() + damping * ((scale * p) ** 2).sum() + one_sided.at(p).cost()
+
+    held = [{"type": "eq", "fun": lambda p: A @ p + c}] if equalities else []
+    other = minimize(
+        cost, np.zeros(n), bounds=[*zip(lower, upper, strict=True)], constraints=held, method="SLSQP",
+        options={"maxiter": 1000, "ftol": 1e-14},
+    )  # fmt: skip
+    if not other.success:
+        pytest.skip("the other minimiser gave up")
+    found = model.step(damping)
+    assert np.abs(A @ found + c).max(initial=0) < 1e-12
+    assert (found >= lower - 1e-12).all()
+    assert (found <= upper + 1e-12).all()
+    assert cost(found) <= other.fun * (1 + 1e-6)
+
+
+def test_conditions_that_exclude_each_other_allow_no_step():
+    model = Linear(
+        np.ones(2), np.eye(2), sides=Sides.none(2), held=(np.array([-5.0]), np.array([[1.0, 0.0]])),
+        limits=(NONE, np.zeros((0, 2))), lower=np.full(2, -1.0), upper=np.full(2, 1.0), scale=np.ones(2),
+    )  # fmt: skip
+    with pytest.raises(NoStep):
+        model.step(1e-3)
+    assert model.step(1e-3, share=0.1)[0] == pytest.approx(0.5)
+
+
+# -- the descent -------------------------------------------------------------------------------------------------------
+
+
+def squares(residuals, jacobian, held=None):
+    """A problem of plain functions of x."""
+
+    def state(x, derivatives):
+        n = len(x)
+        c, A = (NONE, np.zeros((0, n))) if held is None else held(x)
+        return State(
+            x, residuals(x), 0, Sides.none(n), c, NONE, jacobian(x) if derivatives else None, A, np.zeros((0, n))
+        )
+
+    return state
+
+
+def rosenbrock(x):
+    return np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]])
+
+
+def by_rosenbrock(x):
+    return np.array([[-20 * x[0], 10.0], [-1.0, 0.0]])
+
+
+@pytest.mark.parametrize("bends", [True, False])
+def test_a_curved_valley_is_followed_to_its_end(bends):
+    end = least_squares(
+        squares(rosenbrock, by_rosenbrock), np.array([-1.2, 1.0]), lower=np.full(2, -FAR), upper=np.full(2, FAR),
+        manner=Manner(bends=bends),
+    )  # fmt: skip
+    assert end.state.x == pytest.approx([1, 1], abs=1e-9)
+    assert end.evaluations < 100
+
+
+def test_bounds_and_equalities_are_met_exactly():
+    """On the circle x² + y² = 2 within x ≤ 0.5 the least is where the bound meets the circle."""
+    held = lambda x: (np.array([x @ x - 2.0]), 2 * x[None])  # noqa: E731
+    end = least_squares(
+        squares(rosenbrock, by_rosenbrock, held), np.array([-1.0, 0.5]),
+        lower=np.full(2, -FAR), upper=np.array([0.5, FAR]),
+    )  # fmt: skip
+    assert abs(end.state.held[0]) < 1e-12
+    assert end.state.x[0] <= 0.5
+    along = np.linspace(np.pi / 2 - np.arcsin(0.5 / np.sqrt(2)), 2 * np.pi - np.pi / 3, 200_001)
+    circle = np.sqrt(2) * np.stack([np.cos(along), np.sin(along)])
+    circle = circle[:, circle[0] <= 0.5]
+    assert end.state.cost <= (rosenbrock(circle) ** 2).sum(0).min() + 1e-6
+
+
+def test_an_interrupt_keeps_the_best():
+    def stop(cycle, state):
+        if cycle.number == 3:
+            raise KeyboardInterrupt
+
+    end = least_squares(
+        squares(rosenbrock, by_rosenbrock), np.array([-1.2, 1.0]), lower=np.full(2, -FAR), upper=np.full(2, FAR),
+        watch=stop,
+    )  # fmt: skip
+    assert end.stopped == "interrupted"
+    assert end.state.cost < rosenbrock(np.array([-1.2, 1.0])) @ rosenbrock(np.array([-1.2, 1.0]))
+
+
+# -- lenses ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def triplet():
+    return rt.read_lens("cooke_triplet")
+
+
+def problem_of(lens, vary, **options):
+    free = freedom(lens, vary)
+    return Problem(Model(free.lens, free.variables, free.solves), rows_of(lens, "spot"), **options)
+
+
+def test_a_triplet_becomes_sharper_and_the_merit_is_that_of_the_lens_it_gives(triplet):
+    found = rt.optimize(triplet, merit="spot", vary="curvature thickness", bounds="thickness:1,90", cycles=40)
+    assert found.merit_after < 0.5 * found.merit_before
+    again = rt.optimize(found.lens, merit="spot", vary="curvature", cycles=1)
+    assert again.merit_before == pytest.approx(found.merit_after, rel=1e-9)
+    radii = rt.spot(found.lens, wavelengths=found.lens.wavelengths).rms_radius
+    assert radii.mean() < rt.spot(triplet, wavelengths=triplet.wavelengths).rms_radius.mean()
+    thicknesses = [float(surface.thickness) for surface in found.lens.surfaces[1:-1]]
+    assert min(thicknesses) >= 1 - 1e-12
+    assert found.contributions.sum() == pytest.approx(1)
+
+
+def test_the_focal_length_is_held_exactly_from_a_lens_that_has_another(triplet):
+    goal = Condition(Row("EFFL", target=90.0))
+    found = rt.optimize(triplet, merit="spot", vary="curvature sensor", hold=[goal])
+    assert float(rt.first_order(found.lens).effective_focal_length) == pytest.approx(90, abs=1e-8)
+    assert found.merit_after < found.merit_before
+
+
+def test_a_limit_is_kept_where_it_is_in_the_way_and_is_let_go_where_it_is_not(triplet):
+    free = rt.optimize(triplet, merit="spot", vary="curvature sensor")
+    length = float(rt.first_order(free.lens).effective_focal_length)
+    tight = rt.optimize(
+        triplet, merit="spot", vary="curvature sensor", hold=[Condition(Row("EFFL", target=length + 3), ">=")]
+    )
+    assert float(rt.first_order(tight.lens).effective_focal_length) == pytest.approx(length + 3, abs=1e-6)
+    loose = rt.optimize(
+        triplet, merit="spot", vary="curvature sensor", hold=[Condition(Row("EFFL", target=length - 3), ">=")]
+    )
+    assert loose.merit_after == pytest.approx(free.merit_after, rel=1e-4)
+    assert tight.merit_after > free.merit_after
+
+
+def test_both_engines_end_at_the_same_lens(triplet):
+    ends = []
+    for engine in ("eager", "auto"):
+        with rt.tracing(engine):
+            found = rt.optimize(triplet, merit="spot", vary="curvature:1-3 sensor", rings=2)
+            ends.append(found.variables_after)
+    assert torch.allclose(*ends, rtol=1e-6, atol=1e-9)
+
+
+def test_the_order_of_rows_does_not_matter(triplet):
+    rows = [row for row in rows_of(triplet, "spot") if row.operand == "TRAC"]
+    ends = [rt.optimize(triplet, merit=one, vary="curvature:1-3 sensor") for one in (rows, rows[::-1])]
+    assert ends[0].merit_after == pytest.approx(ends[1].merit_after, rel=1e-9)
+    assert torch.allclose(ends[0].variables_after, ends[1].variables_after, rtol=1e-5)
+
+
+def test_a_merit_in_inches_ends_at_the_same_lens(triplet):
+    rows = rows_of(triplet, "spot")
+    variables = tuple(Vary(k, "curvature") for k in (1, 2, 3))
+    ends = []
+    for unit in (1.0, 25.4):
+        told = dataclasses.replace(triplet, intent=Intent(variables, (), rows, unit=unit))
+        ends.append(rt.optimize(told))
+    assert ends[0].merit_after == pytest.approx(25.4 * ends[1].merit_after, rel=1e-9)
+    assert torch.allclose(ends[0].variables_after, ends[1].variables_after, rtol=1e-6)
+
+
+# -- lost rays ---------------------------------------------------------------------------------------------------------
+
+
+def bent_too_far(lens):
+    """The lens with surfaces so steep that rays miss them or are totally reflected."""
+    lens = lens.at(entrance_pupil_diameter=float(rt.first_order(lens).entrance_pupil_diameter))
+    return lens.replace(4, curvature=torch.tensor(-0.06, dtype=torch.float64))
+
+
+def test_what_a_lost_ray_misses_by_has_the_derivative_of_differences(triplet):
+    problem = problem_of(bent_too_far(triplet), "curvature thickness")
+    x = problem.model.start
+    found = problem.evaluated(x)
+    rows = np.nonzero(found.lost)[0]
+    assert len(rows) > 3
+    recovery = Recovery(problem.evaluation)
+    missed, slopes, _ = recovery.excess(x, rows, derivatives=True)
+    assert (missed > 0).all()
+    for i in range(len(x)):
+        h = 1e-6 * max(abs(x[i]), 1e-2)
+        ends = [recovery.excess(x + h * sign * np.eye(len(x))[i], rows, derivatives=False)[0] for sign in (1, -1)]
+        assert (ends[0] - ends[1]) / (2 * h) == pytest.approx(slopes[:, i], rel=1e-4, abs=1e-5 * np.abs(slopes).max())
+
+
+def test_a_lens_that_loses_rays_gets_them_back(triplet):
+    lens = bent_too_far(triplet)
+    before = problem_of(lens, "curvature")
+    assert before.state(before.model.start, False).lost > 3
+    found = rt.optimize(lens, merit="spot", vary="curvature sensor", seconds=20)
+    after = problem_of(found.lens, "curvature")
+    assert after.state(after.model.start, False).lost == 0
+    assert found.merit_after < 0.1
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
+
+
+def test_the_document_has_the_fixed_keys_and_the_lens_comes_back(command_line):
+    words = ["optimize", "cooke_triplet", "--merit", "spot", "--vary"]
+    done = command_line(*words, "curvature sensor", "--json", "-o", "better.zmx", "--cycles", 6)
+    assert done.code == 0, done.err
+    told = done.document
+    assert [*told] == [
+        "merit_before", "merit_after", "cycles", "evaluations", "seconds", "stopped", "variables", "operands",
+    ]  # fmt: skip
+    assert [*told["variables"][0]] == ["name", "before", "after"]
+    assert [*told["operands"][0]] == ["row", "operand", "target", "weight", "before", "after"]
+    assert told["cycles"] <= 6
+    own = command_line("optimize", "better.zmx", "--json", "--cycles", 1).document
+    assert own["merit_before"] == pytest.approx(told["merit_after"], rel=1e-9)
+    assert sorted(one["name"] for one in own["variables"]) == sorted(one["name"] for one in told["variables"])
+
+
+def test_log_checkpoint_and_resume(command_line, tmp_path):
+    words = ["optimize", "cooke_triplet", "--merit", "spot", "--vary", "curvature sensor"]
+    done = command_line(*words, "--json", "--log", "log.csv", "--checkpoint", "kept.json", "--cycles", 4)
+    assert done.code == 0, done.err
+    lines = (tmp_path / "log.csv").read_text().splitlines()
+    assert lines[0].startswith("cycle,merit,")
+    assert len(lines) == 1 + done.document["cycles"]
+    kept = json.loads((tmp_path / "kept.json").read_text())
+    assert kept["merit"] == pytest.approx(done.document["merit_after"])
+    again = command_line(*words, "--json", "--resume", "kept.json", "--cycles", 4).document
+    assert again["merit_after"] < done.document["merit_after"] * (1 + 1e-12)
+    other = command_line("optimize", "cooke_triplet", "--merit", "spot", "--vary", "conic:1", "--resume", "kept.json")
+    assert "a checkpoint of other variables" in other.error
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--merit", "spot"], "the file tells no variables: --vary names them"),
+        (["--vary", "curvature"], "no merit function of its own: choose one by --merit spot"),
+        (["--merit", "spot", "--vary", "curvature", "--bounds", "curvature:3,2"], "3 is not less than 2"),
+        (["--merit", "spot", "--vary", "curvature", "-o", "lens.foo"], "expected a name that ends in .zmx"),
+        (["--merit", "spots", "--vary", "curvature"], "did you mean spot"),
+    ],
+)
+def test_what_cannot_be_optimised_is_told_in_a_line(words, said, command_line):
+    assert said in command_line("optimize", "cooke_triplet", *words).error
+
+
+def test_a_merit_without_weight_and_one_without_light_are_refused(triplet):
+    with pytest.raises(NoProblem, match="no row of the merit function has a weight"):
+        rt.optimize(triplet, merit=[Row("EFFL")], vary="curvature")
+    row = Row("TRAC", (0, 1), (0.0, 0.0, 0.0, 40.0), weight=1.0)
+    with pytest.raises(NoProblem, match="no ray"):
+        rt.optimize(triplet, merit=[row], vary="sensor")
+
+
+def test_the_figure_shows_before_and_after(triplet, tmp_path):
+    found = rt.optimize(triplet, merit="spot", vary="curvature sensor", cycles=5)
+    figure = found.plot(tmp_path / "report.png")
+    titles = [axes.get_title() for axes in figure.axes]
+    assert any(title.startswith("Before: merit") for title in titles)
+    assert any(title.startswith("After: merit") for title in titles)
+    assert "Merit function" in titles
