@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from raytrace.merit.aberrations import ABERRATIONS
 from raytrace.merit.arithmetic import ARITHMETIC
 from raytrace.merit.boundaries import BOUNDARIES
 from raytrace.merit.incidence import INCIDENCE
@@ -30,6 +31,7 @@ OPERANDS = Operands(
     {
         **RAYS,
         **PARAXIAL,
+        **ABERRATIONS,
         **INCIDENCE,
         **PATH,
         **QUALITY,
