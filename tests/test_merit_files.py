@@ -1,0 +1,70 @@
+"""Merit functions of real files: every row and the merit itself, against an independent evaluation of the same lines."""
+
+import functools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from raytrace.formats import read_lens
+from raytrace.merit.merit import Evaluation
+from raytrace.merit.model import Model
+
+FOLDER = Path(__file__).parents[2] / "shared" / "merit" / "dev"
+
+CLOSE = 1e-8  # relative
+NEAR_ZERO = {"OPDC": 1e-7, "OPDX": 1e-7, "OPDM": 1e-7}  # waves; lengths: 1e-9
+
+#: What the oracle does not settle.
+OPEN = ("DISC",)
+
+
+@functools.cache
+def cases():
+    path = FOLDER / "oracle.json"
+    found = json.loads(path.read_text())["files"] if path.exists() else []
+    return {case["file"]: case for case in found if case["copied"] and case["status"] == "usable"}
+
+
+@functools.cache
+def evaluation(name: str) -> Evaluation:
+    lens = read_lens(FOLDER / name)
+    model = Model(lens, lens.intent.variables, lens.intent.solves)
+    return Evaluation(model, lens.intent.merit, unit=lens.intent.unit)
+
+
+@pytest.mark.skipif(not cases(), reason="the files are not here")
+def test_all_files_are_there():
+    assert len(cases()) == 17
+
+
+@pytest.mark.parametrize("name", cases())
+def test_the_merit_and_every_row(name):
+    case, evaluate = cases()[name], evaluation(name)
+    found = evaluate(evaluate.model.start)
+    for told in case["values"]:
+        row, value = evaluate.rows[told["row"] - 1], found.values[told["row"] - 1]
+        assert row.operand == told["op"]
+        if row.operand in OPEN:
+            continue
+        expected, value = (abs(told["value"]), abs(value)) if row.operand.startswith("OPD") else (told["value"], value)
+        close = max(CLOSE * abs(expected), NEAR_ZERO.get(row.operand, 1e-9))
+        assert value == pytest.approx(expected, abs=close), told
+    assert found.merit == pytest.approx(case["mf_stored"], rel=CLOSE, abs=1e-13)
+    assert not found.lost.any()
+
+
+@pytest.mark.parametrize("name", cases())
+def test_the_jacobian_is_that_of_finite_differences(name):
+    evaluate = evaluation(name)
+    x = evaluate.model.start
+    found = evaluate(x, derivatives=True)
+    spread = np.random.default_rng(0).normal(size=(len(x), 2)) * np.maximum(np.abs(x), 1e-9)[:, None]
+    for along in spread.T:
+        step = 1e-6
+        ahead, back = (evaluate(x + sign * step * along).residuals for sign in (1, -1))
+        difference = (ahead - back) / (2 * step)
+        size = np.abs(difference).max()
+        kinks = np.abs(found.jacobian @ along - difference) > 1e-4 * size + 1e-9
+        assert kinks.mean() < 0.01
