@@ -4,15 +4,20 @@ Every problem states the law that makes it exact, so that a test needs no second
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
 
+import numpy as np
 import pytest
 import torch
 
 from raytrace.formats import read_lens
 from raytrace.media.glass import AIR, MIRROR, Glass, constant
+from raytrace.merit.merit import Evaluation
+from raytrace.merit.model import Model
 from raytrace.optics.scene import Scene, scene
+from raytrace.system.intent import Row
 from raytrace.system.lens import Fields, Lens, SystemAperture
 from raytrace.system.surface import Aperture, Surface
 
@@ -315,3 +320,8 @@ def covariance(spectrum: torch.Tensor) -> torch.Tensor:
 
 def vignetting_aperture(radius: float) -> tuple[Aperture, ...]:
     return (Aperture("circular", (0.0, radius)),)
+
+
+def values(lens: Lens, asked: Sequence[Row], **how) -> np.ndarray:
+    """Values (R,) of rows of a merit function."""
+    return Evaluation(Model(lens), asked, **how)(np.zeros(0)).values

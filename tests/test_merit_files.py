@@ -1,4 +1,4 @@
-"""Merit functions of real files: every row and the merit itself, against an independent evaluation of the same lines."""
+"""Merit functions of real files: every row and the merit itself, against an independent evaluation of the lines."""
 
 import functools
 import json

@@ -10,7 +10,7 @@ import torch
 from bends import folded
 from differences import slopes_by_differences
 from problems import lens as lens_of
-from problems import surface, vector
+from problems import surface, values, vector
 
 import raytrace as rt
 from raytrace.merit.merit import Evaluation
@@ -37,10 +37,6 @@ def rows(operand: str, *, wavelengths=(1, 2, 3), fields=FIELDS, points=POINTS) -
     """Rows with unlike weights."""
     asked = [(w, h, p) for h in fields for w in wavelengths for p in points]
     return [Row(operand, (0, w), (*h, *p), weight=0.5 + 0.1 * (k % 7)) for k, (w, h, p) in enumerate(asked)]
-
-
-def values(lens: rt.Lens, asked: list[Row], **how) -> np.ndarray:
-    return Evaluation(Model(lens), asked, **how)(np.zeros(0)).values
 
 
 def beam(lens: rt.Lens, w: int, field, points) -> tuple[rt.Rays, torch.Tensor, torch.Tensor]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from differences import slopes_by_differences
-from problems import vector, vignetting_aperture
+from problems import values, vector, vignetting_aperture
 
 import raytrace as rt
 from raytrace.maths.pupil import gauss_rings, square
@@ -19,10 +19,6 @@ from raytrace.optics.wavefront import rms, wavefront_of, without
 from raytrace.system.intent import Row, Solve, Vary
 
 FIELD = (0.0, 0.7)
-
-
-def values(lens: rt.Lens, asked: list[Row], **how) -> np.ndarray:
-    return Evaluation(Model(lens), asked, **how)(np.zeros(0)).values
 
 
 def bare(lens: rt.Lens) -> rt.Lens:
