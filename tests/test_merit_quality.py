@@ -220,6 +220,8 @@ def test_derivatives_of_modulation(operand):
         (in_columns("MTFT", frequency=0.0), "has the frequency 0"),
         (in_columns("GMTA", sampling=0), "has the sampling 0: expected 1 to 6"),
         (in_columns("STRH", field=1.5), "names field 1.5"),
+        (in_columns("MTFS", wavelength=4), r"names wavelength 4: .* wavelengths 0 to 3 \(0: all by their weights\)"),
+        (in_columns("RSCE", wavelength=4), "names wavelength 4"),
     ],
 )
 def test_arguments_that_name_nothing(row, words):

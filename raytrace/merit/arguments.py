@@ -29,6 +29,7 @@ ARGUMENTS = {
     "met surface": Argument("surface", lambda lens: 1, _image),
     "contribution": Argument("surface", lambda lens: 0, lambda lens: _image(lens) - 1, "all of them"),
     "wavelength": Argument("wavelength", lambda lens: 0, lambda lens: len(lens.wavelengths), "the primary one"),
+    "colour": Argument("wavelength", lambda lens: 0, lambda lens: len(lens.wavelengths), "all by their weights"),
     "shortest": Argument("wavelength", lambda lens: 0, lambda lens: len(lens.wavelengths), "the shortest"),
     "longest": Argument("wavelength", lambda lens: 0, lambda lens: len(lens.wavelengths), "the longest"),
     "field": Argument("field", lambda lens: 0, lambda lens: len(lens.fields.x), "the largest"),

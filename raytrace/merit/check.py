@@ -6,7 +6,8 @@ from pathlib import Path
 
 from raytrace import formats
 from raytrace.formats import ImportReport
-from raytrace.merit.operands import OPERANDS, SETTINGS
+from raytrace.merit.operands import OPERANDS
+from raytrace.merit.plan import SETTINGS
 
 
 def check(

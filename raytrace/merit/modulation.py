@@ -208,6 +208,7 @@ def _modulation(weights: np.ndarray, place, frequency: float):
     return np.sqrt(real * real + imaginary * imaginary)
 
 
+_TAKES = "", "colour"
 _COLUMNS = "int1 sampling, int2 wavelength (0: all by weight), field number, cycles/mm"
 _WAVES = (
     "at least 16 · 2^int1 points across the pupil, more where the blur needs them; the column of the grid is not read"
@@ -218,16 +219,17 @@ _SECTIONS = {"T": "along y", "S": "along x", "A": "mean of both sections"}
 
 MODULATION = {
     **{
-        f"MTF{s}": Operand(by_waves(s), f"diffraction MTF {text}; {_COLUMNS}", reading=_WAVES)
+        f"MTF{s}": Operand(by_waves(s), f"diffraction MTF {text}; {_COLUMNS}", reading=_WAVES, takes=_TAKES)
         for s, text in _SECTIONS.items()
     },
     **{
-        f"GMT{s}": Operand(by_rays(s), f"geometric MTF {text}; {_COLUMNS}", reading=_RAYS)
+        f"GMT{s}": Operand(by_rays(s), f"geometric MTF {text}; {_COLUMNS}", reading=_RAYS, takes=_TAKES)
         for s, text in _SECTIONS.items()
     },
     "STRH": Operand(
         strehl_ratio,
         "Strehl ratio; int2 wavelength (0: all by weight), field number",
         reading="the best point of the image; as many rays as it needs, int1 is not read; of all wavelengths the mean",
+        takes=_TAKES,
     ),
 }

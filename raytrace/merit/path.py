@@ -218,7 +218,7 @@ def between_surfaces(leg: Callable[[Line, Planner], tuple[int, int, int]]):
 
 def _path_of(line: Line, first: int, last: int, wavelength: int, planner: Planner) -> Callable[[Now], object]:
     """Reduced path between the surfaces, and that of the axis, which it lacks."""
-    first, last = sorted(planner.checked(line, surface) for surface in (first, last))
+    first, last = sorted((first, last))
     source = planner.lens.surfaces[0]
     from_object = first == 0 and bool(source.thickness.isfinite())
     if from_object and not source.is_plane:
@@ -248,29 +248,41 @@ def _from_one_to_another(line: Line, planner: Planner) -> tuple[int, int, int]:
     return *line.row.integers, planner.primary
 
 
+_WAVELENGTH = "", "wavelength"
 _SPHERE = (
     "about the image point of the chief ray of the row's wavelength (reading `opd_chief`), through the axial point of "
     "the exit pupil; a longer path is positive (`opd_sign`)"
 )
 
 PATH = {
-    "OPDC": Operand(opd_less(nothing), "optical path difference to the chief ray, waves; Hx Hy Px Py", reading=_SPHERE),
+    "OPDC": Operand(
+        opd_less(nothing),
+        "optical path difference to the chief ray, waves; Hx Hy Px Py",
+        reading=_SPHERE,
+        takes=_WAVELENGTH,
+    ),
     "OPDM": Operand(
-        opd_less(piston), "the same less its mean over the rows of its field and wavelength, by weight", reading=_SPHERE
+        opd_less(piston),
+        "the same less its mean over the rows of its field and wavelength, by weight",
+        reading=_SPHERE,
+        takes=_WAVELENGTH,
     ),
     "OPDX": Operand(
         opd_less(piston_and_tilt),
         "the same less the piston and tilt that fit its field and wavelength best, by weight",
         reading=f"{_SPHERE}; a tilt for every wavelength (`opd_tilt`)",
+        takes=_WAVELENGTH,
     ),
     "OPTH": Operand(
         between_surfaces(_to_surface),
         "optical path of a ray to a surface, from the object, or from surface 1 if that is at infinity",
         length=1,
+        takes=("surface", "wavelength"),
     ),
     "PLEN": Operand(
         between_surfaces(_from_one_to_another),
         "optical path of a ray of the primary wavelength from one surface to another",
         length=1,
+        takes=("surface", "surface"),
     ),
 }

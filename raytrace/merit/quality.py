@@ -159,6 +159,7 @@ QUALITY = {
         f"{text}; int1 rays, int2 wavelength (0: all by weight), Hx Hy",
         length=1 if name.startswith("RS") else 0,
         reading=_RINGS if whole else _GRID,
+        takes=("", "colour"),
     )
     for name, (vector, whole, text) in _TABLE.items()
 }
