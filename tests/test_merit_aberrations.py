@@ -11,9 +11,11 @@ from problems import fields
 
 import raytrace as rt
 from raytrace.files import shipped
+from raytrace.merit.aberrations import OF_WAVEFRONT
 from raytrace.merit.merit import Evaluation
 from raytrace.merit.model import Model
 from raytrace.merit.plan import BadRow
+from raytrace.merit.readings import Readings
 from raytrace.optics.paraxial import first_order
 from raytrace.system.intent import Row
 
@@ -21,7 +23,6 @@ pytestmark = pytest.mark.usefixtures("compiler")
 
 STORED = Path(__file__).parents[2] / "shared" / "merit" / "dev"
 SUMS = ("SPHA", "COMA", "ASTI", "FCUR")
-OF_WAVEFRONT = (8, 2, 2, 4, 2)
 
 
 @pytest.mark.parametrize("name", [n for n in LENSES if LENSES[n].fields.kind == "angle"])
@@ -133,6 +134,20 @@ def test_vignetting_leaves_the_chief_ray_in_the_middle():
     told = told_of(vignetted, rows)
     assert told == pytest.approx(values_of("near", rows), rel=1e-9)
     assert told_of(vignetted, [Row("WFNO")]) != values_of("near", [Row("WFNO")])
+
+
+def test_other_readings():
+    """Each by its own definition from the first choice."""
+    lens = lens_of("colours").at(fields=[0.0, 20.0])
+    rows = [Row("AXCL"), Row("LACL"), *(Row(operand) for operand in SUMS), Row("DIST", (2, 0))]
+    readings = Readings(colour="second", seidel="wavefront", f_theta="axis included")
+    first, other = told_of(lens, rows), Evaluation(Model(lens), rows, readings=readings)(np.zeros(0)).values
+    assert first / other == pytest.approx([-1, -1, *OF_WAVEFRONT], rel=1e-12)
+    theta = np.deg2rad(20.0) * np.arange(1, 30) / 29
+    y = told_of(lens, [Row("REAY", (8, 2), (0.0, k / 29, 0.0, 0.0)) for k in range(1, 30)])
+    off = 100 * np.abs(y / (theta * (y @ theta) / (theta @ theta)) - 1).max()
+    told = Evaluation(Model(lens), [Row("DISC", (0, 2))], readings=readings)(np.zeros(0)).values
+    assert told == pytest.approx([off], rel=1e-10)
 
 
 def rows_of(name):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from merit_cases import LENSES, check_derivatives, is_near, lens_of, values_of
 
+from raytrace.merit.readings import Readings
 from raytrace.optics.f_number import real_working_f_number
 from raytrace.optics.paraxial import first_order
 from raytrace.system.intent import Row
@@ -75,6 +76,14 @@ def test_lengths():
     rows = [Row("TOTR"), Row("TTHI", (1, 3)), Row("TTHI", (2, 2)), Row("TTHI", (3, 1))]
     assert values_of("two aspheric mirrors", rows) == pytest.approx([150.0, 110.0, -70.0, 110.0])
     assert values_of("two aspheric mirrors", rows, unit=10.0) == pytest.approx([15.0, 11.0, -7.0, 11.0])
+
+
+def test_other_readings():
+    """In air behind glass, and the sum of thicknesses of what folds."""
+    readings = Readings(focal_length="in air", total_track="sum")
+    inside = values_of("immersed image", [Row("EFFL")])[0]
+    assert values_of("immersed image", [Row("EFFL")], readings=readings)[0] == pytest.approx(inside / 1.5, rel=1e-12)
+    assert values_of("two aspheric mirrors", [Row("TOTR")], readings=readings)[0] == pytest.approx(110.0)
 
 
 @pytest.mark.parametrize("name", ["near", "thick lens", "concave mirror", "immersed image"])

@@ -47,6 +47,7 @@ def _chief(line: Line, planner: Planner, field: tuple[float, float], wavelength:
 
 def _axial_colour(lines: Sequence[Line], planner: Planner) -> Evaluate:
     """Where light of one wavelength meets the axis, less where that of another does."""
+    side = _side(planner)
     waves = [_two_wavelengths(line, planner) for line in lines]
     zones = [line.row.numbers[0] for line in lines]
     rays = [
@@ -62,7 +63,7 @@ def _axial_colour(lines: Sequence[Line], planner: Planner) -> Evaluate:
         return crossing[0] - crossing[1]
 
     def evaluate(now: Now) -> Found:
-        told = [number(now, pair, asked) for pair, asked in zip(waves, rays, strict=True)]
+        told = [side * number(now, pair, asked) for pair, asked in zip(waves, rays, strict=True)]
         return Found(listed(told, now.moment.count))
 
     return evaluate
@@ -70,6 +71,7 @@ def _axial_colour(lines: Sequence[Line], planner: Planner) -> Evaluate:
 
 def _lateral_colour(lines: Sequence[Line], planner: Planner) -> Evaluate:
     """y of the chief ray of the largest field of one wavelength, less that of another."""
+    side = _side(planner)
     waves = [_two_wavelengths(line, planner) for line in lines]
     field = field_of(planner, 0)
     first, second = (
@@ -79,9 +81,13 @@ def _lateral_colour(lines: Sequence[Line], planner: Planner) -> Evaluate:
 
     def evaluate(now: Now) -> Found:
         one, other = now.hits(first), now.hits(second)
-        return Found(known(one.valid & other.valid, one.position[1] - other.position[1]))
+        return Found(known(one.valid & other.valid, side * (one.position[1] - other.position[1])))
 
     return evaluate
+
+
+def _side(planner: Planner) -> float:
+    return 1.0 if planner.readings.colour == "first" else -1.0
 
 
 def _two_wavelengths(line: Line, planner: Planner) -> tuple[int, int]:
@@ -169,18 +175,23 @@ class _Shapes:
         return (listed(shape, count) * c * c * c - vertex * vertex * vertex) / 8 + listed(terms, count)
 
 
+#: Seidel's coefficients S1 to S5 by those of the wavefront, W040, W131, W222, W220P and W311.
+OF_WAVEFRONT = 8, 2, 2, 4, 2
+
+
 def _of_seidel(which: int) -> Callable[[Sequence[Line], Planner], Evaluate]:
     """A sum in waves of the row's wavelength, of a surface or of all."""
 
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
         _need_seidel(lines[0], planner)
         shapes = planner.shared(_Shapes)
+        share = OF_WAVEFRONT[which] if planner.readings.seidel == "wavefront" else 1
 
         def number(now: Now, line: Line):
             sums = now.moment.kept(_seidel, line.wavelength, shapes)[which]
             surface = line.row.integers[0]
             told = sums[surface - 1] if surface else sums.sum()
-            return told / (1e-3 * planner.view.wavelengths[line.wavelength])
+            return told / (share * 1e-3 * planner.view.wavelengths[line.wavelength])
 
         return lambda now: Found(listed([number(now, line) for line in lines], now.moment.count))
 
@@ -263,7 +274,8 @@ def _calibrated_distortion(lines: Sequence[Line], planner: Planner) -> Evaluate:
     if planner.lens.fields.kind != "angle" or not _largest(planner):
         kind = planner.lens.fields.kind.replace("_", " ")
         raise BadRow(lines[0], f"is of angles of the field; this lens has a field of {kind}")
-    parts = [(k + 1) / _FIELDS for k in range(_FIELDS)]
+    steps = _FIELDS if planner.readings.f_theta == "axis left out" else _FIELDS - 1
+    parts = [(k + 1) / steps for k in range(steps)]
     theta = np.deg2rad(_largest(planner)) * np.array(parts)
     rays = [np.array([_chief(line, planner, (0.0, part), line.wavelength) for part in parts]) for line in lines]
 
@@ -317,7 +329,7 @@ def _field_curvature(across: bool) -> Callable[[Sequence[Line], Planner], Evalua
 
 
 _SEIDEL = "S{} in waves: of a surface (0: all of them), at a wavelength"
-_SEIDEL_READING = "Seidel's coefficient S{} itself over the wavelength; the coefficient of the wavefront is S{}/{}"
+_SEIDEL_READING = "Seidel's coefficient S{} itself over the wavelength; `seidel` wavefront: S{}/{}"
 _CONTRIBUTION = "contribution", "wavelength"
 _CLOSE = "without vignetting factors, by rays at a thousandth of the pupil"
 
@@ -337,14 +349,14 @@ ABERRATIONS = {
         "axial colour: where one wavelength meets the axis less where another does; paraxial, or of the real ray at "
         "the height of the pupil in the column of Hx",
         length=1,
-        reading="the first wavelength's less the second's",
+        reading="the first wavelength's less the second's; `colour` second: the other way round",
         takes=("shortest", "longest"),
     ),
     "LACL": Operand(
         _lateral_colour,
         "lateral colour: y of the chief ray of one wavelength less that of another, of the largest field",
         length=1,
-        reading="real chief rays; the first wavelength's less the second's",
+        reading="real chief rays; the first wavelength's less the second's; `colour` second: the other way round",
         takes=("shortest", "longest"),
     ),
     "SPHA": _sum_row(1, "spherical aberration", 8),
@@ -355,7 +367,7 @@ ABERRATIONS = {
         _distortion_sum,
         "distortion S5 in waves of a surface at a wavelength; of surface 0 that of the largest field in %, or in "
         "lengths where the number in the column of Hx is not 0",
-        reading="S5 itself over the wavelength; of surface 0 by the real chief ray, against one near the axis",
+        reading="S5 itself over the wavelength, `seidel` wavefront: S5/2; of surface 0 by the real chief ray, against one near the axis",
         takes=_CONTRIBUTION,
     ),
     "DIMX": Operand(
@@ -369,7 +381,8 @@ ABERRATIONS = {
         _calibrated_distortion,
         "largest distortion from y = f θ at a wavelength, in %, or in lengths where the number in the column of Hx is "
         "not 0",
-        reading=f"{_FIELDS} fields along y at even steps, the axis left out, f by least squares over them",
+        reading=f"{_FIELDS} fields along y at even steps, the axis left out, f by least squares over them; `f_theta` "
+        f"axis included: {_FIELDS - 1} steps and the axis",
         takes=("", "wavelength"),
     ),
     "FCGS": Operand(

@@ -47,7 +47,12 @@ def over(a, b):
     return a / b if value_of(b) != 0 else np.inf
 
 
-# -- pupils and conjugates ---------------------------------------------------------------------------------------------
+# -- focal length, pupils and conjugates -------------------------------------------------------------------------------
+
+
+def _focal_length(now: Now, line: Line):
+    data = now.moment.gaussian(line.wavelength)
+    return over(-1.0, data.C) if now.planner.readings.focal_length == "in air" else data.effective_focal_length
 
 
 def _exit_pupil_position(moment: Moment):
@@ -139,10 +144,12 @@ def _total_thickness(now: Now, line: Line):
     return sum(now.moment.thickness[first : last + 1])
 
 
-def _total_track(moment: Moment):
+def _total_track(now: Now, line: Line):
     """Between the leftmost and the rightmost vertex of surface 1 to the image, on a straight axis."""
+    if now.planner.readings.total_track == "sum":
+        return sum(now.moment.thickness[1:-1])
     places = [0.0]
-    for thickness in moment.thickness[1:-1]:
+    for thickness in now.moment.thickness[1:-1]:
         places.append(places[-1] + thickness)
     values = [value_of(place) for place in places]
     return places[int(np.argmax(values))] - places[int(np.argmin(values))]
@@ -247,10 +254,10 @@ def _derivative(count: int) -> np.ndarray:
 
 PARAXIAL = {
     "EFFL": Operand(
-        at_wavelength(lambda moment, w: moment.gaussian(w).effective_focal_length),
+        one_by_one(_focal_length),
         "effective focal length at a wavelength",
         length=1,
-        reading="-y/u′ with u′ in image space: f, not n′ f, where that is not air",
+        reading="n′/power, as of the slope behind the lens, where that is not air; `focal_length` in air: 1/power",
         takes=("", "wavelength"),
     ),
     "PMAG": Operand(at_wavelength(_magnification), "paraxial magnification at a wavelength", takes=("", "wavelength")),
@@ -310,10 +317,11 @@ PARAXIAL = {
     "EXPP": Operand(of_moment(_exit_pupil_position), "exit pupil, from the image", length=1),
     "EXPD": Operand(of_moment(_exit_pupil_diameter), "exit pupil diameter", length=1),
     "TOTR": Operand(
-        of_moment(_total_track),
+        one_by_one(_total_track),
         "total track, surface 1 to image",
         length=1,
-        reading="from the leftmost to the rightmost vertex on a straight axis, where thicknesses are negative too",
+        reading="from the leftmost to the rightmost vertex on a straight axis; `total_track` sum: of the thicknesses, "
+        "which differs where some are negative",
     ),
     "TTHI": Operand(
         one_by_one(_total_thickness),

@@ -13,6 +13,12 @@ class Readings:
     boundary: what a row over several surfaces is off by, the sum of what they lack or the largest of it.
     behind_mirrors: whether least and largest thicknesses are compared with those behind an odd number of mirrors
         reversed, along the light, or signed, as the lens has them.
+    focal_length: of EFFL, whether it is that in image space, n'/power, or that in air, 1/power.
+    total_track: of TOTR, whether it reaches from the leftmost vertex to the rightmost, or sums up the thicknesses.
+    colour: of AXCL and LACL, which of the two wavelengths counts positive.
+    seidel: of SPHA to DIST, whether waves are counted of Seidel's coefficients, or of the wavefront: S1/8, S2/2, S3/2,
+        S4/4, S5/2.
+    f_theta: of DISC, whether its fields are 30 steps from the axis, which is left out, or 29 from it.
     """
 
     opd_tilt: str = "per wavelength"
@@ -20,6 +26,11 @@ class Readings:
     opd_sign: str = "longer"
     boundary: str = "sum"
     behind_mirrors: str = "reversed"
+    focal_length: str = "in image space"
+    total_track: str = "extent"
+    colour: str = "first"
+    seidel: str = "coefficients"
+    f_theta: str = "axis left out"
 
     def __post_init__(self):
         for name, known in CHOICES.items():
@@ -34,4 +45,9 @@ CHOICES = {
     "opd_sign": ("longer", "shorter"),
     "boundary": ("sum", "largest"),
     "behind_mirrors": ("reversed", "signed"),
+    "focal_length": ("in image space", "in air"),
+    "total_track": ("extent", "sum"),
+    "colour": ("first", "second"),
+    "seidel": ("coefficients", "wavefront"),
+    "f_theta": ("axis left out", "axis included"),
 }

@@ -1,0 +1,54 @@
+"""Operands of rays: derivatives against differences, also of rays on inner surfaces and beside rays that are lost."""
+
+import math
+
+import numpy as np
+import pytest
+from merit_cases import LENSES, check_derivatives, lens_of, model_of
+
+from raytrace.merit.merit import LOST, Evaluation
+from raytrace.merit.rays import RAYS
+from raytrace.system.intent import Row
+
+pytestmark = pytest.mark.usefixtures("compiler")
+
+
+def rows_of(name):
+    """Of several rays of a field, at the image and on inner surfaces; targets that make a length one number, or two."""
+    last = len(LENSES[name].surfaces) - 1
+    rays = [(0.0, 0.6, 0.3, 0.5), (0.0, 0.6, -0.2, 0.4), (0.0, 0.6, 0.1, -0.7)]
+    on_image = [Row(o, (0, 1), ray, target, 1.0) for o in RAYS if o[:2] == "TR" for ray in rays for target in (0, 0.1)]
+    inside = [Row(o, (k, 1), rays[0], 0.1) for o in RAYS if o[:2] != "TR" for k in (1, 2, last)]
+    return on_image + inside
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_derivatives(name):
+    check_derivatives(name, rows_of(name))
+
+
+@pytest.mark.parametrize("name", ["near", "double Gauss"])
+def test_rows_of_lost_rays_do_not_move_and_leave_the_others_alone(name):
+    """Each counts as an error of LOST; the others are what they are without them."""
+    model = model_of(name)
+    kept = [Row("TRAR", (0, 1), (0.0, 0.6, 0.3, 0.5), 0.0, 1.0), Row("REAY", (3, 1), (0.0, 0.6, 0.3, 0.5), 0.0, 1.0)]
+    lost = [Row("TRAR", (0, 1), (0.0, 0.6, 0.0, 9.0), 0.0, 1.0), Row("REAB", (3, 1), (0.0, 0.6, 0.0, 9.0), 0.0, 1.0)]
+    whole, alone = (Evaluation(model, rows)(model.start, derivatives=True) for rows in (kept + lost, kept))
+    assert list(whole.lost) == [False, False, True, True]
+    assert np.isnan(whole.values[2:]).all()
+    assert whole.merit == pytest.approx(math.sqrt((alone.merit**2 + LOST**2) / 2), rel=1e-12)
+    stays, gone = whole.of_row < 2, whole.of_row >= 2
+    assert not whole.jacobian[gone].any()
+    assert whole.jacobian[stays] * math.sqrt(2) == pytest.approx(alone.jacobian, rel=1e-10, abs=1e-14)
+
+
+def test_the_angle_to_the_axis_is_that_of_the_cosines():
+    lens = lens_of("two aspheric mirrors")
+    rows = [Row(o, (k, 1), (0.0, 1.0, 0.2, 0.7)) for k in range(1, len(lens.surfaces)) for o in ("RANG", "REAC")]
+    angle, cosine = (
+        Evaluation(model_of("two aspheric mirrors"), rows)(model_of("two aspheric mirrors").start)
+        .values.reshape(-1, 2)
+        .T
+    )
+    assert angle == pytest.approx(np.arccos(np.abs(cosine)), rel=1e-9)
+    assert (cosine < 0).any()
