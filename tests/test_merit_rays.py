@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from merit_cases import LENSES, check_derivatives, lens_of, model_of
+from merit_cases import LENSES, check_derivatives, lens_of, model_of, values_of
 
 from raytrace.merit.merit import LOST, Evaluation
 from raytrace.merit.rays import RAYS
@@ -16,15 +16,16 @@ pytestmark = pytest.mark.usefixtures("compiler")
 def rows_of(name):
     """Of several rays of a field, at the image and on inner surfaces; targets that make a length one number, or two."""
     last = len(LENSES[name].surfaces) - 1
+    targets = (0,) if name == "telescope" else (0, 0.1)  # its spot is smaller than what a difference moves it by
     rays = [(0.0, 0.6, 0.3, 0.5), (0.0, 0.6, -0.2, 0.4), (0.0, 0.6, 0.1, -0.7)]
-    on_image = [Row(o, (0, 1), ray, target, 1.0) for o in RAYS if o[:2] == "TR" for ray in rays for target in (0, 0.1)]
+    on_image = [Row(o, (0, 1), ray, target, 1.0) for o in RAYS if o[:2] == "TR" for ray in rays for target in targets]
     inside = [Row(o, (k, 1), rays[0], 0.1) for o in RAYS if o[:2] != "TR" for k in (1, 2, last)]
     return on_image + inside
 
 
 @pytest.mark.parametrize("name", LENSES)
 def test_derivatives(name):
-    check_derivatives(name, rows_of(name))
+    check_derivatives(name, rows_of(name), steps=(1e-4, 1e-5, 1e-6, 1e-7, 1e-8))
 
 
 @pytest.mark.parametrize("name", ["near", "double Gauss"])
@@ -45,10 +46,6 @@ def test_rows_of_lost_rays_do_not_move_and_leave_the_others_alone(name):
 def test_the_angle_to_the_axis_is_that_of_the_cosines():
     lens = lens_of("two aspheric mirrors")
     rows = [Row(o, (k, 1), (0.0, 1.0, 0.2, 0.7)) for k in range(1, len(lens.surfaces)) for o in ("RANG", "REAC")]
-    angle, cosine = (
-        Evaluation(model_of("two aspheric mirrors"), rows)(model_of("two aspheric mirrors").start)
-        .values.reshape(-1, 2)
-        .T
-    )
+    angle, cosine = values_of("two aspheric mirrors", rows).reshape(-1, 2).T
     assert angle == pytest.approx(np.arccos(np.abs(cosine)), rel=1e-9)
     assert (cosine < 0).any()

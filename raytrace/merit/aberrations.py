@@ -367,7 +367,8 @@ ABERRATIONS = {
         _distortion_sum,
         "distortion S5 in waves of a surface at a wavelength; of surface 0 that of the largest field in %, or in "
         "lengths where the number in the column of Hx is not 0",
-        reading="S5 itself over the wavelength, `seidel` wavefront: S5/2; of surface 0 by the real chief ray, against one near the axis",
+        reading="S5 itself over the wavelength, `seidel` wavefront: S5/2; of surface 0 by the real chief ray, against "
+        "one near the axis",
         takes=_CONTRIBUTION,
     ),
     "DIMX": Operand(
