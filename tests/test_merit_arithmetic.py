@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from merit_cases import check_derivatives, model_of, values_of
 
+import raytrace as rt
 from raytrace.merit.arithmetic import ARITHMETIC, Circle
 from raytrace.merit.merit import Evaluation, UnknownOperand
+from raytrace.merit.model import Model
 from raytrace.merit.plan import BadRow
-from raytrace.system.intent import Row
+from raytrace.system.intent import Row, Vary
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -138,6 +140,23 @@ def shifted():
         to = tuple(max(n - 1, 0) for n in row.integers) if row.operand in ARITHMETIC else row.integers
         moved.append(Row(row.operand, to, row.numbers, row.target, row.weight))
     return moved
+
+
+def test_rows_of_other_configurations():
+    """The focal length of one over that of another, and what it moves by, from either."""
+    zoom = rt.read_lens("double_gauss").with_configurations(thickness={6: [12.4281, 16.0]})
+    model = Model(zoom, (Vary(1, "curvature"), Vary(6, "thickness", configuration=2, operand=0)))
+    rows = [Row("CONF", (1, 0)), Row("DIVI", (3, 5), weight=1.0), Row("EFFL"), Row("CONF", (2, 0)), Row("EFFL")]
+    found = Evaluation(model, rows)(model.start, derivatives=True)
+    lengths = [float(rt.first_order(one).effective_focal_length) for one in zoom.configurations]
+    assert found.values[[2, 4]] == pytest.approx(lengths, rel=1e-12)
+    assert found.values[1] == pytest.approx(lengths[0] / lengths[1], rel=1e-12)
+    assert Evaluation(model, [*rows, Row("CONF", (1, 0))])(model.start).values[1] == found.values[1]
+    for i, step in enumerate((1e-7, 1e-4)):
+        ahead, back = (Evaluation(model, rows)(model.start + side * step * np.eye(2)[i]).values[1] for side in (1, -1))
+        assert found.jacobian[0, i] == pytest.approx((ahead - back) / (2 * step), rel=1e-6)
+    with pytest.raises(BadRow, match=r"CONF names configuration 3: this lens has configurations 1 to 2$"):
+        Evaluation(model, [Row("CONF", (3, 0))])
 
 
 def test_values_are_taken_in_the_unit_of_the_rows():
