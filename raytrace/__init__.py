@@ -74,6 +74,8 @@ PUBLIC = {
     "tracing": "fused",
     # optimisation
     "BadMerit": "merit.default",
+    "Measure": "merit.measure",
+    "Readings": "merit.readings",
     "Condition": "optimization.problem",
     "NoProblem": "optimization.problem",
     "Optimized": "optimization.result",

@@ -59,15 +59,12 @@ def _planned(function: Callable) -> Callable[[Sequence[Line], Planner], Evaluate
             if found is None or alone[0]:
                 return Found(listed([np.nan if found is None else found[0]] * len(lines), now.moment.count))
             length = np.sqrt(sum(number * number for number in found))
-            return Found(listed([length] * len(lines), now.moment.count), _parts(found, len(lines), now))
+            parts = tuple(listed([number] * len(lines), now.moment.count) for number in found)
+            return Found(listed([length] * len(lines), now.moment.count), parts)
 
         return evaluate
 
     return plan
-
-
-def _parts(numbers: Sequence, rows: int, now: Now) -> tuple:
-    return tuple(listed([number] * rows, now.moment.count) for number in numbers)
 
 
 class OrLost:

@@ -159,10 +159,11 @@ class Evaluation:
                     continue
                 factor = self.factors[places][chosen]
                 target = self.targets[places][chosen] if number is told.values else 0.0
-                residuals.append(factor * (value_of(number)[chosen] - target))
+                errors = factor * (value_of(number)[..., chosen] - target)
+                residuals.append(errors.ravel())
                 if derivatives:
-                    slopes.append((factor * slope_of(number, count)[:, chosen]).T)
-                of_row.append(places[chosen])
+                    slopes.append((factor * slope_of(number, count)[..., chosen]).reshape(count, -1).T)
+                of_row.append(np.broadcast_to(places[chosen], errors.shape).ravel())
         return self._evaluated(values, residuals, slopes if derivatives else None, of_row, count)
 
     def _evaluated(self, values, residuals, slopes, of_row, count: int) -> Evaluated:

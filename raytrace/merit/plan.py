@@ -52,7 +52,7 @@ class BadRow(ValueError):
 class Found(NamedTuple):
     """What rows come to: values (R,), an array or dual numbers, nan where a ray is lost.
 
-    parts: several (R,), whose squares sum up to the square of the value, and which are smooth where it is 0.
+    parts: several (R,) or (K, R), whose squares sum up to the square of the value, and which are smooth where it is 0.
     """
 
     values: object

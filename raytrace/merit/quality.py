@@ -68,15 +68,15 @@ def colours_of(line: Line, planner: Planner) -> dict[int, float]:
     return {w: weight for w, weight in enumerate(weights) if weight > 0}
 
 
-def rms_of(vector: Callable, rule: Callable, *, clips: bool) -> Callable[[Sequence[Line], Planner], Evaluate]:
-    """The RMS of rows, each the length of what `vector` gives of a beam, a row to itself."""
+def rms_of(vectors: Callable, rule: Callable, *, clips: bool) -> Callable[[Sequence[Line], Planner], Evaluate]:
+    """The RMS of rows, each the length of what `vectors` gives of its beam."""
 
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
-        tell = [vector(beam_of(line, rule, clips, planner), planner) for line in lines]
+        tell = vectors([beam_of(line, rule, clips, planner) for line in lines], planner)
 
         def evaluate(now: Now) -> Found:
-            parts = _side_by_side([one(now) for one in tell], now.moment.count)
-            return Found(np.sqrt((parts * parts).sum(0)), tuple(parts[k] for k in range(parts.shape[0])))
+            parts = _side_by_side(tell(now), now.moment.count)
+            return Found(np.sqrt((parts * parts).sum(0)), (parts,))
 
         return evaluate
 
@@ -101,10 +101,10 @@ def _side_by_side(vectors: Sequence, count: int):
 def spot(*, about_chief: bool):
     """√w (x - x₀) and √w (y - y₀) mm on the image, from the centroid or the primary wavelength's chief ray."""
 
-    def vector(beam: Beam, planner: Planner) -> Callable[[Now], object]:
-        chief = np.array([planner.ask(planner.primary, beam.line.field, (0.0, 0.0))])
+    def vectors(beams: Sequence[Beam], planner: Planner) -> Callable[[Now], list]:
+        chiefs = [np.array([planner.ask(planner.primary, beam.line.field, (0.0, 0.0))]) for beam in beams]
 
-        def tell(now: Now):
+        def of(beam: Beam, chief: np.ndarray, now: Now):
             hits, centre = now.hits(beam.rays, clips=beam.clips), now.hits(chief)
             weights = beam.weights(hits.valid)
             if weights is None or (about_chief and not centre.valid[0]):
@@ -115,28 +115,39 @@ def spot(*, about_chief: bool):
                 parts.append(root * (place - (centre.position[k][0] if about_chief else weights @ place)))
             return np.concatenate(parts)
 
-        return tell
+        return lambda now: [of(beam, chief, now) for beam, chief in zip(beams, chiefs, strict=True)]
 
-    return vector
+    return vectors
 
 
 def wave(*, tilted: bool):
     """√w W, waves, about the mean of each colour on its own sphere; tilted: about its tilt too, the centroid's."""
 
-    def vector(beam: Beam, planner: Planner) -> Callable[[Now], object]:
-        opd = opd_of(beam.rays, [(w, beam.line.field) for w in beam.colours.tolist()], planner, clips=beam.clips)
-        own = beam.colours[:, None] == np.unique(beam.colours)
-        terms = (1.0, *beam.points) if tilted else (1.0,)
-        fit = Fit(np.concatenate([own * np.broadcast_to(t, own.shape[:1])[:, None] for t in terms], 1), beam.shares)
+    def vectors(beams: Sequence[Beam], planner: Planner) -> Callable[[Now], list]:
+        rays = np.concatenate([beam.rays for beam in beams])
+        own = [(w, beam.line.field) for beam in beams for w in beam.colours.tolist()]
+        opd = opd_of(rays, own, planner, clips=beams[0].clips)
+        ends = np.cumsum([len(beam.rays) for beam in beams])
+        places = [slice(end - len(beam.rays), end) for beam, end in zip(beams, ends, strict=True)]
+        fits = [Fit(_terms(beam, tilted), beam.shares) for beam in beams]
 
-        def tell(now: Now):
+        def tell(now: Now) -> list:
             valid, found = opd(now)
-            weights = beam.weights(valid)
-            return None if weights is None else np.sqrt(weights) * fit.less(found, valid)
+            return [of(*one, valid, found) for one in zip(beams, fits, places, strict=True)]
 
         return tell
 
-    return vector
+    def of(beam: Beam, fit: Fit, place: slice, valid: np.ndarray, found):
+        weights = beam.weights(valid[place])
+        return None if weights is None else np.sqrt(weights) * fit.less(found[place], valid[place])
+
+    return vectors
+
+
+def _terms(beam: Beam, tilted: bool) -> np.ndarray:
+    """(R, K): of every colour 1 and, where `tilted`, the pupil point."""
+    own = (beam.colours[:, None] == np.unique(beam.colours)).astype(float)
+    return np.concatenate([own, *(own * part[:, None] for part in beam.points)] if tilted else [own], 1)
 
 
 _RINGS = "int1 rings of four arms each, six at the least; a ray that does not arrive leaves no value"
