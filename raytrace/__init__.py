@@ -74,13 +74,15 @@ PUBLIC = {
     "tracing": "fused",
     # optimisation
     "BadMerit": "merit.default",
+    "Condition": "merit.hold",
     "Measure": "merit.measure",
+    "Merit": "merit.value",
     "Readings": "merit.readings",
-    "Condition": "optimization.problem",
     "NoProblem": "optimization.problem",
     "Optimized": "optimization.result",
     "Row": "system.intent",
     "Vary": "system.intent",
+    "evaluate": "merit.evaluate",
     "optimize": "optimization.optimize",
     # images and analyses
     "Memo": "optics.reuse",

@@ -91,15 +91,26 @@ def rows_of(
     """
     choice = Choice(rings, arms, field_weights, wavelength_weights, tuple(frequencies))
     operand = _operand(kind, reference, choice)
-    every = range(1, len(lens.configurations) + 1) if configurations is None else configurations
     about = f"{kind}, from the {reference}" if len(KINDS[kind].operands) > 1 else kind
     found = [Row("DMFS"), Row("BLNK", text=f"{about}: {KINDS[kind].text}")]
-    for number in every:
-        one = lens.configuration(number) if lens.operands else lens
-        found += [Row("CONF", (number, 0))] if lens.operands else []
-        found += (boundaries or Boundaries()).rows(one)
-        found += KINDS[kind].rows(one, operand, choice)
+    for setting, one in _configurations(lens, configurations):
+        found += (*setting, *(boundaries or Boundaries()).rows(one), *KINDS[kind].rows(one, operand, choice))
     return tuple(found)
+
+
+def boundary_rows(lens: Lens, boundaries: Boundaries, configurations: Sequence[int] | None = None) -> tuple[Row, ...]:
+    """The rows of boundaries alone, in every configuration."""
+    found: list[Row] = []
+    for setting, one in _configurations(lens, configurations):
+        rows = tuple(boundaries.rows(one))
+        found += (*setting, *rows) if rows else ()
+    return tuple(found)
+
+
+def _configurations(lens: Lens, chosen: Sequence[int] | None) -> Iterator[tuple[tuple[Row, ...], Lens]]:
+    """The row that says which configuration the rows below are of, if there are several, and the lens in it."""
+    for number in range(1, len(lens.configurations) + 1) if chosen is None else chosen:
+        yield ((Row("CONF", (number, 0)),), lens.configuration(number)) if lens.operands else ((), lens)
 
 
 def _operand(kind: str, reference: str, choice: Choice) -> str:
@@ -126,7 +137,7 @@ def _by_rays(lens: Lens, operand: str, choice: Choice) -> Iterator[Row]:
             share = np.pi * weight * field_weight / (len(colours) * len(fields) * len(angles))
             for angle in angles if share else ():
                 for radius, g in zip(np.sqrt(0.5 * (nodes + 1)), 0.5 * weights, strict=True):
-                    pupil = float(radius * np.cos(angle)), float(radius * np.sin(angle))
+                    pupil = _clean(radius * np.cos(angle)), _clean(radius * np.sin(angle))
                     yield Row(operand, (0, wavelength), (*field, *pupil), weight=float(share * g))
 
 
@@ -165,6 +176,11 @@ def _arms(lens: Lens, field: tuple[float, float], arms: int) -> np.ndarray:
     if not is_round_about_axis(lens) or bool(lens.fields.x.any()):
         return angles
     return angles[: arms // 2] if field != (0.0, 0.0) else np.zeros(1)
+
+
+def _clean(number: float) -> float:
+    """Without what rounding leaves of 0."""
+    return round(float(number), 15) + 0.0
 
 
 REFERENCES = ("centroid", "chief")

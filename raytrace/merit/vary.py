@@ -19,11 +19,11 @@ import numpy as np
 import torch
 
 from raytrace.media.glass import Glass, is_air
-from raytrace.merit.model import Address, names_at
+from raytrace.merit.model import GLASS, Address, names_at
 from raytrace.system.configurations import same
 from raytrace.system.intent import Solve, Vary
 from raytrace.system.lens import Lens
-from raytrace.system.naming import BadVariables, counted, parse_bounds, sensor
+from raytrace.system.naming import BadVariables, counted, joined, parse_bounds, sensor
 from raytrace.system.places import modelled, places
 from raytrace.words import did_you_mean
 
@@ -38,7 +38,7 @@ SOLVED_BY = {
 }
 
 #: Numbers that belong to a medium.
-MEDIA = ("index", "abbe_number", "glass")
+MEDIA = (*GLASS, "glass")
 
 #: What is not varied by that name, and what is instead.
 _INSTEAD = {"radius": "curvature", "focus": "sensor", "glasses": "glass", "abbe": "abbe_number"}
@@ -57,7 +57,7 @@ class Freedom:
     solves: tuple[Solve, ...] = ()
 
 
-def freedom(lens: Lens, vary: str | None = None) -> Freedom:
+def freedom(lens: Lens, vary: str | Sequence[str] | None = None) -> Freedom:
     """What varies of a lens: what words name, or without any what its file does.
 
     Solves of the file hold where no word says otherwise: a number that is named varies, and one that belongs to no
@@ -68,7 +68,7 @@ def freedom(lens: Lens, vary: str | None = None) -> Freedom:
         if lens.intent is None or not lens.intent.variables:
             raise BadVariables("the file tells no variables: `vary` names them, as 'curvature thickness'")
         return Freedom(lens, lens.intent.variables, own)
-    words = _words(vary)
+    words = _words(joined(vary))
     told = tuple(solve for word in words if "=" in word for solve in _solves(lens, word))
     found: dict[str, Vary] = {}
     for word in words:
@@ -76,7 +76,9 @@ def freedom(lens: Lens, vary: str | None = None) -> Freedom:
             follow = () if ":" in word or word == "sensor" else _addresses((*told, *own))
             found |= {name_of(one): one for one in varied(lens, word) if _address(one) not in follow}
     if not found:
-        raise BadVariables(f"`vary={vary}` leaves nothing to vary; expected words like curvature thickness:5,6 conic:3")
+        raise BadVariables(
+            f"`vary={joined(vary)}` leaves nothing to vary; expected words like curvature thickness:5,6 conic:3"
+        )
     free = _addresses(found.values())
     for surface, quantity in free & _addresses(told):
         raise BadVariables(f"{quantity}:{surface} is to vary and to follow: leave one out")
@@ -119,7 +121,9 @@ def name_of(one: Vary) -> str:
     return f"{one.quantity}_{one.surface}" + (f"@{one.configuration}" if one.configuration else "")
 
 
-def bounds_of(lens: Lens, variables: Sequence[Vary], text: str | None = None) -> tuple[np.ndarray, np.ndarray]:
+def bounds_of(
+    lens: Lens, variables: Sequence[Vary], text: str | Sequence[str] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Smallest and largest value (n,) of every variable, of words like "thickness:2..15 curvature_3:-0.1,0".
 
     A name stands for all variables of a kind, for one of a surface (thickness_3, or thickness:3-5 of several), or for
@@ -128,7 +132,7 @@ def bounds_of(lens: Lens, variables: Sequence[Vary], text: str | None = None) ->
     """
     own = [getattr(one, "bounds", ()) or (-np.inf, np.inf) for one in variables]
     low, high = (np.array([ends[k] for ends in own], dtype=float) for k in range(2))
-    for name, ends in parse_bounds(text or "").items():
+    for name, ends in parse_bounds(joined(text or "")).items():
         kind, _, surfaces = name.partition(":")
         wanted = {f"{kind}_{k}" for k in counted(name, surfaces)} if surfaces else {name}
         chosen = [position for position, one in enumerate(variables) if wanted & _names(lens, one)]
@@ -175,7 +179,7 @@ def _makes_sense(lens: Lens, kind: str, k: int) -> bool:
     """Whether a kind that is named alone means surface k too."""
     surface = lens.surfaces[k]
     if kind == "curvature":
-        return surface.is_mirror or not same(_medium(lens, k - 1), _medium(lens, k))
+        return bends_light(lens, k)
     if kind == "thickness":
         return k == sensor(lens) or bool(surface.thickness != 0)
     if kind in MEDIA:
@@ -184,6 +188,11 @@ def _makes_sense(lens: Lens, kind: str, k: int) -> bool:
     if kind == "conic":
         return surface.conic is not None
     return any(quantity in present for quantity in GROUPS.get(kind, (kind,)))
+
+
+def bends_light(lens: Lens, k: int) -> bool:
+    """Whether a surface is a mirror, or has other media before and behind it."""
+    return lens.surfaces[k].is_mirror or not same(_medium(lens, k - 1), _medium(lens, k))
 
 
 def _medium(lens: Lens, k: int) -> Glass:

@@ -9,9 +9,10 @@ import numpy as np
 import torch
 
 from raytrace.fused import prepare
-from raytrace.merit.default import Boundaries, rows_of
+from raytrace.merit.hold import conditions_of
 from raytrace.merit.merit import Evaluated
 from raytrace.merit.model import Model
+from raytrace.merit.value import Merit, merit_for
 from raytrace.merit.vary import Freedom, bounds_of, freedom, name_of
 from raytrace.optimization.checkpoint import Checkpoint, Log, resumed
 from raytrace.optimization.least_squares import Cycle, State
@@ -20,20 +21,19 @@ from raytrace.optimization.problem import Condition, NoProblem, Problem
 from raytrace.optimization.result import Optimized
 from raytrace.system.intent import Intent, Row, Vary
 from raytrace.system.lens import Lens
-from raytrace.system.naming import parse_range
 
 
 def optimize(
     lens: Lens,
     *,
-    merit: str | Sequence[Row] | None = None,
+    merit: str | Merit | Sequence[Row] | None = None,
     vary: str | Sequence[str | Vary] | None = None,
     bounds: str | Sequence[str] | None = None,
-    hold: Sequence[Condition] | None = None,
-    rings: int = 3,
-    arms: int = 6,
-    reference: str = "centroid",
-    frequencies: Sequence[float] = (),
+    hold: str | Sequence[str | Condition] | None = None,
+    rings: int | None = None,
+    arms: int | None = None,
+    reference: str | None = None,
+    frequencies: Sequence[float] | None = None,
     field_weights: Sequence[float] | None = None,
     wavelength_weights: Sequence[float] | None = None,
     glass_thickness: str | tuple[float, float] | None = None,
@@ -50,27 +50,26 @@ def optimize(
 ) -> Optimized:
     """The lens at the least of its merit function, by damped least squares on the exact derivatives of every row.
 
-    merit: rows, by default the file's, or the kind of a default merit function: "spot", "wavefront", "angular", "mtf",
-    which rings, arms, reference, frequencies (cycles/mm) and the weights of fields and wavelengths belong to, as in
-    `default.rows_of`, and boundaries in mm: glass_thickness, air_thickness (least, greatest), edge (least).
+    merit: `Merit`, rows, by default the file's, or the kind of a default merit function: "spot", "wavefront",
+    "angular", "mtf", which rings, arms, reference, frequencies (cycles/mm) and the weights of fields and wavelengths
+    belong to, as in `default.rows_of`; boundaries in mm beside it: glass_thickness, air_thickness (least, greatest),
+    edge (least).
     vary: variables, or words for them, as "curvature thickness:5,6", by default the file's; bounds: of variables, as
-    "thickness:2,15"; hold: what is met exactly. cycles, seconds: after which it ends; paths: how many ways of damping
-    are tried. skip_unknown: leave rows of unknown operands out. log: a file with a line for every cycle; checkpoint: a
-    file that keeps the best variables; resume: one that they are taken from. Ctrl-C ends with the best lens.
-    Raises NoProblem, BadMerit, BadVariables, BadRow, UnknownOperand, BadCheckpoint.
+    "thickness:2,15"; hold: what is met exactly, as "efl=50 total_track<=80" (`merit.hold`). cycles, seconds: after
+    which it ends; paths: how many ways of damping are tried. skip_unknown: leave rows of unknown operands out. log: a
+    file with a line for every cycle; checkpoint: a file that keeps the best variables; resume: one that they are taken
+    from. Ctrl-C ends with the best lens.
+    Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadCheckpoint.
     """
     prepare()
-    own = {
-        "rings": rings, "arms": arms, "reference": reference, "frequencies": frequencies,
-        "field_weights": field_weights, "wavelength_weights": wavelength_weights,
-        "boundaries": Boundaries(_range(glass_thickness), _range(air_thickness), edge),
-    }  # fmt: skip
+    function = merit_for(
+        lens, merit, rings=rings, arms=arms, reference=reference, frequencies=frequencies, field_weights=field_weights,
+        wavelength_weights=wavelength_weights, glass_thickness=glass_thickness, air_thickness=air_thickness, edge=edge,
+    )  # fmt: skip
     free = _freedom(lens, vary)
     names = tuple(name_of(one) for one in free.variables)
-    rows, unit = _rows(lens, merit, own)
-    conditions = tuple(hold or ())
     model = Model(free.lens, free.variables, free.solves)
-    problem = Problem(model, rows, conditions, unit=unit, skip_unknown=skip_unknown)
+    problem = Problem(model, function.rows, _conditions(lens, hold), unit=function.unit, skip_unknown=skip_unknown)
     lower, upper = _bounds(free, bounds, names)
     start = model.start if resume is None else resumed(resume, names)
     begun, before = time.monotonic(), problem.evaluated(model.start)
@@ -100,33 +99,19 @@ def optimize(
 
 def _freedom(lens: Lens, vary: str | Sequence[str | Vary] | None) -> Freedom:
     if vary is None or isinstance(vary, str) or all(isinstance(one, str) for one in vary):
-        return freedom(lens, _joined(vary))
+        return freedom(lens, vary)
     return Freedom(lens, tuple(vary), () if lens.intent is None else lens.intent.solves)
 
 
-def _joined(words: str | Sequence[str] | None) -> str | None:
-    return words if words is None or isinstance(words, str) else " ".join(words)
-
-
-def _range(ends: str | tuple[float, float] | None) -> tuple[float, float] | None:
-    """Least and greatest, as numbers or as "2:15"."""
-    return parse_range(ends) if isinstance(ends, str) else ends
-
-
-def _rows(lens: Lens, merit: str | Sequence[Row] | None, own: dict) -> tuple[tuple[Row, ...], float]:
-    """The rows, and mm in their unit. Raises NoProblem and BadMerit."""
-    if isinstance(merit, str):
-        return rows_of(lens, merit, **own), 1.0
-    if merit is not None:
-        return tuple(merit), 1.0
-    if lens.intent is None or not lens.intent.merit:
-        raise NoProblem("the lens has no merit function of its own: choose one by `merit=spot`")
-    return lens.intent.merit, lens.intent.unit
+def _conditions(lens: Lens, hold: str | Sequence[str | Condition] | None) -> tuple[Condition, ...]:
+    if hold is None or isinstance(hold, str) or all(isinstance(one, str) for one in hold):
+        return conditions_of(lens, hold)
+    return tuple(hold)
 
 
 def _bounds(free: Freedom, bounds: str | Sequence[str] | None, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
     """Bounds (n,) of the variables. Raises NoProblem where none is left between them."""
-    lower, upper = bounds_of(free.lens, free.variables, _joined(bounds))
+    lower, upper = bounds_of(free.lens, free.variables, bounds)
     for name, least, most in zip(names, lower, upper, strict=True):
         if not least <= most:
             raise NoProblem(f"`bounds` of {name}: from {least:g} to {most:g} there is nothing")

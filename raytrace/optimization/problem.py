@@ -4,17 +4,18 @@ Rows of positive weight are squared; rows of negative weight, and what is held, 
 """
 
 import dataclasses
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from raytrace.merit.hold import Condition as Condition
 from raytrace.merit.merit import LOST, Evaluated, Evaluation
 from raytrace.merit.model import Model
 from raytrace.optimization.least_squares import State
 from raytrace.optimization.lost import MARGIN, STEEP, Recovery
 from raytrace.optimization.step import Sides
 from raytrace.system.intent import Row
+from raytrace.system.lens import Lens
 
 #: Signs by which a relation is a limit ≤ 0; equalities have none.
 RELATIONS = {"=": 0, "<=": 1, ">=": -1}
@@ -22,14 +23,6 @@ RELATIONS = {"=": 0, "<=": 1, ">=": -1}
 
 class NoProblem(ValueError):
     """Nothing that could be optimised; the message says what is missing."""
-
-
-@dataclass(frozen=True)
-class Condition:
-    """What is held: the value of a row related to its target by a key of RELATIONS."""
-
-    row: Row
-    relation: str = "="
 
 
 class Problem:
@@ -45,15 +38,15 @@ class Problem:
         skip_unknown: bool = False,
     ):
         """unit: mm in the unit of length of rows and conditions. Raises NoProblem and UnknownOperand."""
-        held = tuple(_held(condition.row) for condition in conditions)
+        held = tuple(_held(model.lens, rows, conditions))
         self.model, self.rows = model, tuple(rows)
-        self.evaluation = Evaluation(model, (*rows, *held), unit=unit, skip_unknown=skip_unknown)
+        self.evaluation = Evaluation(model, (*rows, *(row for row, _ in held)), unit=unit, skip_unknown=skip_unknown)
         weights = self.evaluation.weights
         if not len(model.variables):
             raise NoProblem("nothing varies: name variables by `vary`, as 'curvature thickness'")
         if not (weights > 0).any():
             raise NoProblem("no row of the merit function has a weight that counts: choose another by `merit`")
-        signs = [0] * len(self.rows) + [RELATIONS[condition.relation] for condition in conditions]
+        signs = [0] * len(self.rows) + [sign for _, sign in held]
         self.signs = np.where(weights < 0, signs, 0)
         self.recovery = Recovery(self.evaluation)
 
@@ -106,6 +99,13 @@ class Problem:
         return float(np.sqrt(own @ own))
 
 
-def _held(row: Row) -> Row:
-    """A row that does not count among the squares."""
-    return Row(row.operand, row.integers, row.numbers, row.target, -1.0, row.text, row.further)
+def _held(lens: Lens, rows: Sequence[Row], conditions: Sequence[Condition]) -> Iterator[tuple[Row, int]]:
+    """Rows that do not count among the squares, and the signs of their relations; rows before them say of which
+    configuration and primary wavelength they are, where the merit function or a condition does."""
+    if any(row.operand == "PRIM" for row in rows):
+        yield Row("PRIM", (0, lens.primary_wavelength + 1)), 0
+    several = any(row.operand == "CONF" for row in rows) or any(one.configuration for one in conditions)
+    for one in conditions:
+        if several:
+            yield Row("CONF", (one.configuration or lens.current_configuration, 0)), 0
+        yield dataclasses.replace(one.row, weight=-1.0), RELATIONS[one.relation]

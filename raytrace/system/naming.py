@@ -7,6 +7,7 @@ sensor:57.5,58 curvature_3:-0.1..0          bounds by name, an open end left out
 
 import math
 import re
+from collections.abc import Sequence
 
 from raytrace.system.lens import Lens
 from raytrace.system.places import Place, places
@@ -19,6 +20,11 @@ class BadVariables(ValueError):
 
 class BadLimits(ValueError):
     """Limits that cannot be read, or that nothing can keep to."""
+
+
+def joined(words: str | Sequence[str]) -> str:
+    """Words as one text, that may come as several."""
+    return words if isinstance(words, str) else " ".join(words)
 
 
 def counted(word: str, numbers: str, what: str = "surface") -> list[int]:
