@@ -1,6 +1,7 @@
 """`raytrace merit`."""
 
 from raytrace.cli import options as words
+from raytrace.cli.merit_options import merit
 
 SUMMARY = "merit function of a lens, row by row"
 DESCRIPTION = (
@@ -19,7 +20,7 @@ VERB = "evaluate"
 def options(parser):
     words.lens(parser)
     words.conditions(parser)
-    words.merit(parser)
+    merit(parser)
     parser.add_argument("--each", action="store_true", help="list every row, also the rays of one field")
     words.plot(parser, "which rows the merit is made of, by operand and field")
 

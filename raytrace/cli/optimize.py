@@ -1,6 +1,7 @@
 """`raytrace optimize`."""
 
 from raytrace.cli import options as words
+from raytrace.cli.merit_options import freedom, merit
 
 SUMMARY = "move the variables of a lens to the least of its merit function"
 DESCRIPTION = (
@@ -18,8 +19,8 @@ EXAMPLES = """examples:
 
 def options(parser):
     words.lens(parser)
-    words.merit(parser)
-    words.freedom(parser)
+    merit(parser)
+    freedom(parser)
     ends = parser.add_argument_group("how long")
     ends.add_argument("--cycles", metavar="N", type=words.count, help="end after so many cycles")
     ends.add_argument("--seconds", metavar="S", type=words.positive_finite, help="end after so much time")
