@@ -97,6 +97,7 @@ class Manner:
     bends: bool = True
     keeps: bool = False
     tolerance: float = 1e-8
+    floor: float = 0.01
 
 
 def least_squares(
@@ -105,6 +106,7 @@ def least_squares(
     *,
     lower: np.ndarray,
     upper: np.ndarray,
+    typical: np.ndarray | None = None,
     manner: Manner = Manner(),
     cycles: int = 1000,
     until: float = np.inf,
@@ -114,13 +116,14 @@ def least_squares(
 
     watch: told of every cycle; a KeyboardInterrupt ends with the best state.
     """
-    return _Run(evaluate, lower, upper, manner, until, watch).descend(x, cycles)
+    typical = np.full(len(x), np.inf) if typical is None else typical
+    return _Run(evaluate, lower, upper, typical, manner, until, watch).descend(x, cycles)
 
 
 class _Run:
-    def __init__(self, evaluate, lower, upper, manner: Manner, until: float, watch):
+    def __init__(self, evaluate, lower, upper, typical, manner: Manner, until: float, watch):
         self.evaluate, self.lower, self.upper, self.manner = evaluate, lower, upper, manner
-        self.until, self.watch = until, watch
+        self.typical, self.until, self.watch = typical, until, watch
         self.evaluations, self.told, self.begun = 0, [], time.monotonic()
         self.damping, self.share, self.price = manner.damping, 1.0, 0.0
         self.scale = None
@@ -152,7 +155,7 @@ class _Run:
             if time.monotonic() > self.until:
                 return "seconds"
             trial, step, foretold = self._try(linear)
-            if step is not None and foretold <= _ROUNDING * self.state.cost and not (self.state.missed > 1e-9).any():
+            if step is not None and self.damping < 1 and foretold <= _ROUNDING * self.state.cost and not (self.state.missed > 1e-9).any():
                 return "gradient"
             if trial is not None and self._takes(trial, foretold):
                 self.state = self.at(trial.x, True)
@@ -172,6 +175,8 @@ class _Run:
     def _linear(self) -> Linear:
         state = self.state
         columns = np.sqrt((state.jacobian**2).sum(0) + (state.sides.slope[state.sides.excess > 0] ** 2).sum(0))
+        floor = self.manner.floor * np.sqrt(self.state.cost) / self.typical
+        columns = np.sqrt(columns**2 + floor**2)
         columns = np.where(columns > 0, columns, 1.0)
         self.scale = np.maximum(columns, self.scale) if self.manner.keeps and self.scale is not None else columns
         return Linear(

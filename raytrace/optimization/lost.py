@@ -48,7 +48,8 @@ class Recovery:
         for place, row in enumerate(rows):
             planner, line = self.planners[row]
             ray = Ray(line.wavelength, line.field, line.pupil)
-            found.setdefault(planner.view, []).append((place, ray))
+            if any(ray in bundle.rays for bundle in planner.bundles.values()):  # else a row of no ray
+                found.setdefault(planner.view, []).append((place, ray))
         return found
 
     def _missed(self, view, moment: Moment, wanted: list[tuple[int, Ray]]):
