@@ -9,7 +9,7 @@ import torch
 from scipy.optimize import minimize
 
 import raytrace as rt
-from raytrace.merit.default import rows_of
+from raytrace.merit.default import Boundaries, rows_of
 from raytrace.merit.model import Model
 from raytrace.merit.vary import freedom
 from raytrace.optimization.least_squares import Manner, State, least_squares
@@ -199,6 +199,38 @@ def test_a_merit_in_inches_ends_at_the_same_lens(triplet):
         ends.append(rt.optimize(told))
     assert ends[0].merit_after == pytest.approx(25.4 * ends[1].merit_after, rel=1e-9)
     assert torch.allclose(ends[0].variables_after, ends[1].variables_after, rtol=1e-6)
+
+
+def test_boundaries_are_known_on_both_sides_and_add_up_to_their_rows(triplet):
+    rows = rows_of(triplet, "spot", boundaries=Boundaries((4.0, 8.0), (1.0, 9.0), 3.0))
+    free = freedom(triplet, "curvature thickness")
+    problem = Problem(Model(free.lens, free.variables, free.solves), rows)
+    x = problem.model.start
+    found, state = problem.evaluated(x, True), problem.state(x, True)
+    assert (state.sides.excess < 0).any()
+    assert (state.sides.excess > 0).any()
+    assert state.cost == pytest.approx(found.merit**2, rel=1e-12)
+    slopes = np.stack(
+        [
+            (problem.state(x + h, False).sides.excess - problem.state(x - h, False).sides.excess) / (2 * h.max())
+            for h in np.diag(1e-6 * np.maximum(np.abs(x), 1e-2))
+        ],
+        -1,
+    )
+    assert slopes == pytest.approx(state.sides.slope, rel=1e-5, abs=1e-5 * np.abs(slopes).max())
+
+
+def test_boundaries_end_a_descent_without_chattering(triplet):
+    """Thicknesses come to rest where the rest of the merit presses them, each within a few steps of its boundary."""
+    found = rt.optimize(
+        triplet, merit="spot", vary="curvature thickness", hold=[Condition(Row("EFFL", target=101.2))],
+        glass_thickness="2:9", air_thickness="0.5:90", edge=1.0,
+    )  # fmt: skip
+    assert found.stopped in ("gradient", "merit")
+    assert found.cycles < 80
+    assert found.merit_after < 0.5 * found.merit_before
+    glass = [float(surface.thickness) for k, surface in enumerate(found.lens.surfaces) if k in (1, 3, 6)]
+    assert max(glass) < 9.2
 
 
 # -- lost rays ---------------------------------------------------------------------------------------------------------

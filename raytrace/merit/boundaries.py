@@ -172,12 +172,15 @@ def within(prepared: Prepared, chosen: Chosen, side: float, length: int):
 
         def evaluate(now: Now) -> Found:
             lacks = side * (targets[places.rows] - places.values(now))
+            sides = ()
+            if counted is _all:
+                sides = places.rows, side * (targets[places.rows] - places.at(now, np.arange(len(places.rows))))
             passed = counted(np.flatnonzero(~(lacks <= 0)), places.rows, lacks)  # nan is none that complies
             if not passed.size:
-                return Found(targets)
+                return Found(targets, sides=sides)
             rows = places.rows[passed]
             of_row = (rows == np.arange(len(lines))[:, None]).astype(float)
-            return Found(targets - of_row @ (targets[rows] - places.at(now, passed)))
+            return Found(targets - of_row @ (targets[rows] - places.at(now, passed)), sides=sides)
 
         return evaluate
 

@@ -33,6 +33,7 @@ class Evaluated:
 
     values: (R,) of all rows, nan for text and rows of unknown operands; lost: (R,) bool. residuals: (m,) whose squares
     sum up to M²; jacobian: (m, n) their derivatives by the variables; of_row: (m,) the row, from 0, of each.
+    sides: of one-sided rows, whose residual is Σ max(0, e), by operand: the rows (K,), e (K,), by the variables (K, n).
     """
 
     values: np.ndarray
@@ -40,6 +41,7 @@ class Evaluated:
     residuals: np.ndarray
     jacobian: np.ndarray | None
     of_row: np.ndarray
+    sides: tuple[tuple, ...] = ()
 
     @property
     def merit(self) -> float:
@@ -142,13 +144,14 @@ class Evaluation:
         count = len(variables)
         x = Dual(np.asarray(variables, dtype=float), np.eye(count)) if derivatives else np.asarray(variables, float)
         values, residuals, slopes, of_row = np.full(len(self.rows), np.nan), [], [], []
-        found: dict[int, object] = {}
+        found, sides = {}, []
         moments = {configuration: self.model.views[configuration - 1].moment(x) for configuration, _ in self.planners}
         now = {id(planner): Now(planner, moments[configuration], found) for configuration, planner in self.planners}
         for planner, lines, evaluate in self.groups:
             places = np.array([line.number - 1 for line in lines])
             told = evaluate(now[id(planner)])
             units = self.units[places]
+            sides += self._sides(told, places, units, count if derivatives else None)
             told = Found(told.values / units, tuple(part / units for part in told.parts))
             values[places] = value_of(told.values)
             found |= {line.number: told.values[k] for k, line in enumerate(lines) if line.number in self.needed}
@@ -164,7 +167,20 @@ class Evaluation:
                 if derivatives:
                     slopes.append((factor * slope_of(number, count)[..., chosen]).reshape(count, -1).T)
                 of_row.append(np.broadcast_to(places[chosen], errors.shape).ravel())
-        return self._evaluated(values, residuals, slopes if derivatives else None, of_row, count)
+        evaluated = self._evaluated(values, residuals, slopes if derivatives else None, of_row, count)
+        return dataclasses.replace(evaluated, sides=tuple(sides))
+
+    def _sides(self, told: Found, places: np.ndarray, units: np.ndarray, count: int | None):
+        """One-sided rows of an operand, as `Evaluated.sides` has them; none of rows that are no number."""
+        if not told.sides:
+            return
+        rows, excess = told.sides
+        undefined = np.bincount(rows, np.isnan(value_of(excess)), minlength=len(places)) > 0
+        chosen = (self.factors[places] > 0)[rows] & ~undefined[rows]
+        if chosen.any():
+            scale = (self.factors[places] / units)[rows[chosen]]
+            slope = None if count is None else (scale * slope_of(excess, count)[:, chosen]).T
+            yield places[rows[chosen]], scale * value_of(excess)[chosen], slope
 
     def _evaluated(self, values, residuals, slopes, of_row, count: int) -> Evaluated:
         of_row = np.concatenate(of_row) if of_row else np.zeros(0, dtype=int)

@@ -53,10 +53,12 @@ class Found(NamedTuple):
     """What rows come to: values (R,), an array or dual numbers, nan where a ray is lost.
 
     parts: several (R,) or (K, R), whose squares sum up to the square of the value, and which are smooth where it is 0.
+    sides: of rows that are off their target by Σ max(0, e): of which row each e is (K,), and e (K,), also below 0.
     """
 
     values: object
     parts: tuple = ()
+    sides: tuple = ()
 
 
 #: Values of rows at a moment; rows of arithmetic take those found so far, by their number.

@@ -155,7 +155,12 @@ class _Run:
             if time.monotonic() > self.until:
                 return "seconds"
             trial, step, foretold = self._try(linear)
-            if step is not None and self.damping < 1 and foretold <= _ROUNDING * self.state.cost and not (self.state.missed > 1e-9).any():
+            if (
+                step is not None
+                and self.damping < 1
+                and foretold <= _ROUNDING * self.state.cost
+                and not (self.state.missed > 1e-9).any()
+            ):
                 return "gradient"
             if trial is not None and self._takes(trial, foretold):
                 self.state = self.at(trial.x, True)

@@ -53,7 +53,7 @@ class Problem:
 
     @cached_property
     def typical(self) -> np.ndarray:
-        """How much (n,) of every variable is a lot: of beams h wide, h in thickness, 1/10h in curvature, …; inf: unknown."""
+        """How much (n,) of every variable is a lot: for beams h wide h in thickness, 1/10h in curvature; or inf."""
         moment = self.model.views[self.model.lens.current_configuration - 1].moment(self.model.start)
         h = 0.5 * float(moment.entrance_pupil_diameter)
         return np.array([_typical(one.quantity, h) for one in self.model.variables])
@@ -65,20 +65,28 @@ class Problem:
         """Residuals of rows of positive weight, and what the others miss, in units of their rows."""
         found = self._charged(self.evaluated(x, derivatives), x)
         of_row, weights = found.of_row, self.evaluation.weights
-        squared = weights[of_row] > 0
         signs, factors = self.signs[of_row], self.evaluation.factors[of_row]
-        equal, limit = ~squared & (signs == 0), ~squared & (signs != 0)
-        slopes = found.jacobian
+        rows, excess, slopes = _joined(found.sides, len(x))
+        sided = np.isin(of_row, rows)
+        squared, exact = (weights[of_row] > 0) & ~sided, (weights[of_row] < 0) & ~sided
+        equal, limit = exact & (signs == 0), exact & (signs != 0)
+        soft, hard = weights[rows] > 0, weights[rows] < 0
+        own = self.evaluation.factors[rows[hard]]
+        jacobian = found.jacobian
         return State(
             x,
             found.residuals[squared],
             int(found.lost[weights != 0].sum()),
-            Sides.none(len(x)),
+            Sides(excess[soft], slopes[soft], rows[soft]),
             found.residuals[equal] / factors[equal],
-            signs[limit] * found.residuals[limit] / factors[limit],
-            None if slopes is None else slopes[squared],
-            None if slopes is None else slopes[equal] / factors[equal, None],
-            None if slopes is None else signs[limit, None] * slopes[limit] / factors[limit, None],
+            np.concatenate([signs[limit] * found.residuals[limit] / factors[limit], excess[hard] / own]),
+            None if jacobian is None else jacobian[squared],
+            None if jacobian is None else jacobian[equal] / factors[equal, None],
+            None
+            if jacobian is None
+            else np.concatenate(
+                [(signs[limit] / factors[limit])[:, None] * jacobian[limit], slopes[hard] / own[:, None]]
+            ),
         )
 
     def _charged(self, found: Evaluated, x: np.ndarray) -> Evaluated:
@@ -122,4 +130,15 @@ def _held(lens: Lens, rows: Sequence[Row], conditions: Sequence[Condition]) -> I
 def _typical(quantity: str, h: float) -> float:
     if quantity[0] == "a" and quantity[1:].isdigit():
         return 0.01 * h ** (1 - int(quantity[1:]))
-    return {"thickness": h, "curvature": 0.1 / h, "conic": 1.0, "index": 0.05, "abbe_number": 10.0}.get(quantity, np.inf)
+    return {"thickness": h, "curvature": 0.1 / h, "conic": 1.0, "index": 0.05, "abbe_number": 10.0}.get(
+        quantity, np.inf
+    )
+
+
+def _joined(sides: tuple[tuple, ...], count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows, excess and its slope of one-sided rows of all operands; slopes of 0 where none were asked for."""
+    if not sides:
+        return np.zeros(0, dtype=int), np.zeros(0), np.zeros((0, count))
+    rows, excess = (np.concatenate([one[k] for one in sides]) for k in range(2))
+    slopes = [np.zeros((len(one[1]), count)) if one[2] is None else one[2] for one in sides]
+    return rows, excess, np.concatenate(slopes)
