@@ -1,5 +1,7 @@
 """Operands of image quality: against the analyses of the same lens, and finite differences with lost rays."""
 
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -319,3 +321,16 @@ def test_a_function_that_has_no_number_at_first_is_an_error_and_later_a_lost_row
 def test_a_function_that_gives_no_numbers_is_refused():
     with pytest.raises(TypeError, match=r"row 1 .*\[2, 2\], expected a tensor \(\) or \(k,\)"):
         values(rt.read_lens("cooke_triplet"), [Row(lambda lens: torch.ones(2, 2), weight=1.0)])
+
+
+def test_an_optimisation_follows_a_function_of_the_lens(tmp_path):
+    """Its row has a name wherever results are told, and cannot be written as a line of a lens file."""
+    lens = rt.read_lens("cooke_triplet")
+    found = rt.optimize(
+        lens, merit=[rt.Row(sharpness, target=1.0, weight=1.0)], vary=[rt.Vary(6, "thickness")], cycles=4
+    )
+    assert found.merit_after < 0.999 * found.merit_before
+    told = json.loads(json.dumps(found.document()))["operands"][0]
+    assert told["operand"] == "sharpness"
+    assert told["after"] == pytest.approx(float(sharpness(found.lens)), rel=1e-9)
+    assert "sharpness" in str(found)

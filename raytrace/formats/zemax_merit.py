@@ -81,8 +81,11 @@ def lines(merit: Iterable[Row], place: Place) -> list[str]:
 
 
 def _line(row: Row, place: Place) -> str:
-    if not _OPERAND.fullmatch(str(row.operand)):
-        raise LensFileError(f"{str(row.operand)!r} is no name of an operand of four capital letters", place)
+    if not isinstance(row.operand, str):  # a text in its place, so that rows below keep their numbers
+        name = one_line(row.name, "a name in the merit function", place)
+        return f"{_TEXT} {name}: a function of the lens, target {row.target:g}, weight {row.weight:g}"
+    if not _OPERAND.fullmatch(row.operand):
+        raise LensFileError(f"{row.operand!r} is no name of an operand of four capital letters", place)
     text = one_line(row.text, "a text of the merit function", place)
     if row.operand == _TEXT:
         return f"{_TEXT} {text}".rstrip()

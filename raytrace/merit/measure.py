@@ -12,6 +12,7 @@ import torch
 
 from raytrace.merit.paraxial import listed
 from raytrace.merit.plan import BadRow, Evaluate, Found, Line, Now, Operand, Planner
+from raytrace.system.intent import Row
 from raytrace.system.lens import Lens
 
 
@@ -36,8 +37,8 @@ class Measure:
 
 def measured(function: Callable[[Lens], torch.Tensor]) -> Operand:
     """The operand of rows that hold a `Measure`, or a function just as it is."""
-    name = getattr(function, "name", None) or getattr(function, "__name__", str(function))
-    return Operand(_planned(function), f"{name}, a function of the lens", length=getattr(function, "length", 0))
+    text = f"{Row(function).name}, a function of the lens"
+    return Operand(_planned(function), text, length=getattr(function, "length", 0))
 
 
 def _planned(function: Callable) -> Callable[[Sequence[Line], Planner], Evaluate]:

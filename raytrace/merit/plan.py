@@ -46,7 +46,7 @@ class BadRow(ValueError):
     """A row that names what the lens does not have."""
 
     def __init__(self, line: Line, words: str):
-        super().__init__(f"row {line.number} of the merit function: {line.row.operand} {words}")
+        super().__init__(f"row {line.number} of the merit function: {line.row.name} {words}")
 
 
 class Found(NamedTuple):

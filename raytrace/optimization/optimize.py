@@ -124,7 +124,7 @@ def _refuse_undefined(problem: Problem, found: Evaluated) -> None:
     if bad.any():
         k = int(found.of_row[np.argmax(bad)])
         row, number = problem.evaluation.rows[k], found.values[k]
-        raise NoProblem(f"row {k + 1} of the merit function, {row.operand}, is {number:g} at the start")
+        raise NoProblem(f"row {k + 1} of the merit function, {row.name}, is {number:g} at the start")
     counted = np.unique(found.of_row)
     if found.lost[counted].all():
         raise NoProblem("no row of the merit function has a value: no ray of them gets through the lens as it is")

@@ -65,7 +65,7 @@ class Optimized(Result):
         kinds = self.words()["operand"]
         return {
             "row": torch.tensor(self.rows),
-            "operand": torch.tensor([kinds.index(row.operand) for row in rows]),
+            "operand": torch.tensor([kinds.index(row.name) for row in rows]),
             "target": torch.tensor([row.target for row in rows], dtype=torch.float64),
             "weight": torch.tensor([row.weight for row in rows], dtype=torch.float64),
             "before": self.values_before[kept],
@@ -74,7 +74,7 @@ class Optimized(Result):
         }
 
     def words(self) -> dict:
-        return {"operand": [*dict.fromkeys(self.merit[i - 1].operand for i in self.rows)]}
+        return {"operand": [*dict.fromkeys(self.merit[i - 1].name for i in self.rows)]}
 
     def document(self) -> dict:
         moved = zip(self.names, self.variables_before.tolist(), self.variables_after.tolist(), strict=True)
@@ -91,7 +91,7 @@ class Optimized(Result):
                 "operands": [
                     {
                         "row": i,
-                        "operand": self.merit[i - 1].operand,
+                        "operand": self.merit[i - 1].name,
                         "target": self.merit[i - 1].target,
                         "weight": self.merit[i - 1].weight,
                         "before": number(before[i - 1]),
@@ -119,7 +119,7 @@ class Optimized(Result):
         for i in left[:_SHOWN]:
             row, share = self.merit[i - 1], float(self.contributions[i - 1])
             ends = f"{float(self.values_before[i - 1]):>14.6g} {float(self.values_after[i - 1]):>14.6g}"
-            lines.append(f"  {i:>5} {row.operand:<8} {row.target:>12.6g} {row.weight:>10.4g} {ends} {share:>7.1%}")
+            lines.append(f"  {i:>5} {row.name:<8} {row.target:>12.6g} {row.weight:>10.4g} {ends} {share:>7.1%}")
         if len(left) > _SHOWN:
             rest = sum(float(self.contributions[i - 1]) for i in left[_SHOWN:])
             lines.append(f"  and {len(left) - _SHOWN} more rows, {rest:.1%}")

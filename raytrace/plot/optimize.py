@@ -105,9 +105,9 @@ def _groups(found: Optimized) -> list[tuple[int, str]]:
     rows = {i: found.merit[i - 1] for i in counts}
     field = {i: "".join(f" {h:.3g}" for h in row.numbers[:2]) if any(row.numbers) else "" for i, row in rows.items()}
     names = (
-        {i: f"{row.operand} {i}" for i, row in rows.items()},
-        {i: row.operand + field[i] for i, row in rows.items()},
-        {i: row.operand for i, row in rows.items()},
+        {i: f"{row.name} {i}" for i, row in rows.items()},
+        {i: row.name + field[i] for i, row in rows.items()},
+        {i: row.name for i, row in rows.items()},
     )
     chosen = next((one for one in names if len(set(one.values())) <= _MOST_BARS), names[-1])
     return [*chosen.items()]

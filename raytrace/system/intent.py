@@ -91,8 +91,9 @@ class Row:
     """One line of a merit function: an operand, its arguments, and what it is meant to be.
 
     operand: its name, as "TRAC", a key of `merit.OPERANDS` where it is known, or a function from a lens to a tensor
-        () or (k,), which may be a `merit.Measure`; integers, numbers: its arguments as the
-        field's programs write them: surfaces, a wavelength (from 1, 0 the primary one) or rows; Hx, Hy, Px, Py or data.
+        () or (k,), which may be a `merit.Measure`; `name` is a word for either.
+    integers, numbers: its arguments as the field's programs write them: surfaces, a wavelength (from 1, 0 the primary
+        one) or rows; Hx, Hy, Px, Py or data.
     target, weight: the merit is the weighted mean square of value - target; a weight of 0 shows the value alone.
     text: what a line of text says, and words behind the numbers; further: numbers behind those.
     Lengths in `Intent.unit`: a merit of lengths and pure numbers depends on the unit, so rows stay as written.
@@ -105,6 +106,13 @@ class Row:
     weight: float = 0.0
     text: str = ""
     further: tuple[float, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Of the operand, also where that is a function."""
+        if isinstance(self.operand, str):
+            return self.operand
+        return getattr(self.operand, "name", None) or getattr(self.operand, "__name__", type(self.operand).__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +137,7 @@ class Intent:
     kept: tuple[Solve, ...] = ()
 
     def __str__(self) -> str:
-        counts = Counter(row.operand for row in self.merit)
+        counts = Counter(row.name for row in self.merit)
         operands = ", ".join(f"{name} x{count}" for name, count in counts.items())
         lines = [
             *(f"varies: {one}" for one in self.variables),
