@@ -9,6 +9,7 @@ from differences import slopes_by_differences
 from problems import values, vector, vignetting_aperture
 
 import raytrace as rt
+from raytrace.formats import LensFileWarning
 from raytrace.maths.pupil import gauss_rings, square
 from raytrace.merit.measure import Measure
 from raytrace.merit.merit import Evaluation
@@ -324,7 +325,7 @@ def test_a_function_that_gives_no_numbers_is_refused():
 
 
 def test_an_optimisation_follows_a_function_of_the_lens(tmp_path):
-    """Its row has a name wherever results are told, and cannot be written as a line of a lens file."""
+    """Its row has a name wherever results are told; in a lens file a text stands for it, with a warning."""
     lens = rt.read_lens("cooke_triplet")
     found = rt.optimize(
         lens, merit=[rt.Row(sharpness, target=1.0, weight=1.0)], vary=[rt.Vary(6, "thickness")], cycles=4
@@ -334,3 +335,7 @@ def test_an_optimisation_follows_a_function_of_the_lens(tmp_path):
     assert told["operand"] == "sharpness"
     assert told["after"] == pytest.approx(float(sharpness(found.lens)), rel=1e-9)
     assert "sharpness" in str(found)
+    with pytest.warns(LensFileWarning, match="what is to be optimised"):
+        rt.write_lens(found.lens, tmp_path / "found.zmx")
+    row = rt.read_lens(tmp_path / "found.zmx").intent.merit[0]
+    assert (row.operand, row.text) == ("BLNK", "sharpness: a function of the lens, target 1, weight 1")
