@@ -120,6 +120,18 @@ def test_a_function_of_a_lens_is_a_row_by_its_name(lens):
     assert "power" in str(found)
 
 
+def test_readings_are_chosen_by_words(lens):
+    rows = [Row("SPHA", (0, 1), weight=1.0)]
+    usual, other = (float(rt.evaluate(lens, merit=rows, readings=r).values[0]) for r in (None, "seidel=wavefront"))
+    assert other == pytest.approx(usual / 8, rel=1e-12)
+    spelled = rt.evaluate(lens, merit=rows, readings=["focal_length=in-air", "seidel=wavefront"])
+    assert float(spelled.values[0]) == other
+    with pytest.raises(ValueError, match=r"did you mean seidel\?"):
+        rt.evaluate(lens, merit=rows, readings="seidl=wavefront")
+    with pytest.raises(ValueError, match="expected one of coefficients, wavefront"):
+        rt.evaluate(lens, merit=rows, readings="seidel=waves")
+
+
 def test_lost_rays_are_told(lens):
     wide = lens.at(fields=[0, 80])
     found = rt.evaluate(wide, merit="spot")

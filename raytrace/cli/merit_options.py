@@ -17,6 +17,15 @@ def merit(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--skip-unknown", action="store_true", default=None, help="leave rows of operands that are not known out"
     )
+    parser.add_argument(
+        "--reading",
+        dest="readings",
+        metavar="NAME=CHOICE",
+        nargs="+",
+        help="where the meaning of an operand is open, another reading than by default: opd_tilt=common, "
+        "opd_chief=primary, opd_sign=shorter, boundary=largest, behind_mirrors=signed, focal_length=in-air, "
+        "total_track=sum, colour=second, seidel=wavefront, f_theta=axis-included",
+    )
     own = parser.add_argument_group("of a default merit function")
     own.add_argument("--rings", metavar="N", type=count, help="rings of rays in the pupil (default 3)")
     own.add_argument("--arms", metavar="N", type=count, help="arms of rays in the pupil, even (default 6)")

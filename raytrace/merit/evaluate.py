@@ -12,6 +12,7 @@ from raytrace.maths.value import value
 from raytrace.merit.merit import Evaluation
 from raytrace.merit.model import Model
 from raytrace.merit.operands import OPERANDS
+from raytrace.merit.readings import Readings, readings_of
 from raytrace.merit.value import Merit, arguments, merit_for, operand_name
 from raytrace.system.intent import Row
 from raytrace.system.lens import Lens
@@ -144,6 +145,7 @@ def evaluate(
     air_thickness: tuple[float, float] | str | None = None,
     edge: float | None = None,
     skip_unknown: bool = False,
+    readings: Readings | str | Sequence[str] | None = None,
     configuration: int | None = None,
     each: bool = False,
 ) -> MeritResult:
@@ -152,8 +154,9 @@ def evaluate(
     merit: `Merit`, rows, or the name of a default one ("spot", "wavefront", "angular", "mtf"); by default the file's.
     rings, arms (even), reference ("centroid", "chief"), frequencies (cycles/mm, of "mtf"), field_weights,
     wavelength_weights: of a default one. glass_thickness, air_thickness: least and greatest in mm, edge: least of glass
-    at its edge: rows beside the others. skip_unknown: leave rows of operands that are not known out. configuration:
-    the rows of that one alone. each: list every row in the text. Raises BadMerit, UnknownOperand.
+    at its edge: rows beside the others. skip_unknown: leave rows of operands that are not known out. readings: where
+    the meaning of an operand is open, as "opd_tilt=common" (`Readings`). configuration: its rows alone. each: list
+    every row in the text. Raises BadMerit, UnknownOperand.
     """
     function = merit_for(
         lens, merit, rings=rings, arms=arms, reference=reference, frequencies=frequencies, field_weights=field_weights,
@@ -164,7 +167,9 @@ def evaluate(
     if configuration is not None:
         apart = {number: 0.0 for number, at in enumerate(where, 1) if at != configuration}
         function = function.with_weights(apart)
-    planned = Evaluation(Model(lens), function.rows, unit=function.unit, skip_unknown=skip_unknown)
+    planned = Evaluation(
+        Model(lens), function.rows, unit=function.unit, skip_unknown=skip_unknown, readings=readings_of(readings)
+    )
     shown = [
         k for k, row in enumerate(function) if row.operand in OPERANDS and where[k] in (configuration or where[k],)
     ]

@@ -9,8 +9,10 @@ from raytrace.merit.bundle import Hits
 from raytrace.merit.plan import Evaluate, Found, Line, Now, Operand, Planner
 
 
-def from_centroid(component: int | None) -> Callable[[Sequence[Line], Planner], Evaluate]:
+def from_centroid(component: int | None, part: str = "position") -> Callable[[Sequence[Line], Planner], Evaluate]:
     """The distance on the image, or its x or y, from the centroid of the rows' rays of one field, all wavelengths.
+
+    part: "position", or "direction": cosines instead of places.
 
     The centroid is weighted as the rows are. In a lens that is symmetric about its axis it is that of the rays and
     their mirror images, of which rows leave out half.
@@ -25,7 +27,7 @@ def from_centroid(component: int | None) -> Callable[[Sequence[Line], Planner], 
             hits = now.hits(rays)
             weights = mean * hits.valid
             weights = weights / np.maximum(weights.sum(-1, keepdims=True), 1e-300)
-            x, y = hits.position[0], hits.position[1]
+            x, y = (getattr(hits, part)[k] for k in range(2))
             if not on_y.all():
                 x = x - np.where(on_y, 0.0, 1.0) * (weights @ x)[of_field]
             if not on_axis.all():
@@ -37,8 +39,8 @@ def from_centroid(component: int | None) -> Callable[[Sequence[Line], Planner], 
     return plan
 
 
-def from_chief(component: int | None) -> Callable[[Sequence[Line], Planner], Evaluate]:
-    """The distance on the image, or its x or y, from the chief ray of the primary wavelength."""
+def from_chief(component: int | None, part: str = "position") -> Callable[[Sequence[Line], Planner], Evaluate]:
+    """The distance on the image, or its x or y, from the chief ray of the primary wavelength; part: as above."""
 
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
         rays = planner.rays(lines)
@@ -46,7 +48,7 @@ def from_chief(component: int | None) -> Callable[[Sequence[Line], Planner], Eva
 
         def evaluate(now: Now) -> Found:
             hits, centre = now.hits(rays), now.hits(chief)
-            x, y = (hits.position[k] - centre.position[k] for k in range(2))
+            x, y = (getattr(hits, part)[k] - getattr(centre, part)[k] for k in range(2))
             return _told(hits.valid & centre.valid, x, y, component)
 
         return evaluate
@@ -136,6 +138,20 @@ RAYS = {
     "TRAR": Operand(
         from_chief(None), "distance on the image from the chief ray of the primary wavelength", length=1, takes=_WAVE
     ),
+    "ANAC": Operand(
+        from_centroid(None, "direction"),
+        "change of the cosines to x and y behind the lens from the centroid of its field, Hx Hy Px Py",
+        takes=_WAVE,
+    ),
+    "ANCX": Operand(from_centroid(0, "direction"), "its x", takes=_WAVE),
+    "ANCY": Operand(from_centroid(1, "direction"), "its y", takes=_WAVE),
+    "ANAR": Operand(
+        from_chief(None, "direction"),
+        "change of the cosines to x and y behind the lens from the chief ray of the primary wavelength",
+        takes=_WAVE,
+    ),
+    "ANAX": Operand(from_chief(0, "direction"), "its x", takes=_WAVE),
+    "ANAY": Operand(from_chief(1, "direction"), "its y", takes=_WAVE),
     "TRAX": Operand(from_chief(0), "its x", length=1, takes=_WAVE),
     "TRAY": Operand(from_chief(1), "its y", length=1, takes=_WAVE),
     "REAX": Operand(

@@ -1,6 +1,10 @@
 """Readings: how operands are taken whose meaning the field's own program leaves open."""
 
 import dataclasses
+from collections.abc import Sequence
+
+from raytrace.system.naming import joined
+from raytrace.words import did_you_mean
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,3 +55,19 @@ CHOICES = {
     "seidel": ("coefficients", "wavefront"),
     "f_theta": ("axis left out", "axis included"),
 }
+
+
+def readings_of(words: "Readings | str | Sequence[str] | None") -> Readings:
+    """Readings as words name them: "opd_tilt=common focal_length=in-air"; by default all as they are by themselves."""
+    if isinstance(words, Readings):
+        return words
+    given = {}
+    for word in joined(words or "").split():
+        name, sign, choice = word.partition("=")
+        if name not in CHOICES or not sign:
+            known = ", ".join(CHOICES)
+            raise ValueError(
+                f"`readings`: {word!r}: expected one of {known}, = and a choice{did_you_mean(name, CHOICES)}"
+            )
+        given[name] = choice.replace("-", " ")
+    return Readings(**given)

@@ -12,6 +12,7 @@ from raytrace.fused import prepare
 from raytrace.merit.hold import conditions_of
 from raytrace.merit.merit import Evaluated
 from raytrace.merit.model import Model
+from raytrace.merit.readings import Readings, readings_of
 from raytrace.merit.value import Merit, merit_for
 from raytrace.merit.vary import Freedom, bounds_of, freedom, name_of
 from raytrace.optimization.checkpoint import Checkpoint, Log, resumed
@@ -43,6 +44,7 @@ def optimize(
     seconds: float | None = None,
     paths: int = 1,
     skip_unknown: bool = False,
+    readings: Readings | str | Sequence[str] | None = None,
     log: str | PathLike | None = None,
     checkpoint: str | PathLike | None = None,
     resume: str | PathLike | None = None,
@@ -56,9 +58,9 @@ def optimize(
     edge (least).
     vary: variables, or words for them, as "curvature thickness:5,6", by default the file's; bounds: of variables, as
     "thickness:2,15"; hold: what is met exactly, as "efl=50 total_track<=80" (`merit.hold`). cycles, seconds: after
-    which it ends; paths: how many ways of damping are tried. skip_unknown: leave rows of unknown operands out. log: a
-    file with a line for every cycle; checkpoint: a file that keeps the best variables; resume: one that they are taken
-    from. Ctrl-C ends with the best lens.
+    which it ends; paths: how many ways of damping are tried. skip_unknown: leave rows of unknown operands out;
+    readings: where an operand is open (`Readings`). log: a file with a line for every cycle; checkpoint: a file that
+    keeps the best variables; resume: one that they are taken from. Ctrl-C ends with the best lens.
     Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadCheckpoint.
     """
     prepare()
@@ -69,7 +71,14 @@ def optimize(
     free = _freedom(lens, vary)
     names = tuple(name_of(one) for one in free.variables)
     model = Model(free.lens, free.variables, free.solves)
-    problem = Problem(model, function.rows, _conditions(lens, hold), unit=function.unit, skip_unknown=skip_unknown)
+    problem = Problem(
+        model,
+        function.rows,
+        _conditions(lens, hold),
+        unit=function.unit,
+        skip_unknown=skip_unknown,
+        readings=readings_of(readings),
+    )
     lower, upper = _bounds(free, bounds, names)
     start = model.start if resume is None else resumed(resume, names)
     begun, before = time.monotonic(), problem.evaluated(model.start)

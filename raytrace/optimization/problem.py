@@ -12,6 +12,7 @@ import numpy as np
 from raytrace.merit.hold import Condition as Condition
 from raytrace.merit.merit import LOST, Evaluated, Evaluation
 from raytrace.merit.model import Model
+from raytrace.merit.readings import Readings
 from raytrace.optimization.least_squares import State
 from raytrace.optimization.lost import MARGIN, STEEP, Recovery
 from raytrace.optimization.step import Sides
@@ -37,11 +38,14 @@ class Problem:
         *,
         unit: float = 1.0,
         skip_unknown: bool = False,
+        readings: Readings | None = None,
     ):
         """unit: mm in the unit of length of rows and conditions. Raises NoProblem and UnknownOperand."""
         held = tuple(_held(model.lens, rows, conditions))
         self.model, self.rows = model, tuple(rows)
-        self.evaluation = Evaluation(model, (*rows, *(row for row, _ in held)), unit=unit, skip_unknown=skip_unknown)
+        self.evaluation = Evaluation(
+            model, (*rows, *(row for row, _ in held)), unit=unit, skip_unknown=skip_unknown, readings=readings
+        )
         weights = self.evaluation.weights
         if not len(model.variables):
             raise NoProblem("nothing varies: name variables by `vary`, as 'curvature thickness'")
