@@ -1,6 +1,7 @@
 """What an optimisation keeps to, as words: each word tells the number of the lens that it names."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -60,6 +61,11 @@ def test_magnification_is_of_an_object_near_by(lens):
 
 def test_every_word_is_an_operand_that_is_known():
     assert {word.operand for word in WORDS.values()} <= {*OPERANDS}
+
+
+def test_the_page_lists_every_word():
+    page = (Path(__file__).parents[1] / "docs" / "merit.md").read_text(encoding="utf-8")
+    assert all(f"| `{name}` | {word.operand} | {word.text}" in page for name, word in WORDS.items())
 
 
 def test_conditions_are_rows_and_relations(lens):
@@ -132,3 +138,10 @@ def test_a_zoom_lens_is_held_in_each_configuration():
     found = rt.optimize(lens, merit="spot", vary="curvature thickness:6 sensor", hold=hold, cycles=8)
     after = [float(rt.first_order(one).effective_focal_length) for one in found.lens.configurations]
     assert after == pytest.approx([lengths[0] - 0.5, lengths[1] + 0.5], rel=1e-7)
+
+
+def test_what_is_held_is_in_millimetres_also_beside_a_merit_function_in_inches():
+    lens = rt.read_lens("cooke_triplet")
+    inches = rt.Merit(rt.Merit.default(lens).rows, 25.4)
+    found = rt.optimize(lens, merit=inches, vary="curvature sensor", hold="efl=99", cycles=6)
+    assert float(rt.first_order(found.lens).effective_focal_length) == pytest.approx(99, rel=1e-8)

@@ -132,6 +132,20 @@ def test_readings_are_chosen_by_words(lens):
         rt.evaluate(lens, merit=rows, readings="seidel=waves")
 
 
+def test_merit_functions_in_inches_and_in_millimetres_are_joined(lens):
+    inches = rt.Merit((Row("EFFL", target=4.0, weight=1.0), Row("PETC", target=-0.254)), 25.4)
+    joined = inches + OWN
+    assert joined.rows[2].target == pytest.approx(100 / 25.4)
+    assert (OWN + inches).rows[1].target == pytest.approx(4 * 25.4)
+    assert (OWN + inches).rows[2].target == pytest.approx(-0.01)
+    assert len(rt.Merit.default(lens) + inches) == len(rt.Merit.default(lens)) + 2
+    value = float(rt.first_order(lens).effective_focal_length)
+    both = [float(rt.evaluate(lens, merit=one).values[0]) for one in (joined, OWN + inches)]
+    assert both == pytest.approx([value / 25.4, value], rel=1e-12)
+    edged = merit_for(dataclasses.replace(lens, intent=Intent(merit=inches.rows, unit=25.4)), edge=2.54)
+    assert edged.rows[-1].target == pytest.approx(0.1)
+
+
 def test_lost_rays_are_told(lens):
     wide = lens.at(fields=[0, 80])
     found = rt.evaluate(wide, merit="spot")

@@ -13,7 +13,7 @@ from raytrace.merit.merit import Evaluation
 from raytrace.merit.model import Model
 from raytrace.merit.operands import OPERANDS
 from raytrace.merit.readings import Readings, readings_of
-from raytrace.merit.value import Merit, arguments, merit_for, operand_name
+from raytrace.merit.value import Merit, arguments, merit_for
 from raytrace.system.intent import Row
 from raytrace.system.lens import Lens
 
@@ -54,7 +54,7 @@ class MeritResult(Result):
         return {
             "row": self.row,
             "configuration": self.configurations,
-            "operand": torch.tensor([kinds.index(operand_name(row)) for row in rows], dtype=torch.int64),
+            "operand": torch.tensor([kinds.index(row.name) for row in rows], dtype=torch.int64),
             "arguments": torch.tensor([said.index(arguments(row)) for row in rows], dtype=torch.int64),
             "target": self.targets,
             "weight": self.weights,
@@ -66,7 +66,7 @@ class MeritResult(Result):
     def words(self) -> dict[str, Sequence[str]]:
         rows = self.valued()
         return {
-            "operand": [*dict.fromkeys(map(operand_name, rows))],
+            "operand": [*dict.fromkeys(row.name for row in rows)],
             "arguments": [*dict.fromkeys(map(arguments, rows))],
         }
 
@@ -86,7 +86,7 @@ class MeritResult(Result):
         counted, unit = int((self.weights != 0).sum()), "" if self.unit == 1 else f", lengths in {self.unit:g} mm"
         lines = [f"merit {float(self.merit):.10g}: {len(self.row)} rows, {counted} with a weight{unit}"]
         if self.skipped:
-            left = ", ".join(f"{number} ({operand_name(self.function[number - 1])})" for number in self.skipped)
+            left = ", ".join(f"{number} ({self.function[number - 1].name})" for number in self.skipped)
             lines.append(f"left out, unknown: rows {left}")
         if lost := int(self.lost.sum()):
             lines.append(f"{lost} rows have lost their ray")
@@ -128,7 +128,7 @@ class MeritResult(Result):
             shown = cell(float((weight * v**2).sum().div(weight.sum()).sqrt()), ">14.6g")
         part, lost = float(self.contributions[places].sum()), "  lost" if bool(self.lost[places].any()) else ""
         told = f"{row.target:>12.6g}{float(weight.sum()):>12.6g}{shown}{100 * part:>8.2f}%{lost}"
-        return f"{name:>9}  {operand_name(row):<8}{said:<{width}}{told}"
+        return f"{name:>9}  {row.name:<8}{said:<{width}}{told}"
 
 
 def evaluate(

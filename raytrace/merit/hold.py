@@ -27,7 +27,7 @@ class BadHold(ValueError):
 
 @dataclass(frozen=True)
 class Condition:
-    """What is held: the value of a row related to its target; in a configuration, 0 the current one.
+    """What is held: the value of a row related to its target, lengths in mm; in a configuration, 0 the current one.
 
     relation: "=", "<=" or ">=".
     """

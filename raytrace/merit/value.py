@@ -24,9 +24,9 @@ _SETTING = ("CONF", "PRIM")
 
 @dataclass(frozen=True)
 class Merit:
-    """Rows of a merit function, in order, lengths in mm; `rows[i - 1]` is row i.
+    """Rows of a merit function, in order; `rows[i - 1]` is row i.
 
-    unit: mm in the unit of length that values are told and squared in, which matters beside rows of other units.
+    unit: mm in the unit of length of targets and values, which matters beside rows of pure numbers or waves.
     """
 
     rows: tuple[Row, ...] = field(default=())
@@ -41,8 +41,8 @@ class Merit:
 
     @classmethod
     def default(cls, lens: Lens, kind: str = "spot", **how) -> "Merit":
-        """A default merit function of the lens; how: as for `default.rows_of`."""
-        return cls(rows_of(lens, kind, **how), 1.0 if lens.intent is None else lens.intent.unit)
+        """A default merit function of the lens, in mm; how: as for `default.rows_of`."""
+        return cls(rows_of(lens, kind, **how))
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -51,9 +51,13 @@ class Merit:
         return iter(self.rows)
 
     def __add__(self, other: "Merit | Sequence[Row]") -> "Merit":
-        """The rows of both, in the unit of the first. Rows of the second stay in the first configuration unless told
-        otherwise, and rows of arithmetic keep to their rows."""
-        behind = tuple(other)
+        """The rows of both, in the unit of the first; mere rows are in mm.
+
+        Rows of the second are of the first configuration until they say otherwise, and rows of arithmetic keep to
+        their rows. Raises BadMerit.
+        """
+        unit = other.unit if isinstance(other, Merit) else 1.0
+        behind = (in_unit(row, unit, self.unit) for row in other)
         if any(row.operand == "PRIM" for row in self.rows):
             raise BadMerit("rows behind a row PRIM would be of that wavelength: join them the other way round")
         reset = (Row("CONF", (1, 0)),) if any(row.operand == "CONF" for row in self.rows) else ()
@@ -61,7 +65,7 @@ class Merit:
         return Merit((*ahead, *(_moved(row, len(ahead)) for row in behind)), self.unit)
 
     def __radd__(self, other: Sequence[Row]) -> "Merit":
-        return Merit(tuple(other), self.unit) + self
+        return Merit(tuple(other)) + self
 
     def __mul__(self, factor: float) -> "Merit":
         """With all weights larger."""
@@ -74,18 +78,18 @@ class Merit:
         return self._with("weight", by_row or {}, by_operand)
 
     def with_targets(self, by_row: Mapping[int, float] | None = None, **by_operand: float) -> "Merit":
-        """With other targets, in mm, by the number of a row or for all rows of an operand. Raises BadMerit."""
+        """With other targets, by the number of a row or for all rows of an operand. Raises BadMerit."""
         return self._with("target", by_row or {}, by_operand)
 
     def _with(self, name: str, by_row: Mapping[int, float], by_operand: Mapping[str, float]) -> "Merit":
-        known = dict.fromkeys(map(operand_name, self.rows))
+        known = dict.fromkeys(row.name for row in self.rows)
         for operand in by_operand:
             if operand not in known:
                 raise BadMerit(f"no row {operand}; there are {', '.join(known)}{did_you_mean(operand, known)}")
         for number in by_row:
             if not 1 <= number <= len(self.rows):
                 raise BadMerit(f"no row {number}; there are rows 1 to {len(self.rows)}")
-        given = [by_row.get(number, by_operand.get(operand_name(row))) for number, row in enumerate(self.rows, 1)]
+        given = [by_row.get(number, by_operand.get(row.name)) for number, row in enumerate(self.rows, 1)]
         changed = (
             row if number is None else dataclasses.replace(row, **{name: float(number)})
             for row, number in zip(self.rows, given, strict=True)
@@ -99,7 +103,7 @@ class Merit:
         lines = [f"{'row':>5}  {'operand':<8}{'arguments':<40}{'target':>14}{'weight':>14}"]
         for number, row in enumerate(self.rows, 1):
             told = "" if row.text else f"{row.target:>14.6g}{row.weight:>14.6g}"
-            lines.append(f"{number:>5}  {operand_name(row):<8}{arguments(row) or row.text:<40}{told}".rstrip())
+            lines.append(f"{number:>5}  {row.name:<8}{arguments(row) or row.text:<40}{told}".rstrip())
         return "\n".join(lines)
 
     __repr__ = __str__
@@ -129,7 +133,7 @@ def merit_for(
         raise BadMerit(f"`{next(iter(how))}` belongs to a default merit function: name it by `merit`, as spot")
     found = Merit.of(lens) if merit is None else merit if isinstance(merit, Merit) else Merit(tuple(merit))
     bounds = boundary_rows(lens, boundaries, configurations)
-    return found + bounds if bounds else found
+    return found + Merit(bounds) if bounds else found
 
 
 def arguments(row: Row) -> str:
@@ -142,9 +146,10 @@ def arguments(row: Row) -> str:
     return "  ".join([*named, *plain, *([" ".join(numbers)] if any(row.numbers) else [])])
 
 
-def operand_name(row: Row) -> str:
-    """What a row's operand is called: its name, or that of the function that stands for itself."""
-    return row.operand if isinstance(row.operand, str) else getattr(row.operand, "__name__", "function")
+def in_unit(row: Row, before: float, after: float) -> Row:
+    """The row with its target in another unit of length; both in mm."""
+    power = OPERANDS[row.operand].length if row.operand in OPERANDS else 0
+    return dataclasses.replace(row, target=row.target * (before / after) ** power) if power else row
 
 
 def _moved(row: Row, by: int) -> Row:

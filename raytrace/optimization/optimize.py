@@ -13,7 +13,7 @@ from raytrace.merit.hold import conditions_of
 from raytrace.merit.merit import Evaluated
 from raytrace.merit.model import Model
 from raytrace.merit.readings import Readings, readings_of
-from raytrace.merit.value import Merit, merit_for
+from raytrace.merit.value import Merit, in_unit, merit_for
 from raytrace.merit.vary import Freedom, bounds_of, freedom, name_of
 from raytrace.optimization.checkpoint import Checkpoint, Log, resumed
 from raytrace.optimization.least_squares import Cycle, State
@@ -74,7 +74,7 @@ def optimize(
     problem = Problem(
         model,
         function.rows,
-        _conditions(lens, hold),
+        _conditions(lens, hold, function.unit),
         unit=function.unit,
         skip_unknown=skip_unknown,
         readings=readings_of(readings),
@@ -112,10 +112,11 @@ def _freedom(lens: Lens, vary: str | Sequence[str | Vary] | None) -> Freedom:
     return Freedom(lens, tuple(vary), () if lens.intent is None else lens.intent.solves)
 
 
-def _conditions(lens: Lens, hold: str | Sequence[str | Condition] | None) -> tuple[Condition, ...]:
-    if hold is None or isinstance(hold, str) or all(isinstance(one, str) for one in hold):
-        return conditions_of(lens, hold)
-    return tuple(hold)
+def _conditions(lens: Lens, hold: str | Sequence[str | Condition] | None, unit: float) -> tuple[Condition, ...]:
+    """What is held, from mm to the unit of length of the merit function."""
+    in_words = hold is None or isinstance(hold, str) or all(isinstance(one, str) for one in hold)
+    found = conditions_of(lens, hold) if in_words else hold
+    return tuple(dataclasses.replace(one, row=in_unit(one.row, 1.0, unit)) for one in found)
 
 
 def _bounds(free: Freedom, bounds: str | Sequence[str] | None, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
@@ -184,4 +185,4 @@ def _with_intent(lens: Lens, model: Model, problem: Problem) -> Lens:
     """The lens with what it was optimised for, where its file says nothing of it."""
     if lens.intent is not None:
         return lens
-    return dataclasses.replace(lens, intent=Intent(model.variables, model.solves, problem.rows))
+    return dataclasses.replace(lens, intent=Intent(model.variables, model.solves, problem.rows, problem.unit))

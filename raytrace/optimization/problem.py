@@ -42,7 +42,7 @@ class Problem:
     ):
         """unit: mm in the unit of length of rows and conditions. Raises NoProblem and UnknownOperand."""
         held = tuple(_held(model.lens, rows, conditions))
-        self.model, self.rows = model, tuple(rows)
+        self.model, self.rows, self.unit = model, tuple(rows), unit
         self.evaluation = Evaluation(
             model, (*rows, *(row for row, _ in held)), unit=unit, skip_unknown=skip_unknown, readings=readings
         )

@@ -3,7 +3,7 @@
 from matplotlib.figure import Figure
 
 from raytrace.merit.evaluate import MeritResult
-from raytrace.merit.value import arguments, operand_name
+from raytrace.merit.value import arguments
 from raytrace.plot.style import FAINT, field_colours, new_figure, number_text, styled
 from raytrace.system.intent import Row
 
@@ -46,11 +46,11 @@ def _shares(found: MeritResult) -> dict[str, tuple[str, float]]:
     for row, number, at, weight, part in zip(found.valued(), *(n.tolist() for n in numbers), strict=True):
         if weight:
             name = f"{_name(number, row)}, conf. {at}" if several else _name(number, row)
-            shares[name] = (operand_name(row), shares.get(name, ("", 0.0))[1] + part)
+            shares[name] = (row.name, shares.get(name, ("", 0.0))[1] + part)
     return shares or {"no row has a weight": ("", 0.0)}
 
 
 def _name(number: int, row: Row) -> str:
     if any(row.numbers[2:]):
-        return f"{operand_name(row)} field {row.numbers[0]:.3g}, {row.numbers[1]:.3g}"
-    return f"{number} {operand_name(row)} {arguments(row)}".rstrip()
+        return f"{row.name} field {row.numbers[0]:.3g}, {row.numbers[1]:.3g}"
+    return f"{number} {row.name} {arguments(row)}".rstrip()
