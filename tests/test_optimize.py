@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,9 +10,10 @@ import torch
 from scipy.optimize import minimize
 
 import raytrace as rt
+from raytrace.bench import optimise as bench
 from raytrace.merit.default import Boundaries, rows_of
 from raytrace.merit.model import Model
-from raytrace.merit.vary import freedom
+from raytrace.merit.vary import freedom, name_of
 from raytrace.optimization.least_squares import Manner, State, least_squares
 from raytrace.optimization.lost import Recovery
 from raytrace.optimization.problem import Condition, NoProblem, Problem
@@ -330,3 +332,37 @@ def test_the_figure_shows_before_and_after(triplet, tmp_path):
     assert any(title.startswith("Before: merit") for title in titles)
     assert any(title.startswith("After: merit") for title in titles)
     assert "Merit function" in titles
+
+
+# -- files with a merit function, where they are at hand ---------------------------------------------------------------
+
+FILES = Path(__file__).parents[2] / "shared" / "merit" / "dev"
+KNOWN = json.loads((FILES / "oracle.json").read_text())["files"] if (FILES / "oracle.json").exists() else []
+QUICK = ("sc_hamm2", "Schmidt-Cassegrain", "sc_slit", "PyZDDE__Doublet", "sc_cooke2", "AchromaticAt800")
+
+
+def of_files():
+    """Every file, the longest slow."""
+    for known in KNOWN:
+        if (FILES / known["file"]).exists():
+            marks = () if any(name in known["file"] for name in QUICK) else pytest.mark.slow
+            yield pytest.param(known, marks=marks, id=known["file"])
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("known", [*of_files()])
+def test_a_file_comes_as_far_as_is_known_from_where_it_stands_and_from_a_moved_start(known):
+    lens = rt.read_lens(FILES / known["file"])
+    found = rt.optimize(lens, seconds=20)
+    assert found.merit_after <= found.merit_before * (1 + 1e-9)
+    best = max(known["mf_best"], 1e-9)  # below it is rounding
+    if known["settled"]:
+        assert found.merit_after <= max(1.0001 * known["mf_stored"], best)
+    else:
+        assert found.merit_after <= 1.0001 * best
+    free = freedom(lens)
+    model = Model(free.lens, free.variables, free.solves)
+    factors = bench._factors(known, [name_of(one) for one in free.variables])
+    moved = rt.optimize(model.lens_at(model.start * factors), seconds=20)
+    assert moved.merit_before == pytest.approx(known["from_perturbed"]["mf_start"], rel=1e-3)
+    assert moved.merit_after <= 1.01 * best

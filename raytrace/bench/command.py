@@ -20,6 +20,7 @@ _TAKES = {
     "psf": ("lenses", "output", "csv", "plot", "threads"),
     "wave": ("docs",),
     "speed": ("docs", "threads", "quick"),
+    "optimise": ("lenses", "docs", "threads"),
 }
 
 
@@ -30,7 +31,9 @@ def run(arguments: argparse.Namespace) -> Measured:
             raise CommandError(f"bench {arguments.what} takes no {'LENS' if name == 'lenses' else f'--{name}'}")
     subject = importlib.import_module(f"raytrace.bench.{arguments.what}")
     peers = None if arguments.no_peers or arguments.what == "wave" else _peers()
-    threads = arguments.threads or {"wave": 1, "speed": _cores()}.get(arguments.what, torch.get_num_threads())
+    threads = arguments.threads or {"wave": 1, "optimise": 1, "speed": _cores()}.get(
+        arguments.what, torch.get_num_threads()
+    )
     with torch_threads(threads):
         if peers:
             peers.set_threads(threads)

@@ -95,8 +95,8 @@ def optimize(
     bar = None if progress is None else progress(cycles, "cycle")
     try:
         found = best_of_paths(
-            problem.state, np.clip(start, lower, upper), lower=lower, upper=upper, paths=paths, cycles=cycles,
-            seconds=seconds, watch=watch,
+            problem.state, np.clip(start, lower, upper), lower=lower, upper=upper, typical=problem.typical,
+            paths=paths, cycles=cycles, seconds=seconds, watch=watch,
         )  # fmt: skip
         kept.keep(found.state.x, float(np.sqrt(found.state.cost)), found.cycles, now=True)
     finally:

@@ -38,6 +38,7 @@ def best_of_paths(
     *,
     lower: np.ndarray,
     upper: np.ndarray,
+    typical: np.ndarray | None = None,
     paths: int = 1,
     cycles: int | None = None,
     seconds: float | None = None,
@@ -49,7 +50,7 @@ def best_of_paths(
     best, stopped, history, evaluations = None, "", [], 0
     for manner in MANNERS[: max(1, paths)]:
         one = least_squares(
-            evaluate, x, lower=lower, upper=upper, manner=manner, cycles=left, until=until,
+            evaluate, x, lower=lower, upper=upper, typical=typical, manner=manner, cycles=left, until=until,
             watch=_counted(watch, len(history), evaluations),
         )  # fmt: skip
         history += [_behind(cycle, len(history) + 1, evaluations) for cycle in one.cycles]
