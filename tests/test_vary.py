@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import raytrace as rt
+from raytrace.media.glass import abbe_number, nd
 from raytrace.merit.model import Model
-from raytrace.merit.vary import bounds_of, freedom, name_of
+from raytrace.merit.vary import VariedGlass, bounds_of, freedom, name_of
 from raytrace.system.intent import Intent, Solve, Vary
 from raytrace.system.naming import BadVariables
 
@@ -29,7 +30,7 @@ def names(lens, vary):
 def test_a_kind_alone_means_every_surface_where_it_makes_sense(lens):
     assert names(lens, "curvature") == [f"curvature_{k}" for k in (1, 2, 3, 4, 5, 7, 8, 9, 10, 11)]  # not the stop
     assert names(lens, "thickness") == [f"thickness_{k}" for k in range(1, 12)]
-    assert names(lens, "index") == [f"index_{k}" for k in (1, 3, 4, 7, 8, 10)]
+    assert names(lens, "glass") == [f"glass_{k}" for k in (1, 3, 4, 7, 8, 10)]
     assert names(lens.replace(4, conic=-0.5), "conic") == ["conic_4"]
     assert names(lens, "sensor") == ["thickness_11"]
     assert names(rt.read_lens("hubble"), "curvature conic") == ["curvature_1", "curvature_2", "conic_1", "conic_2"] or (
@@ -57,6 +58,19 @@ def test_what_is_not_modelled_yet_is_modelled_at_zero(lens):
     assert float(at.surfaces[5].before.tilt_y) == 0.02
     same, other = (rt.spot(one, fields=[7]).rms_radius for one in (lens, model.lens_at(model.start)))
     assert float((same - other).abs().max()) < 1e-12
+
+
+def test_a_glass_of_a_catalog_varies_as_a_model_glass(lens):
+    """It has the same index, dispersion and partial dispersion, and is told of once for each surface."""
+    with pytest.warns(VariedGlass, match="varies as a model glass, whose index is off by") as said:
+        found = freedom(lens, "index abbe_number:3")
+    assert len(said) == len(found.variables) - 1 == 6
+    model = Model(found.lens, found.variables)
+    for number, k in zip(model.start, (1, 3, 4, 7, 8, 10), strict=False):
+        assert number == pytest.approx(float(nd(lens.surfaces[k].glass)), rel=1e-12)
+    assert model.start[-1] == pytest.approx(float(abbe_number(lens.surfaces[3].glass)), rel=1e-12)
+    before, after = (float(rt.first_order(one).effective_focal_length) for one in (lens, model.lens_at(model.start)))
+    assert after == pytest.approx(before, rel=1e-4)
 
 
 def test_numbers_that_differ_between_configurations_vary_in_each(zoom):

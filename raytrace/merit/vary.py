@@ -4,7 +4,7 @@ curvature thickness           all surfaces that bend light; all gaps from surfac
 curvature:1-4,7 conic:3 a4:3  of some surfaces
 tilt:5 decentre:5             tilt_x and tilt_y; x and y of the pose
 sensor                        the last gap
-index glass:2                 the index of a medium that is no catalog's; a glass that may be exchanged
+index glass:2                 the index of all glasses, as model glasses; a glass that may be exchanged
 thickness:6@2                 in configuration 2, of a number that differs from one to the next
 curvature:4=-curvature:3      follows: a number times another and one more, as thickness:8=2*thickness:2+1
 curvature:7=f_number(4)       follows: a solve, a row of SOLVED_BY
@@ -12,13 +12,22 @@ curvature:7=f_number(4)       follows: a solve, a row of SOLVED_BY
 
 import dataclasses
 import re
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
-from raytrace.media.glass import Glass, is_air
+from raytrace.media.glass import (
+    Glass,
+    abbe_number,
+    is_air,
+    model_glass,
+    nd,
+    normal_line_deviation,
+    refractive_index,
+)
 from raytrace.merit.model import GLASS, Address, names_at
 from raytrace.system.configurations import same
 from raytrace.system.intent import Solve, Vary
@@ -46,6 +55,10 @@ _INSTEAD = {"radius": "curvature", "focus": "sensor", "glasses": "glass", "abbe"
 _NUMBER = r"\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+(?:[eE][-+]?\d+)?"
 _PICKUP = re.compile(rf"([-+]?)(?:({_NUMBER})\*)?([a-z]\w*):(\d+)(?:([-+])({_NUMBER}))?")
 _SOLVE = re.compile(r"([a-z]\w*)\(([^()]*)\)")
+
+
+class VariedGlass(UserWarning):
+    """A glass of a catalog is a model glass now, whose numbers can vary."""
 
 
 @dataclass(frozen=True)
@@ -144,12 +157,32 @@ def bounds_of(
 
 
 def with_modelled(lens: Lens, moved: Sequence[Vary | Solve]) -> Lens:
-    """The lens with every such number modelled, at 0 where it was not."""
+    """The lens with every such number modelled, at 0 where it was not, and glasses whose numbers move as model glasses.
+
+    Warns VariedGlass of the latter: between the lines of its definition a model glass is only near that of a catalog.
+    """
     surfaces = list(lens.surfaces)
     for one in moved:
-        if one.quantity not in MEDIA:
-            surfaces[one.surface] = modelled(surfaces[one.surface], one.quantity)
+        surface = surfaces[one.surface]
+        if one.quantity in GLASS:
+            surfaces[one.surface] = dataclasses.replace(surface, glass=_model_of(surface.glass, one.surface, lens))
+        elif one.quantity not in MEDIA:
+            surfaces[one.surface] = modelled(surface, one.quantity)
     return dataclasses.replace(lens, surfaces=tuple(surfaces))
+
+
+def _model_of(glass: Glass, surface: int, lens: Lens) -> Glass:
+    """The model glass of the same index, Abbe number and partial dispersion."""
+    if glass.formula in ("model", "constant"):
+        return glass
+    found = model_glass(nd(glass).detach(), abbe_number(glass).detach(), normal_line_deviation(glass).detach())
+    off = refractive_index(found, lens.wavelengths) - refractive_index(glass, lens.wavelengths)
+    warnings.warn(
+        f"surface {surface}: {glass.name} varies as a model glass, whose index is off by {float(off.abs().max()):.1g}",
+        VariedGlass,
+        stacklevel=4,
+    )
+    return found
 
 
 def _names(lens: Lens, one: Vary) -> set[str]:
