@@ -174,5 +174,9 @@ def test_bounds_by_kind_surface_and_configuration(zoom):
     assert high[5] == 0
     with pytest.raises(BadVariables, match="did you mean curvature_3"):
         bounds_of(found.lens, found.variables, "curvatur_3:0,1")
+    told = freedom(zoom, [*["curvature:3", "thickness:5"]])
+    own = [Vary(3, "curvature", bounds=(0.01, 0.05)), told.variables[1]]
+    low, high = bounds_of(zoom, own, "thickness:1..")
+    assert (low.tolist(), high.tolist()) == ([0.01, 1.0], [0.05, inf])
     with pytest.raises(BadVariables, match="15 is not less than 2"):
         bounds_of(found.lens, found.variables, "thickness:15..2")

@@ -143,7 +143,7 @@ def bounds_of(
     one in a configuration (thickness_3@2); what comes later in the text counts. Raises BadVariables for a name that
     none of them has.
     """
-    own = [getattr(one, "bounds", ()) or (-np.inf, np.inf) for one in variables]
+    own = [one.bounds or (-np.inf, np.inf) for one in variables]
     low, high = (np.array([ends[k] for ends in own], dtype=float) for k in range(2))
     for name, ends in parse_bounds(joined(text or "")).items():
         kind, _, surfaces = name.partition(":")
@@ -151,7 +151,7 @@ def bounds_of(
         chosen = [position for position, one in enumerate(variables) if wanted & _names(lens, one)]
         if not chosen:
             known = [known for one in variables for known in _names(lens, one)]
-            raise BadVariables(f"bounds for {name}, not among the variables{did_you_mean(name, known)}")
+            raise BadVariables(f"`bounds` for {name}, not among the variables{did_you_mean(name, known)}")
         low[chosen], high[chosen] = ends
     return low, high
 
@@ -319,7 +319,7 @@ def _refuse_circles(solves: Sequence[Solve]) -> None:
     after = {
         _address(one): (one.source, one.quantity_of_source or one.quantity)
         for one in solves
-        if one.kind == "pickup" and getattr(one, "operand", None) is None
+        if one.kind == "pickup" and one.operand is None
     }
     for start in after:
         at, passed = after[start], 0
