@@ -1,6 +1,7 @@
 """The benchmarks as pictures: on logarithmic axes a line for each entrant, a panel for each task, case or dtype."""
 
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -33,6 +34,7 @@ _MODELS = {
     "Optiland FFT": (3, "D"),
     "Optiland Huygens": (3, "v"),
 }
+_ROUNDING = 1e-6  # merits below it are drawn as that
 #: Number of the colour, marker and name, by wave engine.
 _ENGINES = {
     "pupil": (0, "o", "pupil matrix DFT"),
@@ -166,24 +168,26 @@ def wave_figure(rows: Sequence[Mapping]) -> Figure:
     return figure
 
 
+@style.styled
 def optimise_figure(rows: Sequence[Mapping]) -> Figure:
     """How far every file comes from its moved start, as a part of the merit it had there."""
-    figure = style.new_figure(7.0, 1.2 + 0.28 * max(len(rows), 1))
+    figure = style.new_figure(8.0, 1.2 + 0.28 * max(len(rows), 1))
     panel = figure.subplots()
     for place, row in enumerate(rows):
-        ends = [max(row[name], 1e-12) for name in ("start_moved", "end_moved")]
+        ends = [max(row[name], _ROUNDING) for name in ("start_moved", "end_moved")]
         panel.plot(ends, [place, place], color=style.FAINT, linewidth=3, zorder=1)
         panel.plot(ends[0], place, "o", color=style.GREY, label="moved start" if place == 0 else None)
         panel.plot(ends[1], place, "o", color=style.FIELD_COLOURS[0], label="end" if place == 0 else None)
-        if row["best_of_oracle"] > 1e-9:
+        if row["best_of_oracle"] > _ROUNDING:
             label = "best that was known" if place == 0 else None
             panel.plot(row["best_of_oracle"], place, "|", color=style.FIELD_COLOURS[2], markersize=11, label=label)
         words = f"{row['seconds_moved']:.2g} s"
         panel.annotate(words, (ends[0], place), (6, 0), textcoords="offset points", va="center", fontsize=7)
-    panel.set_yticks(range(len(rows)), [row["file"] for row in rows])
+    panel.set_yticks(range(len(rows)), [Path(row["file"]).stem[:44] for row in rows])
     panel.invert_yaxis()
     panel.set_xscale("log")
-    panel.set_xlabel("merit")
+    panel.set_xlim(0.5 * _ROUNDING, 2e3)
+    panel.set_xlabel("merit; below 10⁻⁶ only that it is")
     panel.grid(axis="x", alpha=0.25)
     if rows:
         figure.legend(loc="outside lower center", ncols=3)
