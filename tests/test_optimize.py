@@ -235,6 +235,22 @@ def test_boundaries_end_a_descent_without_chattering(triplet):
     assert max(glass) < 9.2
 
 
+def test_a_merit_that_is_no_sum_of_squares_is_descended_by_its_gradient(triplet):
+    """The mean of the RMS radii over the field, not their mean square; within bounds."""
+
+    def merit(lens):
+        return rt.spot(lens, fields=[0, 8.4], wavelengths=lens.wavelengths).rms_radius.mean()
+
+    found = rt.optimize(triplet, merit=merit, vary="curvature:1-3 sensor", bounds="curvature_1:0.02,0.03", cycles=30)
+    assert float(merit(found.lens)) == pytest.approx(found.merit_after, rel=1e-9)
+    assert found.merit_after < 0.9 * found.merit_before
+    assert 0.02 <= float(found.lens.surfaces[1].curvature) <= 0.03
+    assert found.plot().axes
+    assert found.document()["operands"] == []
+    with pytest.raises(NoProblem, match="`hold` goes with a merit of rows"):
+        rt.optimize(triplet, merit=merit, vary="sensor", hold="efl=100")
+
+
 # -- lost rays ---------------------------------------------------------------------------------------------------------
 
 

@@ -15,10 +15,11 @@ from raytrace.merit.model import Model
 from raytrace.merit.readings import Readings, readings_of
 from raytrace.merit.value import Merit, in_unit, merit_for
 from raytrace.merit.vary import Freedom, bounds_of, freedom, name_of
+from raytrace.optimization.bfgs import Function, lowest
 from raytrace.optimization.checkpoint import Checkpoint, Log, resumed
-from raytrace.optimization.least_squares import Cycle, State
+from raytrace.optimization.least_squares import Cycle
 from raytrace.optimization.paths import Found, best_of_paths
-from raytrace.optimization.problem import Condition, NoProblem, Problem
+from raytrace.optimization.problem import Condition, NoProblem, Problem, typical_of
 from raytrace.optimization.result import Optimized
 from raytrace.system.intent import Intent, Row, Vary
 from raytrace.system.lens import Lens
@@ -27,7 +28,7 @@ from raytrace.system.lens import Lens
 def optimize(
     lens: Lens,
     *,
-    merit: str | Merit | Sequence[Row] | None = None,
+    merit: str | Merit | Sequence[Row] | Callable[[Lens], torch.Tensor] | None = None,
     vary: str | Sequence[str | Vary] | None = None,
     bounds: str | Sequence[str] | None = None,
     hold: str | Sequence[str | Condition] | None = None,
@@ -55,7 +56,7 @@ def optimize(
     merit: `Merit`, rows, by default the file's, or the kind of a default merit function: "spot", "wavefront",
     "angular", "mtf", which rings, arms, reference, frequencies (cycles/mm) and the weights of fields and wavelengths
     belong to, as in `default.rows_of`; boundaries in mm beside it: glass_thickness, air_thickness (least, greatest),
-    edge (least).
+    edge (least); or any function of a lens that gives one number (), to be least, which L-BFGS descends on.
     vary: variables, or words for them, as "curvature thickness:5,6", by default the file's; bounds: of variables, as
     "thickness:2,15"; hold: what is met exactly, as "efl=50 total_track<=80" (`merit.hold`). cycles, seconds: after
     which it ends; paths: how many ways of damping are tried. skip_unknown: leave rows of unknown operands out;
@@ -64,13 +65,21 @@ def optimize(
     Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadCheckpoint.
     """
     prepare()
+    free = _freedom(lens, vary)
+    names = tuple(name_of(one) for one in free.variables)
+    model = Model(free.lens, free.variables, free.solves)
+    lower, upper = _bounds(free, bounds, names)
+    start = np.clip(model.start if resume is None else resumed(resume, names), lower, upper)
+    how = {"lower": lower, "upper": upper, "typical": typical_of(model), "cycles": cycles, "seconds": seconds}
+    if callable(merit) and not isinstance(merit, Merit):
+        if hold:
+            raise NoProblem("`hold` goes with a merit of rows: of a function give `bounds`, or make it a row")
+        with _Told(names, log, checkpoint, progress and progress(cycles, "cycle")) as told:
+            return _by_gradient(lens, model, merit, names, start, how, told)
     function = merit_for(
         lens, merit, rings=rings, arms=arms, reference=reference, frequencies=frequencies, field_weights=field_weights,
         wavelength_weights=wavelength_weights, glass_thickness=glass_thickness, air_thickness=air_thickness, edge=edge,
     )  # fmt: skip
-    free = _freedom(lens, vary)
-    names = tuple(name_of(one) for one in free.variables)
-    model = Model(free.lens, free.variables, free.solves)
     problem = Problem(
         model,
         function.rows,
@@ -79,31 +88,51 @@ def optimize(
         skip_unknown=skip_unknown,
         readings=readings_of(readings),
     )
-    lower, upper = _bounds(free, bounds, names)
-    start = model.start if resume is None else resumed(resume, names)
     begun, before = time.monotonic(), problem.evaluated(model.start)
     _refuse_undefined(problem, before)
-    with_log, kept = Log(log), Checkpoint(checkpoint, names)
-
-    def watch(cycle: Cycle, state: State) -> None:
-        with_log.tell(cycle)
-        kept.keep(state.x, cycle.merit, cycle.number)
-        if bar is not None:
-            bar.update(1)
-            bar.set_postfix_str(_words(cycle))
-
-    bar = None if progress is None else progress(cycles, "cycle")
-    try:
+    with _Told(names, log, checkpoint, progress and progress(cycles, "cycle")) as told:
         found = best_of_paths(
-            problem.state, np.clip(start, lower, upper), lower=lower, upper=upper, typical=problem.typical,
-            paths=paths, cycles=cycles, seconds=seconds, watch=watch,
-        )  # fmt: skip
-        kept.keep(found.state.x, float(np.sqrt(found.state.cost)), found.cycles, now=True)
-    finally:
-        with_log.close()
-        if bar is not None:
-            bar.close()
+            problem.state, start, paths=paths, watch=lambda cycle, state: told.tell(cycle, state.x), **how
+        )
+        told.kept.keep(found.state.x, float(np.sqrt(found.state.cost)), found.cycles, now=True)
     return _result(lens, problem, names, before, found, time.monotonic() - begun)
+
+
+class _Told:
+    """Who is told of every cycle: a log, a checkpoint and a bar of progress."""
+
+    def __init__(self, names: Sequence[str], log, checkpoint, bar):
+        self.log, self.kept, self.bar = Log(log), Checkpoint(checkpoint, names), bar
+
+    def tell(self, cycle: Cycle, x: np.ndarray) -> None:
+        self.log.tell(cycle)
+        self.kept.keep(x, cycle.merit, cycle.number)
+        if self.bar is not None:
+            self.bar.update(1)
+            self.bar.set_postfix_str(_words(cycle))
+
+    def __enter__(self) -> "_Told":
+        return self
+
+    def __exit__(self, *error) -> None:
+        self.log.close()
+        if self.bar is not None:
+            self.bar.close()
+
+
+def _by_gradient(lens: Lens, model: Model, merit: Callable, names: tuple[str, ...], start, how: dict, told: _Told):
+    """The lens where a function of it is least."""
+    if not names:
+        raise NoProblem("nothing varies: name variables by `vary`, as 'curvature thickness'")
+    function, begun = Function(model, merit), time.monotonic()
+    before = function(model.start)[0]
+    if not np.isfinite(before):
+        raise NoProblem(f"the merit is {before:g} at the start: nothing to follow")
+    x, stopped, cycles = lowest(function, start, watch=told.tell, **how)
+    after = function(x)[0]
+    told.kept.keep(x, after, len(cycles), now=True)
+    found = Found(x, tuple(cycles), stopped, len(cycles), function.evaluations)
+    return _optimized(lens, model, names, x, found, time.monotonic() - begun, merit_before=before, merit_after=after)
 
 
 def _freedom(lens: Lens, vary: str | Sequence[str | Vary] | None) -> Freedom:
@@ -150,24 +179,48 @@ def _words(cycle: Cycle) -> str:
 def _result(
     lens: Lens, problem: Problem, names: tuple[str, ...], before: Evaluated, found: Found, seconds: float
 ) -> Optimized:
-    model, count = problem.model, len(problem.rows)
-    after = problem.evaluated(found.state.x)
+    after, count = problem.evaluated(found.state.x), len(problem.rows)
+    return _optimized(
+        lens, problem.model, names, found.state.x, found, seconds, rows=problem.rows, unit=problem.unit,
+        merit_before=problem.merit(before), merit_after=problem.merit(after),
+        values=(before.values[:count], after.values[:count]),
+        contributions=(_contributions(before, count), _contributions(after, count)),
+    )  # fmt: skip
+
+
+def _optimized(
+    lens: Lens,
+    model: Model,
+    names: tuple[str, ...],
+    x: np.ndarray,
+    found: Found,
+    seconds: float,
+    *,
+    merit_before: float,
+    merit_after: float,
+    rows: tuple[Row, ...] = (),
+    unit: float = 1.0,
+    values: tuple = ((), ()),
+    contributions: tuple = ((), ()),
+) -> Optimized:
+    def tensor(numbers) -> torch.Tensor:
+        return torch.tensor(np.asarray(numbers, dtype=float), dtype=torch.float64)
+
     history = [[c.merit, c.missed, c.step, c.damping, c.seconds] for c in found.history]
-    tensor = lambda numbers: torch.tensor(np.asarray(numbers, dtype=float), dtype=torch.float64)  # noqa: E731
     return Optimized(
-        lens=_with_intent(model.lens_at(found.state.x), model, problem),
+        lens=_with_intent(model.lens_at(x), model, rows, unit),
         before=lens,
-        merit=problem.rows,
+        merit=rows,
         names=names,
         variables_before=tensor(model.start),
-        variables_after=tensor(found.state.x),
-        values_before=tensor(before.values[:count]),
-        values_after=tensor(after.values[:count]),
-        contributions_before=tensor(_contributions(before, count)),
-        contributions=tensor(_contributions(after, count)),
+        variables_after=tensor(x),
+        values_before=tensor(values[0]),
+        values_after=tensor(values[1]),
+        contributions_before=tensor(contributions[0]),
+        contributions=tensor(contributions[1]),
         history=tensor(history).reshape(-1, 5),
-        merit_before=problem.merit(before),
-        merit_after=problem.merit(after),
+        merit_before=merit_before,
+        merit_after=merit_after,
         cycles=found.cycles,
         evaluations=found.evaluations,
         seconds=seconds,
@@ -181,8 +234,8 @@ def _contributions(found: Evaluated, rows: int) -> np.ndarray:
     return squares / max(squares.sum(), 1e-300)
 
 
-def _with_intent(lens: Lens, model: Model, problem: Problem) -> Lens:
+def _with_intent(lens: Lens, model: Model, rows: tuple[Row, ...], unit: float) -> Lens:
     """The lens with what it was optimised for, where its file says nothing of it."""
     if lens.intent is not None:
         return lens
-    return dataclasses.replace(lens, intent=Intent(model.variables, model.solves, problem.rows, problem.unit))
+    return dataclasses.replace(lens, intent=Intent(model.variables, model.solves, rows, unit))

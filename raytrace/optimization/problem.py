@@ -5,7 +5,6 @@ Rows of positive weight are squared; rows of negative weight, and what is held, 
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from functools import cached_property
 
 import numpy as np
 
@@ -54,13 +53,6 @@ class Problem:
         signs = [0] * len(self.rows) + [sign for _, sign in held]
         self.signs = np.where(weights < 0, signs, 0)
         self.recovery = Recovery(self.evaluation)
-
-    @cached_property
-    def typical(self) -> np.ndarray:
-        """How much (n,) of every variable is a lot: for beams h wide h in thickness, 1/10h in curvature; or inf."""
-        moment = self.model.views[self.model.lens.current_configuration - 1].moment(self.model.start)
-        h = 0.5 * float(moment.entrance_pupil_diameter)
-        return np.array([_typical(one.quantity, h) for one in self.model.variables])
 
     def evaluated(self, x: np.ndarray, derivatives: bool = False) -> Evaluated:
         return self.evaluation(x, derivatives=derivatives)
@@ -129,6 +121,13 @@ def _held(lens: Lens, rows: Sequence[Row], conditions: Sequence[Condition]) -> I
         if several:
             yield Row("CONF", (one.configuration or lens.current_configuration, 0)), 0
         yield dataclasses.replace(one.row, weight=-1.0), RELATIONS[one.relation]
+
+
+def typical_of(model: Model) -> np.ndarray:
+    """How much (n,) of every variable is a lot: for beams h wide h in thickness, 1/10h in curvature; or inf."""
+    moment = model.views[model.lens.current_configuration - 1].moment(model.start)
+    h = 0.5 * float(moment.entrance_pupil_diameter)
+    return np.array([_typical(one.quantity, h) for one in model.variables])
 
 
 def _typical(quantity: str, h: float) -> float:
