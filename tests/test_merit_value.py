@@ -179,10 +179,10 @@ def test_a_stored_merit_is_that_of_the_oracle(name):
 
 
 def test_the_command_says_what_the_verb_does(command):
-    code, out, err = command("merit", "double_gauss", "--merit", "spot", "--rings", 4, "--arms", 8)
+    code, out, err = command("evaluate", "double_gauss", "--merit", "spot", "--rings", 4, "--arms", 8)
     assert code == 0, err
     assert out.startswith("merit 0.14")
-    code, out, err = command("merit", "double_gauss", "--merit", "spot", "--json")
+    code, out, err = command("evaluate", "double_gauss", "--merit", "spot", "--json")
     document = json.loads(out)
     assert [*document] == ["analysis", "merit", "unit", "skipped", "results"]
     assert document["results"][0] == {
@@ -194,14 +194,14 @@ def test_the_command_says_what_the_verb_does(command):
 
 def test_boundaries_are_rows_of_the_command(command):
     words = ("--glass-thickness", "2:15", "--air-thickness", "0.5:50", "--edge", 1)
-    code, out, err = command("merit", "double_gauss", "--merit", "spot", *words, "--json")
+    code, out, err = command("evaluate", "double_gauss", "--merit", "spot", *words, "--json")
     assert code == 0, err
     operands = [one["operand"] for one in json.loads(out)["results"]]
     assert {"MNCG", "MXCG", "MNEG", "MNCA", "MXCA", "MNEA"} < {*operands}
 
 
 def test_the_figure_shows_the_parts(command):
-    code, _, err = command("merit", "double_gauss", "--merit", "wavefront", "--plot", "merit.png")
+    code, _, err = command("evaluate", "double_gauss", "--merit", "wavefront", "--plot", "merit.png")
     assert code == 0, err
     assert Path("merit.png").stat().st_size > 5000
 
@@ -219,7 +219,7 @@ def test_the_figure_shows_the_parts(command):
     ],
 )
 def test_what_cannot_be_evaluated_is_one_line(command, words, said):
-    code, out, err = command("merit", "double_gauss", *words)
+    code, out, err = command("evaluate", "double_gauss", *words)
     assert code in (1, 2)
     assert out == ""
     assert len(err.splitlines()) == 1

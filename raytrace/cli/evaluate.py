@@ -1,4 +1,4 @@
-"""`raytrace merit`."""
+"""`raytrace evaluate`."""
 
 from raytrace.cli import options as words
 from raytrace.cli.merit_options import merit
@@ -10,11 +10,10 @@ DESCRIPTION = (
     "line, --each lists them all. Rows of operands that are not known are an error if they have a weight."
 )
 EXAMPLES = """examples:
-  raytrace merit lens.zmx
-  raytrace merit double_gauss --merit spot --rings 6 --arms 8 --plot merit.png
-  raytrace merit tessar --merit wavefront --glass-thickness 2:15 --air-thickness 0.5:50 --edge 1 --json
-  raytrace merit zoom.zmx --configuration 2 --skip-unknown"""
-VERB = "evaluate"
+  raytrace evaluate lens.zmx
+  raytrace evaluate double_gauss --merit spot --rings 6 --arms 8 --plot merit.png
+  raytrace evaluate tessar --merit wavefront --glass-thickness 2:15 --air-thickness 0.5:50 --edge 1 --json
+  raytrace evaluate zoom.zmx --configuration 2 --skip-unknown"""
 
 
 def options(parser):
