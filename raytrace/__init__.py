@@ -83,7 +83,10 @@ PUBLIC = {
     "Row": "system.intent",
     "Vary": "system.intent",
     "evaluate": "merit.evaluate",
+    "BadSearch": "optimization.journal",
+    "Searched": "optimization.searched",
     "optimize": "optimization.optimize",
+    "search": "optimization.search",
     # images and analyses
     "Memo": "optics.reuse",
     "Psf": "kernels",

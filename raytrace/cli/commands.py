@@ -13,7 +13,7 @@ ANALYSES = (
 #: All commands, in the order of the help page.
 COMMANDS = (
     *(Command.of(f"cli.{name}") for name in ("info", "check", "convert", "layout", "spot", "focus", "optimize")),
-    *(Command.of(f"cli.{name}") for name in ("evaluate", "trace", "psf")),
+    *(Command.of(f"cli.{name}") for name in ("search", "evaluate", "trace", "psf")),
     *(Command.of(f"cli.{name}") for name in ("compare", "glass", "bench", *ANALYSES)),
     command("codesign"),
     Command.of("cli.wave"),

@@ -36,7 +36,7 @@ def optimize_report(found: Optimized) -> Figure:
 
 
 def _draw_lens(axes: Axes, lens: Lens, title: str) -> None:
-    draw_layout(axes, lens, fields=_fields(lens), rays=5)
+    draw_layout(axes, lens, fields=drawn_fields(lens), rays=5)
     axes.set_title(f"{title}\n", fontweight="bold", pad=4)
     axes.annotate(
         style.first_order_text(lens, first_order(lens)), (0.5, 1.0), (0, 5), xycoords="axes fraction",
@@ -44,7 +44,7 @@ def _draw_lens(axes: Axes, lens: Lens, title: str) -> None:
     )  # fmt: skip
 
 
-def _fields(lens: Lens):
+def drawn_fields(lens: Lens):
     """The fields that are drawn (2, F): all, or as many as stay legible, spread over all."""
     points = torch.stack([lens.fields.x, lens.fields.y])
     count = points.shape[1]
@@ -54,7 +54,7 @@ def _fields(lens: Lens):
 
 def _draw_spots(page, before: Lens, after: Lens) -> None:
     """A row of spots before and one after, each on a scale of its own, which its bars tell."""
-    fields = _fields(after)
+    fields = drawn_fields(after)
     panels = page.subplots(2, fields.shape[1], squeeze=False)
     wavelengths, airy = style.array(after.wavelengths), float(airy_radius(after))
     for row, lens, when in zip(panels, (before, after), ("before", "after"), strict=True):

@@ -1,0 +1,264 @@
+"""Searching: the distinct minima of a merit function between bounds, the best lens first.
+
+In batches: starts spread evenly (`starts.py`), the best of several points each, descend a little on a narrow beam and
+then on the whole one; the best of a batch are followed to their minima; and from the best minima so far the search
+hops over their walls. What a batch decides follows from the batches before it alone, never from the clock.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+
+import numpy as np
+
+from raytrace.fused import prepare
+from raytrace.merit.default import KINDS
+from raytrace.merit.hold import Condition, conditions_of
+from raytrace.merit.model import Model
+from raytrace.merit.readings import Readings, readings_of
+from raytrace.merit.value import Merit, merit_for
+from raytrace.merit.vary import bounds_of, freedom, name_of
+from raytrace.optimization.journal import Ended, Journal, Stopped
+from raytrace.optimization.least_squares import Manner, least_squares
+from raytrace.optimization.minima import Minima
+from raytrace.optimization.problem import Problem
+from raytrace.optimization.searched import Searched, searched
+from raytrace.optimization.starts import Space, length_of, space_of
+from raytrace.shards import Share
+from raytrace.system.intent import Row
+from raytrace.system.lens import Lens
+from raytrace.system.naming import parse_range
+
+STARTS = 64
+_BATCH = 16  # starts; what is done in a batch is shared by processes
+_POINTS = 8  # of which a start is the best
+_NARROW = 0.5, 0.6  # parts of pupil and field that a start descends on first
+_SHORT = 10, 12  # cycles on the narrow and on the whole beam
+_FOLLOWED = 4  # of a batch
+_HOPS = 4  # of a batch
+_SPRINGS = 3  # minima from which they start, the best ones
+_LONG = 120  # cycles to a minimum
+_REACH = 0.02, 0.3  # of a hop, of the ranges of the variables
+_FOLLOW = Manner(tolerance=1e-5)
+_DAMPED = Manner(damping=0.1, bends=False)
+
+_DEFAULT = {operand for kind in KINDS.values() for operand in kind.operands.values()} - {"MTFA"}
+
+
+def search(
+    lens: Lens,
+    *,
+    merit: str | Merit | Sequence[Row] | None = None,
+    vary: str | Sequence[str] | None = None,
+    bounds: str | Sequence[str] | None = None,
+    hold: str | Sequence[str] | Sequence[Condition] | None = None,
+    rings: int | None = None,
+    arms: int | None = None,
+    reference: str | None = None,
+    frequencies: Sequence[float] | None = None,
+    field_weights: Sequence[float] | None = None,
+    wavelength_weights: Sequence[float] | None = None,
+    glass_thickness: str | tuple[float, float] | None = None,
+    air_thickness: str | tuple[float, float] | None = None,
+    edge: float | None = None,
+    skip_unknown: bool = False,
+    readings: Readings | str | Sequence[str] | None = None,
+    starts: int = STARTS,
+    seconds: float | None = None,
+    seed: int = 0,
+    folder: str | PathLike | None = None,
+    progress: Callable | None = None,
+    share: Share | None = None,
+) -> Searched:
+    """The distinct minima of a merit function, from starts spread over all that the bounds allow; the lens is one.
+
+    merit to readings: as for `optimize`; bounds that are not given follow from the focal length (`starts.py`),
+    which is that of `hold`, of a row EFFL or of the lens. starts: how many; seconds: after which it ends; seed: of all
+    that is drawn. folder: keeps the minima as lens files, a table and figures, and how far the search has come: called
+    again it goes on, and ends as if it had never ended before. Ctrl-C ends with what was found.
+    Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadSearch.
+    """
+    prepare()
+    begun = time.monotonic()
+    function = merit_for(
+        lens, merit, rings=rings, arms=arms, reference=reference, frequencies=frequencies, field_weights=field_weights,
+        wavelength_weights=wavelength_weights, glass_thickness=glass_thickness, air_thickness=air_thickness, edge=edge,
+    )  # fmt: skip
+    free = freedom(lens, vary)
+    conditions = _conditions(lens, hold)
+    model = Model(free.lens, free.variables, free.solves)
+    glass, air = (parse_range(ends) if isinstance(ends, str) else ends for ends in (glass_thickness, air_thickness))
+    length = length_of(model, function.rows, function.unit, conditions)
+    space = space_of(model, bounds_of(free.lens, free.variables, bounds), length, glass, air)
+    problems = [
+        Problem(model, rows, conditions, unit=function.unit, skip_unknown=skip_unknown, readings=readings_of(readings))
+        for rows in (_narrowed(function.rows), function.rows)
+    ]
+    about = _about(problems[1], space, seed)
+    journal = Journal(folder, about, begun + (np.inf if seconds is None else seconds))
+    run = _Run(problems[0], problems[1], space, journal, seed)
+    stopped = run.through(starts, progress)
+    found = searched(lens, problems[1], run.minima, starts=run.begun, stopped=stopped, seconds=time.monotonic() - begun)
+    if folder is not None and not (share and share.rank):
+        found.save(folder)
+    return found
+
+
+def _conditions(lens: Lens, hold) -> tuple[Condition, ...]:
+    if hold is None or isinstance(hold, str) or all(isinstance(one, str) for one in hold):
+        return conditions_of(lens, hold)
+    return tuple(hold)
+
+
+def _about(problem: Problem, space: Space, seed: int) -> dict:
+    """What a search depends on, for its journal."""
+    return {
+        "variables": [name_of(one) for one in problem.model.variables],
+        "start": problem.model.start.tolist(),
+        "bounds": [space.lower.tolist(), space.upper.tolist()],
+        "rows": [repr(row) for row in problem.evaluation.rows],
+        "seed": seed,
+    }
+
+
+def _narrowed(rows: Sequence[Row]) -> tuple[Row, ...]:
+    """The rows with the rays of default merit functions nearer to the axis, in pupil and field."""
+    pupil, field = _NARROW
+    scale = np.array([field, field, pupil, pupil])
+    return tuple(
+        replace(row, numbers=tuple((scale * row.numbers).tolist())) if row.operand in _DEFAULT else row for row in rows
+    )
+
+
+@dataclass
+class _Run:
+    """A search under way."""
+
+    narrow: Problem
+    whole: Problem
+    space: Space
+    journal: Journal
+    seed: int
+    begun: int = 0  # starts
+    work: float = 0.0  # s
+
+    def __post_init__(self):
+        self.minima = Minima(np.maximum(self.space.upper - self.space.lower, 1e-300), _turned(self.space))
+
+    def through(self, starts: int, progress: Callable | None) -> str:
+        """All batches; why it ended: a key of `searched.STOPPED`."""
+        bar = None if progress is None else progress(starts, "start")
+        try:
+            for first in range(0, starts, _BATCH):
+                self._batch(range(first, min(first + _BATCH, starts)), bar)
+        except Stopped:
+            return "seconds" if time.monotonic() > self.journal.until else "interrupted"
+        except KeyboardInterrupt:
+            return "interrupted"
+        finally:
+            if bar is not None:
+                bar.close()
+        return "starts"
+
+    def _batch(self, numbers: range, bar) -> None:
+        keys = [f"start {i}" for i in numbers]
+        ends = self._each(
+            [(key, _watched(lambda i=i: self._start(i), bar)) for key, i in zip(keys, numbers, strict=True)]
+        )
+        self.begun = numbers[-1] + 1
+        best = sorted(zip(keys, ends, strict=True), key=lambda pair: pair[1].rank)[:_FOLLOWED]
+        self._follow([(f"{key}, followed", end.x) for key, end in best], bar)
+        springs = self.minima.each[:_SPRINGS]
+        hops = [(f"hop {numbers[0] + k}", springs[k % len(springs)].ended.x) for k in range(_HOPS)] if springs else []
+        self._follow([(key, self._hopped(key, x)) for key, x in hops], bar)
+
+    def _each(self, tasks) -> list[Ended]:
+        ends = self.journal.each(tasks, len(self.space.lower))
+        self.work += sum(end.seconds for end in ends)
+        return ends
+
+    def _follow(self, tasks: Sequence[tuple[str, np.ndarray]], bar) -> None:
+        ends = self._each([(key, lambda x=x: self._descended(x, ((self.whole, _LONG, _FOLLOW),))) for key, x in tasks])
+        for (key, _), end in zip(tasks, ends, strict=True):
+            if self.minima.add(end, key, self.work) and bar is not None:
+                bar.set_postfix_str(f"{len(self.minima.each)} minima, the best {self.minima.each[0].ended.merit:.6g}")
+
+    def _start(self, number: int) -> Ended:
+        """The lens as it is, or the best of some points between the bounds; both descended a little."""
+        model = self.narrow.model
+        points = self.space.sobol(number, _POINTS, self.seed) if number else np.clip(model.start, *self._bounds)[None]
+        points = [self.space.prepared(x) for x in points]
+        best = min(points, key=self._worth)
+        return self._descended(best, ((self.narrow, _SHORT[0], _DAMPED), (self.whole, _SHORT[1], Manner())))
+
+    @property
+    def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.space.lower, self.space.upper
+
+    def _worth(self, x: np.ndarray) -> tuple[float, float]:
+        """Lost rays and squares of a point on the narrow beam."""
+        with np.errstate(all="ignore"):
+            found = self.narrow.evaluated(x)
+        squares = float(np.nansum(found.residuals**2))
+        return float(found.lost.sum()), squares
+
+    def _hopped(self, key: str, x: np.ndarray) -> np.ndarray:
+        """A point beyond a minimum, drawn by the name of the hop."""
+        draw = np.random.default_rng([self.seed, *key.encode()])
+        size = _REACH[0] * (_REACH[1] / _REACH[0]) ** draw.random()
+        return self.space.prepared(x + size * (self.space.high - self.space.low) * draw.normal(size=len(x)))
+
+    def _descended(self, x: np.ndarray, stages: Sequence[tuple[Problem, int, Manner]]) -> Ended:
+        """Where x comes to on each of the problems in turn, in so many cycles."""
+        begun = time.monotonic()
+        for problem, cycles, manner in stages:
+            with np.errstate(all="ignore"):
+                end = self._descent(problem, x, cycles, manner)
+            if end is None:
+                break
+            x = end.x
+        if end is None:
+            return Ended(np.inf, np.inf, np.inf, time.monotonic() - begun, x)
+        missed = float(end.missed.max(initial=0.0))
+        return Ended(end.lost, missed, float(np.sqrt(end.cost)), time.monotonic() - begun, end.x)
+
+    def _descent(self, problem: Problem, x: np.ndarray, cycles: int, manner: Manner):
+        """The state that a descent ends in; None where there is no way from x."""
+        if not problem.state(x, False).is_finite:
+            return None
+        try:
+            end = least_squares(
+                problem.state, x, lower=self.space.lower, upper=self.space.upper, manner=manner, cycles=cycles
+            )
+        except (np.linalg.LinAlgError, RuntimeError):
+            return None  # numbers that overflow on the way
+        if end.stopped == "interrupted":
+            raise Stopped
+        return end.state if end.state.is_finite else None
+
+
+def _watched(task: Callable[[], Ended], bar) -> Callable[[], Ended]:
+    """The task, after which the bar moves."""
+
+    def done() -> Ended:
+        end = task()
+        if bar is not None:
+            bar.update(1)
+        return end
+
+    return done
+
+
+def _turned(space: Space) -> tuple[np.ndarray, np.ndarray] | None:
+    """Which variable takes the place of each in the lens turned round, and its sign; None where no lens is."""
+    lens = space.model.lens
+    if not np.isfinite(float(lens.surfaces[0].thickness)):
+        return None
+    variables, last = space.model.variables, len(lens.surfaces) - 2
+    at = {(one.surface, one.quantity): k for k, one in enumerate(variables)}
+    partner = {"curvature": lambda k: last + 1 - k, "thickness": lambda k: last - k}
+    other = [(partner.get(one.quantity, lambda k: -1)(one.surface), one.quantity) for one in variables]
+    if any(place not in at for place in other):
+        return None
+    return np.array([at[place] for place in other]), np.where([o == "curvature" for _, o in other], -1.0, 1.0)

@@ -1,0 +1,150 @@
+"""Searched: the distinct minima that a search found, the best first."""
+
+import warnings
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from raytrace.files import write_table
+from raytrace.formats import LensFileWarning, write_lens
+from raytrace.maths.result import Result, called, cell
+from raytrace.maths.value import value
+from raytrace.optics.paraxial import first_order
+from raytrace.optics.spots import spot
+from raytrace.optimization.minima import Minima
+from raytrace.optimization.problem import NoProblem, Problem
+from raytrace.system.intent import Intent
+from raytrace.system.lens import Lens
+
+#: Why a search ends, by what is told of it.
+STOPPED = {
+    "starts": "as many starts as were asked for",
+    "seconds": "as much time as was asked for",
+    "interrupted": "interrupted; these were found so far",
+}
+KEPT = 40  # minima that are told of
+
+
+@value
+class Searched(Result):
+    """The minima (M,), the best first.
+
+    lenses: one each; merit, focal_length in mm, spots (M, F): RMS radius of every field in mm, all wavelengths by their
+    weights; found: how often; after: seconds of work until it was; tasks: what found it. variables: (M, n).
+    """
+
+    before: Lens
+    lenses: tuple[Lens, ...]
+    names: tuple[str, ...]
+    tasks: tuple[str, ...]
+    variables: Tensor
+    merit: Tensor
+    focal_length: Tensor
+    spots: Tensor
+    found: Tensor
+    after: Tensor
+    starts: int
+    seconds: float
+    stopped: str
+
+    FIGURE = "plot.search.best"
+
+    @property
+    def lens(self) -> Lens:
+        """The best one."""
+        return self.lenses[0]
+
+    def columns(self) -> dict[str, Tensor]:
+        fields = {f"rms_{f}": self.spots[:, f - 1] for f in range(1, self.spots.shape[1] + 1)}
+        variables = {name: self.variables[:, k] for k, name in enumerate(self.names)}
+        number = torch.arange(1, len(self.lenses) + 1)
+        own = {"minimum": number, "merit": self.merit, "efl": self.focal_length, **fields}
+        return {**own, "found": self.found, "seconds": self.after, **variables}
+
+    def document(self) -> dict:
+        told = {"starts": self.starts, "seconds": round(self.seconds, 3), "stopped": self.stopped}
+        return {**told, **Result.document(self)}
+
+    def __str__(self) -> str:
+        width = max(8 * self.spots.shape[1], 8)
+        count = f"{len(self.lenses)} minima" if len(self.lenses) > 1 else "1 minimum"
+        lines = [
+            self.before.name,
+            f"  {count} from {self.starts} starts in {self.seconds:.1f} s; {STOPPED[self.stopped]}\n",
+            f"  {'':>7} {'':>12} {'EFL':>10} {'RMS spots':>{width}}\n  {'minimum':>7} {'merit':>12} {'mm':>10} "
+            f"{'µm, by field':>{width}} {'found':>6}",
+        ]
+        for k in range(len(self.lenses)):
+            spots = "".join(cell(1e3 * float(one), "8.2f") for one in self.spots[k])
+            length = cell(float(self.focal_length[k]), "10.4f")
+            merit, found = float(self.merit[k]), int(self.found[k])
+            lines.append(f"  {k + 1:>7} {merit:>12.6g} {length} {spots:>{width}} {found:>6}")
+        return "\n".join(lines)
+
+    def save(self, folder: str | PathLike) -> None:
+        """Write a lens file and a thumbnail of every minimum, the table, and a figure of the best side by side."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        for number, lens in enumerate(self.lenses, 1):
+            with warnings.catch_warnings():
+                if number > 1:  # what a file cannot hold is the same of all
+                    warnings.simplefilter("ignore", LensFileWarning)
+                write_lens(lens, folder / f"minimum_{number:02d}.zmx")
+            called("plot.search.thumbnail")(lens, folder / f"minimum_{number:02d}.png")
+        for path in folder.glob("minimum_*.*"):
+            if path.stem.removeprefix("minimum_").isdigit() and int(path.stem.removeprefix("minimum_")) > number:
+                path.unlink()
+        columns = {name: column.tolist() for name, column in self.columns().items()}
+        write_table(
+            folder / "minima.csv", [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+        )
+        self.plot(folder / "best.png")
+
+
+def searched(lens: Lens, problem: Problem, minima: Minima, *, starts: int, stopped: str, seconds: float) -> Searched:
+    """The result. Raises NoProblem where nothing was found."""
+    if not minima.each:
+        raise NoProblem(
+            f"no lens of all light, and of what is held, from {starts} starts: allow more by `starts`, `seconds` or "
+            "wider `bounds`, or hold less"
+        )
+    kept = minima.each[:KEPT]
+    lenses = tuple(_named(lens, problem, one.ended.x, k) for k, one in enumerate(kept, 1))
+    tensor = lambda numbers: torch.tensor(np.asarray(numbers, dtype=float), dtype=torch.float64)  # noqa: E731
+    names = tuple(f"{one.quantity}_{one.surface}" for one in problem.model.variables)
+    return Searched(
+        before=lens,
+        lenses=lenses,
+        names=names,
+        tasks=tuple(one.task for one in kept),
+        variables=tensor([one.ended.x for one in kept]),
+        merit=tensor([one.ended.merit for one in kept]),
+        focal_length=torch.stack([first_order(one).effective_focal_length.reshape(()) for one in lenses]),
+        spots=torch.stack([_spots(one) for one in lenses]),
+        found=torch.tensor([one.found for one in kept]),
+        after=tensor([one.seconds for one in kept]),
+        starts=starts,
+        seconds=seconds,
+        stopped=stopped,
+    )
+
+
+def _spots(lens: Lens) -> Tensor:
+    """RMS radius (F,) in mm about the centroid of all wavelengths, by their weights."""
+    each = spot(lens, wavelengths=lens.wavelengths)
+    share = lens.wavelength_weights / lens.wavelength_weights.sum()
+    centre = (each.centroid * share).sum(-1, keepdim=True)
+    apart = (each.centroid - centre).square().sum(0)
+    return ((each.rms_radius.square() + apart) * share).sum(-1).sqrt().reshape(-1)
+
+
+def _named(lens: Lens, problem: Problem, x: np.ndarray, number: int) -> Lens:
+    """The lens there, with its number behind its name, and with what it was searched for."""
+    model = problem.model
+    found = model.lens_at(x)
+    intent = found.intent or Intent(model.variables, model.solves, problem.rows)
+    return replace(found, name=f"{lens.name}, minimum {number}".removeprefix(", "), intent=intent)

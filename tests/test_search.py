@@ -1,0 +1,264 @@
+"""Searching: starts, the journal, minima each once, the verb and its command."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas
+import pytest
+import torch
+
+import raytrace as rt
+from raytrace.merit.default import rows_of
+from raytrace.merit.hold import conditions_of
+from raytrace.merit.model import Model
+from raytrace.merit.vary import bounds_of, freedom
+from raytrace.optimization.journal import BadSearch, Ended, Journal, Stopped
+from raytrace.optimization.minima import Minima
+from raytrace.optimization.problem import NoProblem
+from raytrace.optimization.starts import length_of, space_of
+
+PLANE = float("inf")
+HOW = {"merit": "spot", "vary": "curvature thickness", "glass_thickness": "2:8", "edge": 1.0, "rings": 2}
+
+
+def plates(*glasses, diameter=10.0, fields=(0.0, 7.0)):
+    rows = [row for glass in glasses for row in (dict(thickness=4, glass=glass), dict(thickness=2))]
+    rows[-1]["thickness"] = 45
+    return rt.lens(rows, stop=2, fields=fields, entrance_pupil_diameter=diameter, name="Plates")
+
+
+@pytest.fixture(scope="module")
+def plate():
+    return plates(1.6)
+
+
+@pytest.fixture(scope="module")
+def found(plate):
+    return rt.search(plate, hold="efl=50", starts=8, **HOW)
+
+
+# -- starts ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("glasses", [(1.6,), (1.6, 1.8), (1.6, 1.8, 1.5, 1.7)])
+def test_starts_have_the_focal_length_and_the_sensor_at_the_paraxial_focus(glasses):
+    lens = plates(*glasses)
+    free = freedom(lens, "curvature thickness")
+    model = Model(free.lens, free.variables)
+    space = space_of(model, bounds_of(free.lens, free.variables, "sensor:1..500"), 50.0)
+    points = [model.start, *space.sobol(1, 16, seed=0)]
+    brought = 0
+    for x in map(space.prepared, points):
+        assert (x >= space.lower).all()
+        assert (x <= space.upper).all()
+        made = model.lens_at(x)
+        length = float(rt.first_order(made).effective_focal_length)
+        if length == pytest.approx(50, rel=1e-6):
+            brought += 1
+            distance = float(rt.paraxial_image_distance(made, np.inf))
+            assert float(made.surfaces[-2].thickness) == pytest.approx(np.clip(distance, 1, 500), rel=1e-9)
+    assert brought >= 12  # steep ones of other signs have no such scale within their bounds
+
+
+def test_starts_are_spread_evenly_and_are_the_same_in_any_order(plate):
+    free = freedom(plate, "curvature thickness")
+    model = Model(free.lens, free.variables)
+    space = space_of(model, bounds_of(free.lens, free.variables), 50.0)
+    blocks = [space.sobol(k, 8, seed=3) for k in range(8)]
+    assert np.array_equal(space.sobol(5, 8, seed=3), blocks[5])
+    assert not np.array_equal(space.sobol(5, 8, seed=4), blocks[5])
+    parts = (np.concatenate(blocks) - space.low) / (space.high - space.low)
+    counts = [np.histogram(part, 8, (0, 1))[0] for part in parts.T]
+    assert np.array_equal(counts, np.full_like(counts, 8))  # a net: as many in each eighth
+
+
+def test_the_focal_length_is_that_held_that_of_a_row_or_that_of_the_lens():
+    lens = rt.read_lens("cooke_triplet")
+    model, own = Model(lens), float(rt.first_order(lens).effective_focal_length)
+    rows = rows_of(lens, "spot")
+    assert length_of(model, rows, 1.0, ()) == pytest.approx(own)
+    aimed = (*rows, rt.Row("EFFL", target=3.0, weight=1.0))
+    assert length_of(model, aimed, 25.4, ()) == pytest.approx(76.2)
+    assert length_of(model, aimed, 1.0, conditions_of(lens, "efl=70")) == 70
+
+
+# -- minima ------------------------------------------------------------------------------------------------------------
+
+
+def ended(x, merit, lost=0):
+    return Ended(float(lost), 0.0, merit, 1.0, np.array(x, dtype=float))
+
+
+def test_a_minimum_is_kept_once_and_the_best_of_its_finds():
+    minima = Minima(np.ones(2))
+    assert minima.add(ended([0.5, 0.5], 2.0), "a", 1)
+    assert not minima.add(ended([0.501, 0.5], 2.001), "b", 2)
+    assert minima.add(ended([0.5, 0.9], 2.0), "c", 3)
+    assert minima.add(ended([0.1, 0.1], 1.0), "d", 4)
+    assert not minima.add(ended([0.9, 0.1], 0.1, lost=1), "e", 5)
+    assert [(one.task, one.found) for one in minima.each] == [("d", 1), ("a", 2), ("c", 1)]
+    assert minima.add(ended([0.505, 0.5], 1.99), "f", 6)
+    assert [(one.task, one.found) for one in minima.each] == [("d", 1), ("f", 3), ("c", 1)]
+
+
+def test_a_lens_and_the_same_turned_round_are_one():
+    minima = Minima(np.ones(2), (np.array([1, 0]), np.array([-1.0, -1.0])))
+    assert minima.add(ended([0.5, -0.2], 1.0), "a", 1)
+    assert not minima.add(ended([0.2, -0.5], 1.0), "b", 2)
+
+
+def test_the_one_minimum_of_a_singlet_is_found_from_everywhere(found):
+    assert len(found.lenses) == 1
+    assert found.found.tolist() == [8]  # four starts that are followed, and four hops
+    assert found.lens is found.lenses[0]
+
+
+def test_each_minimum_is_told_once_and_is_one():
+    how = {
+        **HOW,
+        "hold": "efl=50",
+        "bounds": "thickness:0.25..17.5 thickness:1,3:2..8 sensor:2.5..100 curvature:-0.08..0.08",
+    }
+    found = rt.search(plates(1.5, 1.8), starts=8, **how)
+    assert len(found.lenses) >= 2
+    assert (found.merit[1:] >= found.merit[:-1]).all()
+    assert found.focal_length.tolist() == pytest.approx([50] * len(found.lenses), rel=1e-6)
+    best = rt.optimize(found.lens, cycles=30, **how)
+    assert best.merit_before == pytest.approx(float(found.merit[0]), rel=1e-9)
+    assert best.merit_after > 0.97 * best.merit_before
+    ranges = found.variables.max(0).values - found.variables.min(0).values
+    apart = (found.variables[:, None] - found.variables).abs() / ranges
+    assert (apart.amax(-1) + torch.eye(len(found.lenses)) > 0.03).all()
+
+
+def test_the_best_singlet_is_that_of_a_scan_over_its_bending(plate, found):
+    """Of one thin lens with its stop near, the bending decides."""
+    scanned = []
+    for first in np.linspace(-0.06, 0.06, 7):
+        bent = plate.replace(1, curvature=torch.tensor(first, dtype=torch.float64))
+        bent = bent.replace(2, curvature=torch.tensor(first - 1 / 30, dtype=torch.float64))
+        scanned.append(
+            rt.optimize(bent, hold="efl=50", bounds="thickness:1..80 curvature:-0.08..0.08", **HOW).merit_after
+        )
+    assert float(found.merit[0]) <= min(scanned) * 1.02
+
+
+# -- the journal -------------------------------------------------------------------------------------------------------
+
+
+def test_tasks_that_are_known_are_not_done_again_and_a_torn_line_is(tmp_path):
+    done = []
+
+    def task(name):
+        return name, lambda: done.append(name) or ended([1.0 / 3, 2.0], 0.1)
+
+    about = {"seed": 1}
+    Journal(tmp_path, about, np.inf).each([task("a"), task("b")], 2)
+    path = tmp_path / "search.jsonl"
+    path.write_text(path.read_text()[:-9])
+    again = Journal(tmp_path, about, np.inf).each([task("a"), task("b"), task("c")], 2)
+    assert done == ["a", "b", "b", "c"]
+    assert np.array_equal(again[0].x, [1.0 / 3, 2.0])
+    with pytest.raises(BadSearch, match="a search of other seed"):
+        Journal(tmp_path, {"seed": 2}, np.inf)
+    with pytest.raises(Stopped):
+        Journal(tmp_path, about, 0.0).each([task("d")], 2)
+
+
+def test_what_goes_on_ends_as_what_was_never_interrupted(plate, found, tmp_path):
+    class Bar:
+        """Interrupts at the fifth start."""
+
+        def __init__(self, *arguments):
+            self.n = 0
+
+        def update(self, n):
+            self.n += n
+            if self.n == 5:
+                raise KeyboardInterrupt
+
+        set_postfix_str = close = lambda self, *arguments: None
+
+    with pytest.raises(NoProblem, match="from 0 starts"):
+        rt.search(plate, hold="efl=50", starts=8, folder=tmp_path, progress=Bar, **HOW)
+    kept = (tmp_path / "search.jsonl").read_text().splitlines()
+    assert 1 + 4 <= len(kept) < 1 + 8
+    whole = rt.search(plate, hold="efl=50", starts=8, folder=tmp_path, **HOW)
+    assert torch.equal(whole.variables, found.variables)
+    assert torch.equal(whole.found, found.found)
+    assert whole.tasks == found.tasks
+
+
+def test_processes_find_what_one_does(plate, found, tmp_path):
+    rt.write_lens(plate, tmp_path / "plate.csv")
+    words = "plate.csv --merit spot --vary curvature thickness --glass-thickness 2:8 --edge 1 --rings 2 --hold efl=50"
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc-per-node",
+        "2",
+        "-m",
+        "raytrace",
+        "search",
+    ]
+    done = subprocess.run(
+        [*command, *words.split(), "--starts", "8", "--json"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"},
+    )
+    assert done.returncode == 0, done.stderr
+    merits = [row["merit"] for row in json.loads(done.stdout)["results"]]
+    assert merits == pytest.approx(found.merit.tolist(), rel=1e-9)
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
+
+
+def test_the_folder_holds_lenses_a_table_and_figures(found, tmp_path):
+    found.save(tmp_path)
+    (tmp_path / "minimum_99.zmx").write_text("of a longer search")
+    found.save(tmp_path)
+    numbers = [f"minimum_{k:02d}" for k in range(1, len(found.lenses) + 1)]
+    files = {path.name for path in tmp_path.iterdir()}
+    assert files == {f"{name}{suffix}" for name in numbers for suffix in (".zmx", ".png")} | {"minima.csv", "best.png"}
+    table = pandas.read_csv(tmp_path / "minima.csv")
+    assert table["merit"].tolist() == found.merit.tolist()
+    own = rt.read_lens(tmp_path / "minimum_01.zmx")
+    assert rt.first_order(own).effective_focal_length == pytest.approx(50)
+    assert rt.spot(own).rms_radius.reshape(-1).tolist() == pytest.approx(found.spots[0].tolist(), rel=1e-6)
+
+
+def test_the_command_writes_what_it_found_and_goes_on(command_line, tmp_path):
+    words = ["search", "singlet", "--merit", "spot", "--vary", "curvature sensor", "--hold", "efl=50", "-o", "minima"]
+    done = command_line(*words, "--starts", 2, "--json")
+    assert done.code == 0, done.err
+    assert [*done.document] == ["starts", "seconds", "stopped", "results"]
+    assert (tmp_path / "minima" / "minimum_01.zmx").exists()
+    again = command_line(*words, "--starts", 2, "--json")
+    assert again.document["results"] == done.document["results"]
+    other = command_line(*words, "--starts", 2, "--seed", 7)
+    assert "keeps a search of other seed" in other.error
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--merit", "spot"], "--vary names them"),
+        (["--vary", "curvature"], "choose one by --merit spot"),
+        (["--merit", "spot", "--vary", "curvature"], "--hold its focal length, as efl=50"),
+        (["--merit", "spot", "--vary", "curvature", "--hold", "efl=50", "--seconds", "1e-9"], "no lens of all light"),
+        (["--merit", "spot", "--vary", "curvatures", "--hold", "efl=50"], "did you mean curvature"),
+    ],
+)
+def test_what_cannot_be_searched_is_told_in_a_line(words, said, plate, command_line, tmp_path):
+    rt.write_lens(plate, tmp_path / "plate.csv")
+    assert said in command_line("search", "plate.csv", *words).error
