@@ -7,6 +7,7 @@ from pathlib import Path
 
 from raytrace.files import shipped
 from raytrace.formats import FORMATS, read_lens, shipped_lens
+from raytrace.media.catalog import shipped_file
 from raytrace.system.lens import Lens, check_media
 from raytrace.words import did_you_mean
 
@@ -49,12 +50,17 @@ def open_lens(arguments: argparse.Namespace) -> Lens:
 
 
 def catalogs(arguments: argparse.Namespace) -> tuple[Path, ...]:
-    """The glass catalogs of --catalog; a missing one is refused here."""
-    paths = tuple(Path(name) for name in arguments.catalog)
+    """The glass catalogs of --catalog, files or names of shipped ones; a missing one is refused here."""
+    paths = tuple(_catalog(name) for name in arguments.catalog)
     for path in paths:
         if not path.is_file():
             raise CommandError(f"{path}: no such glass catalog; expected an .agf file after --catalog")
     return paths
+
+
+def _catalog(name: str) -> Path:
+    path = Path(name)
+    return path if path.suffix or path.exists() else shipped_file(name) or path
 
 
 def refuse_suffix(option: str, path: str | None, known: tuple[str, ...]) -> None:

@@ -181,6 +181,12 @@ def shipped_folder() -> Path:
     return folder
 
 
+def shipped_file(name: str) -> Path | None:
+    """The file of a shipped catalog; None for a name that is not shipped."""
+    shipped = _shipped_name(name)
+    return None if shipped is None else shipped_folder() / f"{shipped}.AGF"
+
+
 def shipped_catalog(name: str) -> Catalog:
     """A shipped catalog by its name, parsed once. Raises CatalogError for a name that is not shipped."""
     shipped = _shipped_name(name)

@@ -17,6 +17,9 @@ from raytrace.merit.value import Merit, in_unit, merit_for
 from raytrace.merit.vary import Freedom, bounds_of, freedom, name_of
 from raytrace.optimization.bfgs import Function, lowest
 from raytrace.optimization.checkpoint import Checkpoint, Log, resumed
+from raytrace.optimization.glass import Choice
+from raytrace.optimization.glass_freedom import without_glass
+from raytrace.optimization.glass_pool import catalogs_of, pool_of
 from raytrace.optimization.least_squares import Cycle
 from raytrace.optimization.paths import Found, best_of_paths
 from raytrace.optimization.problem import Condition, NoProblem, Problem, typical_of
@@ -46,6 +49,7 @@ def optimize(
     paths: int = 1,
     skip_unknown: bool = False,
     readings: Readings | str | Sequence[str] | None = None,
+    catalog: Sequence[str | PathLike] = (),
     log: str | PathLike | None = None,
     checkpoint: str | PathLike | None = None,
     resume: str | PathLike | None = None,
@@ -60,18 +64,22 @@ def optimize(
     vary: variables, or words for them, as "curvature thickness:5,6", by default the file's; bounds: of variables, as
     "thickness:2,15"; hold: what is met exactly, as "efl=50 total_track<=80" (`merit.hold`). cycles, seconds: after
     which it ends; paths: how many ways of damping are tried. skip_unknown: leave rows of unknown operands out;
-    readings: where an operand is open (`Readings`). log: a file with a line for every cycle; checkpoint: a file that
-    keeps the best variables; resume: one that they are taken from. Ctrl-C ends with the best lens.
+    readings: where an operand is open (`Readings`). catalog: names of shipped catalogs, or AGF files, for glasses that
+    vary, by default those of the lens, else SCHOTT (`optimization.glass`). log: a file with a line for every cycle;
+    checkpoint: a file that keeps the best variables; resume: one that they are taken from. Ctrl-C ends with the best
+    lens.
     Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadCheckpoint.
     """
     prepare()
-    free = _freedom(lens, vary)
+    free, glasses = without_glass(_freedom(lens, vary), vary)
     names = tuple(name_of(one) for one in free.variables)
     model = Model(free.lens, free.variables, free.solves)
     lower, upper = _bounds(free, bounds, names)
     start = np.clip(model.start if resume is None else resumed(resume, names), lower, upper)
     how = {"lower": lower, "upper": upper, "typical": typical_of(model), "cycles": cycles, "seconds": seconds}
     if callable(merit) and not isinstance(merit, Merit):
+        if glasses:
+            raise NoProblem("`vary=glass` goes with a merit of rows: make the function a row")
         if hold:
             raise NoProblem("`hold` goes with a merit of rows: of a function give `bounds`, or make it a row")
         with _Told(names, log, checkpoint, progress and progress(cycles, "cycle")) as told:
@@ -80,22 +88,23 @@ def optimize(
         lens, merit, rings=rings, arms=arms, reference=reference, frequencies=frequencies, field_weights=field_weights,
         wavelength_weights=wavelength_weights, glass_thickness=glass_thickness, air_thickness=air_thickness, edge=edge,
     )  # fmt: skip
-    problem = Problem(
-        model,
-        function.rows,
-        _conditions(lens, hold, function.unit),
-        unit=function.unit,
-        skip_unknown=skip_unknown,
-        readings=readings_of(readings),
-    )
+    conditions = _conditions(lens, hold, function.unit)
+    of_rows = {"unit": function.unit, "skip_unknown": skip_unknown, "readings": readings_of(readings)}
+    problem = Problem(model, function.rows, conditions, **of_rows)
     begun, before = time.monotonic(), problem.evaluated(model.start)
     _refuse_undefined(problem, before)
+    until, choice = np.inf if seconds is None else begun + seconds, None
+    if glasses:
+        pool, limits = pool_of(lens, catalogs_of(lens, catalog)), (lower, upper)
+        choice = Choice(free, glasses, pool, function.rows, conditions, limits, cycles=cycles, until=until, **of_rows)
+        start, problem = choice.run(start).x, choice.problem(choice.best.glasses, ())
+        how["seconds"] = None if seconds is None else until - time.monotonic()
     with _Told(names, log, checkpoint, progress and progress(cycles, "cycle")) as told:
         found = best_of_paths(
             problem.state, start, paths=paths, watch=lambda cycle, state: told.tell(cycle, state.x), **how
         )
         told.kept.keep(found.state.x, float(np.sqrt(found.state.cost)), found.cycles, now=True)
-    return _result(lens, problem, names, before, found, time.monotonic() - begun)
+    return _with_choice(_result(lens, problem, names, before, found, time.monotonic() - begun), choice)
 
 
 class _Told:
@@ -226,6 +235,14 @@ def _optimized(
         seconds=seconds,
         stopped=found.stopped,
     )
+
+
+def _with_choice(found: Optimized, choice: Choice | None) -> Optimized:
+    """The result with how its glasses were chosen."""
+    if choice is None:
+        return found
+    evaluations = found.evaluations + choice.evaluations
+    return dataclasses.replace(found, glasses=tuple(choice.steps), evaluations=evaluations)
 
 
 def _contributions(found: Evaluated, rows: int) -> np.ndarray:

@@ -10,6 +10,7 @@ from raytrace.formats import write_lens
 from raytrace.maths.result import Result, number, plain
 from raytrace.maths.value import value
 from raytrace.merit.operands import OPERANDS
+from raytrace.optimization.glass import GlassStep
 from raytrace.system.intent import Row
 from raytrace.system.lens import Lens
 
@@ -31,7 +32,8 @@ class Optimized(Result):
 
     merit: the rows; names (n,) of the variables, before and after in variables: (n,) in mm; values: (R,) of the rows
     before and after; contributions: (R,) of each to the square of the merit, which add up to 1; history: (cycles, 5)
-    merit, how far conditions are missed, step, damping and seconds of every cycle; stopped: a key of STOPPED.
+    merit, how far conditions are missed, step, damping and seconds of every cycle; stopped: a key of STOPPED;
+    glasses: the steps in which glasses that vary were chosen.
     """
 
     lens: Lens
@@ -51,6 +53,7 @@ class Optimized(Result):
     evaluations: int
     seconds: float
     stopped: str
+    glasses: tuple[GlassStep, ...] = ()
 
     FIGURE = "plot.optimize.optimize_report"
 
@@ -99,6 +102,7 @@ class Optimized(Result):
                     }
                     for i in self.rows
                 ],
+                **({"glasses": [step.document() for step in self.glasses]} if self.glasses else {}),
             }
         )
 
@@ -113,6 +117,9 @@ class Optimized(Result):
         ]
         for name, *ends in zip(self.names, self.variables_before.tolist(), self.variables_after.tolist(), strict=True):
             lines.append(f"  {name:<18} {ends[0]:>16.8g} {ends[1]:>16.8g}")
+        if self.glasses:
+            lines.append(f"\n  {'glass':<52} {'predicted':>14} {'merit':>14} {'s':>8}")
+            lines += [f"  {step}" for step in self.glasses]
         left = [i for i in sorted(self.rows, key=lambda i: -float(self.contributions[i - 1])) if self._counts(i)]
         ends = f"{'before':>14} {'after':>14}"
         lines.append(f"\n  {'row':>5} {'operand':<8} {'target':>12} {'weight':>10} {ends} {'left':>7}")

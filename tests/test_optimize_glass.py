@@ -1,0 +1,197 @@
+"""Glasses that vary: the hull of a catalog, what the expansion foretells, and the glasses that a lens ends with."""
+
+import dataclasses
+import json
+import re
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import spearmanr
+
+import raytrace as rt
+from raytrace.cli import main
+from raytrace.fused import prepare
+from raytrace.media.catalog import shipped_catalog
+from raytrace.media.glass import abbe_number, nd, refractive_index
+from raytrace.merit.hold import conditions_of
+from raytrace.merit.value import merit_for
+from raytrace.merit.vary import freedom
+from raytrace.optimization.glass import Choice, Design, expansion
+from raytrace.optimization.glass_freedom import without_glass
+from raytrace.optimization.glass_pool import STATUSES, Pool, catalogs_of, hull, pool_of
+from raytrace.optimization.least_squares import State, least_squares
+from raytrace.optimization.problem import NoProblem
+from raytrace.optimization.step import Sides
+from raytrace.system.intent import Intent, Solve, Vary
+
+NONE = np.zeros(0)
+BOUNDS = {"glass_thickness": (2.0, 20.0), "air_thickness": (0.3, 100.0), "edge": 1.0}
+
+
+@pytest.fixture(scope="module")
+def triplet():
+    prepare()
+    return rt.read_lens("cooke_triplet")
+
+
+def choice_of(lens, words="curvature thickness glass", **options) -> Choice:
+    function = merit_for(lens, "spot", **BOUNDS)
+    free, surfaces = without_glass(freedom(lens, words), words)
+    far = np.full(len(free.variables), np.inf)
+    pool = pool_of(lens, catalogs_of(lens))
+    return Choice(free, surfaces, pool, function.rows, conditions_of(lens, "efl=100"), (-far, far), **options)
+
+
+@pytest.fixture(scope="module")
+def found(triplet):
+    return rt.optimize(triplet, merit="spot", vary="curvature thickness glass", hold="efl=100", cycles=40, **BOUNDS)
+
+
+# -- the glasses -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_a_hull_holds_all_of_its_points_and_no_more(count):
+    points = np.random.default_rng(1).normal(size=(60, count)) * [0.1, 15.0, 3e-3][:count] + [1.6, 50.0, 0.0][:count]
+    normal, reach = hull(points)
+    assert (points @ normal.T <= reach + 1e-9).all()
+    assert np.isclose((points @ normal.T - reach).max(0), 0, atol=1e-9).all()  # every side touches one
+    assert (points.mean(0) @ normal.T < reach).all()
+    beyond = points.mean(0) + 1.01 * (points[:10] - points.mean(0)) * 4
+    assert ((beyond @ normal.T > reach).any(1)).any()
+
+
+def test_the_hull_of_points_in_a_plane_is_their_box():
+    normal, reach = hull(np.array([[1.5, 60.0], [1.6, 60.0], [1.7, 60.0]]))
+    assert (np.array([1.55, 60.0]) @ normal.T <= reach + 1e-9).all()
+    assert (np.array([1.75, 60.0]) @ normal.T > reach).any()
+
+
+@pytest.mark.parametrize("wavelengths", [(0.53,), (0.45, 0.65), (0.4861, 0.5876, 0.6563), (0.45, 0.5, 0.55, 0.6, 0.65)])
+def test_numbers_of_a_glass_give_its_indices_at_the_wavelengths_of_the_lens(wavelengths):
+    """Exactly, up to three; BK7's are those of its data sheet at the lines F, d and C."""
+    at = torch.tensor(wavelengths, dtype=torch.float64)
+    glasses = [shipped_catalog("SCHOTT").glasses[name] for name in ("N-BK7", "N-SF6", "N-KZFS4")]
+    pool = Pool(glasses, at)
+    assert pool.count == min(3, len(wavelengths))
+    for glass in glasses:
+        off = refractive_index(pool.model(pool.numbers_of(glass)), at) - refractive_index(glass, at)
+        assert float(off.abs().max()) < (1e-12 if len(wavelengths) < 4 else 2e-4)
+    if wavelengths == (0.4861, 0.5876, 0.6563):
+        expected = [float(nd(glasses[0])), float(abbe_number(glasses[0]))]
+        assert np.allclose(pool.numbers_of(glasses[0])[:2], expected, rtol=1e-3)
+
+
+def test_glasses_to_choose_from_are_current_and_cover_the_wavelengths(triplet):
+    pool = pool_of(triplet, catalogs_of(triplet))
+    assert {glass.status for glass in pool.glasses} <= set(STATUSES)
+    assert "N-BK7" in {glass.name for glass in pool.glasses}
+    assert "SK4" not in {glass.name for glass in pool.glasses}
+    assert all(glass.wavelength_range[0] <= 0.4861 and glass.wavelength_range[1] >= 0.6563 for glass in pool.glasses)
+    assert {glass.catalog for glass in pool_of(triplet, catalogs_of(triplet, ["OHARA"])).glasses} == {"OHARA"}
+    with pytest.raises(NoProblem, match="catalog"):
+        catalogs_of(triplet, ["NOWHERE"])
+
+
+# -- the expansion -----------------------------------------------------------------------------------------------------
+
+
+def test_the_expansion_of_a_linear_merit_is_what_the_others_reach():
+    """Residuals linear in all: the least over the variables that follow, with equalities, found by elimination."""
+    draw = np.random.default_rng(2)
+    J, r = draw.normal(size=(30, 7)), draw.normal(size=30)
+    A, c = draw.normal(size=(1, 7)), draw.normal(size=1)
+    state = State(np.zeros(7), r, 0, Sides.none(7), c, NONE, J, A, np.zeros((0, 7)))
+    foretold = expansion(state, np.array([5, 6]), np.arange(5), np.zeros((0, 7)))
+    for d in draw.normal(size=(5, 2)):
+        system = np.block([[J[:, :5].T @ J[:, :5], A[:, :5].T], [A[:, :5], np.zeros((1, 1))]])
+        right = -np.concatenate([J[:, :5].T @ (r + J[:, 5:] @ d), c + A[:, 5:] @ d])
+        y = np.linalg.solve(system, right)[:5]
+        least = np.linalg.norm(r + J @ np.concatenate([y, d]))
+        assert foretold.merit(d) == pytest.approx(least, rel=1e-3)  # of the damping
+
+
+def test_what_is_foretold_ranks_what_is_reached(triplet):
+    """Spearman's correlation, over glasses from all of the map, each optimised in place of the last one's."""
+    choice = choice_of(triplet)
+    start = least_squares(
+        choice.problem({}, ()).state, choice.problem({}, ()).model.start, lower=choice.bounds[0],
+        upper=choice.bounds[1], cycles=60,
+    )  # fmt: skip
+    own = {k: triplet.surfaces[k].glass for k in choice.surfaces}
+    design = Design(start.state.x, own, start.state)
+    for surface in choice.surfaces:
+        merits = choice.foretold(design, [surface], ())[surface]
+        some = np.argsort(merits)[:60:5]
+        glasses = [choice.candidates[surface][0][i] for i in some]
+        reached = [choice.descend(Design(design.x, own | {surface: g}, None), (), 15).merit for g in glasses]
+        assert spearmanr(merits[some], reached)[0] > 0.6
+
+
+# -- the lens ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_lens_ends_with_glasses_of_the_catalog_and_no_worse_than_with_its_own(triplet, found):
+    own = rt.optimize(triplet, merit="spot", vary="curvature thickness", hold="efl=100", cycles=40, **BOUNDS)
+    assert found.merit_after <= own.merit_after * 1.0001
+    assert found.merit_after < 0.95 * own.merit_after
+    glasses = [found.lens.surfaces[k].glass for k in (1, 3, 6)]
+    assert all(glass.catalog == "SCHOTT" and glass.formula != "model" for glass in glasses)
+    kinds = [step.kind for step in found.glasses]
+    assert kinds[:5] == ["own", "model", "snap", "snap", "snap"]
+    assert set(kinds[5:]) <= {"swap"}
+    assert found.glasses[1].reached < found.glasses[0].reached
+    assert {step.surface for step in found.glasses if step.kind == "snap"} == {1, 3, 6}
+    assert found.merit_after <= min(step.reached for step in found.glasses if step.kind in ("own", "swap")) * 1.0001
+
+
+def test_the_lens_is_written_with_its_glasses_and_reads_the_same(found, tmp_path):
+    found.save(tmp_path / "found.zmx")
+    again = rt.read_lens(tmp_path / "found.zmx")
+    names = [found.lens.surfaces[k].glass.name for k in (1, 3, 6)]
+    assert [again.surfaces[k].glass.name for k in (1, 3, 6)] == names
+    assert all(name in str(found) for name in names) or "SK4" in names or "SF2" in names
+
+
+def test_it_is_reproducible(triplet, found):
+    again = rt.optimize(triplet, merit="spot", vary="curvature thickness glass", hold="efl=100", cycles=40, **BOUNDS)
+    assert again.merit_after == found.merit_after
+    assert [step.name for step in again.glasses] == [step.name for step in found.glasses]
+
+
+def test_which_glasses_vary(triplet):
+    words = "curvature glass:3"
+    assert without_glass(freedom(triplet, words), words)[1] == (3,)
+    substitute = (Solve(1, "glass", "substitute"),)
+    pickup = (Solve(6, "glass", "pickup", source=1),)
+    for kept, expected in (((), (1, 3, 6)), (substitute, (1,)), (pickup, (1, 3))):
+        lens = rt.read_lens("cooke_triplet")
+        lens = dataclasses.replace(lens, intent=Intent(variables=(Vary(1, "curvature"),), kept=kept))
+        free, surfaces = without_glass(freedom(lens, "glass"), "glass")
+        assert surfaces == expected
+        assert free.variables == (Vary(1, "curvature"),)
+    with pytest.raises(NoProblem, match="nothing but glasses"):
+        without_glass(freedom(triplet, "glass"), "glass")
+
+
+def test_a_glass_that_is_picked_up_follows(triplet):
+    """The last element has the first one's glass at every step."""
+    intent = Intent(kept=(Solve(6, "glass", "pickup", source=1),))
+    lens = dataclasses.replace(triplet, intent=intent)
+    found = rt.optimize(lens, merit="spot", vary="curvature sensor glass", hold="efl=100", cycles=6, **BOUNDS)
+    assert found.lens.surfaces[6].glass.name == found.lens.surfaces[1].glass.name
+    assert {step.surface for step in found.glasses} <= {0, 1, 3}
+
+
+def test_the_command_prints_the_sequence(capsys):
+    words = ["optimize", "cooke_triplet", "--merit", "spot", "--vary", "curvature", "sensor", "glass:3"]
+    main([*words, "--hold", "efl=100", "--cycles", "5", "--catalog", "HOYA", "--json"])
+    document = json.loads(capsys.readouterr().out)
+    steps = document["glasses"]
+    assert [step["step"] for step in steps[:3]] == ["own", "model", "snap"]
+    assert {step["glass"] for step in steps[2]["tried"]} & set(shipped_catalog("HOYA").glasses)
+    assert steps[2]["surface"] == 3
+    assert steps[2]["tried"]
+    main([*words, "--cycles", "2"])
+    assert re.search(r"surface 3: \S+ \(SCHOTT\)", capsys.readouterr().out)
