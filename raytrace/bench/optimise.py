@@ -29,7 +29,7 @@ from raytrace.system.lens import Lens
 
 MOST = 10.0  # s a file
 FRACTION = 0.05  # by which variables are moved
-_STEPS = 300  # of the other program's Adam
+_STEPS = 40  # of the other program's Adam
 
 
 @dataclasses.dataclass(frozen=True)
