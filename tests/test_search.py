@@ -257,6 +257,7 @@ def test_the_command_writes_what_it_found_and_goes_on(command_line, tmp_path):
         (["--merit", "spot", "--vary", "curvature"], "--hold its focal length, as efl=50"),
         (["--merit", "spot", "--vary", "curvature", "--hold", "efl=50", "--seconds", "1e-9"], "no lens of all light"),
         (["--merit", "spot", "--vary", "curvatures", "--hold", "efl=50"], "did you mean curvature"),
+        (["--merit", "spot", "--vary", "curvature glass", "--hold", "efl=50"], "--vary glass is for optimize"),
     ],
 )
 def test_what_cannot_be_searched_is_told_in_a_line(words, said, plate, command_line, tmp_path):

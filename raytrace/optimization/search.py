@@ -22,7 +22,7 @@ from raytrace.merit.vary import bounds_of, freedom, name_of
 from raytrace.optimization.journal import Ended, Journal, Stopped
 from raytrace.optimization.least_squares import Manner, least_squares
 from raytrace.optimization.minima import Minima
-from raytrace.optimization.problem import Problem
+from raytrace.optimization.problem import NoProblem, Problem
 from raytrace.optimization.searched import Searched, searched
 from raytrace.optimization.starts import Space, length_of, space_of
 from raytrace.shards import Share
@@ -86,6 +86,10 @@ def search(
         wavelength_weights=wavelength_weights, glass_thickness=glass_thickness, air_thickness=air_thickness, edge=edge,
     )  # fmt: skip
     free = freedom(lens, vary)
+    if any(one.quantity == "glass" for one in free.variables):
+        raise NoProblem(
+            "`vary=glass` is for optimize: search with the glasses as they are, then optimize what is found"
+        )
     conditions = _conditions(lens, hold)
     model = Model(free.lens, free.variables, free.solves)
     glass, air = (parse_range(ends) if isinstance(ends, str) else ends for ends in (glass_thickness, air_thickness))
