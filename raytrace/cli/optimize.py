@@ -13,6 +13,7 @@ EXAMPLES = """examples:
   raytrace optimize lens.zmx -o better.zmx --plot better.png
   raytrace optimize double_gauss --merit spot --vary curvature thickness --seconds 10 -o better.zmx
   raytrace optimize tessar --merit spot --vary curvature sensor thickness:2,4 --bounds thickness:1.. --hold efl=100
+  raytrace optimize tessar --merit spot --vary curvature sensor glass --hold efl=100 --catalog SCHOTT -o better.zmx
   raytrace optimize lens.zmx --cycles 50 --checkpoint best.json --log cycles.csv
   raytrace optimize lens.zmx --resume best.json -o better.zmx"""
 

@@ -171,7 +171,8 @@ def catalog(parser: argparse.ArgumentParser) -> None:
         type=file_name,
         action="append",
         default=[],
-        help="glass catalog (.agf) to search first; may be repeated; also the environment variable RAYTRACE_CATALOGS",
+        help="glass catalog to search first, an .agf file or the name of a shipped one; may be repeated; also the "
+        "environment variable RAYTRACE_CATALOGS",
     )
 
 
