@@ -12,6 +12,7 @@ import torch
 from hypothesis import settings
 
 from raytrace.cli import main
+from raytrace.formats import read_lens
 from raytrace.fused import NoCompiler, prepare, tracing
 from raytrace.fused.library import library
 
@@ -32,6 +33,12 @@ def compiler():
         library()
     except NoCompiler as error:
         pytest.skip(str(error))
+
+
+@pytest.fixture(scope="module")
+def lens():
+    """The shipped double Gauss."""
+    return read_lens("double_gauss")
 
 
 @pytest.fixture

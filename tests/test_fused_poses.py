@@ -233,6 +233,7 @@ def _columns_of(part, whole) -> list[int]:
             found |= {own[k]: other[k] for k in places}
         found |= {own[9] + j: other[9] + j for j in range(own[3])}
         found |= {own[15] + j: other[15] + j for j in range(own[14])}
+        found |= {own[17] + j: other[17] + j for j in range(own[16] + 4 if own[16] else 0)}
     return [found[k] for k in range(part.given[3].shape[-1])]
 
 

@@ -16,11 +16,6 @@ from raytrace.optics.launch import launch
 from raytrace.optics.trace import trace_lens
 
 
-@pytest.fixture(scope="module")
-def lens():
-    return rt.read_lens("double_gauss")
-
-
 def value(lens, hold):
     (one,) = conditions_of(lens, hold)
     assert one.row.weight == 0

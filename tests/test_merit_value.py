@@ -18,11 +18,6 @@ DEVELOPMENT = Path(__file__).parents[2] / "shared" / "merit" / "dev"
 
 
 @pytest.fixture(scope="module")
-def lens():
-    return rt.read_lens("double_gauss")
-
-
-@pytest.fixture(scope="module")
 def spot(lens):
     return rt.Merit.default(lens, rings=4, arms=8)
 

@@ -14,11 +14,6 @@ from raytrace.system.naming import BadVariables
 
 
 @pytest.fixture(scope="module")
-def lens():
-    return rt.read_lens("double_gauss")
-
-
-@pytest.fixture(scope="module")
 def zoom(lens):
     return lens.with_configurations(thickness={6: [12.4281, 16.0], 11: [57.9, 52.0]})
 
