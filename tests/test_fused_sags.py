@@ -53,6 +53,12 @@ FACES = {
     "Zernike": departed(ZernikeSag(drawn(11, 0.02), scalar(9.0)), 1 / 20, 0.4),
 }
 each = pytest.mark.parametrize("name", FACES)
+
+#: Whose derivatives by torch take longest, one number after the other.
+LONG = "fringe", "polynomial", "Zernike", "polynomial on an asphere", "irregular"
+each_but_long = pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in LONG else name for name in FACES]
+)
 END = Surface(scalar(0.0))
 
 
@@ -104,7 +110,7 @@ def test_the_adjoint_is_what_autograd_finds(name, dtype, close, with_path):
         assert float((f - e).abs().max()) <= close * (float(e.abs().max()) + 1.0)
 
 
-@each
+@each_but_long
 @pytest.mark.parametrize(
     ("dtype", "close"), [(torch.float64, 1e-11), pytest.param(torch.float32, 2e-3, marks=pytest.mark.slow)]
 )

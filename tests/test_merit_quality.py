@@ -156,7 +156,7 @@ def in_columns(operand: str, *, wavelength=0, field=1, frequency=20.0, sampling=
     return Row(operand, (sampling, wavelength), (field, frequency, plain, 0.0), weight=weight)
 
 
-@pytest.mark.parametrize("name", ["cooke_triplet", "double_gauss_28deg"])
+@pytest.mark.parametrize("name", ["cooke_triplet", pytest.param("double_gauss_28deg", marks=pytest.mark.slow)])
 def test_modulation_is_that_of_the_analysis(name):
     """To what a grid of 128 points leaves, the least that the analysis takes; rays to what rings leave."""
     lens = rt.read_lens(name)

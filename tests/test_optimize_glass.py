@@ -112,6 +112,7 @@ def test_the_expansion_of_a_linear_merit_is_what_the_others_reach():
         assert foretold.merit(d) == pytest.approx(least, rel=1e-3)  # of the damping
 
 
+@pytest.mark.slow
 def test_what_is_foretold_ranks_what_is_reached(triplet):
     """Spearman's correlation, over glasses from all of the map, each optimised in place of the last one's."""
     choice = choice_of(triplet)
@@ -154,6 +155,7 @@ def test_the_lens_is_written_with_its_glasses_and_reads_the_same(found, tmp_path
     assert all(name in str(found) for name in names) or "SK4" in names or "SF2" in names
 
 
+@pytest.mark.slow
 def test_it_is_reproducible(triplet, found):
     again = rt.optimize(triplet, merit="spot", vary="curvature thickness glass", hold="efl=100", cycles=40, **BOUNDS)
     assert again.merit_after == found.merit_after

@@ -193,6 +193,7 @@ def test_what_goes_on_ends_as_what_was_never_interrupted(plate, found, tmp_path)
     assert whole.tasks == found.tasks
 
 
+@pytest.mark.slow
 def test_processes_find_what_one_does(plate, found, tmp_path):
     rt.write_lens(plate, tmp_path / "plate.csv")
     words = "plate.csv --merit spot --vary curvature thickness --glass-thickness 2:8 --edge 1 --rings 2 --hold efl=50"
