@@ -116,17 +116,24 @@ _DAMAGES = (_flipped, _flipped, _truncated, _spliced, _cut, _renumbered, _renumb
 
 @contextlib.contextmanager
 def bounded() -> Iterator[None]:
-    """What runs inside may take MEGABYTES more address space than there is, and stops at an alarm."""
+    """What runs inside may take MEGABYTES more address space than there is, and stops when `_limited` says so."""
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     before = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEGABYTES * 2**20, before[1]))
-    handler = signal.signal(signal.SIGALRM, _too_slow)
+    handlers = {kind: signal.signal(kind, _too_slow) for kind in (signal.SIGALRM, signal.SIGPROF)}
     try:
         yield
     finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, handler)
+        _limited(0)
+        for kind, handler in handlers.items():
+            signal.signal(kind, handler)
         resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def _limited(seconds: int) -> None:
+    """From now on so much time of the processor, and twelve times as long on a clock: the machine may be busy."""
+    signal.setitimer(signal.ITIMER_PROF, seconds)
+    signal.alarm(12 * seconds)
 
 
 class TooSlow(BaseException):
@@ -155,7 +162,7 @@ def survive(reader: Reader, count: int, seed: int) -> tuple[int, int]:
             content = damaged(source.choice(reader.originals), source.choice(reader.originals), source)
             if content.startswith(b"\x89PNG") and source.randrange(2):
                 content = resealed(content)
-            signal.alarm(SECONDS)
+            _limited(SECONDS)
             try:
                 reader.read(content)
                 read += 1
