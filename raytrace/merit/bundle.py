@@ -126,13 +126,21 @@ class Bundle:
         """(2, W, R) in the lens's own kind of field."""
         fields = self.view.lens.fields
         largest = float(torch.hypot(fields.x, fields.y).max())
-        return largest * np.array([[ray.field for ray in row] for row in self._places[1]]).transpose(2, 0, 1)
+        return (
+            self._opening
+            * largest
+            * np.array([[ray.field for ray in row] for row in self._places[1]]).transpose(2, 0, 1)
+        )
 
     @cached_property
     def pupil(self) -> np.ndarray:
         """(2, W, R) of the entrance pupil, vignetted."""
-        points = np.array([[ray.pupil for ray in row] for row in self._places[1]]).transpose(2, 0, 1)
+        points = self._opening * np.array([[ray.pupil for ray in row] for row in self._places[1]]).transpose(2, 0, 1)
         return vignette(self.view.lens, torch.from_numpy(self.field), torch.from_numpy(points.copy())).numpy()
+
+    @property
+    def _opening(self) -> float:
+        return self.view.model.opening
 
     @cached_property
     def _template(self):
@@ -175,7 +183,7 @@ class Bundle:
     def _marginal(self) -> "Bundle":
         """The axial ray through the edge of the paraxial entrance pupil, on the stop."""
         found = Bundle(self.view, self.view.lens.stop)
-        found.ask(self.view.lens.primary_wavelength, (0.0, 0.0), (0.0, 1.0))
+        found.ask(self.view.lens.primary_wavelength, (0.0, 0.0), (0.0, 1.0 / self._opening))
         return found
 
     # -- at a moment ---------------------------------------------------------------------------------------------------

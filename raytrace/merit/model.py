@@ -62,12 +62,14 @@ def with_numbers_of(lens: Lens, numbers: dict[Address, Tensor]) -> Lens:
 class Model:
     """A lens whose variables move.
 
-    lens: as it is at the start; variables, solves: of `Intent`. Raises UnknownNumber for numbers that it does not have.
+    lens: as it is at the start; variables, solves: of `Intent`; opening: the part of the pupil and of the field that
+    rays of a merit function go through. Raises UnknownNumber for numbers that it does not have.
     """
 
     lens: Lens
     variables: tuple[Vary, ...] = ()
     solves: tuple[Solve, ...] = ()
+    opening: float = 1.0
 
     def __post_init__(self):
         for one in (*self.variables, *self.solves):

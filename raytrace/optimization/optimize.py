@@ -21,6 +21,7 @@ from raytrace.optimization.glass import Choice
 from raytrace.optimization.glass_freedom import without_glass
 from raytrace.optimization.glass_pool import catalogs_of, pool_of
 from raytrace.optimization.least_squares import Cycle
+from raytrace.optimization.opening import opened
 from raytrace.optimization.paths import Found, best_of_paths
 from raytrace.optimization.problem import Condition, NoProblem, Problem, typical_of
 from raytrace.optimization.result import Optimized
@@ -92,8 +93,10 @@ def optimize(
     of_rows = {"unit": function.unit, "skip_unknown": skip_unknown, "readings": readings_of(readings)}
     problem = Problem(model, function.rows, conditions, **of_rows)
     begun, before = time.monotonic(), problem.evaluated(model.start)
-    _refuse_undefined(problem, before)
     until, choice = np.inf if seconds is None else begun + seconds, None
+    start = opened(problem, start, lower=lower, upper=upper, typical=how["typical"], until=until)
+    how["seconds"] = None if seconds is None else until - time.monotonic()
+    _refuse_undefined(problem, problem.evaluated(start))
     if glasses:
         pool, limits = pool_of(lens, catalogs_of(lens, catalog)), (lower, upper)
         choice = Choice(free, glasses, pool, function.rows, conditions, limits, cycles=cycles, until=until, **of_rows)

@@ -41,6 +41,9 @@ class Problem:
     ):
         """unit: mm in the unit of length of rows and conditions. Raises NoProblem and UnknownOperand."""
         held = tuple(_held(model.lens, rows, conditions))
+        self._again = lambda model: Problem(
+            model, rows, conditions, unit=unit, skip_unknown=skip_unknown, readings=readings
+        )
         self.model, self.rows, self.unit = model, tuple(rows), unit
         self.evaluation = Evaluation(
             model, (*rows, *(row for row, _ in held)), unit=unit, skip_unknown=skip_unknown, readings=readings
@@ -53,6 +56,10 @@ class Problem:
         signs = [0] * len(self.rows) + [sign for _, sign in held]
         self.signs = np.where(weights < 0, signs, 0)
         self.recovery = Recovery(self.evaluation)
+
+    def through(self, opening: float) -> "Problem":
+        """The same with rays through a part of the pupil and of the field alone."""
+        return self._again(dataclasses.replace(self.model, opening=opening))
 
     def evaluated(self, x: np.ndarray, derivatives: bool = False) -> Evaluated:
         return self.evaluation(x, derivatives=derivatives)
