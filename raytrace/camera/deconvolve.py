@@ -74,7 +74,16 @@ def blind_error(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Te
 
     In the second form, whose difference is the variance ⟨|H - ⟨H⟩|²⟩, small errors keep their digits.
     """
-    return _blind_errors(transfer, spectrum, sigma).mean((-2, -1))
+    return blind_density(transfer, spectrum, sigma).mean((-2, -1))
+
+
+def blind_density(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
+    """e (..., frequencies) whose mean over all frequencies is `blind_error`; any axes for the frequencies."""
+    middle = transfer.mean(0)
+    spread, noise = _square(transfer - middle).mean(0), _variance(sigma)
+    total = spectrum * (spread + _square(middle)) + noise
+    # No light and no noise: nothing is measured, and all of S is missing.
+    return spectrum * torch.where(total != 0, safe_divide(spectrum * spread + noise, total), 1.0)
 
 
 def kernel_error(kernels: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
@@ -90,7 +99,7 @@ def kernel_error(kernels: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Te
     # Every column stands for its mirror image as well, but 0 and the Nyquist frequency, which are their own.
     weight = torch.where((place == 0) | (2 * place == columns), 1.0, 2.0).to(spectrum.dtype) * (half / columns)
     transfer = torch.fft.rfft2(kernels, s=(rows, columns))
-    return (weight * _blind_errors(transfer, spectrum[..., :half], sigma)).mean((-2, -1))
+    return (weight * blind_density(transfer, spectrum[..., :half], sigma)).mean((-2, -1))
 
 
 def errors_knowing(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
@@ -167,14 +176,6 @@ def mean_square_error(estimate: Tensor, picture: Tensor, *, margin: int | tuple[
 def psnr(mean_square: Tensor, *, peak: float = 1.0) -> Tensor:
     """Peak signal over a mean square error, 10 log₁₀(peak²/e) dB; average the errors of colours first."""
     return 20 * math.log10(peak) - 10 * torch.log10(mean_square)
-
-
-def _blind_errors(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
-    middle = transfer.mean(0)
-    spread, noise = _square(transfer - middle).mean(0), _variance(sigma)
-    total = spectrum * (spread + _square(middle)) + noise
-    # No light and no noise: nothing is measured, and all of S is missing.
-    return spectrum * torch.where(total != 0, safe_divide(spectrum * spread + noise, total), 1.0)
 
 
 def _square(z: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ PLACES = {
     "focus": "focusing.command",
     "edof": "edof.command",
     "table": "edof.table_command",
+    "noise": "edof.noise_command",
     "superres": "superres.command",
     "quantise": "quantise.command",
 }

@@ -208,7 +208,7 @@ def table(arguments: argparse.Namespace) -> Table:
             raise CommandError(f"--{option} {' '.join(unknown)}: expected {', '.join(ROWS)}{meant}")
     usual = (name for name, row in ROWS.items() if not row.is_extra)
     rows, world = [*(arguments.rows or usual), *(arguments.also or ())], World()
-    contents, train = _contents(arguments)
+    contents, train = contents_of(arguments)
     learned = _learned(arguments, rows, world, train)
     elements = elements_of(rows, world, spectrum(contents[0].train), learned=learned)
     found = table_of(contents, elements, world, progress=lambda given: progress(given, "row"))
@@ -220,7 +220,7 @@ def table(arguments: argparse.Namespace) -> Table:
     return Table(found)
 
 
-def _contents(arguments: argparse.Namespace) -> tuple[list[Content], Pictures]:
+def contents_of(arguments: argparse.Namespace) -> tuple[list[Content], Pictures]:
     """All contents of the table, and the pictures that elements are learned from: sharp leaves."""
     leaves = argparse.Namespace(**vars(arguments) | {"data": None})
     parts = {name: split(_pictures(leaves, name)) for name in progress(LEAVES, "dead leaf")}

@@ -24,13 +24,11 @@ from raytrace.files import write_atomically
 from raytrace.maths.value import detached
 from raytrace.media.catalog import find_glass
 from raytrace.media.glass import index
-from raytrace.optics.reuse import Memo
 from raytrace.studies.edof.settings import Settings
-from raytrace.studies.edof.world import World, best_of_starts, expected_error, mirrored, restored, scene, transfer
+from raytrace.studies.edof.world import ClosedForm, World, best_of_starts, mirrored, restored, scene, transfer
 from raytrace.studies.pictures import Pictures, crop, draws
 from raytrace.wave.designs import aim, converging
 from raytrace.wave.element import Element, EvenPowers, Zernike, as_rings, wrapped
-from raytrace.wave.plan import plan
 from raytrace.wave.psf import psf
 
 _NETWORK = RedNetShape(6, 16)  # behind the blind filter, the same for every colour
@@ -62,19 +60,18 @@ class EdofCamera(nn.Module):
             like = variables.change
             self.v = nn.Parameter(like.new_tensor(0.1))
             self.t = nn.Parameter(like.new_tensor(math.sqrt(1e-3 * world.design)))
-        self._memo, self._plan = Memo(), plan(scene(variables(), world))
+        self.expected = ClosedForm(variables(), world, spectrum)
 
     def transfer(self, *, draw: torch.Generator | None = None) -> Tensor:
         """H (D, W, n, n) of the world's depths, of an element as it may come out of fabrication."""
-        found = psf(scene(self.variables(draw=draw), self.world), plan=self._plan, memo=self._memo)
-        return transfer(found, self.spectrum.shape[-1])
+        return self.expected.transfer(self.variables(draw=draw))
 
     def filter(self, H: Tensor) -> Tensor:
         """G (W, n, n)."""
         if self.restoration != "towards":
             return blind_filter(H, self.spectrum, self.world.noise)
         at_target = dataclasses.replace(scene(self.variables(), self.world), depths=1e3 * self.t.square().reshape(1))
-        found = psf(at_target, plan=self._plan)
+        found = psf(at_target, plan=self.expected.plan)
         return towards_measurement(transfer(found, self.spectrum.shape[-1])[0], self.v.square())
 
     def forward(self, pictures: Tensor, depth: Tensor, noise: Tensor, *, draw: torch.Generator | None = None) -> Tensor:
@@ -169,7 +166,7 @@ def _loss(camera: EdofCamera, pictures: Pictures, settings: Settings, step: int,
     draw = torch.Generator().manual_seed(int(draws(settings.seed, step, _SAMPLE).integers(2**62)))
     if settings.loss == "spectral":
         # One process has it all: shares of a sum that is not one over samples.
-        return expected_error(camera.transfer(draw=draw), camera.spectrum, camera.world.noise) / share.processes
+        return camera.expected(camera.variables(draw=draw)) / share.processes
     per_epoch = max(1, len(pictures) * 4 // settings.batch)
     epoch, place = divmod(step, per_epoch)
     samples = share.of(range(place * settings.batch, (place + 1) * settings.batch))

@@ -15,12 +15,13 @@ import scipy.optimize
 import torch
 from torch import Tensor, nn
 
-from raytrace.camera.deconvolve import blind_error, blind_filter, errors, power_spectrum, psnr, wiener
+from raytrace.camera.deconvolve import blind_error, blind_filter, power_spectrum, psnr, wiener
 from raytrace.camera.image import transfer_functions
 from raytrace.maths.grid import grid
 from raytrace.maths.result import Result
 from raytrace.optics.reuse import Memo
 from raytrace.studies.descent import NoOptimum, minimise
+from raytrace.studies.edof.octant import Octant, fits
 from raytrace.studies.pictures import Pictures, draws
 from raytrace.wave.element import Element, Rings
 from raytrace.wave.plan import plan
@@ -119,6 +120,27 @@ def expected_error(H: Tensor, S: Tensor, noise: float) -> Tensor:
     return blind_error(H, S, noise).mean()
 
 
+class ClosedForm:
+    """`expected_error` of elements in one world, for pictures of spectrum S (n, n); differentiable. What their heights
+    do not change is kept: first, the elements that the sampling is planned for, have their steps where others will.
+    """
+
+    def __init__(self, first: Sequence[Element], world: World, S: Tensor):
+        self.world, self.S, self._memo = world, S, Memo()
+        own = scene(first, world)
+        self.plan = plan(own)
+        self._octant = Octant(own, self.plan, S.shape[-1]) if fits(own, self.plan, S) else None
+
+    def __call__(self, elements: Sequence[Element]) -> Tensor:
+        if self._octant is not None:
+            return self._octant.error(scene(elements, self.world), self.S, self.world.noise)
+        return expected_error(self.transfer(elements), self.S, self.world.noise)
+
+    def transfer(self, elements: Sequence[Element]) -> Tensor:
+        """H (D, W, n, n)."""
+        return transfer(psf(scene(elements, self.world), plan=self.plan, memo=self._memo), self.S.shape[-1])
+
+
 @dataclasses.dataclass(frozen=True)
 class Quality:
     """What an element is worth, by filter: PSNR in dB of restored pictures.
@@ -201,8 +223,13 @@ def _mean_square(pictures: Tensor, H: Tensor, G: Tensor, noise: Tensor) -> Tenso
 def best_gamma(H: Tensor, S: Tensor, noise: float, at_design: Tensor) -> float:
     """The constant γ of the Wiener filter of the design depth (W, N, N) that errs least over all depths."""
 
+    # The error of a filter G, ⟨S|1 - G H|² + σ²|G|²⟩, needs but two means over the depths.
+    middle, square = H.mean(0), (H.real**2 + H.imag**2).mean(0)
+
     def error(logarithm: float) -> float:
-        return float(errors(H, S, noise, filter=wiener(at_design, 10**logarithm)).mean())
+        G = wiener(at_design, 10**logarithm)
+        power = S * square + noise**2
+        return float((S * (1 - 2 * (G * middle).real) + (G.real**2 + G.imag**2) * power).mean())
 
     # Coarse steps first: far from the best γ the error is flat.
     places = np.arange(-6.0, 2.0, 0.5)
@@ -228,17 +255,16 @@ def best_of_starts(
 
     variables: makes them anew; spread: standard deviation of the first changes; starts 0: as they are made.
     """
-    best, least, memo = variables(), math.inf, Memo()
+    best, least = variables(), math.inf
     for number in progress(range(starts)):
         own = variables()
         with torch.no_grad():
             for p in own.parameters():
                 p.copy_(torch.as_tensor(spread * draws(seed, number, _START).standard_normal(p.shape)))
-        how = plan(scene(own(), world))
+        expected = ClosedForm(own(), world, spectrum)
 
-        def error(own=own, how=how) -> Tensor:
-            found = psf(scene(own(), world), plan=how, memo=memo)
-            return expected_error(transfer(found, spectrum.shape[-1]), spectrum, world.noise)
+        def error(own=own, expected=expected) -> Tensor:
+            return expected(own())
 
         found = min(minimise(list(own.parameters()), error, steps=steps).course)
         if found < least:

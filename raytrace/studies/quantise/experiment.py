@@ -20,16 +20,13 @@ from raytrace.camera.deconvolve import blind_filter, errors, psnr
 from raytrace.camera.phase import PhaseVariables
 from raytrace.camera.training import DamagedRun, load_state, read_json
 from raytrace.maths.value import detached
-from raytrace.optics.reuse import Memo
 from raytrace.studies import options
 from raytrace.studies.edof.settings import Settings
 from raytrace.studies.edof.training import begin, scheduled
-from raytrace.studies.edof.world import World, expected_error, scene, spectrum, transfer
+from raytrace.studies.edof.world import ClosedForm, World, expected_error, scene, spectrum, transfer
 from raytrace.studies.edof.world import kernels as kernels_of
 from raytrace.studies.pictures import draws
 from raytrace.wave.element import Element, Pixels, Rings, period, with_tolerance, wrapped
-from raytrace.wave.plan import plan
-from raytrace.wave.psf import psf
 from raytrace.wave.scene import residual
 
 WAVELENGTH = 0.55  # µm: at which heights are wrapped, and whose period is stepped
@@ -87,21 +84,24 @@ class Judge:
     """
 
     def __init__(self, world: World, S: Tensor):
-        self.world, self.S, self._memo, self._plan = world, S, Memo(), None
+        self.world, self.S, self._expected = world, S, None
 
     def error(self, element: Element) -> Tensor:
         """Mean square error of the best blind filter in closed form, mean over colours; differentiable."""
-        return expected_error(self.transfer(element), self.S, self.world.noise)
+        if isinstance(element.profile, Pixels):
+            return expected_error(self.transfer(element), self.S, self.world.noise)
+        return self._of_rings(element)((element,))
 
     def transfer(self, element: Element) -> Tensor:
         """H (D, W, n, n)."""
         if isinstance(element.profile, Pixels):
             return transfer(kernels_of((element,), self.world), self.S.shape[-1])
-        found = scene((element,), self.world)
+        return self._of_rings(element).transfer((element,))
+
+    def _of_rings(self, element: Element) -> ClosedForm:
         # The sums of rings depend on their heights no more than the plan should: one for all.
-        self._plan = self._plan or plan(scene((whole(element),), self.world))
-        kernels = psf(found, plan=self._plan, memo=self._memo)
-        return transfer(kernels, self.S.shape[-1])
+        self._expected = self._expected or ClosedForm((whole(element),), self.world, self.S)
+        return self._expected
 
     @torch.no_grad()
     def closed(self, element: Element) -> float:

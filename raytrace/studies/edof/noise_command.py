@@ -1,0 +1,42 @@
+"""`raytrace wave noise`: its words and options. Imports no torch before it runs."""
+
+import argparse
+import dataclasses
+
+from raytrace.cli.options import json, output_folder
+from raytrace.studies import options as rows
+from raytrace.studies.edof.command import PICTURES
+from raytrace.studies.options import add_options, documents, option, pictures
+
+SUMMARY = "elements of extended depth of field over noise"
+DESCRIPTION = """\
+PSNR of restored pictures over 0.5 m to infinity for baselines and learned elements at several noises: elements are
+learned, filters made and strengths chosen anew for each. Learned elements from several random starts, of which the one
+of least expected error is kept; gains over the Fresnel lens with their 95 % intervals over pictures drawn with
+replacement. What is learned is kept in FOLDER: the same command goes on where it was stopped."""
+EXAMPLES = """examples:
+  raytrace wave noise --noise 0.01 --starts 1 --rows fresnel learned -o noise
+  raytrace wave noise --data pictures --limit 400 -o noise --docs docs"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings(rows.Settings):
+    """seed: of dead leaves, of how pictures are split and drawn."""
+
+    noise: tuple[float, ...] = option(
+        (0.001, 0.002, 0.005, 0.01, 0.02), "standard deviations (default 0.001 0.002 0.005 0.01 0.02)", "S"
+    )
+    starts: int = option(5, "random starts of every learned element")
+    steps: int = option(150, "of learning")
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--rows", metavar="ROW", nargs="+", help="only these of `wave table` (default: all but --also)")
+    add_options(parser, Settings)
+    pictures(parser, PICTURES, "seed", settings=Settings, limit=80)
+    output_folder(parser, "folder of learned elements", required=True)
+    documents(parser, "wave_noise.md and wave/")
+    json(parser)
+
+
+run = "studies.edof.noise_report.noise"
