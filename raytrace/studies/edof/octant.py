@@ -1,23 +1,25 @@
 """The closed-form error of round elements, from their light along one radius: no pixel is ever written.
 
-    H_f = Σ_k Q_fk I(ρ_k)       I: light per mm² at the radii of `radial`; Q: to its pixels, and their transform
+    H_f = Σ_k Q_fk I(ρ_k),   I = |L U|²       I: light per mm² at the radii of `radial`; Q: to its pixels, and their
+                                             transform; L: of U, of half the frequencies, from half as many radii
 
 Round light in a centred window has the symmetry of the square, so that f runs over an octant: an eighth of the
-frequencies holds all, and a step of learning costs a fourth of one by way of the kernels.
+frequencies holds all.
 """
 
 import functools
+import math
 
 import torch
 from torch import Tensor
 
 from raytrace.camera.deconvolve import blind_density
 from raytrace.camera.image import transfer_functions
-from raytrace.kernels.radial import radii_of_waves, unfold
+from raytrace.kernels.radial import radii_of_waves, reach, unfold
 from raytrace.maths.grid import grid
 from raytrace.wave import radial
 from raytrace.wave.plan import Plan
-from raytrace.wave.scene import WaveScene
+from raytrace.wave.scene import WaveScene, spheres
 
 _CHUNK = 32  # radii whose pixels are held at once
 
@@ -25,20 +27,29 @@ _CHUNK = 32  # radii whose pixels are held at once
 class Octant:
     """What the heights of round elements do not change, for pictures of size × size pixels.
 
-    scene, plan: one of the radial engine, whose elements may have other heights later, steps at the same radii.
+    scene, plan: one of the radial engine, whose elements may have other heights later, steps at the same radii. dtype:
+    of all sums; phases are of the scene's own.
     """
 
-    def __init__(self, scene: WaveScene, plan: Plan, size: int):
-        order = radial.order_of(scene, plan.nodes)
-        self._sums = radial.prepare(scene, plan.samples, order)
-        pitch, cutoff = float(scene.grid.pitch), radial.cutoff(scene)
-        self._to_octant = _to_octant(scene.grid.rows, pitch, cutoff, order, size)
+    def __init__(self, scene: WaveScene, plan: Plan, size: int, *, dtype: torch.dtype = torch.float64):
+        order, cutoff = radial.order_of(scene, plan.nodes), radial.cutoff(scene)
+        half, _ = radii_of_waves(scene.grid, 0.5 * cutoff, order)
+        self._r, bessel = radial.to_radii(scene, half, plan.samples)
+        self._sphere, self._bessel = spheres(scene, self._r * self._r), bessel.to(dtype)
+        rows, pitch = scene.grid.rows, float(scene.grid.pitch)
+        self._between = _between(radii_of_waves(scene.grid, cutoff, order)[0] / (pitch * reach(scene.grid)), len(half))
+        self._between = self._between.to(dtype)
+        self._to_octant = _to_octant(rows, pitch, cutoff, order, size).to(dtype)
         self._rows, self._columns = _octant(size)
         self._weight = _weight(size)
 
     def transfer(self, scene: WaveScene) -> Tensor:
         """H (D, W, F), real, of the frequencies of the octant; light that misses the window is haze, at the first."""
-        found = radial.intensity(scene, self._sums) @ self._to_octant.T
+        rays = torch.view_as_real(radial.phasors(scene, self._r, self._sphere)).permute(1, 2, 0, 3)  # (W, J, D, 2)
+        field = self._between @ (self._bessel @ rays.flatten(2).to(self._bessel.dtype))
+        light = field.unflatten(-1, (-1, 2)).square().sum(-1).permute(2, 0, 1)
+        found = light.flatten(0, 1) @ self._to_octant.T
+        found = found.unflatten(0, light.shape[:2]).to(self._r.dtype)
         return torch.cat([torch.ones_like(found[..., :1]), found[..., 1:]], -1)
 
     def error(self, scene: WaveScene, spectrum: Tensor, noise: float) -> Tensor:
@@ -47,6 +58,14 @@ class Octant:
         both = torch.stack([spectrum[self._rows, self._columns], spectrum[self._columns, self._rows]])
         density = blind_density(self.transfer(scene)[:, :, None], both, noise)
         return (self._weight * density).sum((-2, -1)).mean()
+
+
+def _between(places: Tensor, count: int) -> Tensor:
+    """(P, K) from values of an even function at K Chebyshev points of [0, 1] to those at places (P,)."""
+    points = torch.cos((2 * torch.arange(count, dtype=places.dtype) + 1) * (math.pi / (4 * count)))
+    order = 2 * torch.arange(count, dtype=places.dtype)
+    series = torch.where(order == 0, 1.0, 2.0)[:, None] / count * torch.cos(order[:, None] * torch.arccos(points))
+    return torch.cos(order * torch.arccos(places)[:, None]) @ series
 
 
 @functools.lru_cache(maxsize=4)

@@ -28,7 +28,7 @@ from raytrace.studies.edof.settings import Settings
 from raytrace.studies.edof.world import ClosedForm, World, best_of_starts, mirrored, restored, scene, transfer
 from raytrace.studies.pictures import Pictures, crop, draws
 from raytrace.wave.designs import aim, converging
-from raytrace.wave.element import Element, EvenPowers, Zernike, as_rings, wrapped
+from raytrace.wave.element import Element, EvenPowers, Rings, Zernike, as_rings, wrapped
 from raytrace.wave.psf import psf
 
 _NETWORK = RedNetShape(6, 16)  # behind the blind filter, the same for every colour
@@ -60,7 +60,9 @@ class EdofCamera(nn.Module):
             like = variables.change
             self.v = nn.Parameter(like.new_tensor(0.1))
             self.t = nn.Parameter(like.new_tensor(math.sqrt(1e-3 * world.design)))
-        self.expected = ClosedForm(variables(), world, spectrum)
+        # Rings are learned in single precision: their sums take most of the time, and Adam needs no more.
+        dtype = torch.float32 if isinstance(variables.element.profile, Rings) else torch.float64
+        self.expected = ClosedForm(variables(), world, spectrum, dtype=dtype)
 
     def transfer(self, *, draw: torch.Generator | None = None) -> Tensor:
         """H (D, W, n, n) of the world's depths, of an element as it may come out of fabrication."""

@@ -123,13 +123,14 @@ def expected_error(H: Tensor, S: Tensor, noise: float) -> Tensor:
 class ClosedForm:
     """`expected_error` of elements in one world, for pictures of spectrum S (n, n); differentiable. What their heights
     do not change is kept: first, the elements that the sampling is planned for, have their steps where others will.
+    dtype: of the sums over a radius.
     """
 
-    def __init__(self, first: Sequence[Element], world: World, S: Tensor):
+    def __init__(self, first: Sequence[Element], world: World, S: Tensor, *, dtype: torch.dtype = torch.float64):
         self.world, self.S, self._memo = world, S, Memo()
         own = scene(first, world)
         self.plan = plan(own)
-        self._octant = Octant(own, self.plan, S.shape[-1]) if fits(own, self.plan, S) else None
+        self._octant = Octant(own, self.plan, S.shape[-1], dtype=dtype) if fits(own, self.plan, S) else None
 
     def __call__(self, elements: Sequence[Element]) -> Tensor:
         if self._octant is not None:
