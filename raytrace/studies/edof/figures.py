@@ -16,6 +16,8 @@ from raytrace.wave.element import Element, height
 from raytrace.wave.psf import ElementPsf
 
 _LEARNED = ("learned", "learned-16", "learned-smooth")
+#: Panels of the figure over noise, by filter.
+NOISE_TITLES = {"wiener": "Wiener filter, 1 m", "blind": "depth-invariant filter"}
 _MARGIN = 1e-5  # of the brightest pixel, what is black
 
 
@@ -61,6 +63,34 @@ def gain_figure(found: Mapping[str, Mapping[str, Quality]]) -> Figure:
     axes.axvline(0, color=GREY, lw=0.8)
     axes.set(xlabel="mean PSNR over that of the Fresnel lens (dB)")
     figure.legend(loc="outside upper center", ncols=2, fontsize=7.5)
+    return figure
+
+
+@styled
+def noise_figure(found) -> Figure:
+    """Gain over the Fresnel lens over noise, a panel for each filter, intervals as bands; found: an `OverNoise`."""
+    content = "pictures" if "pictures" in found.pictures else next(iter(found.pictures))
+    figure = new_figure(9.2, 3.9)
+    axes = figure.subplots(1, len(NOISE_TITLES), sharey=True)
+    for panel, (filter, title) in zip(axes, NOISE_TITLES.items(), strict=True):
+        rows = {row: own for row, own in found.of(content, filter).items() if row != "fresnel"}
+        for row, own in rows.items():
+            noises = sorted(own)
+            gains = [own[noise].gain for noise in noises]
+            look = _look(row, list(rows))
+            panel.plot(noises, [one.value for one in gains], label=ROWS[row].title, **look)
+            low, high = ([getattr(one, end) for one in gains] for end in ("low", "high"))
+            panel.fill_between(noises, low, high, color=look["color"], alpha=0.13, lw=0)
+        published = ROWS["learned"].published - ROWS["fresnel"].published
+        panel.axhline(published, color=INK, lw=0.8, ls=(0, (1, 2)))
+        panel.annotate("Sitzmann 2018", (1, published), (-2, 2), xycoords=("axes fraction", "data"),
+                       textcoords="offset points", ha="right", fontsize=7)  # fmt: skip
+        panel.set(xscale="log", xlabel="noise, standard deviation", title=f"{content}, {title}")
+        panel.set_xticks(noises, [f"{noise:g}" for noise in noises])
+        panel.minorticks_off()
+    axes[0].set_ylabel("PSNR over that of the Fresnel lens (dB)")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right center", fontsize=7.5)
     return figure
 
 

@@ -15,7 +15,7 @@ learned, filters made and strengths chosen anew for each. Learned elements from 
 of least expected error is kept; gains over the Fresnel lens with their 95 % intervals over pictures drawn with
 replacement. What is learned is kept in FOLDER: the same command goes on where it was stopped."""
 EXAMPLES = """examples:
-  raytrace wave noise --noise 0.01 --starts 1 --rows fresnel learned -o noise
+  raytrace wave noise --noises 0.01 --starts 1 --rows fresnel learned -o noise
   raytrace wave noise --data pictures --limit 400 -o noise --docs docs"""
 
 
@@ -24,7 +24,10 @@ class Settings(rows.Settings):
     """seed: of dead leaves, of how pictures are split and drawn."""
 
     noise: tuple[float, ...] = option(
-        (0.001, 0.002, 0.005, 0.01, 0.02), "standard deviations (default 0.001 0.002 0.005 0.01 0.02)", "S"
+        (0.001, 0.002, 0.005, 0.01, 0.02),
+        "standard deviations (default 0.001 0.002 0.005 0.01 0.02)",
+        "S",
+        name="noises",
     )
     starts: int = option(5, "random starts of every learned element")
     steps: int = option(150, "of learning")

@@ -119,7 +119,7 @@ def noise(arguments: argparse.Namespace) -> OverNoise:
     kept = Kept(root / "judged", banks)
     fixed = _judge_baselines(rows, settings, banks, kept)
     learned = {unit: _judge_learned(unit, settings, train, root, kept) for unit in progress(todo, "learned element")}
-    found = OverNoise(list(_scores(fixed, learned, banks, settings)), {one.name: len(one.powers) for one in banks})
+    found = OverNoise(list(scores(fixed, learned, banks, settings)), {one.name: len(one.powers) for one in banks})
     if arguments.docs:
         _publish(found, settings, arguments)
     return found
@@ -201,12 +201,14 @@ def _judge_learned(
         return float(camera.expected(elements)), found
 
 
-def _scores(
+def scores(
     fixed: Mapping[tuple[str, float], dict[str, Errors]],
     learned: Mapping[Unit, tuple[float, dict[str, Errors]]],
     banks: Sequence[Bank],
     settings: Settings,
 ) -> Iterator[Score]:
+    """Of every bank, filter, row and noise, from errors by content of baselines, by row and noise, and of learned
+    elements beside what each is expected to leave."""
     by: dict[tuple[str, float], list] = {}
     for unit, own in learned.items():
         by.setdefault((unit.row, unit.noise), []).append(own)

@@ -1,0 +1,189 @@
+"""Extended depth of field over noise: the octant beside the kernels, errors picture by picture, their intervals."""
+
+import dataclasses
+import json
+import math
+
+import pytest
+import torch
+
+from raytrace.camera.deconvolve import blind_density, blind_error, errors, psnr
+from raytrace.camera.training import OtherSettings
+from raytrace.cli import main
+from raytrace.studies.edof import report
+from raytrace.studies.edof.noise import (
+    Bank,
+    Unit,
+    best_strengths,
+    cases,
+    drawn,
+    errors_of,
+    gain,
+    mean_psnr,
+    units,
+)
+from raytrace.studies.edof.noise_command import Settings
+from raytrace.studies.edof.noise_report import Kept, scores
+from raytrace.studies.edof.octant import Octant, fits
+from raytrace.studies.edof.world import ClosedForm, World, expected_error, periodic, quality, scene, spectrum, transfer
+from raytrace.studies.pictures import dead_leaves
+from raytrace.wave.designs import aim, baseline
+from raytrace.wave.plan import plan
+from raytrace.wave.psf import psf
+
+SMALL = World(depths=(500.0, 1000.0, math.inf), wavelengths=(0.5, 0.6), size=63, pixel=0.00738)
+PICTURES = periodic(dead_leaves(8, size=64, seed=5, smallest=2.5), 128)
+S = spectrum(PICTURES)
+
+
+@pytest.mark.parametrize("name", ["singlet", "fresnel", "hybrid"])
+def test_an_octant_is_the_closed_form_of_the_kernels(name):
+    """Error and its gradient to 1e-7, rings, wraps and smooth lenses; single precision to 1e-5."""
+    elements = baseline(name, aim())
+    free = elements[0].numbers.detach().clone().requires_grad_()
+    elements = (elements[0].with_numbers(free), *elements[1:])
+    H = transfer(psf(scene(elements, SMALL)), 128)
+    expected = expected_error(H, S, SMALL.noise)
+    slope = torch.autograd.grad(expected, free)[0]
+    for dtype, tolerance in ((torch.float64, 1e-7), (torch.float32, 1e-5)):
+        found = ClosedForm(elements, SMALL, S, dtype=dtype)(elements)
+        torch.testing.assert_close(found, expected, rtol=tolerance, atol=0)
+        own = torch.autograd.grad(found, free)[0]
+        assert float((own - slope).norm()) < 100 * tolerance * float(slope.norm())
+
+
+def test_frequencies_of_the_octant_are_those_of_the_kernels():
+    own = scene(baseline("fresnel", aim()), SMALL)
+    how = plan(own)
+    found = Octant(own, how, 128).transfer(own)
+    H = transfer(psf(own, plan=how), 128).real
+    a, b = torch.triu_indices(65, 65)
+    torch.testing.assert_close(found, H[..., a, b], rtol=0, atol=1e-7)
+
+
+def test_pictures_that_are_not_their_mirror_images_have_no_octant():
+    own = scene(baseline("fresnel", aim()), SMALL)
+    how = plan(own)
+    assert fits(own, how, S)
+    lopsided = S.clone()
+    lopsided[3, 5] *= 2
+    assert not fits(own, how, lopsided)
+    even = scene(baseline("fresnel", aim()), dataclasses.replace(SMALL, size=64))
+    assert not fits(even, plan(even), S)
+
+
+def test_density_adds_up_to_the_error():
+    H = transfer(psf(scene(baseline("singlet", aim()), SMALL)), 128)
+    torch.testing.assert_close(blind_density(H, S, 0.01).mean((-2, -1)), blind_error(H, S, 0.01))
+
+
+def test_errors_of_pictures_add_up_to_those_of_their_spectrum():
+    """Their mean is the closed form of the mean spectrum, and restored pictures have them, noise drawn."""
+    bank = Bank.of("leaves", PICTURES[:5], PICTURES[5:])
+    elements = baseline("singlet", aim())
+    H = transfer(psf(scene(elements, SMALL)), 128)
+    found = errors_of(H, SMALL, bank)
+    blind = errors(H, spectrum(PICTURES[5:]), SMALL.noise, filter=_filter(H, bank))
+    torch.testing.assert_close(found["blind"].mean(0), blind, rtol=1e-9, atol=0)
+    drawn_once = quality(elements, SMALL, train=PICTURES[:5], test=PICTURES[5:])
+    for name in ("wiener", "blind"):
+        assert float(mean_psnr(found[name])) == pytest.approx(drawn_once.mean[name], abs=0.03)
+
+
+def _filter(H, bank):
+    from_spectrum = bank.spectrum
+    G = from_spectrum * H.mean(0).conj() / (from_spectrum * H.abs().square().mean(0) + SMALL.noise**2)
+    return G
+
+
+def test_intervals_hold_the_mean_of_many_pictures():
+    """Errors of known law: the interval of 95 % is that of Gauss for a mean of 100 logarithms, to a tenth."""
+    generator = torch.Generator().manual_seed(0)
+    base = torch.ones(100, 1, 1, dtype=torch.float64)
+    own = base * (1 + 0.05 * torch.randn(100, 1, 1, generator=generator, dtype=torch.float64))
+    found = gain(own, base, drawn(100))
+    half = 1.96 * 10 / math.log(10) * float(own.std()) / 10 / float(own.mean())
+    assert (found.high - found.low) / 2 == pytest.approx(half, rel=0.1)
+    assert found.low < found.value < found.high
+    assert found.value == pytest.approx(float(-psnr(base.mean()) + psnr(own.mean())))
+    same = gain(base, base, drawn(100))
+    assert (same.value, same.low, same.high) == (0, 0, 0)
+
+
+def test_every_noise_and_row_once_before_any_a_second_time():
+    found = list(units(["fresnel", "learned", "learned-16"], [0.01, 0.02], 2))
+    assert len(found) == 8
+    assert {unit.start for unit in found[:4]} == {0}
+    settings = Unit("learned", 0.02, 3).settings(17)
+    assert (settings.seed, settings.starts, settings.steps, settings.noise) == (3, 1, 17, (0.02, 0.02))
+    assert Unit("learned-smooth", 0.02, 3).settings(300).steps == 60
+
+
+def test_cubic_plates_have_the_strength_of_their_noise():
+    strengths = {0.001: 20.0, 0.01: 10.0, 0.02: 10.0}
+    found = [(row, noises) for row, _, noises in cases(["fresnel", "cubic-refractive"], list(strengths), strengths)]
+    assert found == [
+        ("fresnel", [0.001, 0.01, 0.02]),
+        ("cubic-refractive", [0.01, 0.02]),
+        ("cubic-refractive", [0.001]),
+    ]
+
+
+def test_the_start_of_least_expected_error_is_kept(tmp_path):
+    """Whatever the restored pictures say; errors are computed once for these pictures, and refused for others."""
+    bank = Bank.of("leaves", PICTURES[:5], PICTURES[5:])
+    kept, made = Kept(tmp_path, [bank]), []
+    names = {"fresnel": 0.0, "singlet": 0.2, "cubic-refractive": 0.1}
+
+    def errors_by(name):
+        def H():
+            made.append(name)
+            return transfer(psf(scene(baseline(name, aim()), SMALL)), 128)
+
+        return kept.find(name, SMALL, H)
+
+    found = [{name: errors_by(name) for name in names} for _ in range(2)][-1]
+    assert made == list(names)
+    learned = {
+        Unit("learned", 0.01, i): (names[name], found[name]) for i, name in enumerate(("singlet", "cubic-refractive"))
+    }
+    rows = {
+        (one.filter, one.row): one
+        for one in scores({("fresnel", 0.01): found["fresnel"]}, learned, [bank], Settings(noise=(0.01,)))
+    }
+    for filter in ("wiener", "blind"):
+        own, base = rows[filter, "learned"], rows[filter, "fresnel"]
+        assert own.psnr == pytest.approx(float(mean_psnr(found["cubic-refractive"]["leaves"][filter])))
+        assert own.gain.value == own.starts[0] == pytest.approx(own.psnr - base.psnr)
+        assert own.gain.low < own.gain.value < own.gain.high
+        assert len(own.starts) == 2
+    with pytest.raises(OtherSettings):
+        Kept(tmp_path, [Bank.of("leaves", PICTURES[:4], PICTURES[4:])])
+
+
+@pytest.mark.slow
+def test_strengths_fall_with_the_noise():
+    found = best_strengths([0.001, 0.02], spectrum(periodic(dead_leaves(4, size=128, smallest=2.5), 256)))
+    assert found[0.001] >= found[0.02]
+
+
+@pytest.mark.slow
+def test_the_command_learns_judges_and_goes_on(capsys, monkeypatch, tmp_path):
+    """One row, one noise, two starts; the second time everything is kept, and the figures are the same."""
+    monkeypatch.setattr(report, "_LEAVES", 4)
+    words = ["wave", "noise", "--rows", "learned-smooth", "--noises", "0.01", "--starts", "2", "--steps", "1"]
+    words += ["-o", str(tmp_path / "run"), "--docs", str(tmp_path / "docs"), "--json"]
+    assert main(words) == 0
+    first = json.loads(capsys.readouterr().out)
+    rows = {(row["content"], row["filter"], row["row"]): row for row in first["rows"]}
+    base, own = (rows["sharp leaves", "blind", name] for name in ("fresnel", "learned-smooth"))
+    assert base["gain"] == base["low"] == base["high"] == 0
+    assert own["starts"] == 2
+    assert own["low"] <= own["gain"] <= own["high"]
+    assert own["gain"] > 4
+    page = (tmp_path / "docs/wave_noise.md").read_text()
+    wiener = rows["sharp leaves", "wiener", "learned-smooth"]
+    assert f"{wiener['gain']:+.2f} ({wiener['low']:+.2f} … {wiener['high']:+.2f})" in page
+    assert (tmp_path / "docs/wave/noise.png").stat().st_size > 10_000
+    assert main(words) == 0
+    assert json.loads(capsys.readouterr().out) == first
