@@ -13,6 +13,7 @@ PLACES = {
     "noise": "edof.noise_command",
     "superres": "superres.command",
     "quantise": "quantise.command",
+    "etch": "quantise.process_command",
 }
 
 

@@ -35,6 +35,7 @@ from raytrace.studies.edof.noise import (
 from raytrace.studies.edof.noise_command import Settings
 from raytrace.studies.edof.report import contents_of, learn
 from raytrace.studies.edof.table import ROWS
+from raytrace.studies.edof.training import EdofCamera
 from raytrace.studies.edof.world import World, kernels, transfer
 from raytrace.studies.pictures import Pictures
 from raytrace.studies.publish import publish
@@ -113,12 +114,12 @@ def noise(arguments: argparse.Namespace) -> OverNoise:
     contents, train = contents_of(arguments)
     todo = list(units(rows, settings.noise, settings.starts))
     for unit in todo:
-        _learn(unit, settings, train, root)
+        learn_unit(unit, settings, train, root)
     banks = [Bank.of(content.name, content.train, content.test) for content in contents]
     del contents
     kept = Kept(root / "judged", banks)
-    fixed = _judge_baselines(rows, settings, banks, kept)
-    learned = {unit: _judge_learned(unit, settings, train, root, kept) for unit in progress(todo, "learned element")}
+    fixed = judge_baselines(rows, settings, banks, kept)
+    learned = {unit: judge_learned(unit, settings, train, root, kept) for unit in progress(todo, "learned element")}
     found = OverNoise(list(scores(fixed, learned, banks, settings)), {one.name: len(one.powers) for one in banks})
     if arguments.docs:
         _publish(found, settings, arguments)
@@ -134,7 +135,8 @@ def _rows(asked: Sequence[str] | None) -> list[str]:
     return [name for name in ROWS if name in wanted]
 
 
-def _learn(unit: Unit, settings: Settings, train: Pictures, root: Path):
+def learn_unit(unit: Unit, settings: Settings, train: Pictures, root: Path) -> EdofCamera:
+    """The camera of a unit, learned as far as is left."""
     label = f"{ROWS[unit.row].title}, noise {unit.noise:g}, start {unit.start}"
     return learn(unit.settings(settings.steps), unit.world(), train, unit.folder(root), label)
 
@@ -164,7 +166,7 @@ class Kept:
             }
 
 
-def _judge_baselines(
+def judge_baselines(
     rows: Sequence[str], settings: Settings, banks: Sequence[Bank], kept: Kept
 ) -> dict[tuple[str, float], dict[str, Errors]]:
     """Errors by row and noise."""
@@ -185,13 +187,13 @@ def _judge_baselines(
     return found
 
 
-def _judge_learned(
+def judge_learned(
     unit: Unit, settings: Settings, train: Pictures, root: Path, kept: Kept
 ) -> tuple[float, dict[str, Errors]]:
     """Its expected error, that of learning, and errors of pictures."""
     size = kept.banks[0].spectrum.shape[-1]
     with torch.no_grad():
-        camera = _learn(unit, settings, train, root)
+        camera = learn_unit(unit, settings, train, root)
         elements = detached(camera.variables())
 
         def H() -> Tensor:

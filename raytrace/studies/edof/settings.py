@@ -7,7 +7,7 @@ from raytrace.studies import options
 from raytrace.studies.options import option
 
 
-def _nanometres(text: str) -> float:
+def nanometres(text: str) -> float:
     return 1e-6 * positive_finite(text)
 
 
@@ -45,5 +45,5 @@ class Settings(options.Settings):
     batch: int = 4
     noise: tuple[float, float] = (0.01, 0.01)
     tolerance: float = option(
-        0.0, "heights of rings err by up to NM nm, drawn anew at every step (default 0)", "NM", type=_nanometres
+        0.0, "heights of rings err by up to NM nm, drawn anew at every step (default 0)", "NM", type=nanometres
     )

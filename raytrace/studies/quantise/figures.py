@@ -81,3 +81,26 @@ def _tolerance(ax: Axes, rows: Sequence[Tolerance]) -> None:
     ax.axhline(0, color=FAINT, linewidth=0.7, zorder=0)
     ax.set(title="errors of height, uniform ±", xlabel="tolerance (nm)", ylabel="change of expected PSNR (dB)")
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), fontsize=6.5)
+
+
+@styled
+def etch_figure(found) -> Figure:
+    """Gain over the Fresnel lens of every process on pictures, behind both filters; found: an `Etching`."""
+    content = "pictures" if "pictures" in found.pictures else next(iter(found.pictures))
+    noise = found.rows[0].noise
+    figure = new_figure(7.6, 3.8)
+    axes = figure.subplots()
+    for number, (filter, label) in enumerate((("wiener", "Wiener, 1 m"), ("blind", "depth-invariant"))):
+        rows = [one for one in found.rows if (one.content, one.filter, one.noise) == (content, filter, noise)]
+        place = np.arange(len(rows))[::-1] + 0.12 * (1 - 2 * number)
+        gains = [one.gains["fresnel"] for one in rows]
+        values = np.array([one.value for one in gains])
+        beside = np.abs(np.array([(one.value - one.low, one.high - one.value) for one in gains]).T)
+        axes.errorbar(values, place, xerr=beside, fmt="os"[number], ms=5, lw=1.2, capsize=2,
+                      color=FIELD_COLOURS[number], label=f"{label} filter")  # fmt: skip
+        hybrid = rows[0].gains["fresnel"].value - rows[0].gains["hybrid"].value
+        axes.axvline(hybrid, color=FIELD_COLOURS[number], lw=0.9, ls=(0, (2, 2)))
+    axes.set_yticks(np.arange(len(rows))[::-1], [one.title for one in rows])
+    axes.set(xlabel=f"PSNR over that of the Fresnel lens (dB), {content}, noise {noise:g}; dashed: the hybrid achromat")
+    axes.legend(loc="best")
+    return figure

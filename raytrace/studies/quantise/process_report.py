@@ -1,0 +1,230 @@
+"""What `raytrace wave etch` finds: as text, as a document, as a page."""
+
+import argparse
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import torch
+
+from raytrace.camera.deconvolve import psnr
+from raytrace.camera.training import Run
+from raytrace.cli.progress import progress
+from raytrace.files import table
+from raytrace.maths.result import Result
+from raytrace.maths.value import detached
+from raytrace.pages import grid, picture
+from raytrace.studies.edof.noise import FILTERS, Bank, Errors, Interval, drawn, gain, mean_psnr
+from raytrace.studies.edof.noise_command import Settings as Noise
+from raytrace.studies.edof.noise_report import TITLES, Kept, judge_baselines, judge_learned, learn_unit
+from raytrace.studies.edof.report import contents_of
+from raytrace.studies.edof.world import ClosedForm, World, kernels, periodic, spectrum, transfer
+from raytrace.studies.pictures import Pictures
+from raytrace.studies.publish import publish
+from raytrace.studies.quantise.process import Case, cases, etch_rings, under_errors
+from raytrace.studies.quantise.process_command import Settings
+from raytrace.wave.designs import aim, baseline
+from raytrace.wave.element import Element
+from raytrace.wave.element_file import read_element, write_element
+from raytrace.wave.etching import Process, relief
+
+BASES = {"fresnel": "Fresnel lens", "hybrid": "hybrid achromat"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Etched:
+    """An element behind one filter on one content: PSNR in dB, its gains over the baselines by name.
+
+    levels, waves: of its process, 0 of its model in whole heights; relief: mm; starts: gains of all starts over the
+    Fresnel lens, that of least expected error first; lost: dB of its expected error by errors of height, mean of draws.
+    """
+
+    content: str
+    filter: str
+    noise: float
+    waves: int
+    levels: int
+    relief: float
+    psnr: float
+    gains: dict[str, Interval]
+    starts: tuple[float, ...]
+    lost: float
+
+    def record(self) -> dict:
+        own = {name: getattr(self, name) for name in ("content", "filter", "noise", "waves", "levels", "psnr", "lost")}
+        for base, one in self.gains.items():
+            own |= {f"over_{base}": one.value, f"over_{base}_low": one.low, f"over_{base}_high": one.high}
+        return own | {"least_start": min(self.starts), "greatest_start": max(self.starts), "starts": len(self.starts)}
+
+    @property
+    def title(self) -> str:
+        if not self.waves:
+            return "whole heights, the model"
+        return f"{1e3 * self.relief:.2f} µm, {self.levels} levels"
+
+
+@dataclasses.dataclass(frozen=True)
+class Etching(Result):
+    """Every process and its model."""
+
+    rows: list[Etched]
+    pictures: dict[str, int]
+    tolerance: float
+
+    FIGURE = "studies.quantise.figures.etch_figure"
+
+    def document(self) -> dict:
+        return {"pictures": self.pictures, "rows": [row.record() for row in self.rows]}
+
+    def lines(self, content: str, filter: str) -> list[tuple[str, ...]]:
+        chosen = [one for one in self.rows if (one.content, one.filter) == (content, filter)]
+        return [
+            (f"{one.noise:g}", one.title, f"{one.psnr:.2f}", *map(str, one.gains.values()),
+             f"{min(one.starts):+.2f} … {max(one.starts):+.2f}", f"{one.lost:.2f}")
+            for one in chosen
+        ]  # fmt: skip
+
+    def __str__(self) -> str:
+        text = []
+        for content in self.pictures:
+            for filter in FILTERS:
+                text.append(f"{content}, {TITLES[filter]}: PSNR in dB, gains (95 % interval)")
+                text += ["".join(f"{cell:>28}" for cell in line) for line in [_HEADER, *self.lines(content, filter)]]
+        return "\n".join(text)
+
+
+_HEADER = ("noise", "relief, levels", "PSNR", *(f"over the {name}" for name in BASES.values()), "starts", "lost")
+
+
+def etch(arguments: argparse.Namespace) -> Etching:
+    """Learn what is left, judge everything; the page where --docs asks for it."""
+    settings, root = Settings.of(vars(arguments)), Path(arguments.folder)
+    contents, train = contents_of(arguments)
+    todo = list(cases(settings.waves, settings.levels, settings.noise, settings.starts))
+    elements = {case: etched(case, settings, train, root) for case in progress(todo, "process")}
+    banks = [Bank.of(content.name, content.train, content.test) for content in contents]
+    kept = Kept(root / "judged", banks)
+    names = {"noise": settings.noise, "starts": settings.starts, "steps": settings.learn}
+    noise = Noise.of(names | {"seed": settings.seed})
+    fixed = judge_baselines(list(BASES), noise, banks, kept)
+    found = {case: _judged(case, element, settings, train, kept) for case, element in elements.items()}
+    models = {case.model: judge_learned(case.model, noise, train, root, kept) for case in todo}
+    rows = _rows(fixed, models, found, banks, settings)
+    result = Etching(rows, {one.name: len(one.powers) for one in banks}, settings.tolerance)
+    if arguments.docs:
+        _publish(result, settings, arguments)
+    return result
+
+
+def process_of(case: Case, settings: Settings) -> Process:
+    return Process(waves=case.waves, levels=case.levels, tolerance=settings.tolerance)
+
+
+def etched(case: Case, settings: Settings, train: Pictures, root: Path) -> Element:
+    """The element of a case, from its folder, or learned now."""
+    folder = case.folder(root)
+    asked = {name: getattr(settings, name) for name in ("steps", "moves", "tolerance", "learn")}
+    file = Run(folder, asked | dataclasses.asdict(case)).folder / "heights.npy"
+    if not file.exists():
+        noise = Noise.of({"steps": settings.learn})
+        with torch.no_grad():
+            (model,) = detached(learn_unit(case.model, noise, train, root).variables())
+        process, expected = process_of(case, settings), _expected(model, case, train)
+        given = {"steps": settings.steps, "moves": settings.moves, "seed": case.start}
+        found = etch_rings(model, process, expected, **given)
+        write_element(found, file, design_wavelength=process.wavelength)
+    return read_element(file, aperture=2 * World().radius)
+
+
+def _expected(like: Element, case: Case, train: Pictures) -> ClosedForm:
+    world = case.model.world()
+    return ClosedForm((like,), world, spectrum(periodic(train, 256)), dtype=torch.float32)
+
+
+@torch.no_grad()
+def _judged(
+    case: Case, element: Element, settings: Settings, train: Pictures, kept: Kept
+) -> tuple[float, float, dict[str, Errors]]:
+    """Its expected error with errors of height, what those cost in dB, and errors of pictures."""
+    size, world, expected = kept.banks[0].spectrum.shape[-1], case.model.world(), _expected(element, case, train)
+    off = torch.tensor(under_errors(element, expected, settings.tolerance))
+    lost = float(psnr(expected((element,))) - psnr(off).mean())
+
+    def H() -> torch.Tensor:
+        return transfer(kernels((element,), world), size)
+
+    return float(off.mean()), lost, kept.find(f"{case.row}-{case.noise:g}-{case.start}", world, H)
+
+
+def _rows(
+    fixed: Mapping[tuple[str, float], dict[str, Errors]],
+    models: Mapping,
+    found: Mapping[Case, tuple[float, float, dict[str, Errors]]],
+    banks: Sequence[Bank],
+    settings: Settings,
+) -> list[Etched]:
+    several: dict[tuple[float, int, int], list] = {}
+    for unit, (error, errors) in models.items():
+        several.setdefault((unit.noise, 0, 0), []).append((error, 0.0, errors))
+    for case, own in found.items():
+        several.setdefault((case.noise, case.waves, case.levels), []).append(own)
+    depth = _reliefs(settings)
+    rows = []
+    for bank in banks:
+        weights = drawn(len(bank.powers), seed=settings.seed)
+        for filter in FILTERS:
+            for (noise, waves, levels), given in several.items():
+                ordered = sorted(given, key=lambda one: one[0])
+                base = {name: fixed[name, noise][bank.name][filter] for name in BASES}
+                errors = [own[bank.name][filter] for _, _, own in ordered]
+                gains = {name: gain(errors[0], own, weights) for name, own in base.items()}
+                starts = tuple(float(mean_psnr(own) - mean_psnr(base["fresnel"])) for own in errors)
+                about = (bank.name, filter, noise, waves, levels, depth.get((waves, levels), 0.0))
+                rows.append(Etched(*about, float(mean_psnr(errors[0])), gains, starts, ordered[0][1]))
+    return rows
+
+
+def _reliefs(settings: Settings) -> dict[tuple[int, int], float]:
+    """mm by waves and levels."""
+    (lens,) = baseline("fresnel", aim())
+    return {
+        (m, count): float(relief(lens, Process(waves=m, levels=count)))
+        for m in settings.waves
+        for count in settings.levels
+    }
+
+
+# --- the page
+
+
+def _publish(found: Etching, settings: Settings, arguments: argparse.Namespace) -> None:
+    words = [f"--data DIR --limit {arguments.limit}"] if arguments.data else []
+    command = " ".join(["raytrace wave etch", *words, *settings.words(), "-o FOLDER --docs docs"])
+    tables = {"etch.csv": table([row.record() for row in found.rows], floats=lambda number: round(number, 4))}
+    figures = {"etch.png": found.plot()}
+    publish(Path(arguments.docs) / "wave_etch.md", "wave", _parts(found, command), tables=tables, figures=figures)
+
+
+def _parts(found: Etching, command: str) -> list[str]:
+    shown = "pictures" if "pictures" in found.pictures else next(iter(found.pictures))
+    nm = 1e6 * found.tolerance
+    return [
+        "# An element one can make",
+        f"    {command}",
+        "Camera, depths and colours of [wave_edof.md](wave_edof.md), pictures and intervals of "
+        "[wave_noise.md](wave_noise.md). Rings of 2 µm of fused silica, a relief below one or two waves of 550 nm, "
+        f"its levels, heights that err by up to ± {nm:g} nm drawn anew at every step. The start is the depths nearest "
+        "in phase, in all three colours, to rings learned in whole heights; then depths are learned modulo the "
+        "relief, and levels move a few rings at a time. Of several starts that of least expected error, errors of "
+        "height included, is kept. *Lost*: what those errors cost in expected PSNR, mean of ten draws.",
+        picture("wave/etch.png", f"Gain over the Fresnel lens on {shown} by process, with 95 % intervals."),
+        *(
+            part
+            for filter in FILTERS
+            for part in (
+                f"## {shown[0].upper()}{shown[1:]}, {TITLES[filter]}",
+                grid(_HEADER, found.lines(shown, filter)),
+            )
+        ),
+        "All figures: [etch.csv](wave/etch.csv).",
+    ]
