@@ -118,8 +118,11 @@ def test_lengths_of_rules_are_in_mm_and_rows_stay_as_written_and_come_back(unit,
     intent = original.intent
     names = ["curvature", "thickness", "conic", "a4", "a6"]
     assert [(one.surface, one.quantity) for one in intent.variables] == [(1, name) for name in names]
-    assert intent.solves == (Solve(2, "thickness", "pickup", source=1, scale=-1.0, offset=0.5 * mm),)
-    assert intent.kept == (Solve(2, "thickness", "marginal_height", (0.125 * mm, 0.7)),)
+    assert intent.solves == (
+        Solve(2, "thickness", "marginal_height", (0.125 * mm, 0.7)),
+        Solve(2, "thickness", "pickup", source=1, scale=-1.0, offset=0.5 * mm),
+    )
+    assert intent.kept == ()
     assert intent.semi_diameter_margin == (5, 0.25 * mm)
     assert intent.semi_diameters == ()
     assert intent.unit == mm
@@ -210,14 +213,14 @@ def test_rules_that_are_not_followed_are_kept_named_and_come_back(tmp_path):
         "stop": "EDGE 0.5 3\nDIAM 5.5 2 1 0 1\nCURV -0.02 99 1 2 3",
     }
     original, report = read_text(file(**rules))
-    assert [one.kind for one in original.intent.solves] == ["power", "position"]
+    assert [one.kind for one in original.intent.solves] == ["power", "position", "edge_thickness"]
+    assert original.intent.solves[2].numbers == (0.5, 3)
     kinds = [(one.surface, one.quantity, one.kind, one.numbers, one.source) for one in original.intent.kept]
     assert kinds == [
         (1, "PARM 2", "PPAR", (-1, 1, 0), 0),
         (1, "glass", "substitute", (), 0),
         (1, "semi_diameter", "maximum", (), 0),
         (2, "curvature", "code 99", (1, 2, 3), 0),
-        (2, "thickness", "edge_thickness", (0.5, 3), 0),
         (2, "semi_diameter", "pickup", (), 1),
     ]
     for one in original.intent.kept:
@@ -244,7 +247,7 @@ def test_numbers_of_configurations_vary_one_by_one_and_void_the_variable_of_the_
         Vary(1, "thickness", 2, 0),
         Vary(1, "a4", 1, 2),
     )
-    (rule,) = (one for one in original.intent.kept if one.operand is not None)
+    (rule,) = (one for one in original.intent.solves if one.operand is not None)
     assert rule == Solve(2, "curvature", "pickup", (1.0,), 1, 2.0, configuration=2, operand=1)
     found = again(original, tmp_path)
     assert found.intent == original.intent

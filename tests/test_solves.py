@@ -4,13 +4,22 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
+from test_corpus import CORPUS
+from test_merit_bounds import semi_diameters
 
 import raytrace as rt
-from raytrace.maths.dual import Dual, slope_of
-from raytrace.media.glass import refractive_index
+from raytrace.maths.dual import Dual, slope_of, value_of
+from raytrace.media.glass import model_glass, refractive_index
 from raytrace.merit.model import Model
 from raytrace.merit.solves import SOLVES
-from raytrace.system.intent import Solve, Vary
+from raytrace.merit.vary import freedom
+from raytrace.optics.launch import rays_of_field
+from raytrace.optics.trace import trace_lens
+from raytrace.system import configurations
+from raytrace.system.configurations import Place
+from raytrace.system.intent import Intent, Solve, Vary
+from raytrace.system.surface import sag
 
 VARY = Vary(1, "curvature"), Vary(3, "thickness"), Vary(5, "curvature")
 
@@ -20,6 +29,7 @@ RULES = {
     "marginal_angle": Solve(11, "curvature", "marginal_angle", (-0.2,)),
     "f_number": Solve(11, "curvature", "f_number", (2.5,)),
     "marginal_height": Solve(11, "thickness", "marginal_height", (0.5,)),
+    "edge_thickness": Solve(3, "thickness", "edge_thickness", (2.5, 10.0)),
     "power": Solve(10, "curvature", "power", (0.012,)),
     "position": Solve(7, "thickness", "position", (30.0,), source=3),
 }
@@ -64,6 +74,9 @@ def test_what_follows_meets_its_rule(kind):
     elif kind == "power":
         before, behind = (refractive_index(lens.surfaces[k].glass, lens.wavelengths[0]) for k in (9, 10))
         assert float(surface.curvature * (behind - before)) == pytest.approx(0.012, rel=1e-13)
+    elif kind == "edge_thickness":
+        near, far = (float(sag(lens.surfaces[k], torch.tensor(100.0, dtype=torch.float64))) for k in (3, 4))
+        assert float(surface.thickness) + far - near == pytest.approx(2.5, rel=1e-13)
     else:
         assert sum(float(lens.surfaces[k].thickness) for k in range(3, 8)) == pytest.approx(30, rel=1e-14)
 
@@ -110,3 +123,128 @@ def test_a_solve_in_the_object_space_of_a_finite_object():
     focused, x, _ = moment_of((own,), lens=lens)
     distance = float(focused.lens_at(x).surfaces[11].thickness)
     assert distance == pytest.approx(float(rt.first_order(image).paraxial_image_distance), rel=1e-12)
+
+
+# -- by real rays, edges, glasses, configurations ----------------------------------------------------------------------
+
+
+def differenced(model, x, at, configuration=1):
+    """Derivatives of a number, exact and by differences."""
+    view = model.views[configuration - 1]
+    exact = slope_of(view.moment(Dual(x, np.eye(len(x)))).numbers[at], len(x))
+    steps = 1e-5 * np.abs(x)
+    moved = [x + sign * h * one for h, one in zip(steps, np.eye(len(x)), strict=True) for sign in (1, -1)]
+    ends = np.array([value_of(view.moment(one).numbers[at]) for one in moved]).reshape(-1, 2)
+    return exact, (ends[:, 0] - ends[:, 1]) / (2 * steps)
+
+
+@pytest.mark.parametrize("part", [0.7, 1.0])
+def test_a_real_ray_meets_the_image_at_the_height_of_its_solve(part):
+    solve = Solve(11, "thickness", "marginal_height", (0.25, part))
+    model, x, _ = moment_of((solve,))
+    lens = model.lens_at(x)
+    wavelength = lens.wavelengths[lens.primary_wavelength]
+    origin, point = torch.zeros(2, dtype=torch.float64), torch.tensor([0.0, part], dtype=torch.float64)
+    rays = rays_of_field(lens, origin, point, wavelength=wavelength)
+    assert float(trace_lens(lens, rays, wavelength).position[1]) == pytest.approx(0.25, rel=1e-10)
+    exact, differences = differenced(model, x, (11, "thickness"))
+    assert exact == pytest.approx(differences, rel=1e-6, abs=1e-8)
+
+
+@pytest.mark.parametrize("height", [12.0, 0.0])
+def test_an_edge_is_as_thick_as_its_solve_at_a_height_or_where_the_light_ends(height):
+    lens = rt.read_lens("double_gauss")
+    lens = dataclasses.replace(lens, intent=Intent(semi_diameter_margin=(5.0, 0.1)))
+    model = Model(lens, (VARY[0], VARY[2]), (Solve(3, "thickness", "edge_thickness", (2.0, height)),))
+    x = model.start * np.array([1.02, 1.01])
+    here = model.lens_at(x)
+    at = height or semi_diameters(here)[3]
+    near, far = (float(sag(here.surfaces[k], torch.tensor(at * at, dtype=torch.float64))) for k in (3, 4))
+    assert float(here.surfaces[3].thickness) + far - near == pytest.approx(2.0, rel=1e-9)
+    exact, differences = differenced(model, x, (3, "thickness"))
+    assert exact == pytest.approx(differences, rel=1e-5, abs=1e-7)
+
+
+def test_a_real_ray_that_is_lost_has_no_thickness():
+    lens = rt.read_lens("double_gauss").at(f_number=0.5)
+    model = Model(lens, VARY, (Solve(11, "thickness", "marginal_height", (0.0, 1.0)),))
+    found = model.views[0].moment(Dual(model.start, np.eye(3))).numbers[11, "thickness"]
+    assert np.isnan(found.value)
+
+
+def test_a_glass_that_is_picked_up_follows_every_number_of_it():
+    lens = rt.read_lens("double_gauss")
+    glass = model_glass(*(torch.tensor(n, dtype=torch.float64) for n in (1.62, 56.0)))
+    lens = lens.replace(1, glass=glass).at(wavelengths=[0.5876, 0.4861])
+    variables = Vary(1, "index"), Vary(1, "abbe_number")
+    model = Model(lens, variables, (Solve(3, "glass", "pickup", source=1), Solve(9, "glass", "pickup", source=3)))
+    x = np.array([1.65, 50.0])
+    here, view = model.lens_at(x), model.views[0]
+    for k in (3, 9):
+        told = refractive_index(here.surfaces[k].glass, here.wavelengths)
+        assert torch.equal(told, refractive_index(here.surfaces[1].glass, here.wavelengths))
+        assert float(told[1]) != float(refractive_index(lens.surfaces[k].glass, lens.wavelengths)[1])
+    moment = view.moment(Dual(x, np.eye(2)))
+    focal = moment.gaussian(1).effective_focal_length
+    for k, h in enumerate((1e-6, 1e-4)):
+        ends = [view.moment(x + s * h * np.eye(2)[k]).gaussian(1).effective_focal_length for s in (1, -1)]
+        assert slope_of(focal, 2)[k] == pytest.approx((ends[0] - ends[1]) / (2 * h), rel=1e-6)
+    assert float(rt.first_order(here, wavelength=here.wavelengths[1]).effective_focal_length) == pytest.approx(
+        value_of(focal), rel=1e-12
+    )
+
+
+def zoom():
+    """Two configurations, in which the thickness of surface 3, and -½ of it and 9 mm of surface 8, differ."""
+    lens = configurations.made(rt.read_lens("double_gauss"), thickness={3: [4.0, 6.0]}, curvature={1: [0.02, 0.01]})
+    gap, bend = lens.operands
+    gap = dataclasses.replace(gap, places=(*gap.places, Place(("surfaces", 8, "thickness"), -0.5, 9.0)))
+    return dataclasses.replace(lens, operands=(gap, bend), intent=Intent(unit=25.4)).configuration(1)
+
+
+def test_derivatives_reach_through_pickups_of_other_surfaces_and_configurations():
+    lens = zoom()
+    follows = Solve(3, "thickness", "pickup", (0.0,), 1, 2.0, 0.1, configuration=2, operand=0)
+    model = Model(lens, (Vary(3, "thickness", 1, 0), Vary(1, "curvature", 2, 1)), (follows,))
+    x = np.array([5.0, 0.012])
+    first, second = (view.moment(Dual(x, np.eye(2))).numbers for view in model.views)
+    assert (value_of(first[3, "thickness"]), value_of(first[8, "thickness"])) == (5.0, 6.5)
+    assert value_of(second[3, "thickness"]) == pytest.approx(12.54)  # 2 · 5 + 0.1 inches
+    assert value_of(second[8, "thickness"]) == pytest.approx(9 - 6.27)
+    for at in ((3, "thickness"), (8, "thickness")):
+        for configuration in (1, 2):
+            exact, differences = differenced(model, x, at, configuration)
+            assert exact == pytest.approx(differences, rel=1e-8, abs=1e-12)
+    moved = model.lens_at(x)
+    assert moved.operands[0].numbers.tolist() == pytest.approx([5.0, 12.54])
+    assert moved.operands[1].numbers.tolist() == [0.02, 0.012]
+    for number, numbers in ((1, first), (2, second)):
+        here = moved.configuration(number)
+        assert float(here.surfaces[8].thickness) == pytest.approx(value_of(numbers[8, "thickness"]), rel=1e-14)
+
+
+def test_what_an_operand_moves_is_named_once():
+    lens = zoom()
+    found = freedom(lens, "thickness:3,8")
+    assert found.variables == (Vary(3, "thickness", 1, 0), Vary(3, "thickness", 2, 0))
+    follows = Solve(3, "thickness", "pickup", (0.0,), 1, configuration=2, operand=0)
+    lens = dataclasses.replace(lens, intent=Intent(solves=(follows,)))
+    assert [one for one in freedom(lens, "thickness").variables if one.surface == 3] == [Vary(3, "thickness", 1, 0)]
+    assert freedom(lens, "thickness:3").solves == ()
+
+
+@pytest.mark.parametrize(
+    ("path", "kind", "near"),
+    [
+        ("Project_X__Houghton.zmx", "edge_thickness", 1e-11),
+        ("ray-optics__US00583336-2-scaled.zmx", "marginal_height", 1e-11),
+    ],
+)
+def test_thicknesses_that_opticstudio_solved_come_out_again(path, kind, near):
+    """5.0376… mm at an edge in inches, 42.3517… mm by the real ray through 0.7 of the pupil; paraxially 41.6005."""
+    if not (CORPUS / "zmx" / path).exists():
+        pytest.skip("the files stand beside the repository")
+    lens = rt.read_lens(CORPUS / "zmx" / path)
+    (solve,) = (one for one in lens.intent.solves if one.kind == kind)
+    found = Model(lens, (), (solve,)).views[0].moment(np.zeros(0)).numbers[solve.surface, "thickness"]
+    assert value_of(found) == pytest.approx(float(lens.surfaces[solve.surface].thickness), rel=near)

@@ -64,9 +64,14 @@ def read(found: Sections, lens: Lens, millimetres: float, report: Draft) -> Lens
 
 def _is_followed(one: Solve) -> bool:
     kinds = [rule.kind for rule in (*CURVATURE_SOLVES.values(), *THICKNESS_SOLVES.values()) if rule.followed]
-    is_number = one.quantity not in ("glass", "semi_diameter") and one.operand is None
-    by_real_ray = one.kind == "marginal_height" and any(one.numbers[1:])
-    return is_number and one.kind in ("pickup", *kinds) and not by_real_ray
+    if one.operand is not None:
+        return one.kind == "pickup" and bool(one.numbers) and _is_linear(one)
+    return one.quantity != "semi_diameter" and one.kind in ("pickup", *kinds)
+
+
+def _is_linear(one: Solve) -> bool:
+    """Whether a pickup between configurations has a unit that is known, or needs none."""
+    return one.quantity in ("thickness", "curvature", "conic") or (not one.offset and one.quantity.islower())
 
 
 def _says_more(intent: Intent, lens: Lens) -> bool:
@@ -98,6 +103,8 @@ def _with_moving(lens: Lens, told: list[Told], intent: Intent) -> Lens:
     """The lens with every number modelled that may change: variables, and what follows them."""
     moving = {(one.surface, one.quantity) for one in intent.variables if one.operand is None}
     for one in intent.solves:
+        if one.operand is not None or one.quantity == "glass":
+            continue
         of = (one.source, one.quantity_of_source or one.quantity)
         if one.kind != "pickup" or of in moving:
             moving.add((one.surface, one.quantity))

@@ -9,7 +9,8 @@ A surface has its rules beside its numbers, which are the solved ones:
     GLAS name code surface nd Vd ΔPgF v v v    code 2: a pickup, 3: may be exchanged; v 1: of a model glass, variable
     DIAM value code         0: follows the rays, 1: given, 2: a pickup, 3: the largest of all configurations
 
-Read against numbers that OpticStudio stored: CURV 2, 4, 8, 11, MAZH, PZUP, TOLE and EDGE give them back. Codes that are
+Read against numbers that OpticStudio stored: CURV 2, 4, 8, 11, MAZH (paraxial, and by a real ray), PZUP, TOLE and
+EDGE give them back. Codes that are
 not followed are kept with their numbers.
 """
 
@@ -57,7 +58,7 @@ CURVATURE_PICKUP = 4
 THICKNESS_SOLVES = {
     "MAZH": Rule("marginal_height", (1, 0), followed=True),
     "TOLE": Rule("position", (1,), from_surface=True, followed=True),
-    "EDGE": Rule("edge_thickness", (1, 1)),
+    "EDGE": Rule("edge_thickness", (1, 1), followed=True),
 }
 
 #: Rules of a semi-diameter by the code of DIAM.

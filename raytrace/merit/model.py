@@ -30,6 +30,9 @@ Address = tuple[int, str]
 #: Numbers that a surface keeps at 0 as None.
 _AT_ZERO = ("curvature", "conic")
 
+#: Power of length of what a pickup between configurations adds.
+_POWERS = {"thickness": 1, "curvature": -1}
+
 #: Numbers of the medium behind a surface, where it is a model glass or a constant index.
 GLASS = {"index": 0, "abbe_number": 1, "partial_dispersion": 2}
 
@@ -76,8 +79,13 @@ class Model:
             if not 0 <= one.surface < len(self.lens.surfaces):
                 last = len(self.lens.surfaces) - 1
                 raise UnknownNumber(f"{one.quantity} of surface {one.surface}: this lens has surfaces 0 to {last}")
-        if len({(one.surface, one.quantity, one.configuration) for one in self.variables}) < len(self.variables):
+        named = {
+            (one.surface, one.quantity) if one.operand is None else (one.operand, one.configuration, "operand")
+            for one in self.variables
+        }
+        if len(named) < len(self.variables):
             raise UnknownNumber("a variable is named twice")
+        object.__setattr__(self, "lens", _with_picked_glasses(self.lens, self.variables, self.solves))
 
     @cached_property
     def views(self) -> tuple["View", ...]:
@@ -102,15 +110,13 @@ class Model:
         """The lens with its variables there, and with all that follows from them."""
         lens = self.lens
         like = lens.wavelengths
-        for one, number in zip(self.variables, variables, strict=True):
-            if one.operand is not None:
-                operand = lens.operands[one.operand]
-                numbers = operand.numbers.clone()
-                numbers[one.configuration - 1] = float(number)
-                moved = dataclasses.replace(operand, numbers=numbers)
-                lens = dataclasses.replace(
-                    lens, operands=(*lens.operands[: one.operand], moved, *lens.operands[one.operand + 1 :])
-                )
+        operands = list(lens.operands)
+        for configuration in range(1, len(self.lens.configurations) + 1) if operands else ():
+            for k, (variable, scale, offset) in followed(self, configuration).items():
+                numbers = operands[k].numbers.clone()
+                numbers[configuration - 1] = scale * float(variables[variable]) + offset
+                operands[k] = dataclasses.replace(operands[k], numbers=numbers)
+        lens = dataclasses.replace(lens, operands=tuple(operands)) if operands else lens
         current = self.views[lens.current_configuration - 1]
         numbers = current.moment(np.asarray(variables, dtype=float)).numbers
         there = {at: like.new_tensor(float(n), dtype=torch.float64) for at, n in numbers.items()}
@@ -126,19 +132,15 @@ class View:
         lens = model.lens.configuration(configuration) if model.lens.operands else model.lens
         lens = lens if clips else _open(lens)
         overridden = _overridden(lens)
-        self.variables: dict[Address, int] = {}
+        #: By address which variable a number is, by what factor, and what is added.
+        self.variables: dict[Address, tuple[int, float, float]] = _of_operands(model, configuration)
         for number, one in enumerate(model.variables):
-            own = one.operand is None and (one.surface, one.quantity) not in overridden
-            if own or (one.operand is not None and one.configuration == configuration):
-                self.variables[one.surface, one.quantity] = number
-        self.solves = sorted(
-            (
-                one
-                for one in model.solves
-                if (one.surface, one.quantity) not in overridden and not self._is_idle(one, lens)
-            ),
-            key=lambda one: (one.surface, one.quantity == "thickness"),
-        )
+            if one.operand is None and (one.surface, one.quantity) not in overridden:
+                self.variables[one.surface, one.quantity] = number, 1.0, 0.0
+        own = [one for one in model.solves if one.operand is None and (one.surface, one.quantity) not in overridden]
+        own = [one for one in own if one.quantity == "glass" or not self._is_idle(one, lens)]
+        own = _with_glasses(own, self.variables)
+        self.solves = sorted(own, key=lambda one: (one.surface, one.quantity == "thickness"))
         moved = (*self.variables, *((one.surface, one.quantity) for one in self.solves))
         self.moved: tuple[Address, ...] = tuple(dict.fromkeys(moved))
         self.lens = _modelled(lens, self.moved)
@@ -165,6 +167,11 @@ class View:
                 return solved.get((one.source, one.quantity_of_source or one.quantity), -1) >= position
             if one.kind in ("power", "position"):
                 return one.source > one.surface
+            if one.kind == "edge_thickness":
+                shape = [
+                    at for surface, quantity in solved if (at := quantity) != "thickness" and surface > one.surface
+                ]
+                return bool(shape) or not any(one.numbers[1:])
             return one.surface < self.lens.stop or self.lens.aperture.kind in ("image_f_number", "working_f_number")
 
         return any(is_late(*found) for found in enumerate(self.solves))
@@ -276,6 +283,67 @@ class View:
 
     def moment(self, variables) -> Moment:
         return Moment(self, variables)
+
+
+def _of_operands(model: Model, configuration: int) -> dict[Address, tuple[int, float, float]]:
+    """What variables of the operands move in a configuration: their own numbers, those that pick them up, and both of
+    operands that pick up the number of another configuration."""
+    found = {}
+    for operand, (number, scale, offset) in followed(model, configuration).items():
+        for place in model.lens.operands[operand].places:
+            if place.path[0] == "surfaces":
+                surface = model.lens.surfaces[place.path[1]]
+                linear = number, place.factor * scale, place.factor * offset + place.offset
+                found |= {(place.path[1], name): linear for name in names_at(surface, place.path[2:])}
+    return found
+
+
+def followed(model: Model, configuration: int) -> dict[int, tuple[int, float, float]]:
+    """By operand that moves in a configuration: which variable moves it, by what factor, and what is added to it.
+
+    A pickup of another configuration is scale · (number there) + offset, and that may be one, too.
+    """
+    moved = {
+        (one.operand, one.configuration): (number, 1.0, 0.0)
+        for number, one in enumerate(model.variables)
+        if one.operand is not None
+    }
+    pickups = [one for one in model.solves if one.operand is not None and one.kind == "pickup" and one.numbers]
+    for _ in pickups:
+        for one in pickups:
+            source, at = (int(one.numbers[0]), one.source), (one.operand, one.configuration)
+            if source in moved and at not in moved:
+                number, scale, offset = moved[source]
+                added = (
+                    one.offset * model.lens.intent.unit ** _POWERS.get(one.quantity, 0) if model.lens.intent else 0.0
+                )
+                moved[at] = number, one.scale * scale, one.scale * offset + added
+    return {operand: linear for (operand, at), linear in moved.items() if at == configuration}
+
+
+def _with_picked_glasses(lens: Lens, variables: Sequence[Vary], solves: Sequence[Solve]) -> Lens:
+    """The lens whose pickups of glasses that vary have the glass that they pick up."""
+    moved, surfaces = {one.surface for one in variables if one.quantity in GLASS}, list(lens.surfaces)
+    pickups = [one for one in solves if (one.quantity, one.kind) == ("glass", "pickup")]
+    for one in sorted(pickups, key=lambda one: one.surface):
+        if one.source in moved:
+            glass = surfaces[one.source].glass
+            surfaces[one.surface] = dataclasses.replace(surfaces[one.surface], glass=glass)
+            moved.add(one.surface)
+    return dataclasses.replace(lens, surfaces=tuple(surfaces)) if pickups else lens
+
+
+def _with_glasses(solves: Sequence[Solve], variables: dict) -> list[Solve]:
+    """Pickups of glasses as those of the numbers that vary of the glass that is picked up."""
+    moved, found = set(variables), []
+    for one in sorted(solves, key=lambda one: one.surface):
+        if one.quantity != "glass":
+            found.append(one)
+            continue
+        names = [name for name in GLASS if (one.source, name) in moved]
+        moved |= {(one.surface, name) for name in names}
+        found += [Solve(one.surface, name, "pickup", source=one.source) for name in names]
+    return found
 
 
 def unbent(lens: Lens, indices: list) -> list:

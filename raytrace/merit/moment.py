@@ -53,7 +53,10 @@ class Moment:
 
     def __init__(self, view, variables):
         self.view, self.lens, self.variables = view, view.lens, variables
-        self.numbers: dict = {at: variables[number] for at, number in view.variables.items()}
+        self.numbers: dict = {
+            at: variables[number] if (scale, offset) == (1.0, 0.0) else scale * variables[number] + offset
+            for at, (number, scale, offset) in view.variables.items()
+        }
         self._gaussian: dict[int, Gaussian] = {}
         self._kept: dict = {}
         self._solve()

@@ -13,9 +13,7 @@ import numpy as np
 from raytrace.maths.dual import Dual
 from raytrace.merit.bundle import Bundle, Marks
 from raytrace.merit.plan import Now, Planner
-
-#: Through which points of the pupil.
-ENDS = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0))
+from raytrace.merit.solves import ENDS
 
 
 class SemiDiameters:

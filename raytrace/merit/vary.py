@@ -44,6 +44,7 @@ SOLVED_BY = {
     "marginal_angle": ("curvature", 1, 1),
     "f_number": ("curvature", 1, 1),
     "marginal_height": ("thickness", 1, 2),
+    "edge_thickness": ("thickness", 1, 2),
 }
 
 #: Numbers that belong to a medium.
@@ -86,16 +87,16 @@ def freedom(lens: Lens, vary: str | Sequence[str] | None = None) -> Freedom:
     found: dict[str, Vary] = {}
     for word in words:
         if "=" not in word:
-            follow = () if ":" in word or word == "sensor" else _addresses((*told, *own))
-            found |= {name_of(one): one for one in varied(lens, word) if _address(one) not in follow}
+            follow = set() if ":" in word or word == "sensor" else _addresses((*told, *own))
+            found |= {name_of(one): one for one in varied(lens, word) if not _addresses([one]) & follow}
     if not found:
         raise BadVariables(
             f"`vary={joined(vary)}` leaves nothing to vary; expected words like curvature thickness:5,6 conic:3"
         )
     free = _addresses(found.values())
-    for surface, quantity in free & _addresses(told):
+    for surface, quantity, *_ in free & _addresses(told):
         raise BadVariables(f"{quantity}:{surface} is to vary and to follow: leave one out")
-    solves = (*(one for one in own if _address(one) not in free | _addresses(told)), *told)
+    solves = (*(one for one in own if not _addresses([one]) & (free | _addresses(told))), *told)
     _refuse_circles(solves)
     return Freedom(with_modelled(lens, (*found.values(), *told)), tuple(found.values()), solves)
 
@@ -104,8 +105,18 @@ def _address(one: Vary | Solve) -> Address:
     return one.surface, one.quantity
 
 
-def _addresses(several: Iterable[Vary | Solve]) -> set[Address]:
-    return {_address(one) for one in several}
+def _addresses(several: Iterable[Vary | Solve]) -> set[tuple]:
+    """Those of numbers; a glass that follows another with all its numbers, one of the configurations as that alone."""
+    found: set[tuple] = set()
+    for one in several:
+        follows = isinstance(one, Solve)
+        if not (follows and one.operand is not None):
+            found.add(_address(one))
+        if one.operand is not None:
+            found.add((*_address(one), one.configuration))
+        if follows and one.quantity == "glass":
+            found |= {(one.surface, name) for name in GLASS}
+    return found
 
 
 def varied(lens: Lens, word: str) -> tuple[Vary, ...]:
@@ -123,7 +134,7 @@ def varied(lens: Lens, word: str) -> tuple[Vary, ...]:
     found = [one for k in surfaces for quantity in _quantities(lens, kind, k, word) for one in _each(lens, k, quantity)]
     found = [one for one in found if not only or one.configuration in only]
     if found:
-        return tuple(found)
+        return tuple(dict.fromkeys(found))
     if only:
         raise BadVariables(f"{word!r}: no such number differs in {_listed('configuration', only)}; leave @ out")
     raise BadVariables(f"{word!r}: no surface has that yet; name surfaces, as {kind}:3")
@@ -261,7 +272,10 @@ def _each(lens: Lens, k: int, quantity: str) -> list[Vary]:
     for position, operand in enumerate(lens.operands):
         for place in operand.places if operand.numbers is not None else ():
             if place.path[:2] == ("surfaces", k) and quantity in names_at(lens.surfaces[k], place.path[2:]):
-                return [Vary(k, quantity, number, position) for number in range(1, len(operand.numbers) + 1)]
+                own = operand.places[0].path  # which other places of the operand follow
+                first = names_at(lens.surfaces[own[1]], own[2:])[0] if own[0] == "surfaces" else ""
+                at = (own[1], first) if first else (k, quantity)
+                return [Vary(*at, number, position) for number in range(1, len(operand.numbers) + 1)]
     return [Vary(k, quantity)]
 
 
@@ -311,7 +325,7 @@ def _arguments(word: str, solve: str, quantity: str, text: str) -> tuple[float, 
     if quantity != solved or not least <= len(found) <= most:
         expected = f"{least}" if least == most else f"{least} or {most}"
         raise BadVariables(f"{word!r}: {solve} solves for a {solved}, by {expected} number(s)")
-    return (*found, 0.0) if solve == "marginal_height" and len(found) == 1 else found
+    return (*found, 0.0) if most == 2 and len(found) == 1 else found
 
 
 def _refuse_circles(solves: Sequence[Solve]) -> None:

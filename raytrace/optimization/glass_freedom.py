@@ -51,8 +51,12 @@ def _marked(lens: Lens, vary: str | Sequence | None, surfaces: set[int]) -> set[
 
 def followers(lens: Lens) -> dict[int, int]:
     """Surfaces whose glass is that of another, and which one's."""
-    kept = () if lens.intent is None else lens.intent.kept
-    return {one.surface: one.source for one in kept if (one.quantity, one.kind) == ("glass", "pickup")}
+    rules = () if lens.intent is None else (*lens.intent.solves, *lens.intent.kept)
+    return {
+        one.surface: one.source
+        for one in rules
+        if (one.quantity, one.kind) == ("glass", "pickup") and one.operand is None
+    }
 
 
 def _differs(lens: Lens, surface: int) -> bool:

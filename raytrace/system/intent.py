@@ -42,18 +42,20 @@ class Solve:
         the one of the same name.
     "marginal_angle": the curvature behind which the paraxial marginal ray has the slope numbers[0].
     "f_number": the curvature behind which the paraxial marginal ray has the slope of the F-number numbers[0].
-    "marginal_height": the thickness behind which the paraxial marginal ray has the height numbers[0] mm; by the real
-        ray through the part numbers[1] > 0 of the pupil it is only kept.
+    "marginal_height": the thickness behind which the paraxial marginal ray has the height numbers[0] mm, or the real
+        axial ray through the part numbers[1] of the pupil, where that is not 0.
+    "edge_thickness": the thickness by which the space behind is numbers[0] mm thick at the height numbers[1] mm, or at
+        0 at the semi-diameter of the surface before it.
     "position": the thickness by which those from surface `source` to this one have the sum numbers[0] mm; of a `source`
         behind this surface, those from this one up to it.
     "power": the curvature by which the surface has the power numbers[0], in 1/mm.
 
+    "pickup" of a "glass": it is that of surface `source`, whatever varies of it.
+
     All at the primary wavelength, in the order of surfaces. numbers: in mm. Kinds that are only kept (`Intent.kept`):
 
-    "edge_thickness": the thickness by which the space behind is numbers[0] mm thick at the height numbers[1] mm, or at
-        0 at the edge.
-    "pickup" and "substitute" of a "glass", the latter: it may be exchanged; "pickup" and "maximum" of a
-        "semi_diameter", the latter: over the configurations.
+    "substitute" of a "glass": it may be exchanged; "pickup" and "maximum" of a "semi_diameter", the latter: over the
+        configurations.
     others, named as the file has them.
 
     configuration, operand: as for `Vary`. A "pickup" of those follows configuration `source`, there operand numbers[0];
