@@ -28,7 +28,8 @@ from raytrace.studies.edof.settings import Settings
 from raytrace.studies.edof.world import ClosedForm, World, best_of_starts, mirrored, restored, scene, transfer
 from raytrace.studies.pictures import Pictures, crop, draws
 from raytrace.wave.designs import aim, converging
-from raytrace.wave.element import Element, EvenPowers, Rings, Zernike, as_rings, wrapped
+from raytrace.wave.element import Element, EvenPowers, Rings, Zernike, as_rings
+from raytrace.wave.etching import Process, matched
 from raytrace.wave.psf import psf
 
 _NETWORK = RedNetShape(6, 16)  # behind the blind filter, the same for every colour
@@ -91,7 +92,8 @@ class EdofCamera(nn.Module):
 def start(
     settings: Settings, world: World, spectrum: Tensor, *, progress: Callable[[Iterable], Iterable] = iter
 ) -> PhaseVariables:
-    """Where learning begins: a lens for the design depth, or the best smooth element of several random starts."""
+    """Where learning begins: a lens for the design depth, or the best smooth element of several random starts; of rings
+    in steps, those nearest to it in phase."""
     if settings.tolerance and settings.kind != "rings":
         raise ValueError(f"a tolerance of {settings.tolerance:g} mm belongs to rings; {settings.kind!r} has none")
     glass = find_glass(settings.glass)
@@ -116,9 +118,11 @@ def start(
     if settings.kind == "smooth":
         return best
     (element,) = detached(best())
+    element = as_rings(element, settings.pitch)
     if settings.levels:
-        element = wrapped(element, made_for.wavelength, levels=settings.levels)
-    return PhaseVariables(as_rings(element, settings.pitch), tolerance=settings.tolerance)
+        process = Process(levels=settings.levels, wavelength=float(made_for.wavelength))
+        element, _ = matched(element, process, element.radius.new_tensor(world.wavelengths))
+    return PhaseVariables(element, tolerance=settings.tolerance)
 
 
 def _zernike(settings: Settings, lens: Element) -> PhaseVariables:
