@@ -187,3 +187,19 @@ def test_the_command_learns_judges_and_goes_on(capsys, monkeypatch, tmp_path):
     assert (tmp_path / "docs/wave/noise.png").stat().st_size > 10_000
     assert main(words) == 0
     assert json.loads(capsys.readouterr().out) == first
+
+
+@pytest.mark.slow
+def test_a_file_of_heights_is_judged_as_the_element_it_was_written_from(capsys, monkeypatch, tmp_path):
+    """Few leaves, two steps: the same figures by the file and by the run, behind both filters."""
+    monkeypatch.setattr(report, "_LEAVES", 4)
+    words = ["wave", "noise", "--noises", "0.01", "--starts", "1", "--steps", "2", "--json", "--rows"]
+    assert main([*words, "learned", "-o", str(tmp_path / "run"), "--docs", str(tmp_path)]) == 0
+    run = json.loads(capsys.readouterr().out)["rows"]
+    file = tmp_path / "wave/elements/learned-0.01.npy"
+    assert main([*words, "fresnel", "--elements", str(file)]) == 0
+    again = json.loads(capsys.readouterr().out)["rows"]
+    own, other = ([row for row in rows if row["row"].startswith("learned")] for rows in (run, again))
+    assert [row["row"] for row in other] == ["learned-0.01"] * 4
+    for a, b in zip(own, other, strict=True):
+        assert (a["psnr"], a["gain"], a["low"]) == pytest.approx((b["psnr"], b["gain"], b["low"]), abs=1e-6)

@@ -12,6 +12,7 @@ PLACES = {
     "table": "edof.table_command",
     "noise": "edof.noise_command",
     "superres": "superres.command",
+    "discover": "superres.discover_command",
     "quantise": "quantise.command",
     "etch": "quantise.process_command",
 }

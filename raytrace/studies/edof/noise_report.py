@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import hashlib
 import io
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -39,9 +40,18 @@ from raytrace.studies.edof.training import EdofCamera
 from raytrace.studies.edof.world import World, kernels, transfer
 from raytrace.studies.pictures import Pictures
 from raytrace.studies.publish import publish
+from raytrace.wave.element import Element, as_made
+from raytrace.wave.element_file import read_element, write_element
 from raytrace.words import did_you_mean
 
+
+def title_of(row: str) -> str:
+    """Of a row of the table, or of a file."""
+    return ROWS[row].title if row in ROWS else row
+
+
 TITLES = {"wiener": "Wiener filter of the PSF at 1 m", "blind": "best depth-invariant filter"}
+WAVELENGTH = 0.55  # µm: of the design
 _PUBLISHED = ROWS["learned"].published - ROWS["fresnel"].published
 
 
@@ -92,7 +102,7 @@ class OverNoise(Result):
         found = self.of(content, filter)
         noises = sorted({noise for row in found.values() for noise in row})
         lines = [
-            [ROWS[row].title, *(cell(own[noise]) if noise in own else "–" for noise in noises)]
+            [title_of(row), *(cell(own[noise]) if noise in own else "–" for noise in noises)]
             for row, own in found.items()
         ]
         return ["element", *(f"noise {noise:g}" for noise in noises)], lines
@@ -109,20 +119,24 @@ class OverNoise(Result):
 
 def noise(arguments: argparse.Namespace) -> OverNoise:
     """Learn what is left to learn, judge everything; the page where --docs asks for it."""
-    settings, root = Settings.of(vars(arguments)), Path(arguments.folder)
-    rows = _rows(arguments.rows)
+    settings, rows = Settings.of(vars(arguments)), _rows(arguments.rows)
     contents, train = contents_of(arguments)
     todo = list(units(rows, settings.noise, settings.starts))
-    for unit in todo:
-        learn_unit(unit, settings, train, root)
-    banks = [Bank.of(content.name, content.train, content.test) for content in contents]
-    del contents
-    kept = Kept(root / "judged", banks)
-    fixed = judge_baselines(rows, settings, banks, kept)
-    learned = {unit: judge_learned(unit, settings, train, root, kept) for unit in progress(todo, "learned element")}
+    with tempfile.TemporaryDirectory() as unkept:
+        root = Path(arguments.folder or unkept)
+        for unit in todo:
+            learn_unit(unit, settings, train, root)
+        banks = [Bank.of(content.name, content.train, content.test) for content in contents]
+        del contents
+        kept = Kept(root / "judged", banks)
+        fixed = judge_baselines(rows, settings, banks, kept)
+        fixed |= judge_files(arguments.elements, settings, kept)
+        bar = progress(todo, "learned element")
+        learned = {unit: judge_learned(unit, settings, train, root, kept) for unit in bar}
+        elements = _best_rings(todo, learned, settings, train, root)
     found = OverNoise(list(scores(fixed, learned, banks, settings)), {one.name: len(one.powers) for one in banks})
     if arguments.docs:
-        _publish(found, settings, arguments)
+        _publish(found, elements, settings, arguments)
     return found
 
 
@@ -187,6 +201,39 @@ def judge_baselines(
     return found
 
 
+def judge_files(files: Sequence[str], settings: Settings, kept: Kept) -> dict[tuple[str, float], dict[str, Errors]]:
+    """Errors of elements in files of heights, by the name of the file and noise."""
+    size, found = kept.banks[0].spectrum.shape[-1], {}
+    for file in files:
+        element = read_element(file, aperture=2 * World().radius)
+        mark = hashlib.sha256(element.numbers.numpy().tobytes()).hexdigest()[:16]
+        H = transfer(kernels((element,), World()), size)
+        for own in settings.noise:
+            world = dataclasses.replace(World(), noise=own)
+            found[Path(file).stem, own] = kept.find(f"file-{mark}-{own:g}", world, lambda H=H: H)
+    return found
+
+
+def _best_rings(
+    todo: Sequence[Unit],
+    learned: Mapping[Unit, tuple[float, dict[str, Errors]]],
+    settings: Settings,
+    train: Pictures,
+    root: Path,
+) -> dict[str, Element]:
+    """Of every row of rings and noise the element that is kept, as it is made, by the name of its file."""
+    best: dict[tuple[str, float], Unit] = {}
+    for unit in todo:
+        other = best.get((unit.row, unit.noise))
+        if ROWS[unit.row].learning["kind"] == "rings" and (other is None or learned[unit][0] < learned[other][0]):
+            best[unit.row, unit.noise] = unit
+    found = {}
+    for (row, own), unit in best.items():
+        (element,) = learn_unit(unit, settings, train, root).variables()
+        found[f"{row}-{own:g}.npy"] = as_made(detached(element))
+    return found
+
+
 def judge_learned(
     unit: Unit, settings: Settings, train: Pictures, root: Path, kept: Kept
 ) -> tuple[float, dict[str, Errors]]:
@@ -230,7 +277,13 @@ def scores(
 # --- the page
 
 
-def _publish(found: OverNoise, settings: Settings, arguments: argparse.Namespace) -> None:
+def _publish(
+    found: OverNoise, elements: Mapping[str, Element], settings: Settings, arguments: argparse.Namespace
+) -> None:
+    beside = Path(arguments.docs) / "wave" / "elements"
+    beside.mkdir(parents=True, exist_ok=True)
+    for name, element in elements.items():
+        write_element(element, beside / name, design_wavelength=WAVELENGTH)
     records = [score.record() for score in found.scores]
     tables = {"noise.csv": table(records, floats=lambda number: round(number, 4))}
     words = [f"--data DIR --limit {arguments.limit}"] if arguments.data else []
@@ -255,7 +308,9 @@ def _parts(found: OverNoise, command: str) -> list[str]:
         picture("wave/noise.png", f"Gain over the Fresnel lens on {shown}, bands: 95 % intervals over the pictures."),
         *(part for filter in FILTERS for part in _tables(found, shown, filter)),
         *(part for name in others for part in _tables(found, name, "wiener", only_gain=True)),
-        "All figures: [noise.csv](wave/noise.csv).",
+        "All figures: [noise.csv](wave/noise.csv). Heights of the rings that were kept stand in "
+        "[wave/elements](wave/elements), to be judged again, on dead leaves or on pictures of one's own:",
+        "    raytrace wave noise --rows fresnel --elements docs/wave/elements/learned-0.01.npy --noises 0.01",
     ]
 
 
@@ -274,7 +329,7 @@ def _tables(found: OverNoise, content: str, filter: str, *, only_gain: bool = Fa
         yield grid(
             header,
             (
-                [ROWS[row].title, *(f"{min(one.starts):+.2f} … {max(one.starts):+.2f}" for one in own.values())]
+                [title_of(row), *(f"{min(one.starts):+.2f} … {max(one.starts):+.2f}" for one in own.values())]
                 for row, own in started.items()
             ),
         )

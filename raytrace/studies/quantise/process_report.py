@@ -16,7 +16,7 @@ from raytrace.maths.value import detached
 from raytrace.pages import grid, picture
 from raytrace.studies.edof.noise import FILTERS, Bank, Errors, Interval, drawn, gain, mean_psnr
 from raytrace.studies.edof.noise_command import Settings as Noise
-from raytrace.studies.edof.noise_report import TITLES, Kept, judge_baselines, judge_learned, learn_unit
+from raytrace.studies.edof.noise_report import TITLES, WAVELENGTH, Kept, judge_baselines, judge_learned, learn_unit
 from raytrace.studies.edof.report import contents_of
 from raytrace.studies.edof.world import ClosedForm, World, kernels, periodic, spectrum, transfer
 from raytrace.studies.pictures import Pictures
@@ -112,7 +112,9 @@ def etch(arguments: argparse.Namespace) -> Etching:
     rows = _rows(fixed, models, found, banks, settings)
     result = Etching(rows, {one.name: len(one.powers) for one in banks}, settings.tolerance)
     if arguments.docs:
-        _publish(result, settings, arguments)
+        best = {(case.row, case.noise): case for case in sorted(todo, key=lambda case: found[case][0], reverse=True)}
+        made = {f"{row}-{own:g}.npy": elements[case] for (row, own), case in best.items()}
+        _publish(result, made, settings, arguments)
     return result
 
 
@@ -197,7 +199,13 @@ def _reliefs(settings: Settings) -> dict[tuple[int, int], float]:
 # --- the page
 
 
-def _publish(found: Etching, settings: Settings, arguments: argparse.Namespace) -> None:
+def _publish(
+    found: Etching, elements: Mapping[str, Element], settings: Settings, arguments: argparse.Namespace
+) -> None:
+    beside = Path(arguments.docs) / "wave" / "elements"
+    beside.mkdir(parents=True, exist_ok=True)
+    for name, element in elements.items():
+        write_element(element, beside / name, design_wavelength=WAVELENGTH)
     words = [f"--data DIR --limit {arguments.limit}"] if arguments.data else []
     command = " ".join(["raytrace wave etch", *words, *settings.words(), "-o FOLDER --docs docs"])
     tables = {"etch.csv": table([row.record() for row in found.rows], floats=lambda number: round(number, 4))}
@@ -226,5 +234,5 @@ def _parts(found: Etching, command: str) -> list[str]:
                 grid(_HEADER, found.lines(shown, filter)),
             )
         ),
-        "All figures: [etch.csv](wave/etch.csv).",
+        "All figures: [etch.csv](wave/etch.csv). Heights of what was kept stand in [wave/elements](wave/elements).",
     ]

@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 
 from raytrace.plot.style import array, new_figure, styled
 from raytrace.studies.figures import picture
+from raytrace.studies.superres.discover_report import Discovered
 from raytrace.studies.superres.report import Superresolution
 
 _SHOWN = 64  # pixels of a full-frame picture, of its 96 that are not mirrored
@@ -41,6 +42,27 @@ def superres_figure(found: Superresolution) -> Figure:
     return figure
 
 
-def _kernel(ax: Axes, values: np.ndarray, title: str) -> None:
+def _kernel(ax: Axes, values: np.ndarray, title: str, *, decades: int = 4) -> None:
     top = float(values.max())
-    picture(ax, np.maximum(values, 1e-4 * top), title, top=None, vmin=None, cmap="magma", norm=LogNorm(1e-4 * top, top))
+    least = 10.0**-decades * top
+    picture(ax, np.maximum(values, least), title, top=None, vmin=None, cmap="magma", norm=LogNorm(least, top))
+
+
+@styled
+def discover_figure(found: Discovered) -> Figure:
+    """Kernels of every plate in the middle colour, a line for each camera, circles where the scene is shown."""
+    cameras = found.cameras
+    columns = max(len(found.lines(colours)) for colours in cameras)
+    figure = new_figure(1.32 * columns, 1.75 * len(cameras) + 0.2)
+    axes = figure.subplots(len(cameras), columns, squeeze=False)
+    for line, colours in zip(axes, cameras, strict=True):
+        own = [one for one in found.plates if one.colours == colours]
+        for ax, one in zip(line, own, strict=False):
+            kernel = array(one.found.kernel[len(one.found.kernel) // 2])
+            title = one.found.start.replace(", ", ",\n").replace("waves RMS", "waves")
+            _kernel(ax, kernel, f"{title}\n{one.found.after:.1f} dB", decades=3)
+            half = kernel.shape[-1] // 2
+            for place in one.found.places:
+                ax.plot(half + place.column, half + place.row, "o", ms=9, mfc="none", mec="white", mew=0.8)
+        line[0].set_ylabel(colours, fontsize=8)
+    return figure
