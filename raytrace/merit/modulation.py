@@ -1,7 +1,8 @@
 """Operands of modulation and of the Strehl ratio.
 
-Those of diffraction are the functions of `analysis.mtf` and `kernels.diffraction`, with their derivatives by torch;
-those of rays are sums over a beam that is traced with all the rows' rays.
+The MTF of diffraction follows from a few rings of rays (`sheared.py`), that of rays is a sum over a beam; both are
+traced with all the rows' rays. What remains, a beam that apertures clip and the Strehl ratio, are the functions of
+`analysis.mtf` and `kernels.diffraction`, with their derivatives by torch.
 """
 
 import dataclasses
@@ -19,11 +20,13 @@ from raytrace.merit.measure import OrLost
 from raytrace.merit.paraxial import listed
 from raytrace.merit.plan import BadRow, Evaluate, Found, Line, Now, Operand, Planner
 from raytrace.merit.quality import Beam, beam_of, colours_of, rings
+from raytrace.merit.sheared import Pupil, Section, modulations
 from raytrace.optics.scene import Scene
 from raytrace.system.lens import Lens
 
 _POINTS = 32  # across the pupil at sampling 1
 _RINGS = 8  # of rays at sampling 1
+_DEGREE, _HIGHEST = 10, 16  # of the polynomials of a wave, at sampling 0 and of any
 
 #: Tangential, sagittal, and their mean.
 _SHARES = {"T": (1.0, 0.0), "S": (0.0, 1.0), "A": (0.5, 0.5)}
@@ -70,15 +73,18 @@ def diffraction_mtf(
 class Wave:
     """The wave of one field at one sampling, of one wavelength or all, and what rows of any operand ask of it.
 
-    Found once a moment, with a pass backward for each number.
+    From the rays of a few rings (`shear.py`). Where these do not tell it, as where apertures stop some of them, from
+    those of a grid by torch, with a pass backward for each number.
     """
 
     def __init__(self, line: Line, planner: Planner):
-        self.field, self.colours = field_of(line, planner), colours_of(line, planner)
+        self.planner, self.field, self.colours = planner, field_of(line, planner), colours_of(line, planner)
         self.least = _POINTS * 2 ** (line.row.integers[0] - 1)
         self.asked: dict[tuple[float, str], int] = {}
         self._numbers = OrLost(line, lambda now: now.moment.through_torch(self.told, clips=True))
         self._found: tuple[Now | None, Sequence | None] = None, None
+        degree = min(_DEGREE + 2 * line.row.integers[0], _HIGHEST)
+        self.beam = Pupil(planner, int(line.row.numbers[0]) - 1, self.colours, degree)
 
     def ask(self, frequency: float, section: str) -> int:
         return self.asked.setdefault((frequency, section), len(self.asked))
@@ -92,7 +98,8 @@ class Wave:
 
     def __call__(self, now: Now) -> Sequence | None:
         if self._found[0] is not now:
-            self._found = now, self._numbers(now)
+            told = now.once(_by_few_rays, self.planner.shared(Waves)).get(self)
+            self._found = now, self._numbers(now) if told is None else told
         return self._found[1]
 
 
@@ -107,6 +114,32 @@ class Waves:
         if key not in self._found:
             self._found[key] = Wave(line, self.planner)
         return self._found[key]
+
+    def by_kind(self) -> list[list[Wave]]:
+        """Those that are evaluated together."""
+        found: dict[tuple, list[Wave]] = {}
+        for wave in self._found.values():
+            found.setdefault(wave.beam.kind, []).append(wave)
+        return list(found.values())
+
+
+def _by_few_rays(now: Now, waves: Waves) -> dict[Wave, list]:
+    """What waves are asked for, of those that a few rays tell."""
+    found = {}
+    for some in waves.by_kind():
+        asked = {(f, axis) for one in some for f, s in one.asked for axis in range(2) if _SHARES[s][1 - axis]}
+        sections = [Section(*each) for each in sorted(asked)]
+        modulation, told = modulations(now, [one.beam for one in some], sections)
+        at = {section: k for k, section in enumerate(sections)}
+        for k in np.flatnonzero(told):
+            found[some[k]] = [_shared(modulation[k], at, *each) for each in some[k].asked]
+    return found
+
+
+def _shared(modulation, at: dict[Section, int], frequency: float, section: str):
+    """The MTF of a section, or the mean of two, from those (Q,) of a beam."""
+    shares = zip((1, 0), _SHARES[section], strict=True)
+    return sum(share * modulation[at[Section(frequency, axis)]] for axis, share in shares if share)
 
 
 def by_waves(section: str) -> Callable[[Sequence[Line], Planner], Evaluate]:
@@ -211,7 +244,8 @@ def _modulation(weights: np.ndarray, place, frequency: float):
 _TAKES = "", "colour"
 _COLUMNS = "int1 sampling, int2 wavelength (0: all by weight), field number, cycles/mm"
 _WAVES = (
-    "at least 16 · 2^int1 points across the pupil, more where the blur needs them; the column of the grid is not read"
+    "rays of 7 + int1 rings, 10 at the most, from which the wave follows by polynomials; where apertures stop some, at "
+    "least 16 · 2^int1 points across the pupil; the column of the grid is not read"
 )
 _RAYS = "4 · 2^int1 rings of rays; times the MTF of a perfect lens, unless the column behind the frequency is not 0"
 

@@ -73,6 +73,15 @@ def path_to(sphere: Sphere, hits: Hits, index: np.ndarray):
     return hits.opl + index * (sagitta - along)
 
 
+def directions_to(sphere: Sphere, hits: Hits) -> tuple:
+    """Unit vectors from where rays cross the sphere to its centre, √(1 - κ² e²) d - κ e: `wavefront.towards_centre`."""
+    offset = tuple(at - centre for at, centre in zip(hits.position, sphere.centre, strict=True))
+    along = dot(offset, hits.direction)
+    across = [sphere.curvature * (o - along * d) for o, d in zip(offset, hits.direction, strict=True)]
+    root = np.sqrt(np.maximum(1 - dot(across, across), 0.0))
+    return tuple(root * d - e for d, e in zip(hits.direction, across, strict=True))
+
+
 def dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
@@ -100,7 +109,7 @@ def opd_of(
 
     def opd(now: Now) -> tuple[np.ndarray, object]:
         hits, chiefs, centres = now.hits(rays, clips=clips), now.hits(chief), now.hits(about)
-        sphere, index = sphere_of(now, centres, bent), _image_index(now, wavelength)
+        sphere, index = sphere_of(now, centres, bent), image_index(now, wavelength)
         zero = path_to(sphere, chiefs, index)
         found = (path_to(sphere.at(of), hits, index[of]) - zero[of]) / waves[of]
         return hits.valid & (chiefs.valid & centres.valid)[of], found
@@ -108,7 +117,7 @@ def opd_of(
     return opd
 
 
-def _image_index(now: Now, wavelengths: np.ndarray):
+def image_index(now: Now, wavelengths: np.ndarray):
     """Index in front of the image at wavelengths, counted from 0."""
     found = [np.abs(now.moment.index(w)[-2]) for w in wavelengths]
     return listed(found, now.moment.count) if any(isinstance(n, Dual) for n in found) else np.array(found)
