@@ -12,16 +12,23 @@ import pytest
 import torch
 
 import raytrace as rt
+from raytrace.media.glass import is_air
 from raytrace.merit.default import rows_of
 from raytrace.merit.hold import conditions_of
 from raytrace.merit.model import Model
+from raytrace.merit.readings import readings_of
 from raytrace.merit.vary import bounds_of, freedom
+from raytrace.optimization.asked import Asked
+from raytrace.optimization.insertion import Place
 from raytrace.optimization.journal import BadSearch, Ended, Journal, Stopped
+from raytrace.optimization.least_squares import Manner, least_squares
+from raytrace.optimization.meniscus import enlarged, saddle, thinned
 from raytrace.optimization.minima import Minima
 from raytrace.optimization.problem import NoProblem
 from raytrace.optimization.starts import length_of, space_of
 
 PLANE = float("inf")
+PLAIN = {"unit": 1.0, "skip_unknown": False, "readings": readings_of(None)}  # of a problem
 HOW = {"merit": "spot", "vary": "curvature thickness", "glass_thickness": "2:8", "edge": 1.0, "rings": 2}
 
 
@@ -147,6 +154,118 @@ def test_the_best_singlet_is_that_of_a_scan_over_its_bending(plate, found):
     assert float(found.merit[0]) <= min(scanned) * 1.02
 
 
+# -- a thin meniscus inserted ------------------------------------------------------------------------------------------
+
+
+def test_a_meniscus_without_thickness_changes_no_ray_and_no_merit():
+    lens = rt.read_lens("cooke_triplet")
+    free = freedom(lens, "curvature thickness:2,4 sensor curvature:6=-curvature:1")
+    rows = (*rows_of(lens, "spot"), rt.Row("REAY", (6, 2), (0, 1, 0, 1), target=5, weight=1), rt.Row("MNEG", (1, 6)))
+    asked = Asked(free, rows, conditions_of(lens, "bfd>=40"), bounds_of(free.lens, free.variables), None, None, PLAIN)
+    before = asked.whole.evaluated(asked.model.start)
+    for k in (1, 2, 3, 4, 7):
+        one = enlarged(lens, asked, k)
+        made, moved = one.model.lens_at(one.model.start), lambda s, k=k: s + 2 if s >= k else s
+        assert [made.surfaces[moved(s)].glass for s in range(7)] == [surface.glass for surface in lens.surfaces[:7]]
+        assert made.stop == moved(lens.stop)
+        assert {surface.glass.name for surface in made.surfaces[k - 1 : k + 3]} >= {made.surfaces[k + 2].glass.name}
+        after = one.whole.evaluated(one.model.start)
+        assert after.residuals == pytest.approx(before.residuals, abs=1e-12)
+        variables = {(moved(v.surface), v.quantity) for v in free.variables}
+        added = {(s, quantity) for s in (k, k + 1) for quantity in ("curvature", "thickness")}
+        assert {(v.surface, v.quantity) for v in one.free.variables} == variables | added
+        assert {(moved(6), moved(1))} == {(v.surface, v.source) for v in one.free.solves}
+
+
+def test_a_range_of_gaps_is_that_of_old_and_a_part_of_the_new_ones():
+    rows = rt.Row("MNEG", (1, 6), target=2.0, weight=1), rt.Row("MXCG", (1, 6), target=9.0, weight=1), rt.Row("EFFL")
+    told = lambda part: [(row.operand, row.integers, row.target) for row in thinned(rows, 3, part)]  # noqa: E731
+    others = [("MXCG", (1, 6), 9.0), ("EFFL", (0, 0), 0.0)]
+    assert told(0) == [("MNEG", (1, 2), 2.0), *others, ("MNEG", (5, 6), 2.0)]
+    assert told(0.5) == [*told(0), ("MNEG", (3, 4), 1.0)]
+    assert told(1) == [("MNEG", (1, 6), 2.0), *others]
+
+
+@pytest.fixture(scope="module")
+def best_triplet():
+    """What is asked of a triplet, and the lens at its minimum."""
+    lens = rt.read_lens("cooke_triplet")
+    free = freedom(lens, "curvature thickness")
+    rows, held = tuple(rows_of(lens, "spot", rings=2)), conditions_of(lens, "efl=100")
+    bounds = bounds_of(free.lens, free.variables, "thickness:1..30 sensor:60..120")
+    asked = Asked(free, rows, held, bounds, (2.0, 8.0), (0.5, 30.0), PLAIN)
+    x, space = asked.model.start, asked.space
+    for manner in (Manner(), Manner(damping=1e-8)):
+        x = least_squares(asked.whole.state, x, lower=space.lower, upper=space.upper, manner=manner).state.x
+    return asked, asked.model.lens_at(x)
+
+
+@pytest.mark.parametrize("k", [1, 2, 4])
+def test_at_a_minimum_the_meniscus_is_a_saddle_with_one_way_down(best_triplet, k):
+    """The merit has no slope along any step that meets the conditions, and curves down along one alone."""
+    asked, lens = best_triplet
+    place = Place(k, enlarged(lens, asked, k))
+    stage, x = place.stage(0.0, 1, Manner()), place.asked.model.start
+    size = np.sqrt(stage.problem.state(x, False).cost)
+    found = saddle(stage.problem, x, stage.moves(x))
+    assert np.abs(found.slope).max() < 1e-7 * size
+    curves = np.linalg.eigvalsh(found.curves)
+    assert curves[0] < -1e-9 < curves[1]
+    for sign in (1.0, -1.0):
+        state = stage.problem.state(place.beside(stage, sign), False)
+        assert np.sqrt(state.cost) < size
+        assert np.abs(state.held).max() < 1e-9
+
+
+def test_along_both_lines_of_a_null_meniscus_the_merit_stays(best_triplet):
+    asked, lens = best_triplet
+    one = enlarged(lens, asked, 4)
+    places = [[(v.surface, v.quantity) for v in one.free.variables].index((s, "curvature")) for s in (4, 5, 6)]
+    before = one.whole.evaluated(one.model.start).residuals
+    for pair in (places[:2], places[1:]):
+        x = one.model.start.copy()
+        x[pair] += 0.004
+        assert one.whole.evaluated(x).residuals == pytest.approx(before, abs=1e-10)
+
+
+def test_from_a_singlet_to_better_lenses_of_two_elements(found, tmp_path):
+    how = {**HOW, "hold": "efl=50"}
+    two = rt.search(found.lens, insert=[1], folder=tmp_path, **how)
+    assert (two.stopped, two.starts) == ("surfaces", 2)
+    assert float(two.merit[0]) < 0.8 * float(found.merit[0])
+    assert (two.merit[1:] >= two.merit[:-1]).all()
+    assert {task.partition(",")[0] for task in two.tasks} == {"surface 1"}
+    assert two.focal_length.tolist() == pytest.approx([50] * len(two.lenses), rel=1e-6)
+    for lens in two.lenses:
+        glass = [k for k in range(1, 5) if not is_air(lens.surfaces[k].glass)]
+        assert glass == [1, 3]
+        assert min(float(lens.surfaces[k].thickness) for k in glass) > 2 - 1e-3
+        assert min(edge_of(lens, k) for k in glass) > 1 - 1e-3
+    again = rt.search(found.lens, insert=[1], folder=tmp_path, **how)
+    assert torch.equal(again.variables, two.variables)
+    with pytest.raises(BadSearch, match="a search of other insert"):
+        rt.search(found.lens, insert=[2], folder=tmp_path, **how)
+
+
+def edge_of(lens, k):
+    """Thickness of the glass behind surface k where the widest beam of all goes through it."""
+    row = rt.Row("ETVA", (k, 0), weight=1.0)
+    return float(rt.evaluate(lens, merit=[row]).values[0])
+
+
+@pytest.mark.slow
+def test_from_a_triplet_to_better_lenses_of_four_elements():
+    how = {"merit": "spot", "vary": "curvature thickness", "hold": "efl=100", "glass_thickness": "2:12", "edge": 1.0}
+    how |= {"air_thickness": "0.5:40"}
+    triplet = rt.read_lens("cooke_triplet")
+    three = rt.optimize(triplet, cycles=200, **how)
+    four = rt.search(triplet, insert=[1, 4, 7], **how)
+    assert len(four.lenses) == 6
+    assert (four.merit < three.merit_after).all()
+    assert float(four.merit[0]) < 0.65 * three.merit_after
+    assert float(four.spots[0].max()) < 0.008
+
+
 # -- the journal -------------------------------------------------------------------------------------------------------
 
 
@@ -259,6 +378,10 @@ def test_the_command_writes_what_it_found_and_goes_on(command_line, tmp_path):
         (["--merit", "spot", "--vary", "curvature", "--hold", "efl=50", "--seconds", "1e-9"], "no lens of all light"),
         (["--merit", "spot", "--vary", "curvatures", "--hold", "efl=50"], "did you mean curvature"),
         (["--merit", "spot", "--vary", "curvature glass", "--hold", "efl=50"], "--vary glass is for optimize"),
+        (["--merit", "spot", "--vary", "curvature", "--insert", "--starts", "3"], "--starts goes without --insert"),
+        (["--merit", "spot", "--vary", "curvature", "--insert", "3"], "surface 3 is none before the image"),
+        (["--merit", "spot", "--vary", "curvature:1", "--insert", "2"], "has a curvature that does not vary"),
+        (["--merit", "spot", "--vary", "thickness", "--insert"], "no spherical surface between glass and air"),
     ],
 )
 def test_what_cannot_be_searched_is_told_in_a_line(words, said, plate, command_line, tmp_path):

@@ -28,7 +28,7 @@ class Stopped(Exception):
 
 
 class Ended(NamedTuple):
-    """Where a task ended: how many rays are lost, how far conditions are missed, the merit, x (n,), and its seconds."""
+    """Where a task ended: rays that are lost, how far conditions are missed, the merit, processor seconds, x (n,)."""
 
     lost: float
     missed: float

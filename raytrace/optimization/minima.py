@@ -12,7 +12,7 @@ _EQUAL = 2e-2  # of the merit
 
 @dataclass
 class Minimum:
-    """Where it lies, how often it was found, how it was found first, and after how many seconds of work."""
+    """Where it lies, how often it was found, how it was found first, and after how many processor seconds."""
 
     ended: Ended
     task: str

@@ -9,22 +9,26 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
+from typing import ClassVar
 
 import numpy as np
 
 from raytrace.fused import prepare
 from raytrace.merit.default import KINDS
 from raytrace.merit.hold import Condition, conditions_of
-from raytrace.merit.model import Model
 from raytrace.merit.readings import Readings, readings_of
-from raytrace.merit.value import Merit, merit_for
-from raytrace.merit.vary import bounds_of, freedom, name_of
+from raytrace.merit.value import Merit, in_unit, merit_for
+from raytrace.merit.vary import Freedom, bounds_of, freedom
+from raytrace.optimization.asked import Asked
+from raytrace.optimization.insertion import Insertion
 from raytrace.optimization.journal import Ended, Journal, Stopped
-from raytrace.optimization.least_squares import Manner, least_squares
-from raytrace.optimization.minima import Minima
+from raytrace.optimization.least_squares import Manner
+from raytrace.optimization.meniscus import places_of
+from raytrace.optimization.minima import Minima, Minimum
 from raytrace.optimization.problem import NoProblem, Problem
 from raytrace.optimization.searched import Searched, searched
-from raytrace.optimization.starts import Space, length_of, space_of
+from raytrace.optimization.stages import FOLLOW, LONG, Stage, descended
+from raytrace.optimization.starts import Space
 from raytrace.shards import Share
 from raytrace.system.intent import Row
 from raytrace.system.lens import Lens
@@ -33,14 +37,13 @@ from raytrace.system.naming import parse_range
 STARTS = 64
 _BATCH = 16  # starts; what is done in a batch is shared by processes
 _POINTS = 8  # of which a start is the best
-_NARROW = 0.5, 0.6  # parts of pupil and field that a start descends on first
-_SHORT = 10, 12  # cycles on the narrow and on the whole beam
+_BEAMS = (0.1, 0.12), (0.25, 0.3), (0.5, 0.6), (0.75, 0.8)  # parts of pupil and field, opened one after the other
+_NARROW = 2  # of these, that a start descends on first where all its rays arrive
+_SHORT = 10, 12  # cycles on each narrow and on the whole beam
 _FOLLOWED = 4  # of a batch
 _HOPS = 4  # of a batch
 _SPRINGS = 3  # minima from which they start, the best ones
-_LONG = 120  # cycles to a minimum
 _REACH = 0.02, 0.3  # of a hop, of the ranges of the variables
-_FOLLOW = Manner(tolerance=1e-5)
 _DAMPED = Manner(damping=0.1, bends=False)
 
 _DEFAULT = {operand for kind in KINDS.values() for operand in kind.operands.values()} - {"MTFA"}
@@ -64,7 +67,8 @@ def search(
     edge: float | None = None,
     skip_unknown: bool = False,
     readings: Readings | str | Sequence[str] | None = None,
-    starts: int = STARTS,
+    starts: int | None = None,
+    insert: bool | Sequence[int] | None = None,
     seconds: float | None = None,
     seed: int = 0,
     folder: str | PathLike | None = None,
@@ -74,9 +78,11 @@ def search(
     """The distinct minima of a merit function, from starts spread over all that the bounds allow; the lens is one.
 
     merit to readings: as for `optimize`; bounds that are not given follow from the focal length (`starts.py`),
-    which is that of `hold`, of a row EFFL or of the lens. starts: how many; seconds: after which it ends; seed: of all
-    that is drawn. folder: keeps the minima as lens files, a table and figures, and how far the search has come: called
-    again it goes on, and ends as if it had never ended before. Ctrl-C ends with what was found.
+    which is that of `hold`, of a row EFFL or of the lens. starts: how many; insert: instead of starts True, or
+    surfaces, at which a meniscus without thickness is inserted, to descend on either side to lenses with one element
+    more (`insertion.py`). seconds: after which it ends; seed: of all that is drawn. folder: keeps the minima as lens
+    files, a table and figures, and how far the search has come: called again it goes on, and ends as if it had never
+    ended before. Ctrl-C ends with what was found.
     Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadSearch.
     """
     prepare()
@@ -90,45 +96,53 @@ def search(
         raise NoProblem(
             "`vary=glass` is for optimize: search with the glasses as they are, then optimize what is found"
         )
-    conditions = _conditions(lens, hold)
-    model = Model(free.lens, free.variables, free.solves)
     glass, air = (parse_range(ends) if isinstance(ends, str) else ends for ends in (glass_thickness, air_thickness))
-    length = length_of(model, function.rows, function.unit, conditions)
-    space = space_of(model, bounds_of(free.lens, free.variables, bounds), length, glass, air)
-    problems = [
-        Problem(model, rows, conditions, unit=function.unit, skip_unknown=skip_unknown, readings=readings_of(readings))
-        for rows in (_narrowed(function.rows), function.rows)
-    ]
-    about = _about(problems[1], space, seed)
-    journal = Journal(folder, about, begun + (np.inf if seconds is None else seconds))
-    run = _Run(problems[0], problems[1], space, journal, seed)
-    stopped = run.through(starts, progress)
-    found = searched(lens, problems[1], run.minima, starts=run.begun, stopped=stopped, seconds=time.monotonic() - begun)
+    ends, conditions = bounds_of(free.lens, free.variables, bounds), _conditions(lens, hold, function.unit)
+    how = {"unit": function.unit, "skip_unknown": skip_unknown, "readings": readings_of(readings)}
+    asked = Asked(free, tuple(function.rows), conditions, ends, glass, air, how)
+    until = begun + (np.inf if seconds is None else seconds)
+    if insert is None or insert is False:
+        run = _Run(asked, Journal(folder, asked.about(seed), until), seed, STARTS if starts is None else starts)
+    else:
+        places = _places(free, insert, starts)
+        journal = Journal(folder, {**asked.about(seed), "insert": list(places)}, until)
+        run = Insertion(asked, journal, places)
+    stopped = _stopped(run, progress)
+    found = searched(lens, run.each(), starts=run.begun, stopped=stopped, seconds=time.monotonic() - begun)
     if folder is not None and not (share and share.rank):
         found.save(folder)
     return found
 
 
-def _conditions(lens: Lens, hold) -> tuple[Condition, ...]:
-    if hold is None or isinstance(hold, str) or all(isinstance(one, str) for one in hold):
-        return conditions_of(lens, hold)
-    return tuple(hold)
+def _places(free: Freedom, insert: bool | Sequence[int], starts: int | None) -> tuple[int, ...]:
+    """Surfaces at which a meniscus is inserted. Raises NoProblem."""
+    if starts is not None:
+        raise NoProblem(
+            "`starts` goes without `insert`, which begins at the lens alone, on both sides of every surface"
+        )
+    return places_of(free, () if insert is True else tuple(insert))
 
 
-def _about(problem: Problem, space: Space, seed: int) -> dict:
-    """What a search depends on, for its journal."""
-    return {
-        "variables": [name_of(one) for one in problem.model.variables],
-        "start": problem.model.start.tolist(),
-        "bounds": [space.lower.tolist(), space.upper.tolist()],
-        "rows": [repr(row) for row in problem.evaluation.rows],
-        "seed": seed,
-    }
+def _stopped(run: "_Run | Insertion", progress: Callable | None) -> str:
+    """Why a search ended: a key of `searched.STOPPED`."""
+    try:
+        run.through(progress)
+    except Stopped:
+        return "seconds" if time.monotonic() > run.journal.until else "interrupted"
+    except KeyboardInterrupt:
+        return "interrupted"
+    return run.DONE
 
 
-def _narrowed(rows: Sequence[Row]) -> tuple[Row, ...]:
-    """The rows with the rays of default merit functions nearer to the axis, in pupil and field."""
-    pupil, field = _NARROW
+def _conditions(lens: Lens, hold, unit: float) -> tuple[Condition, ...]:
+    """What is held, from mm to the unit of length of the merit function."""
+    in_words = hold is None or isinstance(hold, str) or all(isinstance(one, str) for one in hold)
+    found = conditions_of(lens, hold) if in_words else hold
+    return tuple(replace(one, row=in_unit(one.row, 1.0, unit)) for one in found)
+
+
+def _narrowed(rows: Sequence[Row], pupil: float, field: float) -> tuple[Row, ...]:
+    """The rows with the rays of default merit functions nearer to the axis, by parts of pupil and field."""
     scale = np.array([field, field, pupil, pupil])
     return tuple(
         replace(row, numbers=tuple((scale * row.numbers).tolist())) if row.operand in _DEFAULT else row for row in rows
@@ -139,31 +153,33 @@ def _narrowed(rows: Sequence[Row]) -> tuple[Row, ...]:
 class _Run:
     """A search under way."""
 
-    narrow: Problem
-    whole: Problem
-    space: Space
+    asked: Asked
     journal: Journal
     seed: int
+    starts: int
     begun: int = 0  # starts
     work: float = 0.0  # s
 
+    DONE: ClassVar[str] = "starts"
+
     def __post_init__(self):
+        self.beams = [self.asked.problem(_narrowed(self.asked.rows, *parts)) for parts in _BEAMS]
+        self.whole, self.space = self.asked.whole, self.asked.space
         self.minima = Minima(np.maximum(self.space.upper - self.space.lower, 1e-300), _turned(self.space))
 
-    def through(self, starts: int, progress: Callable | None) -> str:
-        """All batches; why it ended: a key of `searched.STOPPED`."""
-        bar = None if progress is None else progress(starts, "start")
+    def each(self) -> list[tuple[Problem, Minimum]]:
+        """All minima, the best first, each with the problem that it is one of."""
+        return [(self.whole, one) for one in self.minima.each]
+
+    def through(self, progress: Callable | None) -> None:
+        """All batches. Raises Stopped."""
+        bar = None if progress is None else progress(self.starts, "start")
         try:
-            for first in range(0, starts, _BATCH):
-                self._batch(range(first, min(first + _BATCH, starts)), bar)
-        except Stopped:
-            return "seconds" if time.monotonic() > self.journal.until else "interrupted"
-        except KeyboardInterrupt:
-            return "interrupted"
+            for first in range(0, self.starts, _BATCH):
+                self._batch(range(first, min(first + _BATCH, self.starts)), bar)
         finally:
             if bar is not None:
                 bar.close()
-        return "starts"
 
     def _batch(self, numbers: range, bar) -> None:
         keys = [f"start {i}" for i in numbers]
@@ -183,18 +199,37 @@ class _Run:
         return ends
 
     def _follow(self, tasks: Sequence[tuple[str, np.ndarray]], bar) -> None:
-        ends = self._each([(key, lambda x=x: self._descended(x, ((self.whole, _LONG, _FOLLOW),))) for key, x in tasks])
+        ends = self._each(
+            [(key, lambda x=x: descended(x, [self._stage(self.whole, LONG, FOLLOW)])) for key, x in tasks]
+        )
         for (key, _), end in zip(tasks, ends, strict=True):
             if self.minima.add(end, key, self.work) and bar is not None:
                 bar.set_postfix_str(f"{len(self.minima.each)} minima, the best {self.minima.each[0].ended.merit:.6g}")
 
     def _start(self, number: int) -> Ended:
         """The lens as it is, or the best of some points between the bounds; both descended a little."""
-        model = self.narrow.model
+        model = self.asked.model
         points = self.space.sobol(number, _POINTS, self.seed) if number else np.clip(model.start, *self._bounds)[None]
         points = [self.space.prepared(x) for x in points]
         best = min(points, key=self._worth)
-        return self._descended(best, ((self.narrow, _SHORT[0], _DAMPED), (self.whole, _SHORT[1], Manner())))
+        beams = self._opening(best) if self._lost(self.beams[_NARROW], best) else self.beams[_NARROW : _NARROW + 1]
+        narrow = [self._stage(beam, _SHORT[0], _DAMPED) for beam in beams]
+        return descended(best, [*narrow, self._stage(self.whole, _SHORT[1], Manner())])
+
+    def _stages(self, x: np.ndarray) -> list[Stage]:
+        """To the minimum from x; where rays are lost the beam is opened step by step first."""
+        narrow = self._opening(x) if self._lost(self.whole, x) else []
+        return [*(self._stage(one, _SHORT[0], _DAMPED) for one in narrow), self._stage(self.whole, LONG, FOLLOW)]
+
+    def _opening(self, x: np.ndarray) -> list[Problem]:
+        """The narrow beams from the widest one that arrives from x, or else from the narrowest."""
+        whole = [k for k, beam in enumerate(self.beams) if not self._lost(beam, x)]
+        return self.beams[max(whole, default=0) :]
+
+    def _lost(self, problem: Problem, x: np.ndarray) -> int:
+        """How many rays are."""
+        with np.errstate(all="ignore"):
+            return int(problem.evaluated(x).lost.sum())
 
     @property
     def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -203,7 +238,7 @@ class _Run:
     def _worth(self, x: np.ndarray) -> tuple[float, float]:
         """Lost rays and squares of a point on the narrow beam."""
         with np.errstate(all="ignore"):
-            found = self.narrow.evaluated(x)
+            found = self.beams[_NARROW].evaluated(x)
         squares = float(np.nansum(found.residuals**2))
         return float(found.lost.sum()), squares
 
@@ -213,33 +248,8 @@ class _Run:
         size = _REACH[0] * (_REACH[1] / _REACH[0]) ** draw.random()
         return self.space.prepared(x + size * (self.space.high - self.space.low) * draw.normal(size=len(x)))
 
-    def _descended(self, x: np.ndarray, stages: Sequence[tuple[Problem, int, Manner]]) -> Ended:
-        """Where x comes to on each of the problems in turn, in so many cycles."""
-        begun = time.monotonic()
-        for problem, cycles, manner in stages:
-            with np.errstate(all="ignore"):
-                end = self._descent(problem, x, cycles, manner)
-            if end is None:
-                break
-            x = end.x
-        if end is None:
-            return Ended(np.inf, np.inf, np.inf, time.monotonic() - begun, x)
-        missed = float(end.missed.max(initial=0.0))
-        return Ended(end.lost, missed, float(np.sqrt(end.cost)), time.monotonic() - begun, end.x)
-
-    def _descent(self, problem: Problem, x: np.ndarray, cycles: int, manner: Manner):
-        """The state that a descent ends in; None where there is no way from x."""
-        if not problem.state(x, False).is_finite:
-            return None
-        try:
-            end = least_squares(
-                problem.state, x, lower=self.space.lower, upper=self.space.upper, manner=manner, cycles=cycles
-            )
-        except (np.linalg.LinAlgError, RuntimeError):
-            return None  # numbers that overflow on the way
-        if end.stopped == "interrupted":
-            raise Stopped
-        return end.state if end.state.is_finite else None
+    def _stage(self, problem: Problem, cycles: int, manner: Manner) -> Stage:
+        return Stage(problem, cycles, manner, self.space.lower, self.space.upper)
 
 
 def _watched(task: Callable[[], Ended], bar) -> Callable[[], Ended]:

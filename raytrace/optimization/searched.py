@@ -1,6 +1,7 @@
 """Searched: the distinct minima that a search found, the best first."""
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -15,7 +16,7 @@ from raytrace.maths.result import Result, called, cell
 from raytrace.maths.value import value
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.spots import spot
-from raytrace.optimization.minima import Minima
+from raytrace.optimization.minima import Minimum
 from raytrace.optimization.problem import NoProblem, Problem
 from raytrace.system.intent import Intent
 from raytrace.system.lens import Lens
@@ -23,6 +24,7 @@ from raytrace.system.lens import Lens
 #: Why a search ends, by what is told of it.
 STOPPED = {
     "starts": "as many starts as were asked for",
+    "surfaces": "both sides of every surface",
     "seconds": "as much time as was asked for",
     "interrupted": "interrupted; these were found so far",
 }
@@ -34,7 +36,7 @@ class Searched(Result):
     """The minima (M,), the best first.
 
     lenses: one each; merit, focal_length in mm, spots (M, F): RMS radius of every field in mm, all wavelengths by their
-    weights; found: how often; after: seconds of work until it was; tasks: what found it. variables: (M, n).
+    weights; found: how often; after: processor seconds until it was; tasks: what found it. variables: (M, n).
     """
 
     before: Lens
@@ -105,32 +107,44 @@ class Searched(Result):
         self.plot(folder / "best.png")
 
 
-def searched(lens: Lens, problem: Problem, minima: Minima, *, starts: int, stopped: str, seconds: float) -> Searched:
-    """The result. Raises NoProblem where nothing was found."""
-    if not minima.each:
+def searched(
+    lens: Lens, each: Sequence[tuple[Problem, Minimum]], *, starts: int, stopped: str, seconds: float
+) -> Searched:
+    """The result: minima, the best first, each with the problem that it is one of. Raises NoProblem without any."""
+    if not each:
         raise NoProblem(
             f"no lens of all light, and of what is held, from {starts} starts: allow more by `starts`, `seconds` or "
             "wider `bounds`, or hold less"
         )
-    kept = minima.each[:KEPT]
-    lenses = tuple(_named(lens, problem, one.ended.x, k) for k, one in enumerate(kept, 1))
+    kept = each[:KEPT]
+    lenses = tuple(_named(lens, problem, one.ended.x, k) for k, (problem, one) in enumerate(kept, 1))
     tensor = lambda numbers: torch.tensor(np.asarray(numbers, dtype=float), dtype=torch.float64)  # noqa: E731
-    names = tuple(f"{one.quantity}_{one.surface}" for one in problem.model.variables)
+    names, variables = _variables(kept)
     return Searched(
         before=lens,
         lenses=lenses,
         names=names,
-        tasks=tuple(one.task for one in kept),
-        variables=tensor([one.ended.x for one in kept]),
-        merit=tensor([one.ended.merit for one in kept]),
+        tasks=tuple(one.task for _, one in kept),
+        variables=tensor(variables),
+        merit=tensor([one.ended.merit for _, one in kept]),
         focal_length=torch.stack([first_order(one).effective_focal_length.reshape(()) for one in lenses]),
         spots=torch.stack([_spots(one) for one in lenses]),
-        found=torch.tensor([one.found for one in kept]),
-        after=tensor([one.seconds for one in kept]),
+        found=torch.tensor([one.found for _, one in kept]),
+        after=tensor([one.seconds for _, one in kept]),
         starts=starts,
         seconds=seconds,
         stopped=stopped,
     )
+
+
+def _variables(kept: Sequence[tuple[Problem, Minimum]]) -> tuple[tuple[str, ...], list[list[float]]]:
+    """Names of what varies in any of them, and their numbers; nan where one does not vary."""
+    tables = [
+        {f"{v.quantity}_{v.surface}": number for v, number in zip(problem.model.variables, one.ended.x, strict=True)}
+        for problem, one in kept
+    ]
+    names = tuple(dict.fromkeys(name for table in tables for name in table))
+    return names, [[table.get(name, np.nan) for name in names] for table in tables]
 
 
 def _spots(lens: Lens) -> Tensor:

@@ -1,0 +1,58 @@
+"""Stages: a descent over several problems of one lens, each with its own bounds, as a task of a search."""
+
+import time
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from raytrace.optimization.journal import Ended, Stopped
+from raytrace.optimization.least_squares import Manner, State, least_squares
+from raytrace.optimization.problem import Problem
+
+#: How a descent is followed to its minimum, and in how many cycles at most.
+FOLLOW, LONG = Manner(tolerance=1e-5), 120
+_AT_BOUND = 1e-9  # of the range of a variable
+
+
+class Stage(NamedTuple):
+    """A problem to descend on between bounds (n,), in at most so many cycles."""
+
+    problem: Problem
+    cycles: int
+    manner: Manner
+    lower: np.ndarray
+    upper: np.ndarray
+
+    def moves(self, x: np.ndarray) -> np.ndarray:
+        """(n,) which variables are at none of their bounds."""
+        near = _AT_BOUND * np.maximum(self.upper - self.lower, 0.0)
+        return (x - self.lower > near) & (self.upper - x > near)
+
+
+def descended(x: np.ndarray, stages: Sequence[Stage]) -> Ended:
+    """Where x comes to on each of the stages in turn; all rays are lost where there is no way from there."""
+    begun = time.process_time()
+    for stage in stages:
+        with np.errstate(all="ignore"):
+            end = _end(stage, np.clip(x, stage.lower, stage.upper))
+        if end is None:
+            return Ended(np.inf, np.inf, np.inf, time.process_time() - begun, x)
+        x = end.x
+    missed = float(end.missed.max(initial=0.0))
+    return Ended(end.lost, missed, float(np.sqrt(end.cost)), time.process_time() - begun, end.x)
+
+
+def _end(stage: Stage, x: np.ndarray) -> State | None:
+    """The state that a stage ends in; None where there is no way from x. Raises Stopped."""
+    if not stage.problem.state(x, False).is_finite:
+        return None
+    try:
+        end = least_squares(
+            stage.problem.state, x, lower=stage.lower, upper=stage.upper, manner=stage.manner, cycles=stage.cycles
+        )
+    except (np.linalg.LinAlgError, RuntimeError):
+        return None  # numbers that overflow on the way
+    if end.stopped == "interrupted":
+        raise Stopped
+    return end.state if end.state.is_finite else None
