@@ -272,11 +272,10 @@ def stored(path: Path) -> dict[int, tuple[float, int]]:
 
 
 #: How many automatic semi-diameters of a file are not met, where any: rays that fail, a cone of 160°, glasses by a
-#: number of six figures, a vignetted image, an ideal lens at its own object.
+#: number of six figures, a vignetted image.
 UNLIKE = {
     "Project_X__Elliptical_reflector_320_degree_light_cone_.zmx": 2,
     "PyZDDE__ConcentricSpheres.zmx": 2,
-    "Optical-design__Relay_exit_pupilMatched_real_Lens.zmx": 12,
     "Project_X__Doublet_using_MIL_number_glasses.zmx": 1,
     "PyZDDE__Tessar_lens_using_vignetting_factors.ZMX": 1,
     "optiland__thorlabs_lj1598l1.zmx": 1,
@@ -284,7 +283,7 @@ UNLIKE = {
 
 
 def test_semi_diameters_are_those_that_opticstudio_stored():
-    """124 of 143 automatic ones in 41 files to 1e-6."""
+    """136 of 143 automatic ones in 41 files to 1e-6."""
     if not (MERIT.exists() and CORPUS.exists()):
         pytest.skip("the files stand beside the repository")
     paths = {
@@ -307,7 +306,7 @@ def test_semi_diameters_are_those_that_opticstudio_stored():
         close = [bool(abs(told[k] - sizes[k][0]) <= max(1e-6 * sizes[k][0], 1e-9)) for k in follow]
         assert close.count(False) == UNLIKE.get(name, 0), name
         met, count, files = met + sum(close), count + len(close), files + 1
-    assert (met, count, files) == (124, 143, 41)
+    assert (met, count, files) == (136, 143, 41)
 
 
 # -- rows and the merit ------------------------------------------------------------------------------------------------

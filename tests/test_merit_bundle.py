@@ -27,6 +27,14 @@ def with_model_glasses(lens):
     return lens.replace(1, glass=model_glass(1.62, 60.0, 0.01)).replace(3, glass=model_glass(1.64, 35.0))
 
 
+def behind_focus(gauss, fields):
+    """A lens that images its stop in front of a near object, and whose light therefore leaves the pupil first."""
+    lens = dataclasses.replace(gauss, stop=len(gauss.surfaces) - 2, fields=fields).replace(9, thickness=400.0)
+    lens = lens.at(object_distance=1.0, entrance_pupil_diameter=20.0)
+    assert float(rt.first_order(lens).entrance_pupil_position) < -1
+    return lens
+
+
 def lenses():
     gauss = rt.read_lens("double_gauss")
     near = gauss.at(object_distance=300.0, wavelengths=[0.48, 0.6])
@@ -42,6 +50,12 @@ def lenses():
         "real image heights": with_field_kind(dataclasses.replace(gauss, fields=image), "real_image_height"),
         "aimed": gauss.at(ray_aiming="real"),
         "aimed by the paraxial ray": near.at(ray_aiming="paraxial"),
+        "virtual": dataclasses.replace(gauss.at(object_distance=-300.0), fields=height),
+        "virtual, before the pupil": dataclasses.replace(
+            gauss.at(object_distance=-30.0, entrance_pupil_diameter=5.0),
+            fields=dataclasses.replace(height, y=0.2 * height.y),
+        ),
+        "pupil before the object": behind_focus(gauss, height),
         "cooke": rt.read_lens("cooke_triplet"),
         "mirrors": rt.read_lens("hubble"),
         "aspheres": rt.read_lens("phone"),

@@ -29,10 +29,14 @@ def launched(moment: Moment, field: np.ndarray, pupil: np.ndarray):
     source = x, y, -distance
     chord = tuple(a - o for a, o in zip(aim, source, strict=True))
     length, far = np.sqrt(dot(chord, chord)), np.sqrt(dot(source, source))
-    direction = tuple(part / length for part in chord)
+    # Towards +z: a virtual object lies behind surface 1, and a pupil may lie before the object.
+    is_backward, is_virtual = value_of(depth) < -value_of(distance), value_of(distance) < 0
+    direction = tuple((-part if is_backward else part) / length for part in chord)
     if abs(value_of(distance)) < abs(value_of(depth)):
-        return source, direction, -index * far
+        return source, direction, index * (far if is_virtual else -far)
     path = (dot(aim, aim) - 2 * dot(aim, source)) / (length + far)
+    if is_backward:
+        path = -path if is_virtual else -path - 2 * far
     return aim, direction, index * path
 
 
