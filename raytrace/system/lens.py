@@ -377,10 +377,13 @@ def _check_kinds(surface: Surface, where: str) -> None:
 
 
 def _check_cone(lens: Lens) -> None:
-    """Refuse a cone of light at the object that reaches a right angle with the axis."""
+    """Refuse a cone of light at the object whose rim lies in the plane of the object, or that is none.
+
+    Beyond a right angle its rim runs back: towards a reflector that the object stands in.
+    """
     kind, number = lens.aperture.kind, float(lens.aperture.value)
-    if kind == "object_cone_angle" and number >= 90:
-        raise ValueError(f"aperture object_cone_angle {number:g} degrees: expected less than 90")
+    if kind == "object_cone_angle" and (number == 90 or number >= 180):
+        raise ValueError(f"aperture object_cone_angle {number:g} degrees: expected less than 180, and not 90")
     if kind == "object_na":
         index = float(index_behind(lens, 0, lens.wavelengths[lens.primary_wavelength]))
         if number >= index:
