@@ -9,6 +9,7 @@ import pytest
 import torch
 from problems import field, number, sharp_double_gauss
 
+import raytrace as rt
 from raytrace.kernels import EmptyPsf, NotConverged, psf
 from raytrace.maths.grid import Grid, grid
 from raytrace.optics.launch import launch
@@ -222,6 +223,15 @@ def test_auto_chooses_by_the_scene_and_says_why():
     assert sharp.model == "wave"
     assert "\n" not in sharp.reason
     assert "more than 0.1" in sharp.reason
+
+
+def test_auto_stays_with_rays_where_waves_are_too_many():
+    """A spectrum of 26 mm: its light lands where a window's waves turn a thousand times."""
+    with pytest.warns(NotConverged, match=r"drt: not compared with waves: the wave model needs \d+ pupil points"):
+        found = rt.psf(rt.read_lens("spectrometer"), "auto", tol=0.5, size=9)
+    assert found.model == "drt"
+    assert "not compared with waves" in found.reason
+    assert bool((found.kernel.sum((-1, -2)) > 0).all())
 
 
 def test_number_of_rays_is_kept_to():

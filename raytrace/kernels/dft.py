@@ -20,6 +20,10 @@ from raytrace.optics.f_number import axial_f_number
 from raytrace.optics.scene import Scene
 
 
+class TooManyPoints(ValueError):
+    """A wave that turns too often over the pupil to be summed; the message says what helps."""
+
+
 class EmptyPupil(ValueError):
     """No light passes the pupil: a point spread function normalised by its light is undefined."""
 
@@ -146,10 +150,10 @@ def rings_and_arms(phase: float, order: int) -> tuple[int, int]:
 
 
 def disc_rule(phase: float, order: int, *, most: int, what: str, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Points and weights of `rings_and_arms`. Raises ValueError where more than `most` points would be needed."""
+    """Points and weights of `rings_and_arms`. Raises TooManyPoints where more than `most` would be needed."""
     rings, arms = rings_and_arms(phase, order)
     if rings * arms > most:
-        raise ValueError(
+        raise TooManyPoints(
             f"{what} needs {rings * arms} pupil points, more than {most}: the phase turns {phase / (2 * math.pi):.0f} "
             "times along a pupil radius. Centre the window where the light lands, make it smaller, or use a ray model"
         )

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
+from raytrace.budget import OverBudget
+from raytrace.kernels.dft import TooManyPoints
 from raytrace.kernels.models import Model
 from raytrace.kernels.result import Kernels, Psf, polychromatic
 from raytrace.maths.grid import Grid
@@ -90,10 +92,18 @@ def between(found: Kernels, half: Kernels, weights: Tensor | None, model: Model)
 
 
 def climb(batch: Scene, pixels: Grid, weights: Tensor | None, rungs: Sequence[Model], tol: float) -> Psf:
-    """The first rung whose kernels differ from those of the next by less than the tolerance."""
+    """The first rung whose kernels differ from those of the next by less than the tolerance.
+
+    Waves that are too much to be summed, as over a spectrum many pixels long, leave the rung below, with a warning.
+    """
     here = by_tolerance(batch, pixels, weights, rungs[0], tol)
     for model in rungs[1:]:
-        above = by_tolerance(batch, pixels, weights, model, tol)
+        try:
+            above = by_tolerance(batch, pixels, weights, model, tol)
+        except (TooManyPoints, OverBudget) as error:
+            if not model.waves:
+                raise
+            return _unproven(here, str(error))
         with torch.no_grad():
             gap = float(_kernel_change(above, here).max())
         if gap <= tol and (model.waves or not _diffracts(batch, pixels, above)):
@@ -101,6 +111,13 @@ def climb(batch: Scene, pixels: Grid, weights: Tensor | None, rungs: Sequence[Mo
             return dataclasses.replace(here, reason=said)
         here, below = above, here.model
     return dataclasses.replace(here, reason=f"{here.model}: {below} differs from it by {gap:.1e}, more than {tol:g}")
+
+
+def _unproven(found: Psf, why: str) -> Psf:
+    """The kernels of a rung that the one above cannot be compared with. Warns NotConverged."""
+    reason = f"{found.model}: not compared with waves: {why}"
+    warnings.warn(reason, NotConverged, stacklevel=5)
+    return dataclasses.replace(found, reason=reason)
 
 
 def _diffracts(batch: Scene, pixels: Grid, light: Psf) -> bool:
