@@ -25,7 +25,7 @@ from raytrace.maths.pupil import gauss_legendre, gauss_rings
 
 _RIM = 1 - 1e-9  # rays of the rim, which rounding must not put outside
 _NEWTON = 12  # steps at the most
-_CLOSE = 1e-12  # of |p|² at the rim
+_CLOSE = 1e-7  # of the pupil, from where one more step ends at rounding
 _WHOLE = 1.98  # of pupil radii: a shear that leaves nothing in common
 
 
@@ -132,7 +132,9 @@ class _Part:
 
 def _raised(x: np.ndarray, powers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """x^k and its slope k x^(k-1), (..., K)."""
-    every = x[..., None] ** np.arange(powers.max() + 1)
+    every = np.ones((*x.shape, powers.max() + 1))
+    for k in range(1, every.shape[-1]):
+        every[..., k] = every[..., k - 1] * x
     return every[..., powers], powers * every[..., np.maximum(powers - 1, 0)]
 
 
@@ -248,7 +250,7 @@ def _corners(pupil: Tensor, shear: Tensor) -> tuple[Tensor, tuple, Tensor]:
         at = at - step.clamp(-0.2, 0.2)
         if float(step.abs().max()) < _CLOSE:
             break
-    found = (step.abs().amax((0, 1)) < 1e-9) & (at[0, 1] > at[0, 0]) & (shear < _WHOLE)
+    found = (step.abs().amax((0, 1)) < _CLOSE) & (at[0, 1] > at[0, 0]) & (shear < _WHOLE)
     at = torch.where(
         found, at, torch.stack([torch.tensor([-0.5, 0.5]).double(), torch.zeros(2).double()])[..., None, None]
     )
