@@ -274,6 +274,20 @@ def test_bounds_of_a_thickness_are_kept_and_those_of_the_program_are_none(tmp_pa
     assert again(original, tmp_path).intent == original.intent
 
 
+@pytest.mark.parametrize("unit", UNITS)
+def test_bounds_on_one_side_are_kept_and_those_of_other_numbers_are_said_to_be_lost(unit, tmp_path):
+    original = lens(surface=RULES, stop="VDSZ 0 0", UNIT=f"UNIT {unit} X", tail="EFFL 0 2 0 0 0 0 50 1 0 0")
+    curvature, thickness, *others, last = original.intent.variables
+    inf = float("inf")
+    bound = (dataclasses.replace(thickness, bounds=(1.5, inf)), *others, dataclasses.replace(last, bounds=(-inf, 30.0)))
+    told = dataclasses.replace(original.intent, variables=(curvature, *bound))
+    assert again(dataclasses.replace(original, intent=told), tmp_path).intent == told
+    steep = dataclasses.replace(told, variables=(dataclasses.replace(curvature, bounds=(0.0, 0.1)), *bound))
+    with pytest.warns(LensFileWarning, match=r"bounds of variables.*thicknesses alone \('curvature of surface 1'\)"):
+        write_lens(dataclasses.replace(original, intent=steep), tmp_path / "again.zmx")
+    assert read_lens_with_report(tmp_path / "again.zmx")[0].intent == told
+
+
 def test_a_merit_function_file_has_two_numbers_more_before_the_target(tmp_path):
     path = tmp_path / "spot.MF"
     path.write_text("VERS 120229\nBLNK spot\nTRAC 0 1 0 0.7 0.5 0 0 0 0.25 0.125\nEFFL 0 2 0 0 0 0 0 0 2 1\n", "utf-16")

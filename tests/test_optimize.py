@@ -251,6 +251,14 @@ def test_a_merit_that_is_no_sum_of_squares_is_descended_by_its_gradient(triplet)
         rt.optimize(triplet, merit=merit, vary="sensor", hold="efl=100")
 
 
+def test_bounds_stay_with_the_lens(triplet, tmp_path):
+    lens = dataclasses.replace(triplet, intent=None)
+    found = rt.optimize(lens, merit="spot", vary="curvature:1 thickness:1,2", bounds="thickness_1:1..", cycles=1).lens
+    assert [one.bounds for one in found.intent.variables] == [(), (1.0, float("inf")), ()]
+    rt.write_lens(found, tmp_path / "lens.zmx")
+    assert rt.read_lens(tmp_path / "lens.zmx").intent.variables == found.intent.variables
+
+
 # -- lost rays ---------------------------------------------------------------------------------------------------------
 
 

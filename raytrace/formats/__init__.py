@@ -231,6 +231,9 @@ def _changed_texts(lens: Lens, content: bytes, form: Format, path: Path, catalog
         pairs.append((f"the other configurations, {count(lens.operands)} in all", lens.current_configuration, 0))
     else:
         pairs += [(str(a), a.values(), b.values()) for a, b in zip(lens.operands, again.operands, strict=False)]
+    if unbound := _unbound(lens.intent, again.intent):
+        pairs.append(("bounds of variables, of which it holds those of thicknesses alone", ", ".join(unbound), ""))
+        again = dataclasses.replace(again, intent=dataclasses.replace(again.intent, variables=lens.intent.variables))
     if _asks(lens.intent) and again.intent != lens.intent:
         pairs.append(("what is to be optimised", f"{len(lens.intent.merit)} rows of a merit function", ""))
     return [f"{what} ({shown(str(before))})" for what, before, after in pairs if before != after]
@@ -248,3 +251,13 @@ def _format(path: Path, known: Sequence[str] = tuple(FORMATS)) -> Format:
         found = f"a {suffix} file is read, but not written" if suffix in FORMATS else f"{found} of lens files"
         raise LensFileError(f"{found}; expected one of {', '.join(known)}", Place(str(path)))
     return FORMATS[suffix]
+
+
+def _unbound(intent: Intent | None, again: Intent | None) -> list[str]:
+    """Variables whose bounds are not those that they were written with, where nothing else of them is another."""
+    if intent is None or again is None:
+        return []
+    free = [[dataclasses.replace(one, bounds=()) for one in told.variables] for told in (intent, again)]
+    pairs = zip(intent.variables, again.variables, strict=False)
+    bare = [f"{a.quantity} of surface {a.surface}" for a, b in pairs if a.bounds and not b.bounds]
+    return bare if free[0] == free[1] else []

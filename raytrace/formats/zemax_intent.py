@@ -81,8 +81,8 @@ def _says_more(intent: Intent, lens: Lens) -> bool:
 
 
 def _refuse_infinite(intent: Intent, told: list[Told]) -> None:
-    for one in (*intent.solves, *intent.kept, *intent.variables):
-        figures = one.bounds if isinstance(one, Vary) else (*one.numbers, one.scale, one.offset)
+    for one in (*intent.solves, *intent.kept):
+        figures = *one.numbers, one.scale, one.offset
         if not all(map(math.isfinite, figures)):
             message = f"a rule of the {one.quantity}: a number is too large once converted to mm"
             raise LensFileError(message, told[min(one.surface, len(told) - 1)].block.place)

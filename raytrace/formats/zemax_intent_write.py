@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from raytrace.formats.source import LensFileError, Place
 from raytrace.formats.zemax_names import listed, names
 from raytrace.formats.zemax_rules import (
+    BOUNDLESS,
     CONFIGURATION_RULES,
     CURVATURE_PICKUP,
     CURVATURE_SOLVES,
@@ -95,7 +96,9 @@ def _with_thickness(lines: Lines, one: Vary | Solve, parameters: dict, place: Pl
 
 def _thickness(one: Vary | Solve, place: Place) -> str:
     if isinstance(one, Vary):
-        return f"VDSZ {' '.join(map(_spelled, one.bounds or (0.0, 0.0)))}"
+        far = 1e3 * BOUNDLESS  # mm: none in metres, too
+        ends = (max(-far, min(end, far)) for end in one.bounds or (0.0, 0.0))
+        return f"VDSZ {' '.join(map(_spelled, ends))}"
     if one.kind == "variable":
         return "VDSZ 0 0"
     if one.kind == "pickup":

@@ -75,7 +75,7 @@ VARIABLE = 1
 CONFIGURATION_RULES = {2: "pickup", 4: "thermal"}
 
 #: Bounds this far out are none.
-_BOUNDLESS = 1e10
+BOUNDLESS = 1e10
 
 
 class Told(NamedTuple):
@@ -199,9 +199,15 @@ def _thickness(one: Told) -> Iterator[Vary | Solve]:
         if math.isinf(float(one.surface.thickness)):
             yield one.solve("thickness", "variable")
             return
-        least, most = (record.number(k, "bound", 0.0) * one.millimetres for k in (0, 1))
-        bounded = least < most and max(-least, most) < _BOUNDLESS
-        yield Vary(one.number, "thickness", bounds=(least, most) if bounded else ())
+        yield Vary(one.number, "thickness", bounds=_bounds(record, one.millimetres))
+
+
+def _bounds(record: Record, millimetres: float) -> tuple[float, ...]:
+    """Least and greatest in mm, infinite on a side that is open; () where both are."""
+    least, most = (record.number(k, "bound", 0.0) for k in (0, 1))
+    if least >= most or (least <= -BOUNDLESS and most >= BOUNDLESS):
+        return ()
+    return tuple(math.copysign(math.inf, n) if abs(n) >= BOUNDLESS else n * millimetres for n in (least, most))
 
 
 def _thickness_pickup(one: Told, record: Record) -> Solve:

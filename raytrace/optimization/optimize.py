@@ -107,7 +107,9 @@ def optimize(
             problem.state, start, paths=paths, watch=lambda cycle, state: told.tell(cycle, state.x), **how
         )
         told.kept.keep(found.state.x, float(np.sqrt(found.state.cost)), found.cycles, now=True)
-    return _with_choice(_result(lens, problem, names, before, found, time.monotonic() - begun), choice)
+    done = _result(lens, problem, names, before, found, time.monotonic() - begun)
+    done = dataclasses.replace(done, lens=_with_bounds(done.lens, free.variables, lower, upper))
+    return _with_choice(done, choice)
 
 
 class _Told:
@@ -259,3 +261,11 @@ def _with_intent(lens: Lens, model: Model, rows: tuple[Row, ...], unit: float) -
     if lens.intent is not None:
         return lens
     return dataclasses.replace(lens, intent=Intent(model.variables, model.solves, rows, unit))
+
+
+def _with_bounds(lens: Lens, variables: Sequence[Vary], lower: np.ndarray, upper: np.ndarray) -> Lens:
+    """The lens whose variables, where its intent has them, have the bounds that held."""
+    ends = zip(map(float, lower), map(float, upper), strict=True)
+    held = {name_of(one): pair for one, pair in zip(variables, ends, strict=True) if not np.isinf(pair).all()}
+    told = tuple(dataclasses.replace(one, bounds=held.get(name_of(one), one.bounds)) for one in lens.intent.variables)
+    return dataclasses.replace(lens, intent=dataclasses.replace(lens.intent, variables=told))
