@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import hashlib
 import io
+import json
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -15,7 +16,7 @@ from torch import Tensor
 from raytrace.camera.training import Run
 from raytrace.cli.door import CommandError
 from raytrace.cli.progress import progress
-from raytrace.files import table, write_atomically
+from raytrace.files import table, write_atomically, write_json
 from raytrace.maths.result import Result
 from raytrace.maths.value import detached
 from raytrace.pages import grid, picture
@@ -37,10 +38,10 @@ from raytrace.studies.edof.noise_command import Settings
 from raytrace.studies.edof.report import contents_of, learn
 from raytrace.studies.edof.table import ROWS
 from raytrace.studies.edof.training import EdofCamera
-from raytrace.studies.edof.world import World, kernels, transfer
+from raytrace.studies.edof.world import ClosedForm, World, kernels, transfer
 from raytrace.studies.pictures import Pictures
 from raytrace.studies.publish import publish
-from raytrace.wave.element import Element, as_made
+from raytrace.wave.element import Element, Rings, as_made
 from raytrace.wave.element_file import read_element, write_element
 from raytrace.words import did_you_mean
 
@@ -159,9 +160,27 @@ class Kept:
     """Errors of every picture, kept in a folder: computed once for these pictures."""
 
     def __init__(self, folder: Path, banks: Sequence[Bank]):
-        self.banks = banks
+        self.banks, self._forms = banks, {}
         marks = {bank.name: hashlib.sha256(bank.powers.numpy().tobytes()).hexdigest()[:16] for bank in banks}
         self.folder = Run(folder, {"pictures": marks}).folder
+
+    def transfer(self, elements: Sequence[Element]) -> Tensor:
+        """H (D, W, n, n) of learned elements, whatever the noise; of rings what heights do not change is kept."""
+        S = self.banks[0].spectrum
+        if len(elements) > 1 or not isinstance(elements[0].profile, Rings):
+            return transfer(kernels(elements, World()), S.shape[-1])
+        mark = elements[0].glass.name, float(elements[0].profile.pitch)
+        if mark not in self._forms:
+            whole = dataclasses.replace(elements[0], period=None, levels=0)
+            self._forms[mark] = ClosedForm((whole,), World(), S)
+        return self._forms[mark].transfer(elements)
+
+    def number(self, name: str, make: Callable[[], float]) -> float:
+        """A number, made only where it is not kept."""
+        file = self.folder / f"{name}.json"
+        if not file.exists():
+            write_json(file, make())
+        return json.loads(file.read_text())
 
     def find(self, name: str, world: World, make: Callable[[], Tensor]) -> dict[str, Errors]:
         """Errors by content of transfer functions, made only where they are not kept."""
@@ -203,11 +222,11 @@ def judge_baselines(
 
 def judge_files(files: Sequence[str], settings: Settings, kept: Kept) -> dict[tuple[str, float], dict[str, Errors]]:
     """Errors of elements in files of heights, by the name of the file and noise."""
-    size, found = kept.banks[0].spectrum.shape[-1], {}
+    found = {}
     for file in files:
         element = read_element(file, aperture=2 * World().radius)
         mark = hashlib.sha256(element.numbers.numpy().tobytes()).hexdigest()[:16]
-        H = transfer(kernels((element,), World()), size)
+        H = kept.transfer((element,))
         for own in settings.noise:
             world = dataclasses.replace(World(), noise=own)
             found[Path(file).stem, own] = kept.find(f"file-{mark}-{own:g}", world, lambda H=H: H)
@@ -238,16 +257,12 @@ def judge_learned(
     unit: Unit, settings: Settings, train: Pictures, root: Path, kept: Kept
 ) -> tuple[float, dict[str, Errors]]:
     """Its expected error, that of learning, and errors of pictures."""
-    size = kept.banks[0].spectrum.shape[-1]
+    name = f"{unit.row}-{unit.noise:g}-{unit.start}"
     with torch.no_grad():
         camera = learn_unit(unit, settings, train, root)
         elements = detached(camera.variables())
-
-        def H() -> Tensor:
-            return transfer(kernels(elements, unit.world()), size)
-
-        found = kept.find(f"{unit.row}-{unit.noise:g}-{unit.start}", unit.world(), H)
-        return float(camera.expected(elements)), found
+        found = kept.find(name, unit.world(), lambda: kept.transfer(elements))
+        return kept.number(name, lambda: float(camera.expected(elements))), found
 
 
 def scores(

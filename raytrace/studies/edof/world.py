@@ -6,6 +6,7 @@ classic Wiener filter of the design depth with the best constant γ, and the bes
 """
 
 import dataclasses
+import functools
 import math
 import warnings
 from collections.abc import Callable, Iterable, Sequence
@@ -127,10 +128,15 @@ class ClosedForm:
     """
 
     def __init__(self, first: Sequence[Element], world: World, S: Tensor, *, dtype: torch.dtype = torch.float64):
-        self.world, self.S, self._memo = world, S, Memo()
-        own = scene(first, world)
-        self.plan = plan(own)
-        self._octant = Octant(own, self.plan, S.shape[-1], dtype=dtype) if fits(own, self.plan, S) else None
+        self.world, self.S, self._memo, self._dtype = world, S, Memo(), dtype
+        self._first = scene(first, world)
+        self.plan = plan(self._first)
+
+    @functools.cached_property
+    def _octant(self) -> Octant | None:
+        if not fits(self._first, self.plan, self.S):
+            return None
+        return Octant(self._first, self.plan, self.S.shape[-1], dtype=self._dtype)
 
     def __call__(self, elements: Sequence[Element]) -> Tensor:
         if self._octant is not None:
@@ -224,13 +230,15 @@ def _mean_square(pictures: Tensor, H: Tensor, G: Tensor, noise: Tensor) -> Tenso
 def best_gamma(H: Tensor, S: Tensor, noise: float, at_design: Tensor) -> float:
     """The constant γ of the Wiener filter of the design depth (W, N, N) that errs least over all depths."""
 
-    # The error of a filter G, ⟨S|1 - G H|² + σ²|G|²⟩, needs but two means over the depths.
-    middle, square = H.mean(0), (H.real**2 + H.imag**2).mean(0)
+    # The error of G = H*/(|H|² + γ), ⟨S|1 - G H_z|² + σ²|G|²⟩, needs but two means over the depths.
+    own = at_design.real**2 + at_design.imag**2
+    along = S * (at_design.conj() * H.mean(0)).real
+    power = own * (S * (H.real**2 + H.imag**2).mean(0) + noise**2)
+    rest = float(S.mean())
 
     def error(logarithm: float) -> float:
-        G = wiener(at_design, 10**logarithm)
-        power = S * square + noise**2
-        return float((S * (1 - 2 * (G * middle).real) + (G.real**2 + G.imag**2) * power).mean())
+        weight = 1 / (own + 10**logarithm)
+        return rest + float((weight * (power * weight - 2 * along)).mean())
 
     # Coarse steps first: far from the best γ the error is flat.
     places = np.arange(-6.0, 2.0, 0.5)

@@ -18,7 +18,7 @@ from raytrace.studies.edof.noise import FILTERS, Bank, Errors, Interval, drawn, 
 from raytrace.studies.edof.noise_command import Settings as Noise
 from raytrace.studies.edof.noise_report import TITLES, WAVELENGTH, Kept, judge_baselines, judge_learned, learn_unit
 from raytrace.studies.edof.report import contents_of
-from raytrace.studies.edof.world import ClosedForm, World, kernels, periodic, spectrum, transfer
+from raytrace.studies.edof.world import ClosedForm, World, periodic, spectrum
 from raytrace.studies.pictures import Pictures
 from raytrace.studies.publish import publish
 from raytrace.studies.quantise.process import Case, cases, etch_rings, under_errors
@@ -148,14 +148,14 @@ def _judged(
     case: Case, element: Element, settings: Settings, train: Pictures, kept: Kept
 ) -> tuple[float, float, dict[str, Errors]]:
     """Its expected error with errors of height, what those cost in dB, and errors of pictures."""
-    size, world, expected = kept.banks[0].spectrum.shape[-1], case.model.world(), _expected(element, case, train)
-    off = torch.tensor(under_errors(element, expected, settings.tolerance))
-    lost = float(psnr(expected((element,))) - psnr(off).mean())
-
-    def H() -> torch.Tensor:
-        return transfer(kernels((element,), world), size)
-
-    return float(off.mean()), lost, kept.find(f"{case.row}-{case.noise:g}-{case.start}", world, H)
+    name, world = f"{case.row}-{case.noise:g}-{case.start}", case.model.world()
+    expected = _expected(element, case, train)
+    off = kept.number(
+        f"{name}-errors", lambda: float(torch.tensor(under_errors(element, expected, settings.tolerance)).mean())
+    )
+    still = kept.number(name, lambda: float(expected((element,))))
+    lost = float(psnr(torch.tensor(still)) - psnr(torch.tensor(off)))
+    return off, lost, kept.find(name, world, lambda: kept.transfer((element,)))
 
 
 def _rows(
