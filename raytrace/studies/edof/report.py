@@ -80,9 +80,7 @@ def edof(arguments: argparse.Namespace) -> Learned:
     with torch.no_grad():
         elements = camera.variables()
         found = kernels(elements, world)
-        own = quality(
-            elements, world, train=periodic(train, _WIDE), test=periodic(test, _WIDE), seed=settings.seed, found=found
-        )
+        own = quality(elements, world, train=periodic(train, _WIDE), test=periodic(test, _WIDE), found=found)
     learned = Learned(elements, world, found, own, settings)
     write_json(folder / "outcome.json", learned.document())
     made = as_made(elements[0]) if settings.kind == "rings" else as_pixels(elements[0], world.pixel)

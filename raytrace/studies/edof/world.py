@@ -16,7 +16,7 @@ import scipy.optimize
 import torch
 from torch import Tensor, nn
 
-from raytrace.camera.deconvolve import blind_error, blind_filter, power_spectrum, psnr, wiener
+from raytrace.camera.deconvolve import blind_error, blind_filter, errors, power_spectrum, psnr, wiener
 from raytrace.camera.image import transfer_functions
 from raytrace.maths.grid import grid
 from raytrace.maths.result import Result
@@ -171,10 +171,9 @@ def quality(
     *,
     train: Tensor,
     test: Tensor,
-    seed: int = 0,
     found: ElementPsf | None = None,
 ) -> Quality:
-    """Restore test pictures (B, N, N) with noise drawn once, filters made for training pictures (A, N, N) alone."""
+    """Of test pictures (B, N, N), expected over noise, behind filters made for training pictures (A, N, N) alone."""
     found = kernels(elements, world) if found is None else found
     size = test.shape[-1]
     H, S = transfer(found, size), spectrum(train)
@@ -184,11 +183,10 @@ def quality(
         at_design = transfer(kernels(elements, world, depths=[world.design]), size)[0]
     gamma = best_gamma(H, S, world.noise, at_design)
     filters = {"wiener": wiener(at_design, gamma), "blind": blind_filter(H, S, world.noise)}
-    generator = torch.Generator().manual_seed(seed)
-    noise = world.noise * torch.randn(len(test), *H.shape[1:], generator=generator, dtype=test.dtype)
+    shown = spectrum(test)
     by_depth, by_colour = {}, {}
     for name, G in filters.items():
-        left = torch.stack([_mean_square(test, H_z, G, noise) for H_z in H])  # (D, W)
+        left = errors(H, shown, world.noise, filter=G)  # (D, W)
         by_depth[name] = tuple(psnr(left.mean(1)).tolist())
         by_colour[name] = tuple(psnr(left).mean(0).tolist())
     return Quality(
@@ -220,11 +218,6 @@ def restored(H: Tensor, G: Tensor, pictures: Tensor, noise: Tensor) -> tuple[Ten
     """
     seen = torch.fft.ifft2(torch.fft.fft2(pictures)[:, None] * H).real + noise
     return seen, torch.fft.ifft2(torch.fft.fft2(seen) * G).real
-
-
-def _mean_square(pictures: Tensor, H: Tensor, G: Tensor, noise: Tensor) -> Tensor:
-    estimate = restored(H, G, pictures, noise)[1]
-    return (estimate - pictures[:, None]).square().mean((0, -2, -1))
 
 
 def best_gamma(H: Tensor, S: Tensor, noise: float, at_design: Tensor) -> float:
