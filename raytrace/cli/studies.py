@@ -11,6 +11,7 @@ PLACES = {
     "edof": "edof.command",
     "table": "edof.table_command",
     "noise": "edof.noise_command",
+    "network": "edof.network_command",
     "superres": "superres.command",
     "discover": "superres.discover_command",
     "quantise": "quantise.command",

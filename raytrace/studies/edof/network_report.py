@@ -1,0 +1,170 @@
+"""What `raytrace wave network` finds: as text, as a document, as a page."""
+
+import argparse
+import dataclasses
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from raytrace.camera.training import read_json
+from raytrace.cli.door import CommandError
+from raytrace.cli.progress import progress
+from raytrace.files import table, write_json
+from raytrace.maths.result import Result
+from raytrace.pages import grid
+from raytrace.studies.edof.network import Filtered, errors_behind, learn_network, patches
+from raytrace.studies.edof.network_command import Settings
+from raytrace.studies.edof.noise import Interval, best_strengths, cases, drawn, gain, mean_psnr
+from raytrace.studies.edof.noise_report import title_of
+from raytrace.studies.edof.report import contents_of
+from raytrace.studies.edof.table import ROWS, Content
+from raytrace.studies.edof.world import World, kernels, spectrum, transfer
+from raytrace.studies.publish import publish
+from raytrace.wave.element import Element
+from raytrace.wave.element_file import read_element
+
+_TRAINED, _RESTORED = 100, 24  # pictures
+
+
+@dataclasses.dataclass(frozen=True)
+class Behind:
+    """One element: PSNR in dB behind the filter and with the network, what the network brings, and the gain of both
+    over those of the first row."""
+
+    row: str
+    filter: float
+    network: float
+    brings: Interval
+    over_filter: Interval
+    over_network: Interval
+
+    def record(self) -> dict:
+        found = {"row": self.row, "filter": self.filter, "network": self.network}
+        for name in ("brings", "over_filter", "over_network"):
+            own = getattr(self, name)
+            found |= {name: own.value, f"{name}_low": own.low, f"{name}_high": own.high}
+        return found
+
+
+@dataclasses.dataclass(frozen=True)
+class Networks(Result):
+    """Every element; pictures: how many were restored."""
+
+    rows: list[Behind]
+    pictures: int
+    kind: str
+    noise: float
+
+    def document(self) -> dict:
+        return {"pictures": self.pictures, "kind": self.kind, "rows": [row.record() for row in self.rows]}
+
+    def lines(self) -> list[tuple[str, ...]]:
+        return [
+            (title_of(one.row), f"{one.filter:.2f}", f"{one.network:.2f}", str(one.brings), str(one.over_filter),
+             str(one.over_network))
+            for one in self.rows
+        ]  # fmt: skip
+
+    @property
+    def header(self) -> tuple[str, ...]:
+        first = title_of(self.rows[0].row)
+        return ("element", "filter", "network", "network brings", f"over {first}, filters", "networks")
+
+    def __str__(self) -> str:
+        lines = [f"{row[0]:>32}" + "".join(f"{cell:>26}" for cell in row[1:]) for row in [self.header, *self.lines()]]
+        return "\n".join([f"{self.kind}, noise {self.noise:g}: PSNR in dB, gains (95 % interval)", *lines])
+
+
+def networks(arguments: argparse.Namespace) -> Networks:
+    """Learn what is left, judge everything; the page where --docs asks for it."""
+    settings = Settings.of(vars(arguments))
+    unknown = [row for row in arguments.rows if row not in ROWS or ROWS[row].learning]
+    if unknown:
+        baselines = ", ".join(row for row in ROWS if not ROWS[row].learning)
+        raise CommandError(f"--rows {' '.join(unknown)}: expected {baselines}")
+    content = contents_of(arguments)[0][-1 if arguments.data else 0]
+    found = {}
+    for name, elements in _elements(arguments, settings, content):
+        found[name] = _judged(name, elements, content, settings, Path(arguments.folder))
+    result = Networks(_rows(found, settings), min(_RESTORED, len(content.test)), content.name, settings.noise)
+    if arguments.docs:
+        words = [f"--rows {' '.join(arguments.rows)}", *(["--elements FILES"] if arguments.elements else [])]
+        words += [f"--data DIR --limit {arguments.limit}"] if arguments.data else []
+        parts = _parts(result, " ".join(["raytrace wave network", *words, *settings.words(), "-o FOLDER --docs docs"]))
+        tables = {"network.csv": table([row.record() for row in result.rows], floats=lambda n: round(n, 4))}
+        publish(Path(arguments.docs) / "wave_network.md", "wave", parts, tables=tables, figures={})
+    return result
+
+
+def _elements(
+    arguments: argparse.Namespace, settings: Settings, content: Content
+) -> Iterator[tuple[str, tuple[Element, ...]]]:
+    cubic = any(row.startswith("cubic") for row in arguments.rows)
+    strengths = best_strengths([settings.noise], spectrum(content.train)) if cubic else {}
+    for row, elements, _ in cases(arguments.rows, [settings.noise], strengths):
+        yield row, elements
+    for file in arguments.elements:
+        yield Path(file).stem, (read_element(file, aperture=2 * World().radius),)
+
+
+def _judged(
+    name: str, elements: tuple[Element, ...], content: Content, settings: Settings, root: Path
+) -> dict[str, Tensor]:
+    """Errors (B, D, W) behind the filter and behind both."""
+    made: list[Filtered] = []
+
+    def camera() -> Filtered:
+        if not made:
+            with torch.no_grad():
+                H = transfer(kernels(elements, World()), content.test.shape[-1])
+            made.append(Filtered.of(H, spectrum(content.train), settings.noise))
+        return made[0]
+
+    numbers = b"".join(element.numbers.detach().numpy().tobytes() for element in elements)
+    about = {"noise": settings.noise, "content": content.name, "pictures": len(content.train)}
+    about |= {"element": hashlib.sha256(numbers).hexdigest()[:16]}
+    folder = root / f"{name}-{settings.noise:g}"
+    network = learn_network(
+        folder,
+        lambda: patches(camera(), content.train[:_TRAINED], seed=settings.seed),
+        about,
+        steps=settings.steps,
+        seed=settings.seed,
+        bar=lambda steps: progress(steps, f"step of the network of {name}"),
+    )
+    file = folder / "errors.json"
+    if not file.exists():
+        errors = errors_behind(camera(), network, content.test[:_RESTORED], progress=lambda own: progress(own, name))
+        write_json(file, {one: own.tolist() for one, own in errors.items()})
+    return {one: torch.tensor(own, dtype=torch.float64) for one, own in read_json(file).items()}
+
+
+def _rows(found: dict[str, dict[str, Tensor]], settings: Settings) -> list[Behind]:
+    first = next(iter(found.values()))
+    weights = drawn(len(first["filter"]), seed=settings.seed)
+    return [
+        Behind(
+            name,
+            *(float(mean_psnr(own[one])) for one in ("filter", "network")),
+            gain(own["network"], own["filter"], weights),
+            *(gain(own[one], first[one], weights) for one in ("filter", "network")),
+        )
+        for name, own in found.items()
+    ]
+
+
+def _parts(found: Networks, command: str) -> list[str]:
+    return [
+        "# A small network behind the filter",
+        f"    {command}",
+        "Camera, depths and colours of [wave_edof.md](wave_edof.md). Elements stay as they are; behind the best "
+        "depth-invariant filter stands a network of 10,000 weights (RED-Net, 6 layers of 16 maps), told neither depth "
+        f"nor colour, learned from patches of {_TRAINED} {found.kind} at depths drawn, noise {found.noise:g}. Judged "
+        f"on {found.pictures} others, all depths and colours, noise drawn once and the same for both. PSNR in dB, mean "
+        "over depths; in brackets the interval of 95 % of 2,000 samples of the pictures drawn with replacement.",
+        grid(found.header, found.lines()),
+        "All figures: [network.csv](wave/network.csv).",
+    ]

@@ -1,0 +1,80 @@
+"""A small network behind the filter: patches of what the filter leaves, learning that resumes, errors beside it."""
+
+import json
+import math
+
+import pytest
+import torch
+
+from raytrace.cli import main
+from raytrace.studies.edof import network_report, report
+from raytrace.studies.edof.network import Filtered, errors_behind, learn_network, patches
+from raytrace.studies.edof.world import World, periodic, spectrum, transfer
+from raytrace.studies.edof.world import scene as scene_of
+from raytrace.studies.pictures import dead_leaves
+from raytrace.wave.designs import aim, baseline
+from raytrace.wave.psf import psf
+
+SMALL = World(depths=(500.0, 1000.0, math.inf), wavelengths=(0.55,), size=63, pixel=0.00738)
+PICTURES = periodic(dead_leaves(8, size=96, seed=5, smallest=2.5), 192)
+
+
+def camera(name="singlet") -> Filtered:
+    H = transfer(psf(scene_of(baseline(name, aim()), SMALL)), 192)
+    return Filtered.of(H, spectrum(PICTURES[:5]), SMALL.noise)
+
+
+def test_patches_are_what_the_filter_makes_of_pictures():
+    given, true = patches(camera(), PICTURES[:3])
+    assert given.shape == true.shape == (3 * 8, 1, 64, 64)
+    assert given.dtype == torch.float32
+    left = float((given - true).square().mean())
+    assert 1e-4 < left < 0.1
+    again, _ = patches(camera(), PICTURES[:3])
+    assert torch.equal(given, again)
+
+
+def test_a_network_learns_what_the_filter_leaves_and_goes_on(tmp_path):
+    """Twelve steps lower the error of pictures it was learned from; a run broken off ends as one that was not."""
+    own = camera()
+
+    def data():
+        return patches(own, PICTURES[:5])
+
+    def broken(steps):
+        for number, step in enumerate(steps):
+            yield step
+            if number == 5:
+                return
+
+    whole = learn_network(tmp_path / "whole", data, {}, steps=12)
+    learn_network(tmp_path / "broken", data, {}, steps=12, bar=broken)
+    resumed = learn_network(tmp_path / "broken", data, {}, steps=12)
+    for a, b in zip(whole.parameters(), resumed.parameters(), strict=True):
+        assert torch.equal(a, b)
+    found = errors_behind(own, whole, PICTURES[:2])
+    assert found["filter"].shape == (2, 3, 1)
+    assert float(found["network"].mean()) < float(found["filter"].mean())
+    finished = learn_network(tmp_path / "whole", lambda: pytest.fail("made anew"), {}, steps=12)
+    assert torch.equal(next(finished.parameters()), next(whole.parameters()))
+
+
+def test_baselines_alone_are_rows(capsys):
+    assert main(["wave", "network", "--rows", "learned", "-o", "nowhere"]) == 1
+    assert "--rows learned: expected fresnel" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_command_learns_judges_and_goes_on(capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(report, "_LEAVES", 6)
+    monkeypatch.setattr(network_report, "_RESTORED", 2)
+    words = ["wave", "network", "--rows", "fresnel", "singlet", "--steps", "2", "-o", str(tmp_path / "run")]
+    words += ["--docs", str(tmp_path / "docs"), "--json"]
+    assert main(words) == 0
+    first = json.loads(capsys.readouterr().out)
+    rows = {row["row"]: row for row in first["rows"]}
+    assert rows["fresnel"]["over_filter"] == 0
+    assert rows["singlet"]["over_filter"] > 1
+    assert "| PMMA singlet |" in (tmp_path / "docs/wave_network.md").read_text()
+    assert main(words) == 0
+    assert json.loads(capsys.readouterr().out) == first
