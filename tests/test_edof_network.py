@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 
+from raytrace.camera.network import RedNet, RedNetShape
 from raytrace.cli import main
 from raytrace.studies.edof import network_report, report
 from raytrace.studies.edof.network import Filtered, errors_behind, learn_network, patches
@@ -34,29 +35,36 @@ def test_patches_are_what_the_filter_makes_of_pictures():
     assert torch.equal(given, again)
 
 
-def test_a_network_learns_what_the_filter_leaves_and_goes_on(tmp_path):
-    """Twelve steps lower the error of pictures it was learned from; a run broken off ends as one that was not."""
+def test_a_run_that_is_broken_off_ends_as_one_that_was_not(tmp_path):
+    """Six steps; finished, its data are not made again. Without a step the filter's picture stays as it is."""
     own = camera()
 
     def data():
-        return patches(own, PICTURES[:5])
+        return patches(own, PICTURES[:2])
 
     def broken(steps):
         for number, step in enumerate(steps):
             yield step
-            if number == 5:
+            if number == 2:
                 return
 
-    whole = learn_network(tmp_path / "whole", data, {}, steps=12)
-    learn_network(tmp_path / "broken", data, {}, steps=12, bar=broken)
-    resumed = learn_network(tmp_path / "broken", data, {}, steps=12)
-    for a, b in zip(whole.parameters(), resumed.parameters(), strict=True):
-        assert torch.equal(a, b)
-    found = errors_behind(own, whole, PICTURES[:2])
+    whole = learn_network(tmp_path / "whole", data, {}, steps=6)
+    learn_network(tmp_path / "broken", data, {}, steps=6, bar=broken)
+    resumed = learn_network(tmp_path / "broken", data, {}, steps=6)
+    finished = learn_network(tmp_path / "whole", lambda: pytest.fail("made anew"), {}, steps=6)
+    for other in (resumed, finished):
+        assert all(torch.equal(a, b) for a, b in zip(whole.parameters(), other.parameters(), strict=True))
+    found = errors_behind(own, RedNet(RedNetShape(6, 16)), PICTURES[:2])
     assert found["filter"].shape == (2, 3, 1)
-    assert float(found["network"].mean()) < float(found["filter"].mean())
-    finished = learn_network(tmp_path / "whole", lambda: pytest.fail("made anew"), {}, steps=12)
-    assert torch.equal(next(finished.parameters()), next(whole.parameters()))
+    torch.testing.assert_close(found["network"], found["filter"], rtol=1e-5, atol=0)
+
+
+@pytest.mark.slow
+def test_a_network_learns_what_the_filter_leaves(tmp_path):
+    own = camera()
+    network = learn_network(tmp_path, lambda: patches(own, PICTURES[:5]), {}, steps=60)
+    found = errors_behind(own, network, PICTURES[:3])
+    assert float(found["network"].mean()) < 0.99 * float(found["filter"].mean())
 
 
 def test_baselines_alone_are_rows(capsys):
