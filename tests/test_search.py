@@ -24,6 +24,7 @@ from raytrace.optimization.journal import BadSearch, Ended, Journal, Stopped
 from raytrace.optimization.least_squares import Manner, least_squares
 from raytrace.optimization.meniscus import enlarged, saddle, thinned
 from raytrace.optimization.minima import Minima
+from raytrace.optimization.opening import opened
 from raytrace.optimization.problem import NoProblem
 from raytrace.optimization.starts import length_of, space_of
 
@@ -81,6 +82,24 @@ def test_starts_are_spread_evenly_and_are_the_same_in_any_order(plate):
     parts = (np.concatenate(blocks) - space.low) / (space.high - space.low)
     counts = [np.histogram(part, 8, (0, 1))[0] for part in parts.T]
     assert np.array_equal(counts, np.full_like(counts, 8))  # a net: as many in each eighth
+
+
+def test_a_start_that_loses_rays_of_half_the_beam_is_opened_step_by_step(monkeypatch):
+    steep = plates(1.8, diameter=36.0, fields=(0.0, 25.0))
+    for k, c in ((1, -0.05), (2, -0.06)):
+        steep = steep.replace(k, curvature=torch.tensor(c, dtype=torch.float64))
+    lost = []
+
+    def told(problem, x, **bounds):
+        there = opened(problem, x, **bounds)
+        lost.append([problem.state(one, False).lost for one in (x, there)])
+        return there
+
+    monkeypatch.setattr("raytrace.optimization.search.opened", told)
+    found = [rt.search(steep, hold="efl=50", starts=1, bounds=f"curvature:-{c}..{c}", **HOW).merit for c in (0.1, 0.06)]
+    assert lost[0][0] > 0
+    assert lost[0][1] == 0
+    assert torch.allclose(*found, rtol=1e-3)
 
 
 def test_the_focal_length_is_that_held_that_of_a_row_or_that_of_the_lens():

@@ -25,6 +25,7 @@ from raytrace.optimization.journal import Ended, Journal, Stopped
 from raytrace.optimization.least_squares import Manner
 from raytrace.optimization.meniscus import places_of
 from raytrace.optimization.minima import Minima, Minimum
+from raytrace.optimization.opening import opened
 from raytrace.optimization.problem import NoProblem, Problem
 from raytrace.optimization.searched import Searched, searched
 from raytrace.optimization.stages import FOLLOW, LONG, Stage, descended
@@ -37,9 +38,8 @@ from raytrace.system.naming import parse_range
 STARTS = 64
 _BATCH = 16  # starts; what is done in a batch is shared by processes
 _POINTS = 8  # of which a start is the best
-_BEAMS = (0.1, 0.12), (0.25, 0.3), (0.5, 0.6), (0.75, 0.8)  # parts of pupil and field, opened one after the other
-_NARROW = 2  # of these, that a start descends on first where all its rays arrive
-_SHORT = 10, 12  # cycles on each narrow and on the whole beam
+_NARROW = 0.5, 0.6  # parts of pupil and field that a start descends on first
+_SHORT = 10, 12  # cycles on the narrow and on the whole beam
 _FOLLOWED = 4  # of a batch
 _HOPS = 4  # of a batch
 _SPRINGS = 3  # minima from which they start, the best ones
@@ -141,8 +141,9 @@ def _conditions(lens: Lens, hold, unit: float) -> tuple[Condition, ...]:
     return tuple(replace(one, row=in_unit(one.row, 1.0, unit)) for one in found)
 
 
-def _narrowed(rows: Sequence[Row], pupil: float, field: float) -> tuple[Row, ...]:
-    """The rows with the rays of default merit functions nearer to the axis, by parts of pupil and field."""
+def _narrowed(rows: Sequence[Row]) -> tuple[Row, ...]:
+    """The rows with the rays of default merit functions nearer to the axis, in pupil and field."""
+    pupil, field = _NARROW
     scale = np.array([field, field, pupil, pupil])
     return tuple(
         replace(row, numbers=tuple((scale * row.numbers).tolist())) if row.operand in _DEFAULT else row for row in rows
@@ -163,7 +164,7 @@ class _Run:
     DONE: ClassVar[str] = "starts"
 
     def __post_init__(self):
-        self.beams = [self.asked.problem(_narrowed(self.asked.rows, *parts)) for parts in _BEAMS]
+        self.narrow = self.asked.problem(_narrowed(self.asked.rows))
         self.whole, self.space = self.asked.whole, self.asked.space
         self.minima = Minima(np.maximum(self.space.upper - self.space.lower, 1e-300), _turned(self.space))
 
@@ -200,7 +201,7 @@ class _Run:
 
     def _follow(self, tasks: Sequence[tuple[str, np.ndarray]], bar) -> None:
         ends = self._each(
-            [(key, lambda x=x: descended(x, [self._stage(self.whole, LONG, FOLLOW)])) for key, x in tasks]
+            [(key, lambda x=x: descended(x, [Stage(self.whole, LONG, FOLLOW, *self._bounds)])) for key, x in tasks]
         )
         for (key, _), end in zip(tasks, ends, strict=True):
             if self.minima.add(end, key, self.work) and bar is not None:
@@ -212,24 +213,10 @@ class _Run:
         points = self.space.sobol(number, _POINTS, self.seed) if number else np.clip(model.start, *self._bounds)[None]
         points = [self.space.prepared(x) for x in points]
         best = min(points, key=self._worth)
-        beams = self._opening(best) if self._lost(self.beams[_NARROW], best) else self.beams[_NARROW : _NARROW + 1]
-        narrow = [self._stage(beam, _SHORT[0], _DAMPED) for beam in beams]
-        return descended(best, [*narrow, self._stage(self.whole, _SHORT[1], Manner())])
-
-    def _stages(self, x: np.ndarray) -> list[Stage]:
-        """To the minimum from x; where rays are lost the beam is opened step by step first."""
-        narrow = self._opening(x) if self._lost(self.whole, x) else []
-        return [*(self._stage(one, _SHORT[0], _DAMPED) for one in narrow), self._stage(self.whole, LONG, FOLLOW)]
-
-    def _opening(self, x: np.ndarray) -> list[Problem]:
-        """The narrow beams from the widest one that arrives from x, or else from the narrowest."""
-        whole = [k for k, beam in enumerate(self.beams) if not self._lost(beam, x)]
-        return self.beams[max(whole, default=0) :]
-
-    def _lost(self, problem: Problem, x: np.ndarray) -> int:
-        """How many rays are."""
-        with np.errstate(all="ignore"):
-            return int(problem.evaluated(x).lost.sum())
+        if self._worth(best)[0]:
+            best = opened(self.whole, best, lower=self.space.lower, upper=self.space.upper)
+        narrow = Stage(self.narrow, _SHORT[0], _DAMPED, *self._bounds)
+        return descended(best, [narrow, Stage(self.whole, _SHORT[1], Manner(), *self._bounds)])
 
     @property
     def _bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -238,7 +225,7 @@ class _Run:
     def _worth(self, x: np.ndarray) -> tuple[float, float]:
         """Lost rays and squares of a point on the narrow beam."""
         with np.errstate(all="ignore"):
-            found = self.beams[_NARROW].evaluated(x)
+            found = self.narrow.evaluated(x)
         squares = float(np.nansum(found.residuals**2))
         return float(found.lost.sum()), squares
 
@@ -247,9 +234,6 @@ class _Run:
         draw = np.random.default_rng([self.seed, *key.encode()])
         size = _REACH[0] * (_REACH[1] / _REACH[0]) ** draw.random()
         return self.space.prepared(x + size * (self.space.high - self.space.low) * draw.normal(size=len(x)))
-
-    def _stage(self, problem: Problem, cycles: int, manner: Manner) -> Stage:
-        return Stage(problem, cycles, manner, self.space.lower, self.space.upper)
 
 
 def _watched(task: Callable[[], Ended], bar) -> Callable[[], Ended]:
