@@ -17,6 +17,7 @@ from raytrace.media.glass import abbe_number, nd, refractive_index
 from raytrace.merit.hold import conditions_of
 from raytrace.merit.value import merit_for
 from raytrace.merit.vary import freedom
+from raytrace.optimization.checkpoint import BadCheckpoint
 from raytrace.optimization.glass import Choice, Design, expansion
 from raytrace.optimization.glass_freedom import without_glass
 from raytrace.optimization.glass_pool import STATUSES, Pool, catalogs_of, hull, pool_of
@@ -197,3 +198,32 @@ def test_the_command_prints_the_sequence(capsys):
     assert steps[2]["tried"]
     main([*words, "--cycles", "2"])
     assert re.search(r"surface 3: \S+ \(SCHOTT\)", capsys.readouterr().out)
+
+
+# -- interrupted -------------------------------------------------------------------------------------------------------
+
+
+def test_exchanges_go_on_where_they_were_interrupted(triplet, tmp_path, monkeypatch):
+    """Ended hard behind the first exchanges, and begun again from the checkpoint: the same lens to the last digit."""
+    path, done = tmp_path / "kept.json", []
+    how = {"merit": "spot", "vary": "curvature glass:1,6", "hold": "efl=100", "cycles": 5, "checkpoint": path, **BOUNDS}
+    whole = rt.optimize(triplet, **how)
+    swap = Choice._swap
+
+    def ended(self, surface, foretold):
+        if len(done) == 1:
+            raise RuntimeError("the machine stops")
+        done.append(surface)
+        return swap(self, surface, foretold)
+
+    monkeypatch.setattr(Choice, "_swap", ended)
+    with pytest.raises(RuntimeError, match="the machine stops"):
+        rt.optimize(triplet, **how)
+    monkeypatch.undo()
+    kept = json.loads(path.read_text())
+    assert set(kept["glasses"]) == {"1", "6"}
+    again = rt.optimize(triplet, resume=path, **how)
+    assert [s.glass.name for s in again.lens.surfaces] == [s.glass.name for s in whole.lens.surfaces]
+    assert again.merit_after == pytest.approx(whole.merit_after, rel=1e-12)
+    with pytest.raises(BadCheckpoint, match="a checkpoint of glasses that vary"):
+        rt.optimize(triplet, resume=path, **(how | {"vary": "curvature"}))

@@ -17,6 +17,7 @@ so that NJ_p holds Schur's complement of the Hessian. The best few of the list a
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -25,6 +26,7 @@ import numpy as np
 from raytrace.media.glass import Glass
 from raytrace.merit.model import Model
 from raytrace.merit.vary import Freedom
+from raytrace.optimization.checkpoint import BadCheckpoint, Kept
 from raytrace.optimization.glass_freedom import followers, with_glasses
 from raytrace.optimization.glass_pool import Pool, charge
 from raytrace.optimization.least_squares import State, least_squares
@@ -149,14 +151,16 @@ class Choice:
         cycles: int | None = None,
         until: float = np.inf,
         tell: Callable[[GlassStep], None] | None = None,
+        keep: Callable[[Kept, float], None] | None = None,
         **options,
     ):
-        """cycles: of a stage, at most; until: a time of `time.monotonic`; tell: told of steps; options: of Problem."""
+        """cycles: of a stage, at most; until: a time of `time.monotonic`; tell: told of steps; keep: given the best
+        while glasses are exchanged, and its merit; options: of Problem."""
         self.free, self.surfaces, self.pool, self.bounds = free, tuple(surfaces), pool, bounds
         self.rows, self.conditions, self.options = rows, conditions, options
         self.cycles = _CYCLES if cycles is None else min(cycles, _CYCLES)
         self.until, self.begun, self.evaluations, self.tell = until, time.monotonic(), 0, tell or (lambda step: None)
-        self.steps: list[GlassStep] = []
+        self.steps, self.keep = [], keep or (lambda kept, merit: None)
 
     @cached_property
     def candidates(self) -> dict[int, tuple[tuple[Glass, ...], np.ndarray]]:
@@ -170,20 +174,36 @@ class Choice:
             found[k] = glasses, np.concatenate(numbers)
         return found
 
-    def run(self, x: np.ndarray) -> Design:
-        """The best design from variables x, which are within their bounds."""
+    def run(self, x: np.ndarray, kept: Kept | None = None) -> Design:
+        """The best design from variables x, which are within their bounds; kept: from where exchanges go on."""
         own = {k: self.free.lens.surfaces[k].glass for k in self.surfaces}
+        if kept is not None and kept.glasses:
+            chosen = own | {k: self._named(k, *one) for k, one in kept.glasses.items()}
+            self.best = Design(x, chosen, self.limited(self.problem(chosen, ()), ())(x, True))
+            with suppress(KeyboardInterrupt):  # the best so far
+                self.swap(kept.tested)
+            return self.best
         first = self.descend(Design(x, own, None), (), self.cycles)
         self._tell(GlassStep("own", first.merit, self.seconds))
         self.best = first
-        try:
+        with suppress(KeyboardInterrupt):
             snapped = self.snapped(first)
             known = all(glass.catalog for glass in own.values())
             self.best = min(first, snapped, key=Design.rank) if known else snapped
+            self._keep(())
             self.swap()
-        except KeyboardInterrupt:
-            pass  # the best so far
         return self.best
+
+    def _named(self, surface: int, catalog: str, name: str) -> Glass:
+        """The candidate of a name. Raises BadCheckpoint."""
+        for glass in self.candidates[surface][0]:
+            if (glass.catalog, glass.name) == (catalog, name):
+                return glass
+        raise BadCheckpoint(f"the checkpoint's glass {name} of {catalog}, surface {surface}: no catalog given has it")
+
+    def _keep(self, tested: Sequence[int]) -> None:
+        glasses = {k: (glass.catalog, glass.name) for k, glass in self.best.glasses.items()}
+        self.keep(Kept(self.best.x, glasses, tuple(sorted(tested))), self.best.merit)
 
     def snapped(self, design: Design) -> Design:
         """The design with model glasses first, then with glasses of the catalogs in their places, one by one."""
@@ -313,9 +333,9 @@ class Choice:
         self._took("snap", surface, glass, "", predicted, found, told)
         return found
 
-    def swap(self) -> None:
-        """Exchange one glass at a time, the most promising first, until none helps."""
-        tested: set[int] = set()
+    def swap(self, tested: Sequence[int] = ()) -> None:
+        """Exchange one glass at a time, the most promising first, until none helps; tested: where none has helped."""
+        tested = set(tested)
         for _ in range(_ROUNDS * len(self.surfaces)):
             left = [k for k in self.surfaces if k not in tested]
             if not left or time.monotonic() > self.until:
@@ -325,6 +345,7 @@ class Choice:
             tested.add(surface)
             if self._swap(surface, foretold[surface]):
                 tested = {surface}
+            self._keep(tested)
 
     def _swap(self, surface: int, foretold: np.ndarray) -> bool:
         """Exchange a glass, if that helps."""

@@ -16,7 +16,7 @@ from raytrace.merit.readings import Readings, readings_of
 from raytrace.merit.value import Merit, in_unit, merit_for
 from raytrace.merit.vary import Freedom, bounds_of, freedom, name_of
 from raytrace.optimization.bfgs import Function, lowest
-from raytrace.optimization.checkpoint import Checkpoint, Log, resumed
+from raytrace.optimization.checkpoint import BadCheckpoint, Checkpoint, Kept, Log, resumed
 from raytrace.optimization.glass import Choice
 from raytrace.optimization.glass_freedom import without_glass
 from raytrace.optimization.glass_pool import catalogs_of, pool_of
@@ -67,8 +67,8 @@ def optimize(
     which it ends; paths: how many ways of damping are tried. skip_unknown: leave rows of unknown operands out;
     readings: where an operand is open (`Readings`). catalog: names of shipped catalogs, or AGF files, for glasses that
     vary, by default those of the lens, else SCHOTT (`optimization.glass`). log: a file with a line for every cycle;
-    checkpoint: a file that keeps the best variables; resume: one that they are taken from. Ctrl-C ends with the best
-    lens.
+    checkpoint: a file that keeps the best variables, and the glasses; resume: one that they are taken from. Ctrl-C ends
+    with the best lens.
     Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadCheckpoint.
     """
     prepare()
@@ -76,7 +76,10 @@ def optimize(
     names = tuple(name_of(one) for one in free.variables)
     model = Model(free.lens, free.variables, free.solves)
     lower, upper = _bounds(free, bounds, names)
-    start = np.clip(model.start if resume is None else resumed(resume, names), lower, upper)
+    kept = Kept(model.start, {}) if resume is None else resumed(resume, names)
+    if set(kept.glasses) - set(glasses):
+        raise BadCheckpoint(f"{resume}: a checkpoint of glasses that vary: go on with the `vary` that it was made with")
+    start = np.clip(kept.x, lower, upper)
     how = {"lower": lower, "upper": upper, "typical": typical_of(model), "cycles": cycles, "seconds": seconds}
     if callable(merit) and not isinstance(merit, Merit):
         if glasses:
@@ -94,15 +97,17 @@ def optimize(
     problem = Problem(model, function.rows, conditions, **of_rows)
     begun, before = time.monotonic(), problem.evaluated(model.start)
     until, choice = np.inf if seconds is None else begun + seconds, None
-    start = opened(problem, start, lower=lower, upper=upper, typical=how["typical"], until=until)
+    if not kept.glasses:
+        start = opened(problem, start, lower=lower, upper=upper, typical=how["typical"], until=until)
+        _refuse_undefined(problem, problem.evaluated(start))
     how["seconds"] = None if seconds is None else until - time.monotonic()
-    _refuse_undefined(problem, problem.evaluated(start))
-    if glasses:
-        pool, limits = pool_of(lens, catalogs_of(lens, catalog)), (lower, upper)
-        choice = Choice(free, glasses, pool, function.rows, conditions, limits, cycles=cycles, until=until, **of_rows)
-        start, problem = choice.run(start).x, choice.problem(choice.best.glasses, ())
-        how["seconds"] = None if seconds is None else until - time.monotonic()
     with _Told(names, log, checkpoint, progress and progress(cycles, "cycle")) as told:
+        if glasses:
+            pool, limits = pool_of(lens, catalogs_of(lens, catalog)), (lower, upper)
+            how_chosen = {"cycles": cycles, "until": until, "keep": told.kept.keep_glasses, **of_rows}
+            choice = Choice(free, glasses, pool, function.rows, conditions, limits, **how_chosen)
+            start, problem = choice.run(start, kept).x, choice.problem(choice.best.glasses, ())
+            how["seconds"] = None if seconds is None else until - time.monotonic()
         found = best_of_paths(
             problem.state, start, paths=paths, watch=lambda cycle, state: told.tell(cycle, state.x), **how
         )
