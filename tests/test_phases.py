@@ -173,6 +173,47 @@ def test_facets_bend_as_the_surface_above_the_plane():
     assert end.valid.all()
 
 
+@pytest.mark.parametrize("engine", ["eager", "fused"])
+@pytest.mark.parametrize("index", [(1.0, 1.5), (1.5, 1.0)])
+def test_beyond_the_edge_of_its_conic_a_fresnel_lens_loses_light_and_has_no_derivative(engine, index, monkeypatch):
+    monkeypatch.setenv("RAYTRACE_TRACE", engine)
+    x = torch.tensor([1.0, 10.5, 40.0], dtype=torch.float64, requires_grad=True)
+    curvature, conic = (torch.tensor(n, dtype=torch.float64, requires_grad=True) for n in (0.1, 0.0))
+    flat = Surface(
+        thickness=real(5.0), curvature=curvature, conic=conic, phase=rt.Facets(), glass=rt.find_glass("N-BK7")
+    )
+    zero = torch.zeros_like(x)
+    rays = start(torch.stack([x, zero, zero]), torch.stack([zero, zero, zero + 1]), real(0.0))
+    n = [*map(real, index), real(index[1])]
+    end = trace_surfaces([flat, Surface(thickness=real(0.0))], rays, indices=n)
+    assert end.valid.tolist() == [True, False, False]
+    by_x, *others = torch.autograd.grad(end.position[0].sum() + end.opl.sum(), [x, curvature, conic])
+    assert by_x[1:].tolist() == [0.0, 0.0]
+    assert all(torch.isfinite(one).all() for one in (by_x, *others))
+    alone = trace_surfaces([flat, Surface(thickness=real(0.0))], rays_of(rays, 1), indices=n)
+    again = torch.autograd.grad(alone.position[0].sum() + alone.opl.sum(), [curvature, conic])
+    assert [float(one) for one in others] == pytest.approx([float(one) for one in again], rel=1e-12)
+
+
+def rays_of(rays, count):
+    """The first rays alone."""
+    return start(rays.position[:, :count].detach(), rays.direction[:, :count], real(0.0))
+
+
+@pytest.mark.parametrize("engine", ["eager", "fused"])
+def test_facets_of_a_mirror_reflect_as_the_mirror_above_the_plane(engine, monkeypatch):
+    """A parabola in facets: light along the axis crosses it at half the radius, 20 mm, less what the plane is lower."""
+    monkeypatch.setenv("RAYTRACE_TRACE", engine)
+    bowl = Surface(thickness=real(0.0), curvature=real(-1 / 40), conic=real(-1.0), glass=rt.MIRROR, phase=rt.Facets())
+    height = torch.linspace(1.0, 10.0, 32, dtype=torch.float64)
+    zero = torch.zeros_like(height)
+    rays = start(torch.stack([zero, height, zero]), torch.stack([zero, zero, zero + 1]), real(0.0))
+    end = trace_surfaces([bowl], rays, indices=[real(1.0), real(1.0)])
+    assert end.valid.all()
+    assert (end.direction[2] < 0).all()
+    assert end.direction[1] / end.direction[2] == pytest.approx(height / (20 - height**2 / 80), rel=1e-12)
+
+
 @pytest.mark.parametrize("name", PHASES)
 def test_derivatives_by_every_number_of_a_phase(name):
     rays, phase = plane_wave(count=4, size=2.0), PHASES[name]

@@ -15,10 +15,12 @@ constexpr int kShape = 2;  // numbers before the terms
 template <typename T>
 struct Facet {
   T dS, by_u, by_c, by_k;  // S', ∂S'/∂u, ∂S'/∂c, ∂S'/∂k
+  bool within;             // of the edge of a closed conic, beyond which there is no facet
 
   template <typename C>
   Facet(const C* numbers, int terms, T u) {
     const T c = T(numbers[0]), shape = T(1) + T(numbers[1]), radicand = T(1) - shape * c * c * u;
+    within = radicand > 0;
     const T over_w = T(1) / root(radicand > 0 ? radicand : std::numeric_limits<T>::min()), steep = c * over_w;
     T p = 0, dp = 0, d2p = 0;  // d2p carries p''/2
     for (int j = terms - 1; j >= 0; j--) {
@@ -34,7 +36,9 @@ struct Facet {
 template <typename T>
 void facet_normals(const Rays<T>& at, Normals<T>& to, int n, const Surface<T>& s) {
   for (int i = 0; i < n; i++) {
-    const T x = at.x[i], y = at.y[i], u = x * x + y * y, dS = Facet<T>(s.phase, s.at->phase_terms - kShape, u).dS;
+    const T x = at.x[i], y = at.y[i], u = x * x + y * y;
+    const Facet<T> facet(s.phase, s.at->phase_terms - kShape, u);
+    const T dS = facet.within ? facet.dS : std::numeric_limits<T>::quiet_NaN();  // passes nothing: see `diffract`
     to.x[i] = T(-2) * dS * x, to.y[i] = T(-2) * dS * y, to.z[i] = 1, to.w[i] = T(1) + T(4) * dS * dS * u;
   }
 }

@@ -131,7 +131,10 @@ bool through_phase(const Surface<double>& s, const C* numbers, double x, double 
   Added<double, 1> added;
   path_at<false>(*s.at, numbers, &x, &y, 1, added);
   if (s.at->phase == kFacets) {
-    const double u = x * x + y * y, dS = Facet<double>(numbers, s.at->phase_terms - kShape, u).dS;
+    const double u = x * x + y * y;
+    const Facet<double> at(numbers, s.at->phase_terms - kShape, u);
+    if (!at.within) return false;
+    const double dS = at.dS;
     const double facet[] = {-2 * dS * x, -2 * dS * y, 1};
     path = 0;
     return diffract(s, added, L, M, N, facet, 1 + 4 * dS * dS * u);

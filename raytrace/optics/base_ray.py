@@ -3,6 +3,8 @@
 The ray of the axial object point through the middle of the stop is traced at the primary wavelength; rays beside it
 are its derivatives, by forward differentiation of the trace. Of four of them, moved and turned in the section of the
 local x and in that of the local y of the start, every first-order figure is made, as of (y, n u) in a straight lens.
+First derivatives of the figures are exact; second ones lack the third derivatives of where rays cross a surface, and
+were off by 0.3 % where that was measured.
 """
 
 import itertools

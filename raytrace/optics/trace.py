@@ -266,6 +266,8 @@ def _through_phase(surface: Surface, hit, direction, cosine, known, exact, n1, n
         behind = bend_slopes(direction, hit, kind.power(phase, wavelength), n1, n2)
         return behind, None, ideal_path(phase, hit, direction, behind, n1, n2)
     n, norm_squared = normal(surface, hit) if known is None else known
+    if kind.flat and surface.is_mirror:
+        return reflect(direction, n, dot(n, direction), norm_squared), None, None
     if kind.flat:
         return *refract(direction, n, dot(n, direction), norm_squared, n1, n2), None
     added, mirror = added_path(phase, hit[0], hit[1], wavelength), surface.is_mirror

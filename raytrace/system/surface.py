@@ -223,7 +223,10 @@ class Meeting(NamedTuple):
 
 def meet(surface: Surface, position: Sequence[Tensor], direction: Sequence[Tensor]) -> Meeting:
     """`intersect` by components, with the cosine that comes with it; arguments are triples of (...)."""
-    if surface.is_plane or (surface.phase is not None and kind_of(surface.phase).flat):
+    if surface.phase is not None and kind_of(surface.phase).flat:
+        meeting = _meet_plane(position, direction)
+        return meeting._replace(met=meeting.met & _within(surface, *meeting.hit[:2]))
+    if surface.is_plane:
         return _meet_plane(position, direction)
     if is_searched(surface):
         return _meet_searched(surface, position, direction)
@@ -237,7 +240,8 @@ def normal(surface: Surface, hit: Sequence[Tensor]) -> tuple[tuple[Tensor, Tenso
     """
     x, y, z = hit
     if surface.phase is not None and kind_of(surface.phase).flat:
-        return _sloped_normal(surface, x, y, None)
+        within = _within(surface, x, y)
+        return _sloped_normal(surface, torch.where(within, x, 0.0), torch.where(within, y, 0.0), None)
     if surface.is_plane:
         return (torch.zeros_like(x), torch.zeros_like(x), torch.ones_like(x)), 1.0
     if is_searched(surface):
@@ -248,6 +252,13 @@ def normal(surface: Surface, hit: Sequence[Tensor]) -> tuple[tuple[Tensor, Tenso
     # In this order no product of a backward derivative leaves the range of numbers: c² c̄ and r² c̄ would.
     k = surface.conic
     return (-c * x, -c * y, 1 - (1 + k) * c * z), 1 - k * (c * (c * (x * x + y * y)))
+
+
+def _within(surface: Surface, x: Tensor, y: Tensor) -> Tensor:
+    """Whether there is a facet: one above the edge of a closed conic has no slope."""
+    c = x.new_zeros(()) if surface.curvature is None else surface.curvature
+    shape = 1.0 if surface.conic is None else 1 + surface.conic
+    return (shape * c * c * (x * x + y * y)).detach() < 1
 
 
 def _meet_plane(position, direction) -> Meeting:
