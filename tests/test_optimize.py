@@ -4,6 +4,7 @@ import dataclasses
 import json
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
@@ -18,6 +19,7 @@ from raytrace.optimization.least_squares import Manner, State, least_squares
 from raytrace.optimization.lost import Recovery
 from raytrace.optimization.problem import Condition, NoProblem, Problem
 from raytrace.optimization.step import Linear, NoStep, Sides
+from raytrace.plot.optimize import optimize_report
 from raytrace.system.intent import Intent, Row, Vary
 
 FAR = np.inf
@@ -390,3 +392,18 @@ def test_a_file_comes_as_far_as_is_known_from_where_it_stands_and_from_a_moved_s
     moved = rt.optimize(model.lens_at(model.start * factors), seconds=20)
     assert moved.merit_before == pytest.approx(known["from_perturbed"]["mf_start"], rel=1e-3)
     assert moved.merit_after <= 1.01 * best
+
+
+@pytest.mark.parametrize("fell", [0.9, 1e-3, 1e-7, 0.0])
+def test_labels_of_the_merit_history_differ(fell):
+    """Also where the merit hardly changes: labels, and what the axis says that they are counted from."""
+    found = rt.optimize(rt.read_lens("singlet"), merit="spot", vary="sensor", cycles=3)
+    history = torch.zeros(2, 5, dtype=torch.float64)
+    history[:, 0] = 0.0453529 * (1 - fell * torch.tensor([0.4, 1.0]))
+    changed = dataclasses.replace(found, history=history, merit_before=0.0453529)
+    axes = next(a for part in optimize_report(changed).subfigs for a in part.axes if a.get_ylabel() == "merit")
+    axes.figure.figure.canvas.draw()
+    labels = [label.get_text() for label in axes.get_yticklabels() if label.get_text()]
+    assert len(labels) >= 2
+    assert len(set(labels)) == len(labels)
+    plt.close("all")

@@ -4,6 +4,7 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from raytrace.optics.paraxial import first_order
 from raytrace.optimization.result import STOPPED, Optimized
@@ -72,7 +73,8 @@ def _draw_spots(page, before: Lens, after: Lens) -> None:
 def _draw_history(axes: Axes, found: Optimized) -> None:
     merit = np.concatenate([[found.merit_before], style.array(found.history)[:, 0]])
     axes.plot(np.arange(len(merit)), merit, color=_AFTER, marker="." if len(merit) < 40 else None, markersize=4)
-    axes.set_yscale("log")
+    _scale_merit(axes, merit)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel(f"cycle ({found.evaluations} evaluations, {found.seconds:.2g} s)")
     axes.set_ylabel("merit")
     axes.set_title("Merit function", fontweight="bold")
@@ -80,6 +82,17 @@ def _draw_history(axes: Axes, found: Optimized) -> None:
         STOPPED[found.stopped], (0.98, 0.94), xycoords="axes fraction", ha="right", fontsize=7.5, color=style.GREY
     )
     axes.grid(alpha=0.25)
+
+
+def _scale_merit(axes: Axes, merit: np.ndarray) -> None:
+    """Logarithmic over more than a factor of three; else even, about a value that is told where the change is small."""
+    least, most = float(np.min(merit)), float(np.max(merit))
+    if least > 0 and most > 3 * least:
+        axes.set_yscale("log")
+    elif most - least <= 1e-9 * most:
+        axes.set_ylim(0.9 * least, 1.1 * most or 1.0)
+    else:
+        axes.ticklabel_format(axis="y", style="sci", scilimits=(-2, 4), useOffset=True)
 
 
 def _draw_left(axes: Axes, found: Optimized) -> None:
