@@ -17,11 +17,11 @@ from raytrace.optics.paraxial import first_order
 from raytrace.pages import kept_of, markdown
 from raytrace.studies.codesign import optima
 from raytrace.studies.codesign.claims import claims, is_of_paper
-from raytrace.studies.codesign.closed_form import even_distances, optimise_closed_form, power_spectrum
+from raytrace.studies.codesign.closed_form import even_distances, optimise_closed_form, power_spectrum, scan
 from raytrace.studies.codesign.conjugates import paraxial_image
 from raytrace.studies.codesign.experiment import Outcome, batch, camera, lens_at_start
 from raytrace.studies.codesign.figures import _marks
-from raytrace.studies.codesign.optima import Optimum, closed_form, closed_forms, scan
+from raytrace.studies.codesign.optima import Optimum, closed_form, closed_forms
 from raytrace.studies.codesign.page import CAPTIONS, Report
 from raytrace.studies.codesign.settings import AFTER_PARAXIAL, Settings
 from raytrace.studies.codesign.setup import settings_of
@@ -205,20 +205,21 @@ def test_optimum_is_the_least_of_its_scan(lens, spectrum, model, tmp_path):
     settings = dataclasses.replace(SMALL, model=model)
     found = closed_form(lens, settings, spectrum)
     own = camera(lens, settings)
-    begun = own.variables.numbers()["sensor"]
+    begun, distances = own.variables.numbers()["sensor"], even_distances(own)
     around = [found.sensor_mm + shift * MICROMETRE for shift in (-20, 0, 20)]
-    low, least, high = scan(own, spectrum, around)
+    low, least, high = scan(own, spectrum, around, distances)
     assert least < min(low, high)
     assert least == pytest.approx(found.error, rel=1e-9)
     assert own.variables.numbers()["sensor"] == begun
-    assert found.course[0] == pytest.approx(scan(own, spectrum, [begun])[0], rel=1e-9)
+    assert found.course[0] == pytest.approx(scan(own, spectrum, [begun], distances)[0], rel=1e-9)
     # Both definitions of focus hold: an object there has its image on the sensor, to a nanometre.
     lens = with_sensor_distance(lens_at_start(lens, settings), found.sensor_mm)
     for image, distance in ((paraxial_image, found.focus_paraxial_m), (best_focus, found.focus_rms_m)):
         place = image(with_object_distance(lens, 1e3 * distance))
         assert float(place) == pytest.approx(found.sensor_mm, abs=1e-3 * MICROMETRE)
     own.use("drt")
-    assert scan(own, spectrum, [found.sensor_mm])[0] == pytest.approx(found.error_drt, rel=0.02)  # the plan's tolerance
+    at_optimum = scan(own, spectrum, [found.sensor_mm], distances)[0]
+    assert at_optimum == pytest.approx(found.error_drt, rel=0.02)  # the plan's tolerance
     write_table(tmp_path / "spectral.csv", [found], optima.COLUMNS)
     with open(tmp_path / "spectral.csv", newline="") as file:
         (row,) = csv.DictReader(file)

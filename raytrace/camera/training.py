@@ -16,6 +16,7 @@ import time
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import torch
 from torch import Tensor, nn
@@ -79,12 +80,13 @@ def load_state(module: nn.Module, state: dict, path: Path, optimizer: torch.opti
 class Run:
     """A folder of a training run.
 
-    settings: whatever decides the result, as JSON; a folder begun with others is refused with OtherSettings.
+    settings: whatever decides the result, as JSON; a folder begun with others is refused with OtherSettings. usual:
+    of settings that a folder may not know, begun when there was no other way.
     """
 
-    def __init__(self, folder: str | Path, settings: Mapping):
+    def __init__(self, folder: str | Path, settings: Mapping, *, usual: Mapping = MappingProxyType({})):
         self.folder = Path(folder)
-        self.settings = json.loads(json.dumps(settings))
+        self.settings, self.usual = (json.loads(json.dumps(dict(one))) for one in (settings, usual))
         self.folder.mkdir(parents=True, exist_ok=True)
         written = self.folder / "settings.json"
         if written.exists():
@@ -93,6 +95,7 @@ class Run:
             write_atomically(written, lambda file: file.write(json.dumps(self.settings, indent=1).encode()))
 
     def _compare(self, before: dict) -> None:
+        before = {key: value for key, value in self.usual.items() if key in self.settings} | before
         differ = [
             f"{_words(key)} was {before.get(key)!r}, now {self.settings.get(key)!r}"
             for key in sorted({*before, *self.settings})

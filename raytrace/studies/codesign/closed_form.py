@@ -1,7 +1,9 @@
 """A camera's error in closed form, by the best linear filter of `deconvolve`: deterministic, no network, no noise."""
 
+import copy
 import dataclasses
 import math
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -16,6 +18,9 @@ from raytrace.studies.pictures import Pictures, crop
 #: Length of the first step, mm of thickness or of sag. L-BFGS-B takes 1 of its own units, and a sensor moved by 1 mm
 #: lands behind the next optimum: where windows hold but the middle of a blur.
 _FIRST_STEP = 0.02
+#: Sensors that a scan tries, by model; those of one focus have one optimum, and Gaussians seldom two.
+_SCANNED = {"gaussian": 17, "drt": 81}  # 16 µm apart for the double Gauss at F/3
+_BETTER = 1e-4  # of the error: so much less a scan must promise for a second descent
 
 
 def power_spectrum(pictures: Pictures, size: int, *, crops: int = 4, seed: int = 0) -> Tensor:
@@ -31,6 +36,32 @@ def power_spectrum(pictures: Pictures, size: int, *, crops: int = 4, seed: int =
     return total / count
 
 
+#: Columns of `spectrum.csv`.
+SPECTRUM_COLUMNS = ("row", "column", "power")
+
+
+def spectrum_rows(spectrum: Tensor) -> list[dict[str, float]]:
+    """A spectrum (n, n) as a table, 0 ≤ row ≤ column ≤ n/2: pictures that are turned and mirrored by chance have no
+    more in theirs, and the mean over what is equal then has less noise."""
+    flipped = spectrum.roll((-1, -1), (0, 1)).flip(0, 1)
+    mean = (spectrum + spectrum.mT + flipped + flipped.mT) / 4
+    across = mean.roll(-1, 1).flip(1)
+    mean = ((mean + across) / 2).tolist()
+    half = len(mean) // 2 + 1
+    return [{"row": i, "column": j, "power": mean[i][j]} for i in range(half) for j in range(i, half)]
+
+
+def spectrum_of_rows(rows: Sequence[Mapping[str, float]], size: int) -> Tensor:
+    """The spectrum (size, size) of such a table."""
+    place = torch.arange(size)
+    place = torch.minimum(place, size - place)
+    quarter = torch.zeros(size // 2 + 1, size // 2 + 1, dtype=torch.float64)
+    for one in rows:
+        i, j = int(one["row"]), int(one["column"])
+        quarter[i, j] = quarter[j, i] = float(one["power"])
+    return quarter[place[:, None], place]
+
+
 def camera_error(camera: Camera, spectrum: Tensor, distances: Tensor) -> Tensor:
     """Mean square error of a camera with the best blind linear filter, over object distances (Z,) mm and its fields.
 
@@ -40,11 +71,14 @@ def camera_error(camera: Camera, spectrum: Tensor, distances: Tensor) -> Tensor:
     return kernel_error(torch.cat(kernels), spectrum.to(kernels[0].dtype), camera.noise)
 
 
-def even_distances(camera: Camera, count: int = 33) -> Tensor:
-    """Object distances (count,) mm, evenly over the camera's range: the middle of each of so many parts."""
+def even_distances(camera: Camera, count: int = 33, *, spread: str = "uniform") -> Tensor:
+    """Object distances z (count,) mm over the camera's range: the middle of each of so many parts.
+
+    spread: parts are as large in z ("uniform") or in 1/z ("reciprocal").
+    """
     near, far = camera.range
     place = (torch.arange(count, dtype=camera.fields.dtype, device=camera.fields.device) + 0.5) / count
-    return near + (far - near) * place
+    return near + (far - near) * place if spread == "uniform" else 1 / (1 / near + (1 / far - 1 / near) * place)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,6 +121,70 @@ def optimise_closed_form(camera: Camera, spectrum: Tensor, *, distances: Tensor 
     return Course(errors, penalties, names, _no_optimum(camera, found, names))
 
 
+def least_of_closed_form(camera: Camera, spectrum: Tensor, *, distances: Tensor | None = None) -> tuple[Course, float]:
+    """Bring the variables of the lens to the least `camera_error` of several descents; and where the first one led.
+
+    One begins where the lens is, another at the least of a scan of sensors, evenly over all that have an object of the
+    range in focus, if that promises less. Returned: the course of the better one, and the sensor distance in mm behind
+    the first one, that of training without luck.
+    """
+    distances = even_distances(camera) if distances is None else distances
+    start = copy.deepcopy(camera.variables.state_dict())
+    downhill = optimise_closed_form(camera, spectrum, distances=distances)
+    reached = float(camera.variables().surfaces[-2].thickness.detach())
+    end = copy.deepcopy(camera.variables.state_dict())
+    camera.variables.load_state_dict(start)
+    place, error = least_of_scan(camera, spectrum, distances)
+    if error >= downhill.errors[-1] * (1 - _BETTER):
+        camera.variables.load_state_dict(end)
+        return downhill, reached
+    put_sensor(camera, place)
+    found = optimise_closed_form(camera, spectrum, distances=distances)
+    if found.no_optimum and not downhill.no_optimum:
+        camera.variables.load_state_dict(end)
+        return downhill, reached
+    return found, reached
+
+
+@torch.no_grad()
+def least_of_scan(camera: Camera, spectrum: Tensor, distances: Tensor) -> tuple[float, float]:
+    """Sensor distance in mm of least error among many that have some object in focus, and that error.
+
+    (nan, inf) where the sensor is no variable, and for models of one focus, whose error has one optimum. The camera is
+    left as it was.
+    """
+    if "sensor" not in [one.kind for one in camera.variables.variables] or camera.model not in _SCANNED:
+        return math.nan, math.inf
+    low, high = _in_focus(camera)
+    bounds = camera.variables.bounds.get("sensor", (-math.inf, math.inf))
+    low, high = max(low, bounds[0]), min(high, bounds[1])
+    count = _SCANNED[camera.model]
+    places = [low + (high - low) * (number + 0.5) / count for number in range(count)]
+    found = scan(camera, spectrum, places, distances) if high > low else [math.inf]
+    return min(zip(places, found, strict=False), key=lambda pair: pair[1])
+
+
+@torch.no_grad()
+def scan(camera: Camera, spectrum: Tensor, sensors: Sequence[float], distances: Tensor) -> list[float]:
+    """Closed-form error of a camera with its sensor at each of the distances in mm; "sensor" is one of its variables.
+
+    The camera is left as it was.
+    """
+    before, found = copy.deepcopy(camera.variables.state_dict()), []
+    for sensor in sensors:
+        put_sensor(camera, sensor)
+        found.append(float(camera_error(camera, spectrum, distances)))
+    camera.variables.load_state_dict(before)
+    return found
+
+
+@torch.no_grad()
+def put_sensor(camera: Camera, sensor: float) -> None:
+    """Move the sensor of a camera, one of its variables, to a distance in mm."""
+    (variable,) = [one for one in camera.variables.variables if one.kind == "sensor"]
+    camera.variables.get_parameter(variable.name).fill_((sensor - variable.start) / variable.unit)
+
+
 def _no_optimum(camera: Camera, found: Descent, at_end: tuple[str, ...]) -> str:
     """Why a descent ended at no optimum; "" where it is one, if only within some of the bounds."""
     variables = camera.variables
@@ -100,10 +198,8 @@ def _no_optimum(camera: Camera, found: Descent, at_end: tuple[str, ...]) -> str:
 
 def out_of_focus(camera: Camera) -> str:
     """Why the sensor of a camera is out of focus for all objects of its range; "" where it is not."""
-    lens = camera.variables()
-    width = float(camera.pixels.pitch.detach()) * camera.pixels.rows
-    low, high = sensor_range(lens, camera.range, fields=camera.fields, width=width)
-    sensor = float(lens.surfaces[-2].thickness.detach())
+    low, high = _in_focus(camera)
+    sensor = float(camera.variables().surfaces[-2].thickness.detach())
     if low <= sensor <= high:
         return ""
     near, far = camera.range
@@ -111,6 +207,12 @@ def out_of_focus(camera: Camera) -> str:
         f"no optimum inside {low:.7g} to {high:.7g} mm of sensor distance, where an object from {near:g} to {far:g} mm "
         f"is in focus to the width of the PSF: the loss still falls at its end, and the sensor went to {sensor:.7g} mm"
     )
+
+
+def _in_focus(camera: Camera) -> tuple[float, float]:
+    """Sensor distances in mm at which an object of the range is in focus to the width of the PSF."""
+    width = float(camera.pixels.pitch.detach()) * camera.pixels.rows
+    return sensor_range(camera.variables(), camera.range, fields=camera.fields, width=width)
 
 
 def _parameter_bounds(variables, variable) -> tuple[float, float]:

@@ -34,10 +34,10 @@ EXAMPLES = """examples:
 
 _SCENE = (
     *("vary", "bounds", "glass_thickness", "air_thickness", "edge", "start", "focus_distance", "f_number"),
-    *("wavelengths", "wavelength_weights", "near", "far", "fields", "pixel", "size", "normalise", "rho"),
-    *("noise", "tol"),
+    *("wavelengths", "wavelength_weights", "near", "far", "spread", "fields", "pixel", "size"),
+    *("normalise", "rho", "noise", "tol", "rays", "sampling"),
 )
-_TRAINING = ("depth", "width", "epochs", "batch", "seed", "rate_network", "rate_optics", "precision")
+_TRAINING = ("depth", "width", "epochs", "batch", "seed", "rate_network", "rate_optics", "decay", "precision")
 
 #: The forms of the command by their word, where they are carried out, and the options that only some of them know.
 _FORMS = {"": "single", "compare": "compare", "sweep": "sweep_page"}

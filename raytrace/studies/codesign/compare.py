@@ -16,7 +16,8 @@ from raytrace.pages import machine
 from raytrace.studies.codesign import figures, optima
 from raytrace.studies.codesign import study as runs
 from raytrace.studies.codesign.claims import is_of_paper
-from raytrace.studies.codesign.experiment import STEPS, Outcome, batch, camera, lens_at_start, outcome
+from raytrace.studies.codesign.closed_form import even_distances, scan
+from raytrace.studies.codesign.experiment import STEPS, Outcome, batch, camera, lens_at_start, outcome, usual
 from raytrace.studies.codesign.page import CAPTIONS, Report
 from raytrace.studies.codesign.settings import AFTER_PARAXIAL, MODELS, NAMES, Settings
 from raytrace.studies.codesign.setup import (
@@ -44,7 +45,9 @@ def compare(arguments: argparse.Namespace) -> None:
     given = experiment(arguments, _recorded_settings(begun) if arguments.report_only else settings_of(arguments, begun))
     refuse_too_few(given)
     common = {k: v for k, v in dataclasses.asdict(given.settings).items() if k not in ("model", "seed")}
-    Run(study, {**common, **given.about})  # refuses a folder begun with other settings, lens or pictures
+    Run(
+        study, {**common, **given.about}, usual=usual(given.settings)
+    )  # refuses a folder begun with other settings, lens or pictures
     models, seeds = _asked(arguments, study)
     if not arguments.report_only:
         _train(given, study, models, seeds)
@@ -166,5 +169,8 @@ def _scan_figure(
     margin = 0.15 * (max(places) - min(places)) + 0.02
     sensors = np.linspace(min(places) - margin, max(places) + margin, 41).tolist()
     own = {m: camera(given.lens, dataclasses.replace(given.settings, model=m)) for m in MODELS}
-    errors = {one.model: optima.scan(own[one.model], spectrum, sensors) for one in best if one.model in MODELS}
+    distances = {m: even_distances(own[m], spread=given.settings.spread) for m in MODELS}
+    errors = {
+        one.model: scan(own[one.model], spectrum, sensors, distances[one.model]) for one in best if one.model in MODELS
+    }
     return {"scan.png": figures.scan_figure(sensors, errors, ends)}

@@ -11,6 +11,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,8 @@ from raytrace.maths.grid import grid
 from raytrace.maths.result import plain
 from raytrace.optics.focus import focused, real_image_distance
 from raytrace.studies.codesign import conjugates
-from raytrace.studies.codesign.closed_form import optimise_closed_form, out_of_focus, power_spectrum
+from raytrace.studies.codesign.closed_form import even_distances, least_of_closed_form, out_of_focus, power_spectrum
+from raytrace.studies.codesign.plain_rays import PlainRays, points
 from raytrace.studies.codesign.settings import Settings
 from raytrace.studies.descent import NoOptimum
 from raytrace.studies.pictures import Pictures, crop, draws
@@ -38,6 +40,11 @@ _SAMPLE = 10  # last number of the key of what a sample draws
 _TEST_EPOCH = 2**20  # test samples are those of an epoch that no training reaches
 STEPS = ("joint", "refine")
 LENS = "lens.zmx"  # of a run: the lens as it was learned
+#: What Adam's rates are multiplied with, by the part of the steps that are taken.
+_DECAYS: dict[str, Callable[[float], float]] = {
+    "none": lambda part: 1.0,
+    "cosine": lambda part: 0.5 * (1 + math.cos(math.pi * part)),
+}
 _INFINITE = ("focus_paraxial_m", "focus_rms_m")  # of an outcome; null in its file
 
 
@@ -107,7 +114,10 @@ def camera(lens: Lens, settings: Settings) -> Camera:
     fields = torch.stack([like.new_zeros(len(settings.fields)), like.new_tensor(settings.fields)])
     if settings.precision not in ("float32", "bfloat16"):
         raise ValueError(f"precision {settings.precision!r}: expected float32 or bfloat16")
-    return Camera(
+    kind = Camera
+    if settings.rays is not None:
+        kind = partial(PlainRays, points=points(settings.sampling, settings.rays, seed=settings.seed))
+    return kind(
         variables(lens, settings),
         RedNet(RedNetShape(settings.depth, settings.width), seed=settings.seed).to(memory_format=torch.channels_last),
         model=settings.model,
@@ -138,11 +148,18 @@ def batch(pictures: Pictures, settings: Settings, samples: list[int], epoch: int
     for sample in samples:
         patch = crop(pictures, sample, epoch=epoch, size=size, crops=settings.crops, seed=settings.seed)
         random = draws(settings.seed, epoch, sample, _SAMPLE)
-        distance = random.uniform(settings.near, settings.far)
+        distance = drawn_distance(random, settings)
         parts.append((patch, distance, random.standard_normal((settings.patch,) * 2, dtype=np.float32)))
     picture, distance, noise = (np.stack(part) for part in zip(*parts, strict=True))
     field = [sample % len(settings.fields) for sample in samples]
     return Batch(torch.as_tensor(picture), torch.as_tensor(distance), torch.as_tensor(noise), field)
+
+
+def drawn_distance(random: np.random.Generator, settings: Settings) -> float:
+    """An object distance in mm, even in z or in 1/z."""
+    if settings.spread == "uniform":
+        return random.uniform(settings.near, settings.far)
+    return 1 / random.uniform(1 / settings.far, 1 / settings.near)
 
 
 class Batches:
@@ -192,15 +209,20 @@ def optimise(
     optics = [p for p in camera.variables.parameters() if p.requires_grad]
     groups = [{"params": list(camera.network.parameters()), "lr": settings.rate_network}]
     groups += [{"params": optics, "lr": settings.rate_optics}] if optics else []
+    optimizer, steps = torch.optim.Adam(groups), settings.epochs * batches.steps_per_epoch
+    rates = [group["lr"] for group in groups]
 
     def loss(step: int, share: Share) -> tuple[Tensor, Record]:
+        # By the number of the step alone: a run that goes on has the rates of one that never stopped.
+        for group, rate in zip(optimizer.param_groups, rates, strict=True):
+            group["lr"] = rate * _DECAYS[settings.decay](step / steps)
         return absolute_error(camera, batches(step, share)).sum() / pixels, camera.variables.numbers()
 
     yield from train(
         camera,
-        torch.optim.Adam(groups),
+        optimizer,
         loss,
-        steps=settings.epochs * batches.steps_per_epoch,
+        steps=steps,
         run=run,
         every=every,
         after_step=camera.variables.project,
@@ -251,7 +273,7 @@ def run_model(
     """
     folder = Path(folder)
     if (folder / "outcome.json").exists():
-        Run(folder / STEPS[0], {**dataclasses.asdict(settings), **about, "step": STEPS[0]})  # refuses other settings
+        _run(settings, folder, about, STEPS[0])  # refuses other settings
         return
     own = camera(lens, settings)
     own.plan()  # before a checkpoint moves the lens: a run that goes on has the PSFs of one that never stopped
@@ -300,11 +322,22 @@ def outcome(folder: Path) -> Outcome | None:
         raise DamagedRun(f"{path}: not what a run found ({error})") from error
 
 
+def _run(settings: Settings, folder: Path, about: dict, name: str) -> Run:
+    """The folder of a step. Raises OtherSettings."""
+    return Run(folder / name, {**dataclasses.asdict(settings), **about, "step": name}, usual=usual(settings))
+
+
+def usual(settings: Settings) -> dict:
+    """The defaults of all settings: what a folder means that was begun before there was one of them."""
+    return {field.name: field.default for field in dataclasses.fields(settings)}
+
+
 def _steps(own: Camera, pictures: Pictures, settings: Settings, folder: Path, about: dict, name: str):
-    run = Run(folder / name, {**dataclasses.asdict(settings), **about, "step": name})
+    run = _run(settings, folder, about, name)
     if settings.start == "spectral" and name == STEPS[0] and not run.checkpoint.exists():
         size = settings.patch + settings.size - 1
-        course = optimise_closed_form(own, power_spectrum(pictures, size, crops=settings.crops, seed=settings.seed))
+        spectrum = power_spectrum(pictures, size, crops=settings.crops, seed=settings.seed)
+        course, _ = least_of_closed_form(own, spectrum, distances=even_distances(own, spread=settings.spread))
         if course.no_optimum:
             warnings.warn(f"start spectral: {course.no_optimum}", NoOptimum, stacklevel=2)
     yield from optimise(own, pictures, settings, run)

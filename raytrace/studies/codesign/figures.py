@@ -24,9 +24,10 @@ _MARKS = (10, 100, 20, 50, 200, 500, 30, 40, 15, 25, 70, 35, 150, 300, 60, 80, 4
 #: What the panels of a sweep are called, and by how many points numbers of the paper are moved that would touch.
 _TITLES = {
     "f_number": "aperture", "rho": "ρ (of paraxial)", "noise": "noise", "normalise": "PSFs normalised to",
-    "start": "start",
+    "start": "start", "spread": "distances", "rays": "Sobol rays", "hexapolar": "hexapolar rays",
 }  # fmt: skip
 _SWEEP_MARKS = (10, 100, 20, 50, 30, 15, 25, 40, 70, 35, 200, 18, 12, 14, 16, 22)
+_CROWDED = 6  # values of a factor, whose marks are turned from there on
 _LIFT = {"paraxial": -3, "fourier": 3}
 
 #: Values over steps or distances, one list for each seed.
@@ -160,7 +161,7 @@ def sweep_figure(found: Sweep) -> Figure:
     papers = PAPER if found.of_paper else {}
     groups = {factor: [one for one in found.readings if one.factor == factor.name] for factor in FACTORS}
     groups = {factor: own for factor, own in groups.items() if own}
-    figure = new_figure(9.6, 5.0)
+    figure = new_figure(max(9.6, 2.4 + 0.28 * sum(map(len, groups.values()))), 5.2)
     axes = figure.subplots(2, len(groups), sharey="row", width_ratios=[1 + len(own) for own in groups.values()])
     for panels, column, label in zip(
         axes, ("focus_paraxial_m", "focus_rms_m"), ("paraxial conjugate (m)", "least RMS spot (m)"), strict=True
@@ -172,6 +173,7 @@ def sweep_figure(found: Sweep) -> Figure:
             for model, (*_, paper) in papers.items():
                 panel.axhline(-1 / paper, color=_look(model)["color"], linewidth=0.6, alpha=0.7, zorder=0)
             panel.set_xticks(range(len(own)), [_sweep_tick(factor, one.value) for one in own])
+            panel.tick_params(axis="x", labelrotation=90 if len(own) > _CROWDED else 0)
             panel.set_xlim(-0.5, len(own) - 0.5)
             panel.tick_params(axis="y", left=panel is panels[0], length=2.5)
             panel.spines["left"].set_visible(panel is panels[0])

@@ -1,14 +1,14 @@
 """Optima of the closed form: where each PSF model would put the lens, without a network, and what DRT says of it."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from raytrace.camera.camera import Camera
 from raytrace.studies.codesign import conjugates
-from raytrace.studies.codesign.closed_form import camera_error, even_distances, optimise_closed_form
+from raytrace.studies.codesign.closed_form import camera_error, even_distances, least_of_closed_form
 from raytrace.studies.codesign.experiment import camera
 from raytrace.studies.codesign.settings import AFTER_PARAXIAL, Settings
 from raytrace.system.lens import Lens
@@ -21,6 +21,8 @@ class Place:
     error: mean square error of a pixel with the model's own PSFs; error_drt: of the same lens with DRT PSFs and the
     filter that is best for them; penalty: mm² of what thicknesses lack (`limits.violation`), no part of the errors.
     Focus distances in m as for `Outcome`; no_optimum: why this lens is none of least error, "" where it is one.
+    downhill_mm: the sensor of the optimum downhill from where the search began, another than `sensor_mm` where that one
+    is only a local one (`least_of_closed_form`).
     """
 
     model: str
@@ -31,6 +33,7 @@ class Place:
     error_drt: float
     penalty: float = 0.0
     no_optimum: str = ""
+    downhill_mm: float = math.nan
 
 
 #: Columns of `spectral.csv`.
@@ -59,15 +62,17 @@ class Optimum(Place):
 def closed_form(lens: Lens, settings: Settings, spectrum: Tensor) -> Optimum:
     """The optimum of the model of the settings. spectrum: `power_spectrum` of the pictures."""
     own = camera(lens, settings)
-    course = optimise_closed_form(own, spectrum)
+    distances = even_distances(own, spread=settings.spread)
+    course, downhill = least_of_closed_form(own, spectrum, distances=distances)
     with torch.no_grad():
         found = own.variables()
-        error = camera_error(own, spectrum, even_distances(own))
+        error = camera_error(own, spectrum, distances)
         own.use("drt")
-        error_drt = camera_error(own, spectrum, even_distances(own))
+        error_drt = camera_error(own, spectrum, distances)
     return Optimum(
         model=settings.model,
         **conjugates.place_of(found),
+        downhill_mm=downhill,
         error=float(error),
         error_drt=float(error_drt),
         variables=own.variables.numbers(),
@@ -91,19 +96,3 @@ def closed_forms(lens: Lens, settings: Settings, spectrum: Tensor, rows: Sequenc
         before = found.get("paraxial") or optimum("paraxial")
         found[AFTER_PARAXIAL] = dataclasses.replace(optimum("gaussian", repr(before.sensor_mm)), model=AFTER_PARAXIAL)
     return [found[row] for row in rows]
-
-
-@torch.no_grad()
-def scan(own: Camera, spectrum: Tensor, sensors: Sequence[float]) -> list[float]:
-    """Closed-form error of a camera with its sensor at each of the distances in mm; "sensor" is one of its variables.
-
-    The camera is left as it was.
-    """
-    place = own.variables.get_parameter("sensor")
-    (variable,) = [one for one in own.variables.variables if one.kind == "sensor"]
-    before, found = place.clone(), []
-    for sensor in sensors:
-        place.fill_((sensor - variable.start) / variable.unit)
-        found.append(float(camera_error(own, spectrum, even_distances(own))))
-    place.copy_(before)
-    return found

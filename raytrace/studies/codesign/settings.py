@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from raytrace.cli.options import field_point, positive, positive_finite
+from raytrace.cli.options import count, field_point, positive, positive_finite
 from raytrace.studies import options
 from raytrace.studies.options import option
 
@@ -22,7 +22,8 @@ NAMES = dict(
 class Settings(options.Settings):
     """All that decides the result of a run. Lengths in mm but for wavelengths in µm; angles in degrees.
 
-    Object distances are drawn evenly from `near` to `far`; samples take the fields (in y) in turn.
+    Samples take the fields (in y) in turn. A setting that a folder of runs does not know, begun before there was one,
+    has its default there.
     """
 
     model: str = option("gaussian", "PSF model of step 1", "MODEL", choices=MODELS)
@@ -51,6 +52,11 @@ class Settings(options.Settings):
     wavelength_weights: tuple[float, ...] = option((1.0,), "of --wavelength (default 1 each)", "W")
     near: float = option(10e3, "nearest object", "MM")
     far: float = option(50e3, "furthest object", "MM")
+    spread: str = option(
+        "uniform",
+        "how object distances z lie between them: evenly in z (uniform, default) or in 1/z (reciprocal)",
+        choices=("uniform", "reciprocal"),
+    )
     fields: tuple[float, ...] = option(
         (0.0,), "field points Y, in the file's own kind of field (default 0)", "F", name="field", type=field_point
     )
@@ -77,3 +83,14 @@ class Settings(options.Settings):
     )
     tol: float = option(1e-2, "what a PSF may err by", "T")
     rho: float = option(0.5, "of the paraxial model: σ over the radius of the blur", "R")
+    rays: int | None = option(
+        None,
+        "plain rays of a traced PSF of step 1, the same ones always, instead of as many as --tol needs",
+        type=count,
+    )
+    sampling: str = option("sobol", "where --rays cross the pupil (default sobol)", choices=("sobol", "hexapolar"))
+    decay: str = option(
+        "none",
+        "Adam's rates in the course of a step: constant (none, default), or falling to 0 along half a cosine",
+        choices=("none", "cosine"),
+    )

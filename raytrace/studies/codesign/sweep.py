@@ -1,17 +1,24 @@
-"""Sweep: optima of the closed form over what the paper leaves open: aperture, ρ, noise, normalisation, start.
+"""Sweep: optima of the closed form over what the paper leaves open: aperture, ρ, noise, normalisation, how distances
+lie, start, how many rays and where they cross the pupil.
 
-Every factor is varied alone, then aperture, noise and normalisation together.
+Every factor is varied alone, then aperture and others together.
 """
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+import json
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
 
 from torch import Tensor
 
+from raytrace.maths.result import plain
 from raytrace.studies.codesign import optima
-from raytrace.studies.codesign.optima import Optimum, Place, closed_form
+from raytrace.studies.codesign.optima import Place, closed_form
 from raytrace.studies.codesign.settings import MODELS, Settings
+from raytrace.studies.codesign.study import PAPER
+from raytrace.studies.options import read
 from raytrace.system.lens import Lens
 
 DEFAULT, COMBINED = "default", "combination"
@@ -19,22 +26,41 @@ DEFAULT, COMBINED = "default", "combination"
 
 @dataclasses.dataclass(frozen=True)
 class Factor:
-    """One of the settings, the values it takes while all others stay, and how one of them is written."""
+    """One of the settings, the values it takes while all others stay, and how one of them is written.
+
+    field: its setting, by default that of its name; also: settings that go with it; models: those it reaches.
+    """
 
     name: str
     values: tuple[float | str, ...]
     text: str
     models: tuple[str, ...] = MODELS
+    field: str = ""
+    also: tuple[tuple[str, str], ...] = ()
+
+    def of(self, value: float | str) -> dict[str, float | str]:
+        """The settings that a value is."""
+        return {self.field or self.name: value, **dict(self.also)}
 
 
+_TRACED = ("gaussian", "drt")
+_FAST = (1.6, 1.65, 1.7, 1.72, 1.74, 1.76, 1.78, 1.8, 1.85, 1.9, 2.0, 2.2, 2.4, 2.7)
 FACTORS = (
-    Factor("f_number", (3.0, 4.0, 5.0, 6.5), "F/{}"),
-    Factor("rho", (0.3, 0.5, 0.7), "ρ {}", models=("paraxial",)),  # of no other model
+    Factor("f_number", (*_FAST, 3.0, 4.0, 5.0, 6.5), "F/{}"),
+    Factor("rho", (0.3, 0.5, 0.7), "ρ {}", models=("paraxial",)),
     Factor("noise", (0.01, 0.1), "noise {}"),
     Factor("normalise", ("window", "energy"), "normalised to {}"),
+    Factor("spread", ("uniform", "reciprocal"), "{} distances"),
     Factor("start", ("paraxial", "rms"), "start {}"),
+    Factor("rays", (12, 50, 256), "{} Sobol rays", models=_TRACED),
+    Factor("hexapolar", (12, 50, 256), "{} hexapolar rays", _TRACED, "rays", (("sampling", "hexapolar"),)),
 )
-TOGETHER = ("f_number", "noise", "normalise")
+#: Factors that are varied together, and the apertures tried with them: closely where the rim's aberration changes sign.
+TOGETHER = {
+    ("f_number", "noise", "normalise", "spread"): (1.7, 1.74, 1.76, 1.8, 1.9, 2.0, 2.4, 3.0, 4.0),
+    ("f_number", "rays"): (1.76, 2.0, 2.4, 3.0),
+    ("f_number", "hexapolar"): (1.76, 2.0, 2.4, 3.0),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +95,15 @@ class Reading:
     def text(self) -> str:
         return {one.name: one for one in FACTORS}[self.factor].text.format(self.value) if self.is_alone else self.value
 
+    def focus(self, definition: Callable[[Row], float]) -> tuple[float, ...]:
+        """Focus distances in m of the models of the paper, by a definition."""
+        return tuple(definition(self.of[model]) for model in PAPER)
+
+    def departure(self, definition: Callable[[Row], float]) -> float:
+        """The most by which one of them departs from the paper's, m."""
+        found = zip(self.focus(definition), PAPER.values(), strict=True)
+        return max(abs(metres - focus) for metres, (*_, focus) in found)
+
     @property
     def is_alone(self) -> bool:
         return self.factor not in (DEFAULT, COMBINED)
@@ -80,20 +115,59 @@ class Reading:
 
 def cases(settings: Settings, factors: Sequence[Factor] = FACTORS) -> list[Case]:
     """All optima of a sweep around these settings: as they are, each factor alone, those of `TOGETHER` together."""
-    found = [Case(DEFAULT, "as set", dataclasses.replace(settings, model=model)) for model in MODELS]
+    found = [Case(DEFAULT, "as set", _of_model(settings, model)) for model in MODELS]
     for factor in factors:
         found += [
-            Case(factor.name, _text(value), dataclasses.replace(settings, model=model, **{factor.name: value}))
+            Case(factor.name, _text(value), _of_model(dataclasses.replace(settings, **factor.of(value)), model))
             for value in factor.values
             for model in factor.models
         ]
-    together = [factor for factor in factors if factor.name in TOGETHER]
-    for values in itertools.product(*(factor.values for factor in together)) if len(together) > 1 else ():
-        changed = list(zip(together, values, strict=True))
-        text = ", ".join(factor.text.format(_text(value)) for factor, value in changed)
-        own = dataclasses.replace(settings, **{factor.name: value for factor, value in changed})
-        found += [Case(COMBINED, text, dataclasses.replace(own, model=model)) for model in MODELS]
+    by_name = {factor.name: factor for factor in factors}
+    for names, apertures in TOGETHER.items():
+        if by_name.keys() >= set(names):
+            found += _together(settings, [by_name[name] for name in names], apertures)
     return found
+
+
+def _together(settings: Settings, factors: Sequence[Factor], apertures: Sequence[float]) -> Iterator[Case]:
+    """All values of several factors with one another, of the aperture these."""
+    values = [apertures if one.name == "f_number" else one.values for one in factors]
+    for chosen in itertools.product(*values):
+        text = ", ".join(one.text.format(_text(value)) for one, value in zip(factors, chosen, strict=True))
+        changed = {key: of for one, value in zip(factors, chosen, strict=True) for key, of in one.of(value).items()}
+        own = dataclasses.replace(settings, **changed)
+        yield from (Case(COMBINED, text, _of_model(own, model)) for model in MODELS)
+
+
+def _of_model(settings: Settings, model: str) -> Settings:
+    """The settings for a model, those that do not reach it as they always are: the same optimum is then sought once."""
+    names = [name for reached, names in _REACH.items() if model not in reached for name in names]
+    usual = {field.name: field.default for field in dataclasses.fields(Settings) if field.name in names}
+    return dataclasses.replace(settings, model=model, **usual)
+
+
+_REACH = {("paraxial",): ("rho",), _TRACED: ("rays", "sampling")}
+
+
+@dataclasses.dataclass(frozen=True)
+class Kept:
+    """Optima in a file of lines of JSON, [settings, optimum], of which one that was begun is no more than not there."""
+
+    path: Path
+
+    def read(self) -> dict[Settings, dict]:
+        lines = self.path.read_text(encoding="utf-8").split("\n")[:-1] if self.path.exists() else []
+        pairs = map(json.loads, lines)
+        return {read(Settings, settings): _numbers(optimum) for settings, optimum in pairs}
+
+    def add(self, settings: Settings, optimum: dict) -> None:
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps([dataclasses.asdict(settings), plain(optimum)]) + "\n")
+
+
+def _numbers(optimum: dict) -> dict:
+    """An optimum as it was written; a focus at infinity is null there."""
+    return {name: math.inf if value is None else value for name, value in optimum.items()}
 
 
 def sweep(
@@ -103,18 +177,21 @@ def sweep(
     *,
     factors: Sequence[Factor] = FACTORS,
     progress: Callable[[Sequence[Case]], Iterable[Case]] = iter,
+    kept: Kept | None = None,
 ) -> list[Row]:
-    """The optimum of every case; one that was found for another case is not sought again.
+    """The optimum of every case; one that was found for another case, or is kept, is not sought again.
 
     spectrum: `power_spectrum` of the pictures; progress: wraps the cases, for a bar.
     """
-    known: dict[Settings, Optimum] = {}
+    known = {} if kept is None else kept.read()
     found = []
     for case in progress(cases(settings, factors)):
         if case.settings not in known:
-            known[case.settings] = closed_form(lens, case.settings, spectrum)
-        optimum = {name: getattr(known[case.settings], name) for name in optima.COLUMNS}
-        found.append(Row(**optimum, factor=case.factor, value=case.value))
+            optimum = closed_form(lens, case.settings, spectrum)
+            known[case.settings] = {name: getattr(optimum, name) for name in optima.COLUMNS}
+            if kept is not None:
+                kept.add(case.settings, known[case.settings])
+        found.append(Row(**known[case.settings], factor=case.factor, value=case.value))
     return found
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 
-from raytrace.camera.training import share
+from raytrace.camera.training import Run, share
 from raytrace.cli.door import CommandError, say
 from raytrace.cli.progress import progress
 from raytrace.cli.run import present
@@ -19,10 +19,11 @@ from raytrace.files import table
 from raytrace.maths.result import Result, plain
 from raytrace.pages import grid, picture, shown
 from raytrace.studies.codesign.claims import SIMPLE, is_of_paper, percent
+from raytrace.studies.codesign.closed_form import SPECTRUM_COLUMNS, spectrum_rows
 from raytrace.studies.codesign.settings import MODELS, NAMES
 from raytrace.studies.codesign.setup import Experiment, experiment, settings_of
 from raytrace.studies.codesign.study import PAPER
-from raytrace.studies.codesign.sweep import COLUMNS, COMBINED, TOGETHER, Reading, Row, distinct, readings
+from raytrace.studies.codesign.sweep import COLUMNS, COMBINED, TOGETHER, Kept, Reading, Row, distinct, readings
 from raytrace.studies.codesign.sweep import sweep as sweep_all
 from raytrace.studies.publish import publish
 
@@ -41,7 +42,8 @@ class Answer:
     """Over all readings, by one definition of focus: is Gaussian DRT nearer than paraxial optics, as in the paper?
 
     least, greatest: focus of Gaussian DRT minus that of paraxial optics, m. closest: the reading nearest to the paper's
-    pair of numbers, with its own pair; appears: whether both are within 2 m of the paper's.
+    three numbers, with its own, of paraxial and Fourier optics and of Gaussian DRT; appears: whether all of them are
+    within 2 m of the paper's, and appear_in: in how many readings.
     """
 
     definition: str
@@ -50,8 +52,9 @@ class Answer:
     least: float
     greatest: float
     closest: str
-    pair: tuple[float, float]
+    focus: tuple[float, ...]
     appears: bool
+    appear_in: int
 
 
 def answers(found: Sequence[Reading]) -> list[Answer]:
@@ -63,18 +66,18 @@ def answers(found: Sequence[Reading]) -> list[Answer]:
 def _answer(definition: str, focus: Callable[[Row], float], found: Sequence[Reading]) -> Answer:
     pairs = [(focus(one.of["paraxial"]), focus(one.of["gaussian"])) for one in found]
     shifts = [0.0 if ours == simple else ours - simple for simple, ours in pairs]  # ∞ - ∞ too
-    papers = PAPER["paraxial"][2], PAPER["gaussian"][2]
-    far = [max(abs(one - paper) for one, paper in zip(pair, papers, strict=True)) for pair in pairs]
-    closest = min(range(len(far)), key=far.__getitem__)
+    closest = min(found, key=lambda one: one.departure(focus))
+    appear_in = sum(one.departure(focus) <= _NEAR for one in found)
     return Answer(
         definition,
         readings=len(found),
         nearer=sum(shift < 0 for shift in shifts),
         least=min(shifts),
         greatest=max(shifts),
-        closest=found[closest].text,
-        pair=pairs[closest],
-        appears=far[closest] <= _NEAR,
+        closest=closest.text,
+        focus=closest.focus(focus),
+        appears=appear_in > 0,
+        appear_in=appear_in,
     )
 
 
@@ -118,15 +121,15 @@ class Sweep(Result):
             )
         for one in answers(self.readings):
             nearer = f"{one.definition}: Gaussian DRT focused nearer than paraxial in {one.nearer} of {one.readings}"
-            closest = f"; closest to the paper {one.pair[0]:.1f} and {one.pair[1]:.1f} m ({one.closest})"
+            closest = f"; closest to the paper {_metres(one.focus)} m ({one.closest})"
             yield f"{nearer} readings{closest if self.of_paper else ''}"
 
     def parts(self) -> list[str]:
         """The page."""
         found, lens = self.readings, self.given.name
         alone = [one for one in found if one.factor != COMBINED]
-        together = [one for one in found if one.factor == COMBINED]
-        verdict = ["## Is the lens of Gaussian DRT focused nearer, at 27.3 m beside 33.9 m?", _verdict(found)]
+        together = [one for one in distinct(found) if one.factor == COMBINED]
+        verdict = ["## Do the three focus distances of the paper appear together?", _verdict(found)]
         lines = "; thin lines: the numbers of the paper" if self.of_paper else ""
         consequences = [
             "## What follows for the paper's claims",
@@ -135,46 +138,52 @@ class Sweep(Result):
             "filters; the paper's are of the mean absolute error behind networks.",
         ]
         return [
-            "# Co-design: the optimum of the best linear filter, by aperture, noise, normalisation and start",
+            "# Co-design: the optimum of the best linear filter, by all that the paper leaves open",
             " ".join([f"    raytrace codesign sweep {lens} --data DIR --docs docs", *self.given.settings.words()]),
             f"The optimum of the closed form for {lens} and the spectrum of {len(self.given.train)} {self.given.kind}: "
-            "the sensor at which the best linear filter that does not know the object distance errs least. Each factor "
-            "is varied alone (ρ, the σ of the paraxial model over the radius of its blur, is of that model only), "
-            f"then {_words(TOGETHER)} together. All rows: [sweep.csv](codesign/sweep.csv). The experiment is that of "
-            "[codesign.md](codesign.md).",
+            "the sensor at which the best linear filter that does not know the object distance errs least, the best "
+            "of several descents. Each factor is varied alone (ρ, the σ of the paraxial model over the radius of its "
+            "blur, is of that model only; a few plain rays instead of all light are of the traced models only), then "
+            f"{' and '.join(_words(names) for names in TOGETHER)} together. All rows: "
+            "[sweep.csv](codesign/sweep.csv); the spectrum: [spectrum.csv](codesign/spectrum.csv). The experiment is "
+            "that of [codesign.md](codesign.md).",
             *(verdict if self.of_paper else []),
             picture("codesign/sweep.png", f"Focus distance of the optimum by factor, model and definition{lines}."),
             *(consequences if self.of_paper else []),
             "## Focus of the optimum",
             _focus_table(alone),
-            "Object distances in m: paraxial conjugate / least RMS spot of the sensor. Shift: of Gaussian DRT's sensor "
-            "from that of paraxial optics; negative is nearer to the lens, for objects further away.",
+            _FOCUS_TABLE,
             "## What each lens costs with DRT PSFs",
             _penalty_table(alone),
-            "## Aperture, noise and normalisation together",
-            _focus_table(together),
-            _penalty_table(together),
+            *([_FURTHER, _descents(found)] if any(map(_further, found)) else []),
+            *(["## Varied together", *_combinations(together, self.of_paper)] if together else []),
         ]
 
 
 def sweep(arguments: argparse.Namespace) -> None:
-    """Find all optima, then write table, figure and page."""
+    """Find all optima, then write table, figure and page; with -o they are kept, and not sought again."""
     if not (arguments.docs or arguments.folder):
         raise CommandError("no folder to write to: give --docs DOCS or -o FOLDER")
     given = experiment(arguments, settings_of(arguments))
     spectrum = given.spectrum()
-    rows = sweep_all(given.lens, given.settings, spectrum, progress=lambda cases: progress(cases, "case"))
+    kept = _kept(given, arguments.folder) if arguments.folder and not share().rank else None
+    rows = sweep_all(given.lens, given.settings, spectrum, progress=lambda cases: progress(cases, "case"), kept=kept)
     if share().rank:
         return  # the first process writes
     found, docs = Sweep(rows, given, is_of_paper(given.lens)), Path(arguments.docs or arguments.folder)
-    tables, figures = {"sweep.csv": table(rows, COLUMNS)}, {"sweep.png": found.plot()}
-    publish(docs / "codesign_sweep.md", "codesign", found.parts(), tables=tables, figures=figures)
+    tables = {"sweep.csv": table(rows, COLUMNS), "spectrum.csv": table(spectrum_rows(spectrum), SPECTRUM_COLUMNS)}
+    publish(docs / "codesign_sweep.md", "codesign", found.parts(), tables=tables, figures={"sweep.png": found.plot()})
     present(found, arguments)
     for row in rows:
         if row.no_optimum:
             say(f"warning: {row.factor} {row.value}, {row.model}: {row.no_optimum}")
     if all(row.no_optimum for row in rows):
         raise CommandError("no case has an optimum; see the warnings, and choose other --near, --far, --bounds")
+
+
+def _kept(given: Experiment, folder: str) -> Kept:
+    """Optima of this lens and these pictures in a folder. Raises OtherSettings for one of others."""
+    return Kept(Run(folder, given.about).folder / "optima.jsonl")
 
 
 # ---------------------------------------------------------------- parts of the page
@@ -184,7 +193,7 @@ def _verdict(found: Sequence[Reading]) -> str:
     given = answers(found)
     header = (
         "focus is", "readings", "Gaussian DRT nearer than paraxial in", "by how much (m)",
-        "closest to the paper: paraxial, Gaussian DRT (m)", "within 2 m of both",
+        "closest to the paper: paraxial, Fourier, Gaussian DRT (m)", f"all within {_NEAR:g} m in",
     )  # fmt: skip
     lines = [
         (
@@ -192,26 +201,64 @@ def _verdict(found: Sequence[Reading]) -> str:
             one.readings,
             one.nearer,
             f"{_signed(one.least)} to {_signed(one.greatest)}",
-            f"{shown(one.pair[0], 1)}, {shown(one.pair[1], 1)} ({one.closest})",
-            f"**{'yes' if one.appears else 'no'}**",
+            f"{_metres(one.focus)} ({one.closest})",
+            f"**{one.appear_in}**",
         )
         for one in given
     ]
-    fitting = [one.definition for one in given if one.appears]
+    papers = _metres([focus for *_, focus in PAPER.values()])
+    fitting = [f"{one.definition} (in {one.appear_in} of {one.readings} readings)" for one in given if one.appears]
     nearer = [f"{one.definition} (in {one.nearer} of {one.readings} readings)" for one in given if one.nearer]
     summary = f"**{'Yes' if fitting else 'No'}.** " + (
-        f"Both numbers appear when focus is {' or '.join(fitting)}."
+        f"The paper's {papers} m appear, to {_NEAR:g} m, when focus is {' or '.join(fitting)}."
         if fitting
-        else f"In no reading do both numbers appear within {_NEAR:g} m of the paper's, by no definition of focus."
+        else f"In no reading do the paper's {papers} m appear, each to {_NEAR:g} m, by no definition of focus."
     )
     if nearer:
-        summary += f" Gaussian DRT is the nearer one only when focus is {' or '.join(nearer)}."
+        summary += f" Gaussian DRT is the nearer one when focus is {' or '.join(nearer)}."
     else:
         summary += " Gaussian DRT is the nearer one in none."
     return (
         f"{summary}\n\n{grid(header, lines)}\n\nEach model's own: the paraxial conjugate for paraxial and Fourier "
-        "optics, which know no other, and the least RMS spot for traced rays."
+        "optics, which know no other, and the least RMS spot for traced rays. Readings that only repeat another count "
+        "once."
     )
+
+
+_FOCUS_TABLE = (
+    "Object distances in m: paraxial conjugate / least RMS spot of the sensor. Shift: of Gaussian DRT's sensor "
+    "from that of paraxial optics; negative is nearer to the lens, for objects further away."
+)
+_FURTHER = "## Where the descent from the start ends at another optimum"
+_SHOWN = 12  # readings of those varied together
+
+
+def _further(one: Reading) -> list[Row]:
+    """Rows whose optimum is not the one downhill from the start: by more than a micrometre."""
+    return [row for row in one.of.values() if abs(row.sensor_mm - row.downhill_mm) > 1e-3]
+
+
+def _descents(found: Sequence[Reading]) -> str:
+    own = {(one.text, row.model): row for one in found if one.is_alone for row in _further(one)}
+    rows = [
+        (text, NAMES[model], f"{row.sensor_mm:.4f}", f"{row.downhill_mm:.4f}", shown(row.focus_paraxial_m, 1))
+        for (text, model), row in own.items()
+    ]
+    header = ("reading", "model", "sensor (mm)", "downhill from the start (mm)", "focus of the first, paraxial (m)")
+    return f"{grid(header, rows)}\n\nTraining goes downhill: what it can reach is the second, not the first."
+
+
+def _combinations(found: Sequence[Reading], of_paper: bool) -> list[str]:
+    """The readings nearest to the paper's numbers, or the first ones."""
+    conjugate = DEFINITIONS["the paraxial conjugate"]
+    nearest = sorted(found, key=lambda one: one.departure(conjugate)) if of_paper else found
+    chosen = nearest[:_SHOWN]
+    what = "whose paraxial conjugates are nearest to the paper's" if of_paper else "first ones"
+    return [
+        f"Of {len(found)} readings the {len(chosen)} {what}; the others are in the table of all rows.",
+        _focus_table(chosen),
+        _penalty_table(chosen),
+    ]
 
 
 #: Claims of the paper: (text, whether it holds in a reading, figures over all of them).
@@ -246,8 +293,20 @@ _CLAIMS: tuple[tuple[str, Callable[[Reading], bool], Callable[[Sequence[Reading]
 
 def _claims(found: Sequence[Reading]) -> str:
     """What of the paper's claims holds in how many readings."""
-    rows = [(text, f"{sum(map(holds, found))} of {len(found)}", figures(found)) for text, holds, figures in _CLAIMS]
-    return grid(("claim", "holds in", "figures"), rows)
+    conjugate = DEFINITIONS["the paraxial conjugate"]
+    fitting = [one for one in found if one.departure(conjugate) <= _NEAR]
+    rows = [
+        (
+            text,
+            f"{sum(map(holds, found))} of {len(found)}",
+            figures(found),
+            f"{sum(map(holds, fitting))} of {len(fitting)}",
+            figures(fitting) if fitting else "–",
+        )
+        for text, holds, figures in _CLAIMS
+    ]
+    where = f"where the three conjugates are the paper's to {_NEAR:g} m"
+    return grid(("claim", "holds in", "figures", where, "figures there"), rows)
 
 
 def _apart(one: Reading) -> float:
@@ -289,10 +348,15 @@ def _pair(row: Row) -> str:
     return f"{shown(row.focus_paraxial_m, 1)} / {shown(row.focus_rms_m, 1)}"
 
 
+def _metres(distances: Sequence[float]) -> str:
+    return ", ".join(shown(one, 1) for one in distances)
+
+
 def _signed(value: float) -> str:
     return f"{value:+.1f}" if math.isfinite(value) else "∞"
 
 
 def _words(names: Sequence[str]) -> str:
-    said = [{"f_number": "aperture", "normalise": "normalisation"}.get(name, name) for name in names]
+    known = {"f_number": "aperture", "normalise": "normalisation", "spread": "distances", "hexapolar": "hexapolar rays"}
+    said = [known.get(name, name) for name in names]
     return f"{', '.join(said[:-1])} and {said[-1]}"

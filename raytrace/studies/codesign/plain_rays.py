@@ -1,0 +1,76 @@
+"""Plain rays: a camera whose traced PSFs are of a few rays, the same ones at every step, as many publications have it.
+
+A Gaussian of twelve rays has the centroid and covariance of those twelve, all of one weight; a lens learned with it
+follows what they say of the aberrations, not what all light does.
+"""
+
+import dataclasses
+import itertools
+
+import torch
+from torch import Tensor
+
+from raytrace.camera.camera import Camera
+from raytrace.kernels import MODELS, gaussian, rays
+from raytrace.kernels.pixels import gaussian_pixels
+from raytrace.maths import pupil
+from raytrace.maths.grid import Grid
+from raytrace.maths.numerics import safe_divide
+from raytrace.optics.scene import Scene, beam_share, scene, trace_scene
+
+_BLUR = 0.25  # of a ray of `drt`, half width in pixels: what makes it differentiable
+
+
+def points(sampling: str, count: int, *, seed: int = 0) -> Tensor:
+    """Pupil points (2, P): `count` of "sobol" or "random", or the least whole rings of "hexapolar" with as many."""
+    if sampling == "hexapolar":
+        return pupil.hexapolar(next(n for n in itertools.count(1) if 1 + 3 * n * (n + 1) >= count))[0]
+    return {"sobol": pupil.sobol, "random": pupil.random}[sampling](count, seed=seed)[0]
+
+
+class PlainRays(Camera):
+    """A camera whose PSFs, of models that trace, are of rays through pupil points (2, P) alone, all of one weight.
+
+    Another model, by `use`, is simulated as by any camera: with as many rays as its tolerance asks for.
+    """
+
+    def __init__(self, *given, points: Tensor, **named):
+        super().__init__(*given, **named)
+        self._points: Tensor | None = points
+
+    def use(self, model: str) -> None:
+        self._points = None
+        super().use(model)
+
+    def kernels(self, object_distances: Tensor, field: int = 0) -> Tensor:
+        if self._points is None or not MODELS[self.model].traces:
+            return super().kernels(object_distances, field)
+        lens, distances, fields = self.variables(), object_distances.to(self.fields.dtype), self.fields[:, [field]]
+        light = scene(lens, fields, distances, lens.wavelengths, self._memo)
+        window = _of_wavelengths(self._window(lens, fields, distances), len(lens.wavelengths))
+        shares = lens.wavelength_weights / lens.wavelength_weights.sum()
+        kernel = (_KERNELS[self.model](light, window, self._points.to(fields)) * shares[:, None, None]).sum(2)[:, 0]
+        return safe_divide(kernel, kernel.sum((-2, -1), keepdim=True)) if self.normalise == "window" else kernel
+
+
+def _of_wavelengths(window: Grid, count: int) -> Grid:
+    """A window that follows chief rays, (2, D, F) of them, for each of so many wavelengths."""
+    if window.centre.dim() == 1:
+        return window
+    return dataclasses.replace(window, centre=window.centre[..., None].expand(*window.centre.shape, count))
+
+
+def _gaussian(light: Scene, window: Grid, disc: Tensor) -> Tensor:
+    """Kernels (D, F, W, rows, columns) of the mean and covariance of the rays that arrive."""
+    traced, weights = trace_scene(light, disc), torch.full_like(disc[0], 1 / disc.shape[1])
+    valid = traced.valid.expand(*light.shape, disc.shape[1])
+    hits = traced.position[:2].expand(2, *valid.shape)
+    centroid, covariance, arrived = gaussian.moments(gaussian.Light(hits, valid, weights, disc.shape[1]), "none")
+    return (arrived * beam_share(light))[..., None, None] * gaussian_pixels(window, centroid, covariance)
+
+
+def _drt(light: Scene, window: Grid, disc: Tensor) -> Tensor:
+    return rays.kernels_of_points(light, window, disc, torch.full_like(disc[0], 1 / disc.shape[1]), width=_BLUR).kernel
+
+
+_KERNELS = {"gaussian": _gaussian, "drt": _drt}
