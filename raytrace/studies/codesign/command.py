@@ -13,7 +13,8 @@ DESCRIPTION = """\
 Learn the sensor distance (or any variables) of a lens together with a network that restores its pictures. Step 1
 learns both with the PSFs of one model; step 2 freezes the lens and goes on with the network on PSFs of traced rays,
 as long as step 1. `compare` runs every model and seed and writes tables, figures and a page about them; `sweep` finds
-the optima of the closed form at several apertures, noises, normalisations and starts, and widths of the paraxial PSF.
+the optima of the closed form at several apertures, noises, normalisations, starts and numbers of rays; `retrain` trains
+fresh networks on the lenses that compare found, each alike, and tells their losses apart seed by seed.
 
 Models: paraxial (a Gaussian as wide as the paraxial blur), fourier (diffraction of the paraxial wavefront), gaussian
 (Gaussian DRT: centroid and covariance of traced rays), drt (differentiable ray tracing: the rays themselves). Closed
@@ -30,7 +31,8 @@ EXAMPLES = """examples:
   raytrace codesign double_gauss --field 0 10 14 --normalise energy --epochs 10 -o fields --json
   raytrace codesign compare double_gauss --data pictures --seeds 0 1 2 -o study --docs docs
   raytrace codesign compare double_gauss --data pictures -o study --docs docs --report-only
-  raytrace codesign sweep double_gauss --data pictures --docs docs"""
+  raytrace codesign sweep double_gauss --data pictures --docs docs
+  raytrace codesign retrain double_gauss --sensors docs/codesign/table2.csv --data pictures -o fresh --docs docs"""
 
 _SCENE = (
     *("vary", "bounds", "glass_thickness", "air_thickness", "edge", "start", "focus_distance", "f_number"),
@@ -40,12 +42,19 @@ _SCENE = (
 _TRAINING = ("depth", "width", "epochs", "batch", "seed", "rate_network", "rate_optics", "decay", "precision")
 
 #: The forms of the command by their word, where they are carried out, and the options that only some of them know.
-_FORMS = {"": "single", "compare": "compare", "sweep": "sweep_page"}
+_FORMS = {
+    "": ("single", "single"),
+    "compare": ("compare", "compare"),
+    "sweep": ("sweep_page", "sweep"),
+    "retrain": ("retrain_page", "retrain_all"),
+}
 _BELONG = {
-    "models": ("compare",),
-    "seeds": ("compare",),
-    "report_only": ("compare",),
-    "docs": ("compare", "sweep"),
+    "models": ("compare", "retrain"),
+    "seeds": ("compare", "retrain"),
+    "report_only": ("compare", "retrain"),
+    "docs": ("compare", "sweep", "retrain"),
+    "page": ("compare", "retrain"),
+    "sensors": ("retrain",),
     "model": ("",),
     "seed": ("",),
     "resume": ("", "compare"),
@@ -53,14 +62,14 @@ _BELONG = {
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    parser.usage = "raytrace codesign [compare | sweep] LENS [-o FOLDER] [options]"
+    parser.usage = "raytrace codesign [compare | sweep | retrain] LENS [-o FOLDER] [options]"
     parser.add_argument(
         "words",
         metavar="LENS",
         type=file_name,
         nargs="+",
         help="lens file, or the name of a shipped lens; before it `compare` runs all models and seeds, "
-        "`sweep` finds optima of the closed form",
+        "`sweep` finds optima of the closed form, `retrain` compares known lenses",
     )
     catalog(parser)
     json(parser)
@@ -93,7 +102,7 @@ def options(parser: argparse.ArgumentParser) -> None:
         help="RED-Net of 10 layers of 32 maps (default), or of 30 layers of 64 maps",
     )
     add_options(training, Settings, *_TRAINING)
-    _compare(parser.add_argument_group("compare and sweep"))
+    _compare(parser.add_argument_group("compare, sweep and retrain"))
 
 
 def _compare(group) -> None:
@@ -105,13 +114,20 @@ def _compare(group) -> None:
         help=f"rows of the table: {', '.join(MODELS)} (default: all), and {AFTER_PARAXIAL}: Gaussian DRT that begins "
         "where the paraxial run ended",
     )
-    group.add_argument("--seeds", metavar="N", type=seed_number, nargs="+", help="of the runs (default 0 1 2)")
-    documents(group, "the page and of codesign/, for compare and sweep (default: FOLDER)")
+    group.add_argument(
+        "--seeds", metavar="N", type=seed_number, nargs="+", help="of the runs (default 0 1 2; of retrain 0 to 4)"
+    )
+    group.add_argument("--sensors", metavar="TABLE", type=file_name, help="table2.csv of the lenses to retrain on")
+    documents(group, "the page and of codesign/ (default: FOLDER)")
+    group.add_argument(
+        "--page", metavar="NAME", type=file_name, help="NAME.md and NAME/ there, for a second study (default codesign)"
+    )
     group.add_argument("--report-only", action="store_true", help="train nothing, write what the runs say so far")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """One model; with the word `compare` all of them; with `sweep` the closed form by what the paper leaves open."""
+    """One model; with the word `compare` all of them; with `sweep` the closed form by what the paper leaves open; with
+    `retrain` fresh networks for the lenses of a comparison."""
     from raytrace.cli.door import CommandError
     from raytrace.shards import processes
 
@@ -119,16 +135,19 @@ def run(arguments: argparse.Namespace) -> None:
     form = before[0] if before else ""
     if len(before) > 1 or form not in _FORMS:
         raise CommandError(
-            f"{' '.join(arguments.words)}: expected LENS, compare LENS or sweep LENS{did_you_mean(form, _FORMS)}"
+            f"{' '.join(arguments.words)}: expected LENS, compare LENS, sweep LENS or retrain LENS"
+            f"{did_you_mean(form, _FORMS)}"
         )
     for name, forms in _BELONG.items():
         if form not in forms and getattr(arguments, name) not in (None, False):
             raise CommandError(f"--{name.replace('_', '-')} belongs to {' and '.join(map(_spelled, forms))}")
     if form and arguments.loss == "spectral":
         raise CommandError("--loss spectral belongs to codesign LENS; compare and sweep use the closed form anyway")
-    name = "spectral" if arguments.loss == "spectral" else form or "single"
+    module, name = _FORMS[form]
+    if arguments.loss == "spectral":
+        name = "spectral"
     with processes():
-        importlib.import_module(f"raytrace.studies.codesign.{_FORMS[form]}").__dict__[name](arguments)
+        importlib.import_module(f"raytrace.studies.codesign.{module}").__dict__[name](arguments)
 
 
 def _spelled(form: str) -> str:

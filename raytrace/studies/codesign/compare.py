@@ -53,7 +53,7 @@ def compare(arguments: argparse.Namespace) -> None:
         _train(given, study, models, seeds)
     if share().rank:
         return  # the first process writes
-    report = _report(given, study, models, seeds, Path(arguments.docs or study))
+    report = _report(given, study, models, seeds, Path(arguments.docs or study), arguments.page or "codesign")
     present(report, arguments)
     nowhere = [one for one in (*report.optima, *report.found) if one.no_optimum]
     for one in nowhere:
@@ -90,7 +90,9 @@ def _train(given: Experiment, study: Path, models: Sequence[str], seeds: Sequenc
         train_run(given, own, runs.run_folder(study, row, seed), f"{number}/{len(asked)} {row} {seed}")
 
 
-def _report(given: Experiment, study: Path, models: Sequence[str], seeds: Sequence[int], docs: Path) -> Report:
+def _report(
+    given: Experiment, study: Path, models: Sequence[str], seeds: Sequence[int], docs: Path, page: str
+) -> Report:
     """Write everything; returns what the page says."""
     found = runs.outcomes(study, models, seeds)
     done = {(one.model, one.seed) for one in found}
@@ -112,10 +114,11 @@ def _report(given: Experiment, study: Path, models: Sequence[str], seeds: Sequen
         figures=tuple(name for name in CAPTIONS if name in drawn),
         machine=machine(),
         sweep=(docs / "codesign_sweep.md").exists(),
+        folder=page,
         of_paper=is_of_paper(given.lens),
     )
     tables = {"table2.csv": table(found, runs.COLUMNS), "spectral.csv": table(best, optima.COLUMNS)}
-    publish(docs / "codesign.md", "codesign", report.parts(), tables=tables, figures=drawn)
+    publish(docs / f"{page}.md", page, report.parts(), tables=tables, figures=drawn)
     return report
 
 

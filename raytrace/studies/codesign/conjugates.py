@@ -1,5 +1,6 @@
 """Conjugates: which object distances a sensor is in focus for, and where it is for any."""
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 
@@ -10,7 +11,9 @@ from torch import Tensor
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
 from raytrace.optics.focus import best_focus, focus_moments, image_rays, real_image_distance
+from raytrace.optics.launch import launch
 from raytrace.optics.paraxial import paraxial_image_distance
+from raytrace.optics.trace import lens_steps
 from raytrace.system.lens import Lens, with_object_distance
 
 _RINGS = 12  # of the pupil, where focus is found
@@ -66,3 +69,27 @@ def place_of(lens: Lens) -> dict[str, float]:
         "focus_paraxial_m": 1e-3 * distance_in_focus(lens, paraxial_image),
         "focus_rms_m": 1e-3 * distance_in_focus(lens, best_focus),
     }
+
+
+@dataclasses.dataclass(frozen=True)
+class Cut:
+    """A surface smaller than the beam on the axis: heights in mm."""
+
+    surface: int
+    height: float
+    semi_diameter: float
+
+
+@torch.no_grad()
+def vignetted(lens: Lens) -> list[Cut]:
+    """Surfaces between object and image, but for the stop, that are smaller than the beam of the object on the axis."""
+    like = lens.wavelengths
+    rays = launch(lens, like.new_tensor([[0.0], [1.0]]), fields=like.new_zeros(2, 1))
+    crossings = list(lens_steps(lens, rays, like[:1, None]))
+    heights = [float(one.rays.position[1].flatten()[0].abs()) for one in crossings]
+    found = zip(lens.surfaces[1:-1], heights, strict=False)
+    return [
+        Cut(number, height, float(surface.semi_diameter))
+        for number, (surface, height) in enumerate(found, 1)
+        if surface.semi_diameter is not None and number != lens.stop and height > float(surface.semi_diameter)
+    ]

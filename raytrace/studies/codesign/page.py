@@ -31,7 +31,8 @@ class Report(Result):
     """All that a page says.
 
     missing: (row, seed) of runs that are not finished; figures: file names that exist; sweep: whether there is a page
-    of one beside this; of_paper: whether the lens is the paper's, whose numbers then stand beside the found ones.
+    of one beside this; folder: beside the page, of tables and figures; of_paper: whether the lens is the paper's, whose
+    numbers then stand beside the found ones.
     """
 
     lens: str
@@ -45,6 +46,7 @@ class Report(Result):
     machine: Mapping[str, str | int]
     sweep: bool = False
     of_paper: bool = True
+    folder: str = "codesign"
 
     @property
     def claims(self) -> list[Claim]:
@@ -91,9 +93,9 @@ class Report(Result):
             _experiment(self),
             _progress(self),
             "## Loss and focus",
-            _table(self.found, of_paper=self.of_paper),
+            _table(self),
             *(["## The paper's claims", grid(asked, answers)] if self.of_paper else []),
-            *(picture(f"codesign/{name}", CAPTIONS[name]) for name in self.figures),
+            *(picture(f"{self.folder}/{name}", CAPTIONS[name]) for name in self.figures),
             "## The best linear filter beside training",
             _closed_form(self),
             "## Time of a step",
@@ -141,7 +143,8 @@ def _progress(report: Report) -> str:
     return f"**Unfinished: {done} of {done + len(report.missing)} runs.** Missing, by model and seed: {missing}."
 
 
-def _table(found: Sequence[Outcome], *, of_paper: bool) -> str:
+def _table(report: Report) -> str:
+    found, of_paper = report.found, report.of_paper
     if not found:
         return "No run is finished yet."
     header = (
@@ -166,7 +169,7 @@ def _table(found: Sequence[Outcome], *, of_paper: bool) -> str:
         f"{grid(header, lines)}\n\nMean ± standard deviation over seeds, of test pictures; every model of a seed sees "
         "the same crops, distances and noise. Focus is the object distance from vertex 1 whose image is on the sensor: "
         f"the paraxial one, or that of least RMS spot{_OF_PAPER if of_paper else ''}."
-        " Rows one by one: [table2.csv](codesign/table2.csv)."
+        f" Rows one by one: [table2.csv]({report.folder}/table2.csv)."
     )
 
 
@@ -197,7 +200,7 @@ def _closed_form(report: Report) -> str:
     ]
     return (
         f"{grid(header, lines)}\n\nMean square error of a pixel behind the best linear filter that does not know the "
-        "object distance, for pictures of this power spectrum: [spectral.csv](codesign/spectral.csv)."
+        "object distance, for pictures of this power spectrum: [spectral.csv]({report.folder}/spectral.csv)."
         f"{f' {_SWEEP}' if report.sweep else ''}"
     )
 

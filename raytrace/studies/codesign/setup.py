@@ -25,7 +25,7 @@ from raytrace.shards import share
 from raytrace.studies.codesign.closed_form import power_spectrum
 from raytrace.studies.codesign.experiment import STEPS, Outcome, camera, lens_at_start, outcome, run_model, variables
 from raytrace.studies.codesign.settings import Settings
-from raytrace.studies.pictures import Pictures, dead_leaves, pictures, split
+from raytrace.studies.pictures import Pictures, dead_leaves, pictures, resized, split
 from raytrace.system.lens import Lens, check, field_points
 
 _LEAVES = 100  # pictures, where none are given
@@ -60,10 +60,10 @@ class Experiment:
         """What thicknesses are held to."""
         return variables(self.lens, self.settings).limits
 
-    def spectrum(self) -> Tensor:
-        """Power spectrum of the training pictures, at the size of a patch with its margin."""
+    def spectrum(self, scale: float = 1.0) -> Tensor:
+        """Power spectrum of the training pictures, at the size of a patch with its margin; scale: as for `resized`."""
         own = self.settings
-        return power_spectrum(self.train, own.patch + own.size - 1, crops=own.crops, seed=own.seed)
+        return power_spectrum(resized(self.train, scale), own.patch + own.size - 1, crops=own.crops, seed=own.seed)
 
 
 def experiment(arguments: argparse.Namespace, settings: Settings) -> Experiment:
@@ -168,21 +168,32 @@ def _digest(given: Pictures) -> str:
 
 def train_run(given: Experiment, settings: Settings, folder: Path, label: str) -> Outcome:
     """Both steps of one run, or what is left of them, with a bar; a run that is finished is read again."""
-    length = settings.epochs * given.steps_per_epoch
-    shown = Progress(label, length, given.steps_per_epoch, focus_of(given.lens, settings))
-    steps = run_model(
-        given.lens,
-        given.train,
-        given.test,
+    follow(
+        given,
         settings,
-        folder,
-        about=given.about,
-        distances=given.distances,
-        catalogs=given.catalogs,
-        progress=shown.testing,
+        label,
+        STEPS,
+        lambda testing: run_model(
+            given.lens,
+            given.train,
+            given.test,
+            settings,
+            folder,
+            about=given.about,
+            distances=given.distances,
+            catalogs=given.catalogs,
+            progress=testing,
+        ),
     )
+    return outcome(folder)
+
+
+def follow(given: Experiment, settings: Settings, label: str, names: Sequence[str], train: Callable) -> None:
+    """Take the steps of a training with a bar. names: of its steps; train: (what wraps tests) -> the iterator."""
+    length = settings.epochs * given.steps_per_epoch
+    shown = Progress(label, length, given.steps_per_epoch, focus_of(given.lens, settings), names)
     try:
-        for name, step, record in steps:
+        for name, step, record in train(shown.testing):
             shown(name, step, record)
     except NotFinite as error:
         raise CommandError(str(error)) from error
@@ -190,25 +201,32 @@ def train_run(given: Experiment, settings: Settings, folder: Path, label: str) -
         shown.close()
     if shown.bar is None:
         say(f"{label}: finished before, nothing to train")
-    return outcome(folder)
 
 
 class Progress:
-    """A bar over both steps of a run on a terminal; elsewhere a line for every epoch."""
+    """A bar over the steps of a run, by their names, on a terminal; elsewhere a line for every epoch."""
 
-    def __init__(self, label: str, length: int, steps_per_epoch: int, focus: Callable[[float], float] | None):
+    def __init__(
+        self,
+        label: str,
+        length: int,
+        steps_per_epoch: int,
+        focus: Callable[[float], float] | None,
+        names: Sequence[str] = STEPS,
+    ):
         self.label, self.length, self.steps_per_epoch, self.focus = label, length, steps_per_epoch, focus
+        self.names, self.whole = names, len(names) * length
         self.bar: tqdm | None = None
         self.losses: list[float] = []
         self.first, self.since, self.is_testing = 0, time.monotonic(), False
 
     def __call__(self, name: str, step: int, record: Record) -> None:
-        place = STEPS.index(name) * self.length + step + 1
+        place = self.names.index(name) * self.length + step + 1
         if self.bar is None:
             self.first = place - 1
             if self.first:
-                say(f"{self.label}: going on behind step {self.first} of {2 * self.length}")
-            self.bar = tqdm(total=2 * self.length, initial=self.first, unit="step", disable=None, dynamic_ncols=True)
+                say(f"{self.label}: going on behind step {self.first} of {self.whole}")
+            self.bar = tqdm(total=self.whole, initial=self.first, unit="step", disable=None, dynamic_ncols=True)
         self.is_testing = False
         self.losses.append(record["loss"])
         if not self.bar.disable:
@@ -238,7 +256,7 @@ class Progress:
         self.bar.set_postfix_str(words, refresh=refresh)
 
     def _line(self, name: str, step: int, record: Record, place: int) -> None:
-        left = (2 * self.length - place) * (time.monotonic() - self.since) / (place - self.first)
+        left = (self.whole - place) * (time.monotonic() - self.since) / (place - self.first)
         epoch, epochs = (step + 1) // self.steps_per_epoch, self.length // self.steps_per_epoch
         loss = sum(self.losses) / len(self.losses)
         self.losses.clear()

@@ -8,6 +8,7 @@ import dataclasses
 import itertools
 import json
 import math
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -161,6 +162,10 @@ class Kept:
         return {read(Settings, settings): _numbers(optimum) for settings, optimum in pairs}
 
     def add(self, settings: Settings, optimum: dict) -> None:
+        """Write one more, behind what is whole."""
+        if self.path.exists():
+            whole = self.path.read_bytes().rpartition(b"\n")
+            os.truncate(self.path, len(whole[0]) + len(whole[1]))
         with self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps([dataclasses.asdict(settings), plain(optimum)]) + "\n")
 
@@ -214,3 +219,25 @@ def distinct(found: Sequence[Reading]) -> list[Reading]:
 
 def _text(value: float | str) -> str:
     return value if isinstance(value, str) else f"{value:g}"
+
+
+# ---------------------------------------------------------------- the size of the pictures
+
+SCALES = (0.75, 1.0, 1.5, 2.0, 2.5)
+SCALE_COLUMNS = ("scale", "deviation", "model", "sensor_mm", "focus_paraxial_m", "rms_error", "rms_error_drt")
+
+
+def by_scale(lens: Lens, settings: Settings, spectrum: Callable[[float], Tensor]) -> list[dict[str, float | str]]:
+    """Optima for pictures resized before patches are cut: errors as roots of mean squares, of pictures from 0 to 1.
+
+    spectrum: of pictures of so many times the size; deviation: theirs about the mean of each patch.
+    """
+    rows = []
+    for scale in SCALES:
+        power = spectrum(scale)
+        deviation = float((power.mean() - power[0, 0] / power.numel()).sqrt())
+        for model in MODELS:
+            found = closed_form(lens, _of_model(settings, model), power)
+            values = (scale, deviation, model, found.sensor_mm, found.focus_paraxial_m)
+            rows.append(dict(zip(SCALE_COLUMNS, (*values, found.error**0.5, found.error_drt**0.5), strict=True)))
+    return rows

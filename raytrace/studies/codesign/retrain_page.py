@@ -1,0 +1,198 @@
+"""`raytrace codesign retrain`: fresh networks for the lenses of a study, and the page about them."""
+
+import argparse
+import dataclasses
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from raytrace.camera.training import Run, share
+from raytrace.cli.door import CommandError
+from raytrace.cli.run import present
+from raytrace.files import table
+from raytrace.maths.result import Result, plain
+from raytrace.pages import grid
+from raytrace.studies.codesign.claims import percent
+from raytrace.studies.codesign.experiment import usual
+from raytrace.studies.codesign.retrain import (
+    COLUMNS,
+    LOSSES,
+    STEP,
+    Effect,
+    Retrained,
+    effects,
+    means,
+    retrain,
+    retrained,
+    sensors_of,
+    settings_of_lens,
+)
+from raytrace.studies.codesign.settings import NAMES, Settings
+from raytrace.studies.codesign.setup import Experiment, experiment, follow, refuse_too_few, settings_of
+from raytrace.studies.publish import publish
+
+_SEEDS = (0, 1, 2, 3, 4)
+_TEST, _LAST = LOSSES
+_SAID = {_TEST: "L¹, test pictures", _LAST: "L¹, batches of the last two epochs"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Footing(Result):
+    """What fresh networks say of lenses; missing: (row, seed) of networks that are not finished."""
+
+    given: Experiment
+    sensors: dict[str, float]
+    found: tuple[Retrained, ...]
+    missing: tuple[tuple[str, int], ...]
+
+    @property
+    def effects(self) -> list[Effect]:
+        return effects(self.found)
+
+    def document(self) -> dict:
+        return plain(
+            {
+                "settings": dataclasses.asdict(self.given.settings),
+                **self.given.about,
+                "sensors": self.sensors,
+                "rows": [dataclasses.asdict(one) for one in self.found],
+                "effects": [dataclasses.asdict(one) for one in self.effects],
+                "missing": [{"model": row, "seed": seed} for row, seed in self.missing],
+            }
+        )
+
+    def __str__(self) -> str:
+        return "\n".join(self._lines())
+
+    def _lines(self) -> Iterator[str]:
+        yield f"{'lens of':>26} {'sensor mm':>10} {'seeds':>5} {'L1 test':>9} {'L1 last':>9}"
+        for model, of in means(self.found).items():
+            seeds = sum(one.model == model for one in self.found)
+            losses = " ".join(f"{of[loss][0]:>9.5f}" for loss in LOSSES)
+            yield f"{NAMES[model]:>26} {self.sensors[model]:>10.4f} {seeds:>5} {losses}"
+        for one in self.effects:
+            yield f"{NAMES[one.model]:>26}: {_told(one)} over {NAMES[one.reference]}, {_SAID[one.loss]}"
+        if self.missing:
+            yield f"not finished: {', '.join(f'{row} {seed}' for row, seed in self.missing)}"
+
+    def parts(self, folder: str) -> list[str]:
+        """The page, whose table is in the folder."""
+        s, begun = self.given.settings, f"{len(self.found)} of {len(self.found) + len(self.missing)}"
+        words = " ".join(s.words())
+        aperture = "the file's aperture" if s.f_number is None else f"F/{s.f_number:g}"
+        return [
+            "# Co-design: the lenses on an equal footing",
+            f"    raytrace codesign retrain {self.given.name} --sensors TABLE --data DIR -o FOLDER --docs docs {words}",
+            f"{self.given.name} at {aperture} with its sensor where each model put it (mean over the seeds of "
+            "`codesign compare`), held there. For every lens and seed a fresh network is trained on ray-traced (DRT) "
+            f"PSFs for {s.epochs} epochs: one budget, and the same crops, object distances and noise for all lenses of "
+            f"a seed. {len(self.given.train)} {self.given.kind} to train on, {len(self.given.test)} to test.",
+            f"**Unfinished: {begun} networks.**" if self.missing else "",
+            _losses(self),
+            "## Differences, seed by seed",
+            _effects(self.effects),
+            "Relative to Gaussian DRT's lens, with 95 % intervals of the mean (Student's t of differences by seed). "
+            "Test pictures: by the last iterate. Batches of the last two epochs: each before the network learned from "
+            f"it. Network by network: [retrain.csv]({folder}/retrain.csv).",
+            "## Over object distance",
+            _by_distance(self.found),
+        ]
+
+
+def _losses(given: Footing) -> str:
+    lines = [
+        (
+            NAMES[model],
+            f"{given.sensors[model]:.4f}",
+            sum(one.model == model for one in given.found),
+            *(f"{of[loss][0]:.5f} ± {of[loss][1]:.5f}" for loss in LOSSES),
+        )
+        for model, of in means(given.found).items()
+    ]
+    return grid(("lens of", "sensor (mm)", "seeds", *_SAID.values()), lines) if lines else "No network is finished yet."
+
+
+def _effects(found: Sequence[Effect]) -> str:
+    if not found:
+        return "Two seeds of two lenses are needed."
+    header = ("lens of", "loss", "seeds", "more than Gaussian DRT's", "p", "")
+    lines = [
+        (
+            NAMES[one.model],
+            _SAID[one.loss],
+            one.seeds,
+            _told(one),
+            f"{one.p:.2g}",
+            ("worse" if one.mean > 0 else "better") if one.is_clear else "no difference shown",
+        )
+        for one in found
+    ]
+    return grid(header, lines)
+
+
+def _told(one: Effect) -> str:
+    return f"{_fine(one.mean)} ({_fine(one.low)} to {_fine(one.high)})"
+
+
+def _fine(part: float) -> str:
+    return f"{100 * part:+.2f} %"
+
+
+def _by_distance(found: Sequence[Retrained]) -> str:
+    """Mean loss of test pictures by object distance, relative to Gaussian DRT's lens at the same seeds."""
+    distances = sorted({float(z) for one in found for z in one.by_distance})
+    of = {(one.model, one.seed): {float(z): loss for z, loss in one.by_distance.items()} for one in found}
+    lines = []
+    for model in dict.fromkeys(one.model for one in found):
+        seeds = [seed for name, seed in of if name == model and ("gaussian", seed) in of]
+        if model == "gaussian" or not seeds:
+            continue
+        ratios = [sum(of[model, k][z] / of["gaussian", k][z] - 1 for k in seeds) / len(seeds) for z in distances]
+        lines.append((NAMES[model], len(seeds), *map(percent, ratios)))
+    header = ("lens of", "seeds", *(f"{z / 1e3:g} m" for z in distances))
+    told = "Mean loss of test pictures over that of Gaussian DRT's lens, less 1."
+    return f"{grid(header, lines)}\n\n{told}" if lines else ""
+
+
+def retrain_all(arguments: argparse.Namespace) -> None:
+    """Train what is missing, seed by seed, then write table and page from what is there."""
+    if not (arguments.folder and arguments.sensors):
+        raise CommandError("give the table of the lenses, --sensors table2.csv, and a folder for the runs, -o FOLDER")
+    study, sensors = Path(arguments.folder), sensors_of(arguments.sensors)
+    given = experiment(arguments, settings_of(arguments, study / "settings.json"))
+    refuse_too_few(given)
+    common = {k: v for k, v in dataclasses.asdict(given.settings).items() if k not in ("model", "seed", "start")}
+    Run(study, {**common, **given.about, "sensors": sensors}, usual=usual(given.settings))
+    models, seeds = [m for m in sensors if m in (arguments.models or sensors)], arguments.seeds or _SEEDS
+    asked = [(row, seed) for seed in seeds for row in models]
+    for number, (row, seed) in enumerate(asked if not arguments.report_only else (), 1):
+        own = settings_of_lens(given.settings, sensors[row], seed)
+        _train(given, own, study / f"{row}-{seed}", row, f"{number}/{len(asked)} {row} {seed}")
+    if share().rank:
+        return  # the first process writes
+    runs = {(row, seed): retrained(study / f"{row}-{seed}") for row, seed in asked}
+    found = tuple(one for one in runs.values() if one is not None)
+    footing = Footing(given, sensors, found, tuple(key for key, one in runs.items() if one is None))
+    page = Path(arguments.docs or study) / f"{arguments.page or 'codesign'}_retrain.md"
+    folder = arguments.page or "codesign"
+    publish(page, folder, footing.parts(folder), tables={"retrain.csv": table(found, COLUMNS)}, figures={})
+    present(footing, arguments)
+
+
+def _train(given: Experiment, settings: Settings, folder: Path, row: str, label: str) -> None:
+    follow(
+        given,
+        settings,
+        label,
+        (STEP,),
+        lambda testing: retrain(
+            given.lens,
+            given.train,
+            given.test,
+            settings,
+            folder,
+            row=row,
+            about=given.about,
+            distances=given.distances,
+            progress=testing,
+        ),
+    )
