@@ -19,6 +19,7 @@ from raytrace.optics.paraxial import paraxial_image_distance
 from raytrace.studies.codesign import setup as codesign_setup
 from raytrace.studies.codesign.experiment import lens_at_start
 from raytrace.studies.codesign.settings import AFTER_PARAXIAL, Settings
+from raytrace.studies.codesign.study import COLUMNS
 from raytrace.studies.pictures import dead_leaves
 
 _LITTLE = "--depth 4 --width 4 --patch 16 --size 7 --epochs 1 --crops 4 --batch 4 --precision float32"
@@ -269,7 +270,7 @@ def test_errors_are_one_line(run, pictures, options, message):
     ("arguments", "message"),
     [
         (("double_gauss",), "no folder to keep the run in: give -o FOLDER"),
-        (("comparing", "double_gauss", "-o", "out"), "expected LENS, compare LENS or sweep LENS"),
+        (("comparing", "double_gauss", "-o", "out"), "expected LENS, compare LENS, sweep LENS or retrain LENS"),
         (("compare", "double_gauss", "--model", "drt", "-o", "out"), "--model belongs to codesign LENS"),
         (("compare", "double_gauss", "--loss", "spectral", "-o", "out"), "--loss spectral belongs to codesign LENS"),
         (("compare", "double_gauss", "--report-only", "-o", "out"), "out: no study was begun here"),
@@ -312,15 +313,17 @@ def test_compare_writes_the_table_and_the_page(run, pictures):
     table = rows("docs/codesign/table2.csv")
     assert [row["model"] for row in table] == ["paraxial", after]
     for row in table:
-        assert tuple(row) == ("model", "seed", "l1_joint", "l1_drt", "focus_paraxial_m", "focus_rms_m", "sensor_mm")
-        assert {key: float(row[key]) for key in list(row)[1:]} == {
-            key: kept[row["model"]][key] for key in list(row)[1:]
-        }
+        assert tuple(row) == COLUMNS
+        of_file = [key for key in COLUMNS[1:] if "last_epochs" not in key]
+        assert {key: float(row[key]) for key in of_file} == {key: kept[row["model"]][key] for key in of_file}
+        with open(f"study/{row['model']}-3/joint/log.csv", newline="") as file:
+            course = [float(step["sensor"]) for step in csv.DictReader(file)]
+        assert float(row["sensor_last_epochs_mm"]) == pytest.approx(sum(course) / len(course))  # of one epoch
     begun = read(f"study/{after}-3/joint/settings.json")
     assert (begun["model"], float(begun["start"])) == ("gaussian", kept["paraxial"]["sensor_mm"])
     document = json.loads(out)
     assert [row["sensor_mm"] for row in document["rows"]] == [kept[model]["sensor_mm"] for model in kept]
-    assert (len(document["claims"]), document["missing"]) == (11, [])
+    assert (len(document["claims"]), document["missing"]) == (21, [])
     page = Path("docs/codesign.md").read_text(encoding="utf-8")
     for name in re.findall(r"\(codesign/(\w+\.\w+)\)", page):
         assert Path("docs/codesign", name).read_bytes().startswith(b"\x89PNG") == name.endswith(".png")

@@ -2,7 +2,7 @@
 
 import argparse
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from raytrace.files import table
 from raytrace.pages import machine
 from raytrace.studies.codesign import figures, optima
 from raytrace.studies.codesign import study as runs
-from raytrace.studies.codesign.claims import is_of_paper
+from raytrace.studies.codesign.claims import Seen, is_of_paper
 from raytrace.studies.codesign.closed_form import even_distances, scan
 from raytrace.studies.codesign.experiment import STEPS, Outcome, batch, camera, lens_at_start, outcome, usual
 from raytrace.studies.codesign.page import CAPTIONS, Report
@@ -24,6 +24,7 @@ from raytrace.studies.codesign.setup import (
     Experiment,
     conjugates,
     experiment,
+    focus_of,
     recorded,
     refuse_too_few,
     settings_of,
@@ -94,14 +95,16 @@ def _report(
     given: Experiment, study: Path, models: Sequence[str], seeds: Sequence[int], docs: Path, page: str
 ) -> Report:
     """Write everything; returns what the page says."""
-    found = runs.outcomes(study, models, seeds)
+    focus = focus_of(given.lens, given.settings)
+    found = runs.with_last_epochs(study, runs.outcomes(study, models, seeds), given.settings.epochs, focus)
     done = {(one.model, one.seed) for one in found}
     own = [dataclasses.replace(given.settings, model=model) for model in models if model in MODELS]
     say("the closed form, and the time of a step, of every model")
     spectrum = given.spectrum()
     best = optima.closed_forms(given.lens, given.settings, spectrum, models)
     times = [runs.step_time(camera(given.lens, s), batch(given.train, s, list(range(s.batch)), 0)) for s in own]
-    drawn = _training_figures(given, study, found) | _lens_figures(given, study, found)
+    blur = _blur(given, study, found)
+    drawn = _training_figures(given, study, found) | _lens_figures(given, study, found, blur)
     drawn |= _scan_figure(given, spectrum, best, found)
     report = Report(
         lens=given.name,
@@ -116,8 +119,21 @@ def _report(
         sweep=(docs / "codesign_sweep.md").exists(),
         folder=page,
         of_paper=is_of_paper(given.lens),
+        seen=Seen(tuple(_distances(given) / 1e3), blur, _settled(given, study, found, focus)),
     )
-    tables = {"table2.csv": table(found, runs.COLUMNS), "spectral.csv": table(best, optima.COLUMNS)}
+    tables = {
+        "table2.csv": table(found, runs.COLUMNS),
+        "distance.csv": table(runs.distance_rows(found), runs.DISTANCE_COLUMNS),
+        "blur.csv": table(
+            [
+                {"model": model, "distance_m": z, "diameter_um": 1e3 * width}
+                for model, own in blur.items()
+                for z, width in zip(report.seen.distances, own, strict=True)
+            ],
+            ("model", "distance_m", "diameter_um"),
+        ),
+        "spectral.csv": table(best, optima.COLUMNS),
+    }
     publish(docs / f"{page}.md", page, report.parts(), tables=tables, figures=drawn)
     return report
 
@@ -133,28 +149,55 @@ def _training_figures(given: Experiment, study: Path, found: Sequence[Outcome]) 
     return drawn
 
 
-def _lens_figures(given: Experiment, study: Path, found: Sequence[Outcome]) -> Mapping[str, figures.Figure]:
+def _distances(given: Experiment) -> np.ndarray:
+    """Object distances in mm over which blur is told."""
+    return np.linspace(given.settings.near, given.settings.far, 41)
+
+
+def _blur(given: Experiment, study: Path, found: Sequence[Outcome]) -> dict[str, list[float]]:
+    """RMS blur diameters in mm of the learned lenses over object distances, the mean over seeds, by model."""
+    diameters: dict[str, list[list[float]]] = {}
+    for one in found:
+        settings = runs.run_settings(study, one.model, one.seed, given.settings)
+        lens = runs.trained(given.lens, settings, runs.run_folder(study, one.model, one.seed)).variables()
+        blur = runs.blur_diameters(lens, lens.wavelengths.new_tensor(_distances(given)))
+        diameters.setdefault(one.model, []).append(blur.tolist())
+    return {model: np.mean(seeds, 0).tolist() for model, seeds in diameters.items()}
+
+
+def _settled(
+    given: Experiment, study: Path, found: Sequence[Outcome], focus: Callable[[float], float] | None
+) -> dict[str, float]:
+    """The part of step 1 behind which the mean focus of an epoch stays within 2 m of its end, by model."""
+    if focus is None:
+        return {}
+    courses, size = runs.courses(study, found, "sensor"), given.steps_per_epoch
+    by_epoch = {
+        model: [[focus(float(np.mean(one[i : i + size]))) for i in range(0, len(one), size)] for one in seeds]
+        for model, seeds in courses.items()
+    }
+    return {model: float(np.mean([runs.settled(one) for one in seeds])) for model, seeds in by_epoch.items()}
+
+
+def _lens_figures(
+    given: Experiment, study: Path, found: Sequence[Outcome], blur: Mapping[str, Sequence[float]]
+) -> Mapping[str, figures.Figure]:
     """Blur and loss over object distance, and restored examples of the first seed."""
     if not found:
         return {}
     near, far = given.settings.near, given.settings.far
-    distances, shown = np.linspace(near, far, 41), [near + part * (far - near) for part in (0, 0.25, 0.5, 1)]
-    diameters: dict[str, list[list[float]]] = {}
+    shown = [near + part * (far - near) for part in (0, 0.25, 0.5, 1)]
     restored: dict[str, dict[str, np.ndarray]] = {}
     leaves = dead_leaves(2, size=2 * (given.settings.patch + given.settings.size))
     for one in found:
-        settings = runs.run_settings(study, one.model, one.seed, given.settings)
-        own = runs.trained(given.lens, settings, runs.run_folder(study, one.model, one.seed))
-        lens = own.variables()
-        blur = runs.blur_diameters(lens, lens.wavelengths.new_tensor(distances)).tolist()
-        diameters.setdefault(one.model, []).append(blur)
         if one.model not in restored:
+            settings = runs.run_settings(study, one.model, one.seed, given.settings)
+            own = runs.trained(given.lens, settings, runs.run_folder(study, one.model, one.seed))
             # Of dead leaves: the page may be published, pictures of a data set often may not.
             patches = runs.examples(own, leaves, settings, shown)
             restored[one.model] = {key: patch.float().numpy() for key, patch in patches.items()}
-    means = {model: np.mean(seeds, 0).tolist() for model, seeds in diameters.items()}
     return {
-        "blur.png": figures.blur_figure(distances.tolist(), means, given.settings.pixel),
+        "blur.png": figures.blur_figure(_distances(given).tolist(), dict(blur), given.settings.pixel),
         "distance.png": figures.distance_figure(*runs.losses_by_distance(found)),
         "examples.png": figures.examples_figure(restored, shown),
     }

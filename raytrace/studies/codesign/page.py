@@ -1,11 +1,12 @@
 """Report of a study: as text, as a document, as a page of Markdown."""
 
 import dataclasses
+import math
 from collections.abc import Iterator, Mapping, Sequence
 
 from raytrace.maths.result import Result, plain
 from raytrace.pages import grid, picture, shown
-from raytrace.studies.codesign.claims import Claim, claims, penalty, percent
+from raytrace.studies.codesign.claims import Claim, Seen, claims, penalty, percent
 from raytrace.studies.codesign.experiment import Outcome
 from raytrace.studies.codesign.optima import Optimum
 from raytrace.studies.codesign.settings import NAMES, Settings
@@ -24,6 +25,9 @@ CAPTIONS = {
 
 _OF_PAPER = "; “paper”: the published study of this lens and these models, which does not say which focus is its own"
 _SWEEP = "At other apertures, ρ, noise, normalisations and starts: [codesign_sweep.md](codesign_sweep.md)."
+
+
+_NOTHING = Seen()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,11 +51,12 @@ class Report(Result):
     sweep: bool = False
     of_paper: bool = True
     folder: str = "codesign"
+    seen: Seen = _NOTHING
 
     @property
     def claims(self) -> list[Claim]:
         """Those of the paper, if the lens is its."""
-        return claims(self.found, self.times) if self.of_paper else []
+        return claims(self.found, self.times, self.seen) if self.of_paper else []
 
     def document(self) -> dict:
         return plain(
@@ -120,14 +125,17 @@ def _experiment(report: Report) -> str:
     }.get(s.start, f"{s.start} mm")
     where = "the axis" if s.fields == (0.0,) else f"the fields {_listed(s.fields)}"
     weights = f" weighted {_listed(s.wavelength_weights)}" if len(s.wavelengths) > 1 else ""
+    rays = "" if s.rays is None else f", those of traced rays in step 1 of {s.rays} ({s.sampling})"
+    spread = "" if s.spread == "uniform" else " in 1/z"
+    falling = "" if s.decay == "none" else ", falling to 0 along half a cosine"
     light = {"window": "the window", "energy": "the light through the pupil"}[s.normalise]
     return (
         f"{report.lens} at {aperture}, {_listed(s.wavelengths)} µm{weights}, on {where}; objects at {s.near / 1e3:g} "
-        f"to {s.far / 1e3:g} m, drawn evenly; windows of {s.size} × {s.size} pixels of {1e3 * s.pixel:g} µm, PSFs "
-        f"normalised to {light}; noise of standard deviation {s.noise:g} on pictures in [0, 1]. Learned: {s.vary}, "
-        f"from {start}. RED-Net of {s.depth} layers of {s.width} maps in {s.precision}, L¹ loss, Adam at "
-        f"{s.rate_network:g} (network) and {s.rate_optics:g} (lens), {s.epochs} epochs of each step, batches of "
-        f"{s.batch} patches of {s.patch} × {s.patch}. {report.pictures}."
+        f"to {s.far / 1e3:g} m, drawn evenly{spread}; windows of {s.size} × {s.size} pixels of {1e3 * s.pixel:g} µm, "
+        f"PSFs normalised to {light}{rays}; noise of standard deviation {s.noise:g} on pictures in [0, 1]. Learned: "
+        f"{s.vary}, from {start}. RED-Net of {s.depth} layers of {s.width} maps in {s.precision}, L¹ loss, Adam at "
+        f"{s.rate_network:g} (network) and {s.rate_optics:g} (lens){falling}, {s.epochs} epochs of each step, batches "
+        f"of {s.batch} patches of {s.patch} × {s.patch}. {report.pictures}."
     )
 
 
@@ -149,7 +157,8 @@ def _table(report: Report) -> str:
         return "No run is finished yet."
     header = (
         "model", "seeds", "L¹, step 1", "L¹, step 2 (DRT)", "change", "focus, paraxial (m)", "focus, RMS (m)",
-        "sensor (mm)", *(("paper: L¹, step 1", "paper: step 2", "paper: focus (m)") if of_paper else ()),
+        "sensor (mm)", "mean of the last two epochs (mm)",
+        *(("paper: L¹, step 1", "paper: step 2", "paper: focus (m)") if of_paper else ()),
     )  # fmt: skip
     lines = [
         (
@@ -161,6 +170,7 @@ def _table(report: Report) -> str:
             _spread(one, "focus_paraxial_m", 1),
             _spread(one, "focus_rms_m", 1),
             _spread(one, "sensor_mm", 4),
+            _spread(one, "sensor_last_epochs_mm", 4),
             *(_paper(one.model) if of_paper else ()),
         )
         for one in summaries(found)
@@ -169,7 +179,8 @@ def _table(report: Report) -> str:
         f"{grid(header, lines)}\n\nMean ± standard deviation over seeds, of test pictures; every model of a seed sees "
         "the same crops, distances and noise. Focus is the object distance from vertex 1 whose image is on the sensor: "
         f"the paraxial one, or that of least RMS spot{_OF_PAPER if of_paper else ''}."
-        f" Rows one by one: [table2.csv]({report.folder}/table2.csv)."
+        f" Rows one by one: [table2.csv]({report.folder}/table2.csv); by object distance: "
+        f"[distance.csv]({report.folder}/distance.csv)."
     )
 
 
@@ -200,7 +211,7 @@ def _closed_form(report: Report) -> str:
     ]
     return (
         f"{grid(header, lines)}\n\nMean square error of a pixel behind the best linear filter that does not know the "
-        "object distance, for pictures of this power spectrum: [spectral.csv]({report.folder}/spectral.csv)."
+        f"object distance, for pictures of this power spectrum: [spectral.csv]({report.folder}/spectral.csv)."
         f"{f' {_SWEEP}' if report.sweep else ''}"
     )
 
@@ -214,4 +225,4 @@ def _times(report: Report) -> str:
 
 def _spread(one: Summary, column: str, digits: int) -> str:
     mean, deviation = shown(one.mean[column], digits), shown(one.deviation[column], digits)
-    return f"{mean} ± {deviation}" if one.seeds > 1 else mean
+    return f"{mean} ± {deviation}" if one.seeds > 1 and math.isfinite(one.deviation[column]) else mean

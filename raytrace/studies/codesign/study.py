@@ -6,6 +6,7 @@ A study is a folder of runs, `<row>-<seed>/`; finished ones are read again, neve
 
 import copy
 import dataclasses
+import math
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -33,7 +34,11 @@ PAPER = {"paraxial": (0.0415, 0.0504, 33.9), "fourier": (0.0408, 0.0509, 35.7), 
 _CHOICE = 16  # patches of which the one with most contrast is shown
 
 #: Columns of `table2.csv`.
-COLUMNS = ("model", "seed", "l1_joint", "l1_drt", "focus_paraxial_m", "focus_rms_m", "sensor_mm")
+COLUMNS = (
+    *("model", "seed", "l1_joint", "l1_drt", "focus_paraxial_m", "focus_rms_m", "sensor_mm"),
+    *("sensor_last_epochs_mm", "focus_last_epochs_m"),
+)
+LAST = 2  # epochs of step 1 that are averaged beside the last iterate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,6 +69,29 @@ def outcomes(study: Path, models: Sequence[str], seeds: Sequence[int]) -> list[O
     return [dataclasses.replace(one, model=model) for model, one in found if one is not None]
 
 
+def with_last_epochs(
+    study: Path, found: Sequence[Outcome], epochs: int, focus: Callable[[float], float] | None
+) -> list[Outcome]:
+    """Outcomes with the mean place of the sensor over the last two epochs of step 1, and its focus by `focus`.
+
+    At a constant rate the last iterate jitters about its place. Runs without a sensor that varies stay as they are.
+    """
+    result = []
+    for one in found:
+        (course,) = (*courses(study, [one], "sensor").values(), [[]])[0]
+        if course and focus is not None:
+            place = statistics.fmean(course[-min(LAST, epochs) * (len(course) // epochs) :])
+            one = dataclasses.replace(one, sensor_last_epochs_mm=place, focus_last_epochs_m=focus(place))
+        result.append(one)
+    return result
+
+
+def settled(course: Sequence[float], near: float = 2.0) -> float:
+    """The part of a course behind which it stays within `near` of its end."""
+    away = [number for number, value in enumerate(course, 1) if abs(value - course[-1]) > near]
+    return (away[-1] if away else 0) / len(course)
+
+
 def rows(found: Sequence[Outcome]) -> list[dict[str, str | float]]:
     """The table, a row for each model and seed."""
     return [{column: getattr(one, column) for column in COLUMNS} for one in found]
@@ -76,9 +104,16 @@ def summaries(found: Sequence[Outcome]) -> list[Summary]:
         own = [one for one in found if one.model == model]
         values = {c: [float(getattr(one, c)) for one in own] for c in (*COLUMNS[2:], "l1_before")}
         mean = {c: statistics.fmean(v) for c, v in values.items()}
-        deviation = {c: statistics.stdev(v) if len(v) > 1 else 0.0 for c, v in values.items()}
+        deviation = {c: _deviation(v) for c, v in values.items()}
         result.append(Summary(model, len(own), mean, deviation))
     return result
+
+
+def _deviation(values: Sequence[float]) -> float:
+    """Standard deviation; 0 of one value, nan where one is not finite."""
+    if not all(map(math.isfinite, values)):
+        return math.nan
+    return statistics.stdev(values) if len(values) > 1 else 0.0
 
 
 def courses(study: Path, found: Sequence[Outcome], column: str, step: str = STEPS[0]) -> dict[str, list[list[float]]]:
@@ -100,6 +135,19 @@ def losses_by_distance(found: Sequence[Outcome]) -> tuple[list[float], dict[str,
         own = {float(d): loss for d, loss in one.by_distance.items()}
         result.setdefault(one.model, []).append([own[d] for d in distances])
     return distances, result
+
+
+#: Columns of `distance.csv`.
+DISTANCE_COLUMNS = ("model", "seed", "distance_m", "l1_drt")
+
+
+def distance_rows(found: Sequence[Outcome]) -> list[dict[str, str | float]]:
+    """Losses of test pictures with DRT PSFs after step 2, by model, seed and object distance."""
+    return [
+        dict(zip(DISTANCE_COLUMNS, (one.model, one.seed, float(distance) / 1e3, loss), strict=True))
+        for one in found
+        for distance, loss in one.by_distance.items()
+    ]
 
 
 def trained(lens: Lens, settings: Settings, folder: Path) -> Camera:
