@@ -22,7 +22,7 @@ _LITTLE = "--depth 4 --width 4 --patch 16 --size 7 --epochs 3 --crops 2 --batch 
 SMALL = tuple(_LITTLE.split(" "))
 
 
-def found_of(**losses):
+def losses_of(**losses):
     return [
         Retrained(model, seed, 57.7, loss, 2 * loss, {"10000": loss, "50000": loss / 2})
         for model, values in losses.items()
@@ -32,7 +32,7 @@ def found_of(**losses):
 
 def test_effects_are_means_of_differences_by_seed_with_their_intervals():
     """Student's t by hand: differences of 1, 2 and 3 %, mean 2 %, s = 1 %, t(0.975, 2) = 4.3027."""
-    found = found_of(gaussian=[1.0, 2.0, 4.0], drt=[1.01, 2.04, 4.12])
+    found = losses_of(gaussian=[1.0, 2.0, 4.0], drt=[1.01, 2.04, 4.12])
     one, last = effects(found)
     assert (one.model, one.reference, one.loss, one.seeds) == ("drt", "gaussian", "l1", 3)
     assert one.mean == pytest.approx(0.02)
@@ -47,18 +47,18 @@ def test_effects_are_means_of_differences_by_seed_with_their_intervals():
 
 def test_what_all_seeds_share_is_no_noise():
     """Seeds differ by 50 %, lenses by 1 % in each: clear, where two unpaired means would say nothing."""
-    found = found_of(gaussian=[1.0, 1.5, 1.25], paraxial=[1.0101, 1.5150, 1.2624])
+    found = losses_of(gaussian=[1.0, 1.5, 1.25], paraxial=[1.0101, 1.5150, 1.2624])
     assert effects(found)[0].is_clear
     assert effects(found)[0].low > 0.009
 
 
 def test_only_seeds_that_both_lenses_have_are_compared():
     found = [
-        one for one in found_of(gaussian=[1.0, 2.0, 3.0], drt=[1.1, 2.0, 9.0]) if (one.model, one.seed) != ("drt", 2)
+        one for one in losses_of(gaussian=[1.0, 2.0, 3.0], drt=[1.1, 2.0, 9.0]) if (one.model, one.seed) != ("drt", 2)
     ]
     assert {one.seeds for one in effects(found)} == {2}
-    assert effects(found_of(gaussian=[1.0], drt=[1.0])) == []
-    assert effects(found_of(drt=[1.0, 2.0])) == []
+    assert effects(losses_of(gaussian=[1.0], drt=[1.0])) == []
+    assert effects(losses_of(drt=[1.0, 2.0])) == []
 
 
 def test_the_last_two_epochs_of_a_log():
@@ -79,18 +79,18 @@ def test_sensors_are_means_over_seeds(tmp_path):
 
 
 @pytest.fixture
-def run(command):
+def retraining(command):
     return functools.partial(command, "codesign", "retrain", "double_gauss")
 
 
-def test_the_command_trains_fresh_networks_on_frozen_lenses(run, tmp_path):
+def test_the_command_trains_fresh_networks_on_frozen_lenses(retraining, tmp_path):
     pictures = tmp_path / "pictures"
     pictures.mkdir()
     for number, sample in enumerate(dead_leaves(10, size=48).samples):
         Image.fromarray(sample).save(pictures / f"{number}.png")
     Path("table2.csv").write_text("model,seed,sensor_mm\nparaxial,0,57.77\ngaussian,0,57.57\n")
     command = ("--sensors", "table2.csv", "--data", pictures, "-o", "fresh", "--docs", "docs", *SMALL)
-    code, out, err = run(*command, "--seeds", "0", "1", "--page", "second", "--json")
+    code, out, err = retraining(*command, "--seeds", "0", "1", "--page", "second", "--json")
     assert code == 0, err
     document = json.loads(out)
     assert [(one["model"], one["seed"]) for one in document["rows"]] == [
@@ -110,17 +110,17 @@ def test_the_command_trains_fresh_networks_on_frozen_lenses(run, tmp_path):
     assert "Unfinished" not in page
     with Path("docs/second/retrain.csv").open(newline="") as file:
         assert len(list(csv.DictReader(file))) == 4
-    code, out, err = run(*command, "--seeds", "0", "1", "2", "--report-only")
+    code, out, err = retraining(*command, "--seeds", "0", "1", "2", "--report-only")
     assert code == 0, err
     assert "not finished: paraxial 2, gaussian 2" in out
     assert "**Unfinished: 4 of 6 networks.**" in Path("docs/codesign_retrain.md").read_text(encoding="utf-8")
     Path("table2.csv").write_text("model,seed,sensor_mm\nparaxial,0,57.70\ngaussian,0,57.57\n")
-    code, _, err = run(*command, "--seeds", "0")
+    code, _, err = retraining(*command, "--seeds", "0")
     assert code == 1
     assert "fresh holds another run: sensors was" in err
 
 
-def test_without_a_table_of_lenses_it_says_what_is_missing(run):
-    code, _, err = run("-o", "fresh")
+def test_without_a_table_of_lenses_it_says_what_is_missing(retraining):
+    code, _, err = retraining("-o", "fresh")
     assert code == 1
     assert "give the table of the lenses, --sensors table2.csv, and a folder" in err

@@ -197,9 +197,12 @@ def test_the_published_page_is_what_its_table_says():
     with open(docs / "codesign" / "sweep.csv", newline="") as file:
         read = list(csv.DictReader(file))
     rows = [Row(**{key: text if key in words else float(text) for key, text in one.items()}) for one in read]
-    given = dataclasses.replace(found_of(rows).given, settings=Settings(), train=range(960))
+    with open(docs / "codesign" / "scale.csv", newline="") as file:
+        scales = list(csv.DictReader(file))
+    lens = read_lens(shipped("lenses") / "double_gauss.zmx")
+    given = dataclasses.replace(found_of(rows).given, settings=Settings(), train=range(960), lens=lens)
     page = (docs / "codesign_sweep.md").read_text(encoding="utf-8")
-    assert markdown(Sweep(rows, given, of_paper=True).parts(), kept_of(page)) == page
+    assert markdown(Sweep(rows, given, of_paper=True, scales=scales).parts(), kept_of(page)) == page
 
 
 def test_the_figure_has_a_panel_for_each_factor_and_definition_and_a_place_for_infinity():

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from raytrace.plot.style import GREY, LOOKS, new_figure, styled
 from raytrace.studies.codesign.settings import NAMES
 from raytrace.studies.codesign.study import PAPER
-from raytrace.studies.codesign.sweep import FACTORS, Factor
+from raytrace.studies.codesign.sweep import FACTORS, Factor, Reading
 from raytrace.studies.codesign.sweep_page import Sweep
 from raytrace.studies.figures import picture as draw
 
@@ -23,8 +23,8 @@ _MARKS = (10, 100, 20, 50, 200, 500, 30, 40, 15, 25, 70, 35, 150, 300, 60, 80, 4
 
 #: What the panels of a sweep are called, and by how many points numbers of the paper are moved that would touch.
 _TITLES = {
-    "f_number": "aperture", "rho": "ρ (of paraxial)", "noise": "noise", "normalise": "PSFs normalised to",
-    "start": "start", "spread": "distances", "rays": "Sobol rays", "hexapolar": "hexapolar rays",
+    "f_number": "aperture", "rho": "ρ", "noise": "noise", "normalise": "PSF sum",
+    "start": "start", "spread": "distances", "rays": "rays, Sobol", "hexapolar": "hexapolar",
 }  # fmt: skip
 _SWEEP_MARKS = (10, 100, 20, 50, 30, 15, 25, 40, 70, 35, 200, 18, 12, 14, 16, 22)
 _CROWDED = 6  # values of a factor, whose marks are turned from there on
@@ -173,7 +173,7 @@ def sweep_figure(found: Sweep) -> Figure:
             for model, (*_, paper) in papers.items():
                 panel.axhline(-1 / paper, color=_look(model)["color"], linewidth=0.6, alpha=0.7, zorder=0)
             panel.set_xticks(range(len(own)), [_sweep_tick(factor, one.value) for one in own])
-            panel.tick_params(axis="x", labelrotation=90 if len(own) > _CROWDED else 0)
+            panel.tick_params(axis="x", labelrotation=90 if _is_crowded(factor, own) else 0)
             panel.set_xlim(-0.5, len(own) - 0.5)
             panel.tick_params(axis="y", left=panel is panels[0], length=2.5)
             panel.spines["left"].set_visible(panel is panels[0])
@@ -190,6 +190,11 @@ def sweep_figure(found: Sweep) -> Figure:
     lines = [Line2D([], [], color=GREY, linewidth=0.6, label="the paper's")] if found.of_paper else []
     _legend(figure, axes[0][0], lines)
     return figure
+
+
+def _is_crowded(factor: Factor, own: Sequence[Reading]) -> bool:
+    """Whether marks of its values would touch, side by side."""
+    return max(len(_sweep_tick(factor, one.value)) for one in own) > 4 or len(own) > _CROWDED
 
 
 def _sweep_tick(factor: Factor, value: str) -> str:

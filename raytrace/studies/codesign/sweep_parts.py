@@ -302,7 +302,7 @@ def metres(distances: Sequence[float]) -> str:
 
 
 def _signed(value: float) -> str:
-    return f"{value:+.1f}" if math.isfinite(value) else "∞"
+    return f"{value:+.1f}" if math.isfinite(value) else "∞" if value > 0 else "-∞"
 
 
 def spoken(names: Sequence[str]) -> str:
