@@ -41,23 +41,23 @@ def textures():
 @pytest.mark.parametrize(
     ("model", "conjugate", "least_spot"), [("paraxial", 35.0, 33.9), ("fourier", 35.6, 34.5), ("gaussian", 27.1, 26.2)]
 )
-def test_the_papers_focus_distances_appear_at_f_1_76(double_gauss, textures, model, conjugate, least_spot):
+def test_the_papers_focus_distances_appear_at_f_1_76(lens, textures, model, conjugate, least_spot):
     """An independent program gives the same: 35.0, 35.6 and 27.1 m, and 33.9, 34.5 and 26.2 m by least RMS spot."""
-    found = closed_form(double_gauss, dataclasses.replace(FAST, model=model), textures)
+    found = closed_form(lens, dataclasses.replace(FAST, model=model), textures)
     assert found.focus_paraxial_m == pytest.approx(conjugate, abs=0.06)
     assert found.focus_rms_m == pytest.approx(least_spot, abs=0.06)
     assert found.no_optimum == ""
 
 
 @pytest.mark.parametrize(("f_number", "metres"), [(1.74, 25.1), (1.80, 33.6)])
-def test_that_aperture_is_a_sharp_one_for_gaussian_drt(double_gauss, textures, f_number, metres):
-    found = closed_form(double_gauss, Settings(model="gaussian", f_number=f_number), textures)
+def test_that_aperture_is_a_sharp_one_for_gaussian_drt(lens, textures, f_number, metres):
+    found = closed_form(lens, Settings(model="gaussian", f_number=f_number), textures)
     assert found.focus_paraxial_m == pytest.approx(metres, abs=0.1)
 
 
-def test_drt_has_several_optima_there(double_gauss, textures):
+def test_drt_has_several_optima_there(lens, textures):
     """Downhill from 25 m lies one of 0.01222; near 57.59 mm the error is 7 % less, behind a hill."""
-    own = camera(double_gauss, dataclasses.replace(FAST, model="drt"))
+    own = camera(lens, dataclasses.replace(FAST, model="drt"))
     least, hill, local = scan(own, textures, [57.593, 57.83, 57.8824], even_distances(own))
     assert least == pytest.approx(0.01138, abs=1e-5)
     assert local == pytest.approx(0.01222, abs=1e-5)
@@ -65,17 +65,17 @@ def test_drt_has_several_optima_there(double_gauss, textures):
 
 
 @pytest.mark.slow
-def test_the_closed_form_finds_the_least_of_them(double_gauss, textures):
-    found = closed_form(double_gauss, dataclasses.replace(FAST, model="drt"), textures)
+def test_the_closed_form_finds_the_least_of_them(lens, textures):
+    found = closed_form(lens, dataclasses.replace(FAST, model="drt"), textures)
     assert found.sensor_mm == pytest.approx(57.593, abs=2e-3)
     assert found.downhill_mm == pytest.approx(57.882, abs=2e-3)
 
 
-def test_what_the_files_semi_diameters_cut_off(double_gauss):
+def test_what_the_files_semi_diameters_cut_off(lens):
     """They let a beam of F/2.1 pass whole; at F/1.76 five surfaces are too small, least at F/3 none."""
-    assert vignetted(lens_at_start(double_gauss, Settings(f_number=3.0))) == []
-    assert vignetted(lens_at_start(double_gauss, Settings(f_number=2.2))) == []
-    cut = {one.surface: one for one in vignetted(lens_at_start(double_gauss, FAST))}
+    assert vignetted(lens_at_start(lens, Settings(f_number=3.0))) == []
+    assert vignetted(lens_at_start(lens, Settings(f_number=2.2))) == []
+    cut = {one.surface: one for one in vignetted(lens_at_start(lens, FAST))}
     assert list(cut) == [3, 4, 5, 7, 8]
     assert cut[5].height == pytest.approx(17.50, abs=0.01)
     assert cut[5].semi_diameter == 14.919
@@ -97,11 +97,11 @@ def test_a_spectrum_is_what_its_table_says():
 
 
 @pytest.mark.parametrize("model", ["gaussian", "drt"])
-def test_many_plain_rays_give_the_psf_and_its_slope(double_gauss, model):
+def test_many_plain_rays_give_the_psf_and_its_slope(lens, model):
     """4096 of them: Gaussians to 0.3 %, all light to 8 %, what counting leaves; few rays are another PSF."""
     z = torch.tensor([12e3, 33e3], dtype=torch.float64)
     many, few, whole = (
-        camera(double_gauss, dataclasses.replace(SMALL, size=21, model=model, rays=rays)) for rays in (4096, 12, None)
+        camera(lens, dataclasses.replace(SMALL, size=21, model=model, rays=rays)) for rays in (4096, 12, None)
     )
     expected = whole.kernels(z)
     near = {"gaussian": 3e-3, "drt": 0.08}[model]
@@ -115,29 +115,27 @@ def test_many_plain_rays_give_the_psf_and_its_slope(double_gauss, model):
     assert float(slopes[0]) == pytest.approx(float(slopes[1]), rel=0.1)
 
 
-def test_a_gaussian_of_plain_rays_has_their_moments(double_gauss):
-    own = camera(double_gauss, dataclasses.replace(SMALL, size=21, rays=50))
+def test_a_gaussian_of_plain_rays_has_their_moments(lens):
+    own = camera(lens, dataclasses.replace(SMALL, size=21, rays=50))
     kernel = own.kernels(torch.tensor([25e3], dtype=torch.float64))[0]
     x = (torch.arange(21, dtype=torch.float64) - 10) * 0.005
-    light = lens_at_start(double_gauss, dataclasses.replace(SMALL, rays=50))
+    light = lens_at_start(lens, dataclasses.replace(SMALL, rays=50))
     assert float((kernel * x).sum().detach()) == pytest.approx(0.0, abs=3e-3)
     assert kernel.shape == (21, 21)
     whole = psf(light, "gaussian", object_distances=[25e3]).kernel[0, 0]
     assert float((kernel - whole).abs().sum().detach()) < 1
 
 
-def test_plain_rays_are_of_the_first_step_alone(double_gauss):
+def test_plain_rays_are_of_the_first_step_alone(lens):
     """Step 2 asks what traced light really does: with as many rays as that takes."""
     z = torch.tensor([12e3], dtype=torch.float64)
-    own, usual_camera = (camera(double_gauss, dataclasses.replace(SMALL, rays=rays)) for rays in (12, None))
+    own, usual_camera = (camera(lens, dataclasses.replace(SMALL, rays=rays)) for rays in (12, None))
     for one in (own, usual_camera):
         one.use("drt")
     assert torch.equal(own.kernels(z), usual_camera.kernels(z))
     assert type(usual_camera) is Camera
-    paraxial = camera(double_gauss, dataclasses.replace(SMALL, model="paraxial", rays=12))
-    assert torch.equal(
-        paraxial.kernels(z), camera(double_gauss, dataclasses.replace(SMALL, model="paraxial")).kernels(z)
-    )
+    paraxial = camera(lens, dataclasses.replace(SMALL, model="paraxial", rays=12))
+    assert torch.equal(paraxial.kernels(z), camera(lens, dataclasses.replace(SMALL, model="paraxial")).kernels(z))
 
 
 def test_where_plain_rays_cross_the_pupil():
@@ -149,8 +147,8 @@ def test_where_plain_rays_cross_the_pupil():
 # ---------------------------------------------------------------- distances, rates, pictures
 
 
-def test_distances_even_in_their_reciprocal(double_gauss):
-    own = camera(double_gauss, SMALL)
+def test_distances_even_in_their_reciprocal(lens):
+    own = camera(lens, SMALL)
     z = even_distances(own, 4, spread="reciprocal")
     torch.testing.assert_close(1e6 / z, torch.tensor([90.0, 70.0, 50.0, 30.0], dtype=torch.float64))
     settings = dataclasses.replace(SMALL, spread="reciprocal")
@@ -160,7 +158,7 @@ def test_distances_even_in_their_reciprocal(double_gauss):
     assert 10e3 <= float(drawn.min()) <= float(drawn.max()) <= 50e3
 
 
-def test_rates_fall_along_half_a_cosine(double_gauss, tmp_path, monkeypatch):
+def test_rates_fall_along_half_a_cosine(lens, tmp_path, monkeypatch):
     """Of 8 steps the first has the whole rate, the fifth half of it; a run that goes on ends as one that never
     stopped, and a constant rate is what it was."""
     rates, step = [], torch.optim.Adam.step
@@ -170,7 +168,7 @@ def test_rates_fall_along_half_a_cosine(double_gauss, tmp_path, monkeypatch):
     pictures, settings = dead_leaves(8, size=32), dataclasses.replace(SMALL, decay="cosine")
 
     def train(folder, most=99):
-        own = camera(double_gauss, settings)
+        own = camera(lens, settings)
         run = Run(tmp_path / folder, {})
         for _ in zip(range(most), optimise(own, pictures, settings, run, every=1), strict=False):
             pass

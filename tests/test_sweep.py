@@ -97,8 +97,9 @@ def test_every_factor_is_varied_alone_and_some_with_the_aperture():
     assert {model for factor, model in seen if factor in ("rays", "hexapolar")} == {"gaussian", "drt"}
 
 
-def test_what_does_not_reach_a_model_is_no_other_case_of_it():
+def test_what_does_not_reach_a_model_is_no_other_case_of_it(monkeypatch):
     """Plain rays are of traced models, ρ of paraxial optics: of the others the same optimum is looked up."""
+    monkeypatch.setattr(module, "TOGETHER", {("f_number", "rays"): (1.76, 3.0)})
     together = [case for case in cases(SMALL) if case.factor == COMBINED and "rays" in case.value]
     assert {case.settings.rays for case in together if case.settings.model in ("paraxial", "fourier")} == {None}
     assert {case.settings.rays for case in together if case.settings.model == "drt"} == {12, 50, 256}
