@@ -55,6 +55,7 @@ class Settings(options.Settings):
     spread: str = option(
         "uniform",
         "how object distances z lie between them: evenly in z (uniform, default) or in 1/z (reciprocal)",
+        name="distances",
         choices=("uniform", "reciprocal"),
     )
     fields: tuple[float, ...] = option(
