@@ -168,6 +168,9 @@ def _aperture(system: Block, stop_semi_diameter: float | None, unit: float, repo
     kind = next((kind for kind, row in SYSTEM_APERTURES.items() if row == (record.keyword, flag)), None)
     if kind is None:
         raise LensFileError(f"{record.keyword} of kind {flag}, expected 0 or 1", record.place)
+    if kind == "object_cone_angle" and size > 90:
+        told = f"a cone of {record.words[0]} degrees reaches behind the object; rays leave on the same lines forwards"
+        report.warn(f"{told}, within {180 - size:g} degrees of the axis, and cover less of a reflector", record.place)
     return SystemAperture(kind, double(size * unit if flag is None else size))
 
 

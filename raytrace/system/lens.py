@@ -379,7 +379,8 @@ def _check_kinds(surface: Surface, where: str) -> None:
 def _check_cone(lens: Lens) -> None:
     """Refuse a cone of light at the object whose rim lies in the plane of the object, or that is none.
 
-    Beyond a right angle its rim runs back: towards a reflector that the object stands in.
+    Of one beyond a right angle, whose rim runs back to a reflector around the object, rays leave on the same lines
+    forwards, within 180 degrees less the angle: the part of the reflector behind its equator is not traced.
     """
     kind, number = lens.aperture.kind, float(lens.aperture.value)
     if kind == "object_cone_angle" and (number == 90 or number >= 180):
