@@ -58,7 +58,7 @@ FACTORS = (
 )
 #: Factors that are varied together, and the apertures tried with them: closely where the rim's aberration changes sign.
 TOGETHER = {
-    ("f_number", "noise", "normalise", "spread"): (1.7, 1.74, 1.76),
+    ("f_number", "noise", "normalise", "spread"): (1.7, 1.74, 1.76, 1.8, 1.9, 2.0, 2.4, 3.0, 4.0),
 }
 
 

@@ -215,7 +215,7 @@ _CLAIMS: tuple[tuple[str, Callable[[Reading], bool], Callable[[Sequence[Reading]
     (
         "Gaussian DRT focuses nearer than both, by paraxial conjugates",
         lambda one: _nearer_by(one) > 0,
-        lambda found: f"nearer by {_range(map(_nearer_by, found), lambda metres: f'{shown(metres, 1)} m')}",
+        lambda found: f"nearer by {_range(map(_nearer_by, found), lambda metres: f'{_signed(metres)} m')}",
     ),
     (
         f"traced, the simple models err {_papers(SIMPLE)} more, to {_POINTS} points",
