@@ -71,7 +71,7 @@ class Networks(Result):
     @property
     def header(self) -> tuple[str, ...]:
         first = title_of(self.rows[0].row)
-        return ("element", "filter", "network", "network brings", f"over {first}, filters", "networks")
+        return ("element", "filter", "network", "network brings", f"gain over the {first}, filters", "networks")
 
     def __str__(self) -> str:
         lines = [f"{row[0]:>32}" + "".join(f"{cell:>26}" for cell in row[1:]) for row in [self.header, *self.lines()]]
@@ -129,7 +129,7 @@ def _judged(
     folder = root / f"{name}-{settings.noise:g}"
     network = learn_network(
         folder,
-        lambda: patches(camera(), content.train[:_TRAINED], seed=settings.seed),
+        lambda: patches(camera(), _evenly(content.train, _TRAINED), seed=settings.seed),
         about,
         steps=settings.steps,
         seed=settings.seed,
@@ -137,9 +137,17 @@ def _judged(
     )
     file = folder / "errors.json"
     if not file.exists():
-        errors = errors_behind(camera(), network, content.test[:_RESTORED], progress=lambda own: progress(own, name))
+        errors = errors_behind(
+            camera(), network, _evenly(content.test, _RESTORED), progress=lambda own: progress(own, name)
+        )
         write_json(file, {one: own.tolist() for one, own in errors.items()})
     return {one: torch.tensor(own, dtype=torch.float64) for one, own in read_json(file).items()}
+
+
+def _evenly(pictures: Tensor, most: int) -> Tensor:
+    """At most so many of all pictures: neighbours are of one kind."""
+    count = min(most, len(pictures))
+    return pictures[torch.arange(count) * len(pictures) // count]
 
 
 def _rows(found: dict[str, dict[str, Tensor]], settings: Settings) -> list[Behind]:
