@@ -1,0 +1,53 @@
+"""Learned heights that ship: few, small, and worth what their pages say."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from raytrace.studies.edof.noise import Bank, errors_of, mean_psnr
+from raytrace.studies.edof.noise_report import Kept
+from raytrace.studies.edof.report import LEAVES
+from raytrace.studies.edof.world import World, periodic
+from raytrace.studies.pictures import dead_leaves, split
+from raytrace.wave.element_file import read_element, read_label
+
+DOCS = Path(__file__).parents[1] / "docs/wave"
+FILES = sorted((DOCS / "elements").glob("*.npy"))
+
+
+def test_they_are_two_hundred_kilobytes_at_most_and_say_what_they_are():
+    assert FILES
+    assert sum(file.stat().st_size for file in (DOCS / "elements").iterdir()) <= 200_000
+    for file in FILES:
+        label = read_label(file)
+        assert label.glass.name == "F_SILICA"
+        assert (label.design_wavelength, label.pitch, label.aperture) == (0.55, 0.002, 5.0)
+
+
+@pytest.mark.parametrize("file", [file for file in FILES if file.stem.startswith("etched")], ids=lambda file: file.stem)
+def test_etched_ones_have_their_levels_and_relief(file):
+    waves, levels = (int(n) for n in file.stem.split("-")[1:3])
+    heights = read_element(file, aperture=5.0).numbers.numpy()
+    step = waves * 1.19609e-3 / levels
+    assert heights.min() >= 0
+    assert heights.max() <= (levels - 1) * step * 1.001
+    np.testing.assert_allclose(heights / step, np.round(heights / step), atol=2e-3 * levels)
+
+
+def test_learned_rings_are_judged_as_the_page_has_them(tmp_path):
+    """Sharp leaves, both filters, noise 0.01: to a hundredth of a dB, from the file alone."""
+    leaves = dead_leaves(40, size=256, smallest=LEAVES["sharp leaves"])
+    bank = Bank.of("sharp leaves", *(periodic(part, 512) for part in split(leaves)))
+    element = read_element(DOCS / "elements/learned-0.01.npy", aperture=5.0)
+    found = errors_of(Kept(tmp_path, [bank]).transfer((element,)), World(), bank)
+    with (DOCS / "noise.csv").open(newline="") as file:
+        wanted = {
+            row["filter"]: float(row["psnr"])
+            for row in csv.DictReader(file)
+            if (row["content"], row["row"], row["noise"]) == ("sharp leaves", "learned", "0.01")
+        }
+    assert set(wanted) == set(found)
+    for name, errors in found.items():
+        assert float(mean_psnr(errors)) == pytest.approx(wanted[name], abs=0.01)
