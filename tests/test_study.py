@@ -380,6 +380,10 @@ def test_the_page_names_settings_that_are_not_usual():
     other = markdown(dataclasses.replace(report, of_paper=False).parts())
     assert "paper" not in other
     assert "[codesign_sweep.md](codesign_sweep.md)" in markdown(dataclasses.replace(report, sweep=True).parts())
+    second = markdown(dataclasses.replace(report, folder="second").parts())
+    assert "--page second" in second.splitlines()[2]
+    assert "](second/loss.png)" in second
+    assert "codesign/" not in second
     begun = dataclasses.replace(report.settings, start="spectral", rho=0.3, bounds="sensor:57,58")
     page_of_begun = markdown(dataclasses.replace(report, settings=begun).parts())
     assert "from the optimum of the closed form" in page_of_begun

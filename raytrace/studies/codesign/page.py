@@ -111,7 +111,8 @@ class Report(Result):
 def _command(report: Report) -> str:
     models = list(dict.fromkeys([one.model for one in report.found] + [row for row, _ in report.missing]))
     seeds = sorted({one.seed for one in report.found} | {seed for _, seed in report.missing})
-    words = [f"--models {' '.join(models)}", f"--seeds {' '.join(map(str, seeds))}", *report.settings.words()]
+    page = [] if report.folder == "codesign" else [f"--page {report.folder}"]
+    words = [f"--models {' '.join(models)}", f"--seeds {' '.join(map(str, seeds))}", *page, *report.settings.words()]
     return f"    raytrace codesign compare {report.lens} --data DIR -o FOLDER --docs docs {' '.join(words)}"
 
 

@@ -77,7 +77,7 @@ class Footing(Result):
     def parts(self, folder: str) -> list[str]:
         """The page, whose table is in the folder."""
         s, begun = self.given.settings, f"{len(self.found)} of {len(self.found) + len(self.missing)}"
-        words = " ".join(s.words())
+        words = " ".join([*([] if folder == "codesign" else [f"--page {folder}"]), *s.words()])
         aperture = "the file's aperture" if s.f_number is None else f"F/{s.f_number:g}"
         return [
             "# Co-design: the lenses on an equal footing",
