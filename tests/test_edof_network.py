@@ -64,7 +64,8 @@ def test_a_network_learns_what_the_filter_leaves(tmp_path):
     own = camera()
     network = learn_network(tmp_path, lambda: patches(own, PICTURES[:5]), {}, steps=60)
     found = errors_behind(own, network, PICTURES[:3])
-    assert float(found["network"].mean()) < 0.99 * float(found["filter"].mean())
+    assert float(found["network"].mean()) < float(found["filter"].mean())
+    assert float(found["network"][:, 1].mean()) < 0.98 * float(found["filter"][:, 1].mean())  # in focus
 
 
 def test_baselines_alone_are_rows(capsys):

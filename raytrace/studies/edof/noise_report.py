@@ -258,8 +258,8 @@ def judge_learned(
 ) -> tuple[float, dict[str, Errors]]:
     """Its expected error, that of learning, and errors of pictures."""
     name = f"{unit.row}-{unit.noise:g}-{unit.start}"
+    camera = learn_unit(unit, settings, train, root)
     with torch.no_grad():
-        camera = learn_unit(unit, settings, train, root)
         elements = detached(camera.variables())
         found = kept.find(name, unit.world(), lambda: kept.transfer(elements))
         return kept.number(name, lambda: float(camera.expected(elements))), found

@@ -129,8 +129,7 @@ def etched(case: Case, settings: Settings, train: Pictures, root: Path) -> Eleme
     file = Run(folder, asked | dataclasses.asdict(case)).folder / "heights.npy"
     if not file.exists():
         noise = Noise.of({"steps": settings.learn})
-        with torch.no_grad():
-            (model,) = detached(learn_unit(case.model, noise, train, root).variables())
+        (model,) = detached(learn_unit(case.model, noise, train, root).variables())
         process, expected = process_of(case, settings), _expected(model, case, train)
         given = {"steps": settings.steps, "moves": settings.moves, "seed": case.start}
         found = etch_rings(model, process, expected, **given)
