@@ -125,7 +125,13 @@ def test_report_and_figure_are_written(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("name", "bound"), [("double_gauss", 1e-10), ("phone", 1e-10), ("hubble", 1e-6), ("cooke_triplet", 1e-10)]
+    ("name", "bound"),
+    [
+        ("double_gauss", 1e-10),
+        pytest.param("phone", 1e-10, marks=pytest.mark.slow),
+        ("hubble", 1e-6),
+        ("cooke_triplet", 1e-10),
+    ],
 )
 def test_package_agrees_with_the_reference(name, bound):
     """Spheres, planes, strong aspheres, conic mirrors: positions, paths and gradients in float64.

@@ -1,6 +1,6 @@
 """The speed benchmark: its limits trace what the package traces, its definitions hold, its page is written. No timings.
 
-Whole processes are stood in for, but for one slow test: each would start torch anew.
+Whole processes are stood in for, but for slow tests: each would start torch anew.
 """
 
 import json
@@ -350,6 +350,7 @@ def test_document_has_speeds_by_entrant_in_millions():
 COMMAND = ["bench", "speed", "--quick", "--repeats", "1", "--no-peers", "--threads", "1"]
 
 
+@pytest.mark.slow
 def test_command_without_compiler_and_peers_says_so_and_leaves_their_ratios_out(monkeypatch, tmp_path, capsys):
     def refuse():
         raise NoCompiler("no C++ compiler found")

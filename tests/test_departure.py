@@ -253,7 +253,7 @@ def with_lost_rays():
     return start(position.double(), direction.double())
 
 
-@pytest.mark.parametrize("kind", ["zernike", "grid"])
+@pytest.mark.parametrize("kind", [pytest.param("zernike", marks=pytest.mark.slow), "grid"])
 def test_first_and_second_derivatives_by_every_number_with_lost_rays(kind):
     face = dataclasses.replace(ALL[kind], curvature=vector(-0.03)[0], semi_diameter=4.0)
     departure, rays = noll(z2=0.02, z3=-0.01, z5=0.008, z7=0.006), with_lost_rays()

@@ -379,7 +379,7 @@ def read_damaged(path: Path, content: bytes) -> None:
 _ORIGINALS = [(path, path.read_bytes()) for path in (*OWN, *CORPUS)]
 
 
-@settings(max_examples=1500, deadline=None)
+@settings(max_examples=750, deadline=None)
 @given(seed=st.integers(0, 2**63), which=st.integers(0, len(_ORIGINALS) - 1))
 def test_damaged_files_give_a_lens_or_a_clear_error(seed, which):
     path, content = _ORIGINALS[which]
