@@ -292,13 +292,18 @@ def scores(
 # --- the page
 
 
-def _publish(
-    found: OverNoise, elements: Mapping[str, Element], settings: Settings, arguments: argparse.Namespace
-) -> None:
-    beside = Path(arguments.docs) / "wave" / "elements"
+def publish_elements(elements: Mapping[str, Element], docs: Path) -> None:
+    """Heights by file name, in `wave/elements` beside the page, to be judged again by anyone."""
+    beside = docs / "wave" / "elements"
     beside.mkdir(parents=True, exist_ok=True)
     for name, element in elements.items():
         write_element(element, beside / name, design_wavelength=WAVELENGTH)
+
+
+def _publish(
+    found: OverNoise, elements: Mapping[str, Element], settings: Settings, arguments: argparse.Namespace
+) -> None:
+    publish_elements(elements, Path(arguments.docs))
     records = [score.record() for score in found.scores]
     tables = {"noise.csv": table(records, floats=lambda number: round(number, 4))}
     words = [f"--data DIR --limit {arguments.limit}"] if arguments.data else []

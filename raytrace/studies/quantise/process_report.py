@@ -16,7 +16,14 @@ from raytrace.maths.value import detached
 from raytrace.pages import grid, picture
 from raytrace.studies.edof.noise import FILTERS, Bank, Errors, Interval, drawn, gain, mean_psnr
 from raytrace.studies.edof.noise_command import Settings as Noise
-from raytrace.studies.edof.noise_report import TITLES, WAVELENGTH, Kept, judge_baselines, judge_learned, learn_unit
+from raytrace.studies.edof.noise_report import (
+    TITLES,
+    Kept,
+    judge_baselines,
+    judge_learned,
+    learn_unit,
+    publish_elements,
+)
 from raytrace.studies.edof.report import contents_of
 from raytrace.studies.edof.world import ClosedForm, World, periodic, spectrum
 from raytrace.studies.pictures import Pictures
@@ -201,10 +208,7 @@ def _reliefs(settings: Settings) -> dict[tuple[int, int], float]:
 def _publish(
     found: Etching, elements: Mapping[str, Element], settings: Settings, arguments: argparse.Namespace
 ) -> None:
-    beside = Path(arguments.docs) / "wave" / "elements"
-    beside.mkdir(parents=True, exist_ok=True)
-    for name, element in elements.items():
-        write_element(element, beside / name, design_wavelength=WAVELENGTH)
+    publish_elements(elements, Path(arguments.docs))
     words = [f"--data DIR --limit {arguments.limit}"] if arguments.data else []
     command = " ".join(["raytrace wave etch", *words, *settings.words(), "-o FOLDER --docs docs"])
     tables = {"etch.csv": table([row.record() for row in found.rows], floats=lambda number: round(number, 4))}
