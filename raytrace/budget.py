@@ -6,6 +6,7 @@ process runs in, has free.
 
 import contextlib
 import contextvars
+import ctypes
 import math
 import os
 import warnings
@@ -15,6 +16,8 @@ from pathlib import Path
 _SMALL = 2**24  # bytes that nobody is asked about
 _LONG = 30.0  # s
 _PIECE = 2**27  # bytes that a piece of what is cut into pieces takes
+_KEPT = 2**30  # bytes: blocks up to this size, and free memory up to twice as much, stay with the process
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 
 #: Predicted peak of a trace without a graph, beside its result: measured, with OPD and moments (tests/test_budget.py).
 RAY_BYTES = 400
@@ -77,6 +80,20 @@ def piece(each: float) -> int:
 def free_bytes() -> float:
     """Memory that the process may still take: of the machine, or of its control groups where that is less."""
     return min([_available(), *map(_left, _groups())])
+
+
+def keep_freed_memory() -> bool:
+    """Let large blocks that are freed stay with the process, where the C library can; whether it can.
+
+    glibc gives every block above 32 MB at most back to the system, which hands it out again page by page, each cleared:
+    a tenth to a sixth of the processor time of large traces and of training. It is a choice for the whole process, so
+    that the command makes it and the library does not.
+    """
+    try:
+        tell = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):
+        return False
+    return bool(tell(_MMAP_THRESHOLD, _KEPT) and tell(_TRIM_THRESHOLD, 2 * _KEPT - 1))
 
 
 def in_words(size: float) -> str:

@@ -173,7 +173,8 @@ HEAVY = (
 def test_memory_stays_within_what_is_allowed(words, most):
     """A process that is allowed so much either refuses, or takes at most twice that beside what torch takes."""
     code = (
-        "import resource, sys; from raytrace.cli import main; code = main(sys.argv[1:]);"
+        "import resource, sys; from raytrace.budget import keep_freed_memory; from raytrace.cli import main;"
+        "keep_freed_memory(); code = main(sys.argv[1:]);"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024, file=sys.stderr); sys.exit(code)"
     )
     environment = {**os.environ, "PYTHONPATH": str(Path(raytrace.__file__).parents[1]), "OMP_NUM_THREADS": "1"}
@@ -182,3 +183,23 @@ def test_memory_stays_within_what_is_allowed(words, most):
         env=environment, capture_output=True, text=True, timeout=600,
     )  # fmt: skip
     assert int(done.stderr.splitlines()[-1]) < 2 * most + 0.4e9
+
+
+def test_freed_memory_is_used_again():
+    """Pages that the system clears: of twenty blocks of 40 MB one after another, those of a few blocks."""
+    code = (
+        "import resource, sys; from raytrace.budget import keep_freed_memory as keep; import torch;"
+        "kept = sys.argv[1] == 'kept'; done = keep() if kept else False;"
+        "before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt;"
+        "any(torch.ones(10_000_000)[0] == 0 for _ in range(20));"
+        "print(int(done or not kept), resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(raytrace.__file__).parents[1]), "OMP_NUM_THREADS": "1"}
+    found = {}
+    for way in ("kept", "given back"):
+        done = subprocess.run([sys.executable, "-c", code, way], env=environment, capture_output=True, text=True)
+        able, pages = map(int, done.stdout.split())
+        if not able:
+            pytest.skip("the C library has no mallopt")
+        found[way] = pages
+    assert found["kept"] < 0.5 * found["given back"]

@@ -12,6 +12,7 @@ import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 
+from raytrace.budget import keep_freed_memory
 from raytrace.cli.command import as_options
 from raytrace.words import did_you_mean
 
@@ -126,6 +127,7 @@ def script() -> None:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a terminal without µ shows ?
+    keep_freed_memory()
     sys.exit(main())
 
 
