@@ -15,15 +15,21 @@ from raytrace.wave.element_file import read_element, read_label
 
 DOCS = Path(__file__).parents[1] / "docs/wave"
 FILES = sorted((DOCS / "elements").glob("*.npy"))
+SMOOTH = sorted(file for file in (DOCS / "elements").glob("*.json") if not file.stem.endswith(".npy"))
 
 
 def test_they_are_two_hundred_kilobytes_at_most_and_say_what_they_are():
     assert FILES
+    assert SMOOTH
     assert sum(file.stat().st_size for file in (DOCS / "elements").iterdir()) <= 200_000
     for file in FILES:
         label = read_label(file)
         assert label.glass.name == "F_SILICA"
         assert (label.design_wavelength, label.pitch, label.aperture) == (0.55, 0.002, 5.0)
+    for file in SMOOTH:
+        label = read_label(file)
+        assert (label.glass.name, label.aperture) == ("PMMA", 5.0)
+        assert len(read_element(file, aperture=5.0).numbers) == 7
 
 
 @pytest.mark.parametrize("file", [file for file in FILES if file.stem.startswith("etched")], ids=lambda file: file.stem)
@@ -36,17 +42,18 @@ def test_etched_ones_have_their_levels_and_relief(file):
     np.testing.assert_allclose(heights / step, np.round(heights / step), atol=2e-3 * levels)
 
 
-def test_learned_rings_are_judged_as_the_page_has_them(tmp_path):
+@pytest.mark.parametrize("name", ["learned-0.01.npy", "learned-smooth-0.01.json"])
+def test_learned_elements_are_judged_as_the_page_has_them(name, tmp_path):
     """Sharp leaves, both filters, noise 0.01: to a hundredth of a dB, from the file alone."""
     leaves = dead_leaves(40, size=256, smallest=LEAVES["sharp leaves"])
     bank = Bank.of("sharp leaves", *(periodic(part, 512) for part in split(leaves)))
-    element = read_element(DOCS / "elements/learned-0.01.npy", aperture=5.0)
+    element = read_element(DOCS / "elements" / name, aperture=5.0)
     found = errors_of(Kept(tmp_path, [bank]).transfer((element,)), World(), bank)
     with (DOCS / "noise.csv").open(newline="") as file:
         wanted = {
             row["filter"]: float(row["psnr"])
             for row in csv.DictReader(file)
-            if (row["content"], row["row"], row["noise"]) == ("sharp leaves", "learned", "0.01")
+            if (row["content"], row["row"], row["noise"]) == ("sharp leaves", name.split("-0.01")[0], "0.01")
         }
     assert set(wanted) == set(found)
     for name, errors in found.items():

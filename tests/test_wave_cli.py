@@ -21,7 +21,7 @@ from raytrace.media.glass import index
 from raytrace.plot.wave import height_figure
 from raytrace.wave.designs import BASELINES, aim, baseline
 from raytrace.wave.element import as_rings
-from raytrace.wave.element_file import read_label, write_element
+from raytrace.wave.element_file import read_element, read_label, write_element
 from raytrace.wave.exchange import write_heights
 from raytrace.wave.plan import ENGINES, plan
 from raytrace.wave.psf import psf
@@ -151,6 +151,30 @@ def test_heights_keep_the_material_that_they_were_learned_for(run, tmp_path):
     code, _, err = run("psf", "--element", "bare.npy", "--aperture", "1", *SMALL)
     assert code == 1
     assert "pitch" in err
+
+
+def test_a_smooth_element_is_a_file_of_its_coefficients(run, tmp_path):
+    """Bit for bit, in its material and in no larger an aperture; polynomials without symmetry only in their own."""
+    lens, plate = baseline("cubic-refractive", aim(radius=0.5))
+    for element, name in ((lens, "lens.json"), (plate, "plate.json")):
+        write_element(element, tmp_path / name, design_wavelength=0.55)
+        again = read_element(tmp_path / name, aperture=1.0)
+        assert type(again.profile) is type(element.profile)
+        assert torch.equal(again.numbers, element.numbers)
+        assert torch.equal(again.glass.coefficients, element.glass.coefficients)
+    named, own = (
+        run("psf", "--element", name, "--aperture", "1", *SMALL, "--json")[1] for name in ("singlet", "lens.json")
+    )
+    assert json.loads(named)["results"] == json.loads(own)["results"]
+    for arguments, words in (
+        (("lens.json", "--aperture", "2"), "lens.json: is made for an aperture of 1 mm, not 2 mm"),
+        (("plate.json", "--aperture", "0.5"), "plate.json: is made for an aperture of 1 mm, not 0.5 mm"),
+        (("lens.json", "--aperture", "1", "--pitch", "0.002"), "is smooth"),
+        (("other.json", "--aperture", "1"), "other.json: is no smooth element"),
+    ):
+        code, _, err = run("psf", "--element", *arguments, *SMALL)
+        assert code == 1
+        assert words in err
 
 
 def test_what_is_dear_is_said_or_refused(run):

@@ -14,7 +14,7 @@ from raytrace.maths.grid import grid
 from raytrace.media.glass import Glass, check_unit, check_wavelengths, from_table
 from raytrace.wave.designs import BASELINES, STEPPED, aim, baseline
 from raytrace.wave.element import Element
-from raytrace.wave.element_file import read_element
+from raytrace.wave.element_file import ELEMENT_FORMATS, SMOOTH, read_element
 from raytrace.wave.exchange import FORMATS
 from raytrace.wave.plan import Plan, plan
 from raytrace.wave.psf import ElementPsf, psf
@@ -131,10 +131,10 @@ def elements(
             radius=0.5 * aperture, sensor=sensor, focus=focus, wavelength=design_wavelength or _DESIGN, exact=exact
         )
         return baseline(name, made_for, **({"levels": levels} if levels else {}))
-    if Path(name).suffix.lower() not in FORMATS:
+    if Path(name).suffix.lower() not in ELEMENT_FORMATS:
         raise ValueError(
             f"`element={name}`: neither a named element ({', '.join(BASELINES)}) nor a height map "
-            f"({', '.join(FORMATS)}){did_you_mean(name, BASELINES)}"
+            f"({', '.join(FORMATS)}) nor a smooth element ({SMOOTH}){did_you_mean(name, BASELINES)}"
         )
     if index is not None:
         if glass:

@@ -2,6 +2,7 @@
 
 Heights are a lens only in their material: the same heights in another glass bend light by another n - 1. The label
 holds the whole glass, so that it needs no catalog, the wavelength that the heights were made for, and their size.
+A smooth element is a few coefficients: it stands in its label alone, smooth.json.
 """
 
 import dataclasses
@@ -16,27 +17,46 @@ from raytrace.files import write_json
 from raytrace.media.catalog import find_glass
 from raytrace.media.formulas import FORMULAS
 from raytrace.media.glass import Glass
-from raytrace.wave.element import Element, Rings, wrapped
-from raytrace.wave.exchange import HeightMapError, read_heights, write_heights
+from raytrace.wave.element import Element, EvenPowers, Rings, Zernike, is_flat, wrapped
+from raytrace.wave.exchange import FORMATS, HeightMapError, read_heights, write_heights
+
+#: Suffix of smooth elements, and their profiles by the name that they have there.
+SMOOTH = ".json"
+_PROFILES = {"even powers of r, mm^(1 - 2k)": EvenPowers, "Noll's polynomials, mm RMS": Zernike}
+
+#: Suffixes of all files that hold an element.
+ELEMENT_FORMATS = (*FORMATS, SMOOTH)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Label:
-    """glass: the material; design_wavelength: µm; pitch, aperture: mm, of the heights and the element's diameter."""
+    """glass: the material; design_wavelength: µm; pitch, aperture: mm, of the heights and the element's diameter.
+
+    profile: of a smooth element, which has no pitch.
+    """
 
     glass: Glass
     design_wavelength: float
-    pitch: float
     aperture: float
+    pitch: float | None = None
+    profile: EvenPowers | Zernike | None = None
 
 
 def write_element(element: Element, path: str | os.PathLike, *, design_wavelength: float) -> tuple[Path, Path]:
-    """Write the heights of an element in the format of the suffix, and its label next to them; both paths.
+    """Write the heights of an element in the format of the suffix, and its label next to them; both paths. A smooth
+    element's name ends in .json: it is its own label.
 
     Raises HeightMapError for what the format cannot hold.
     """
     path, glass = Path(path), element.glass
-    write_heights(element.profile, path)
+    if is_flat(element) or path.suffix.lower() != SMOOTH:
+        write_heights(element.profile, path)
+        own = {"pitch": float(element.profile.pitch.detach())}
+    elif element.period is not None:
+        raise HeightMapError("a smooth profile that is wrapped is no smooth one; take as_rings or as_pixels", str(path))
+    else:
+        name = next(name for name, kind in _PROFILES.items() if isinstance(element.profile, kind))
+        own = {"profile": name, "coefficients_of_profile": element.numbers.detach().tolist()}
     document = {
         "material": glass.name,
         "catalog": glass.catalog,
@@ -44,8 +64,8 @@ def write_element(element: Element, path: str | os.PathLike, *, design_wavelengt
         "coefficients": glass.coefficients.detach().tolist(),
         "wavelength_range": glass.wavelength_range,
         "design_wavelength": design_wavelength,
-        "pitch": float(element.profile.pitch.detach()),
         "aperture": 2 * float(element.radius.detach()),
+        **own,
     }
     write_json(_label_of(path), document)
     return path, _label_of(path)
@@ -62,7 +82,7 @@ def read_element(
     levels: int = 0,
     catalog: Sequence[str | os.PathLike] = (),
 ) -> Element:
-    """The element of a file of heights in an aperture of so many mm.
+    """The element of a file of heights, or of a smooth one, in an aperture of so many mm.
 
     glass: its material, by default that of its label; a name is looked up, first in the catalogs (.agf) given. pitch,
     span: mm, of a file that does not say them (`read_heights`), nor its label. design_wavelength (µm), levels: the
@@ -71,6 +91,32 @@ def read_element(
     material or design wavelength nobody knows.
     """
     label = read_label(path)
+    if isinstance(glass, str):
+        glass = find_glass(glass, user=tuple(catalog))
+    if Path(path).suffix.lower() == SMOOTH:
+        element = _smooth(str(path), label, aperture, glass, pitch, span)
+    else:
+        element = _flat(path, label, aperture, glass, pitch, span)
+    if not (design_wavelength or levels):
+        return element
+    design = design_wavelength or (label and label.design_wavelength)
+    if not design:
+        raise ValueError(f"{path}: does not say what it was made for; give `design_wavelength`")
+    return wrapped(element, design, levels=levels)
+
+
+def _smooth(file: str, label: Label | None, aperture: float, glass: Glass | None, *of_heights) -> Element:
+    if label is None or label.profile is None:
+        raise HeightMapError("is no smooth element: expected the coefficients of one", file)
+    if any(given is not None for given in of_heights):
+        raise ValueError(f"{file}: is smooth; `pitch` and `span` belong to a height map")
+    fixed = isinstance(label.profile, Zernike)
+    if aperture > label.aperture * (1 + 1e-9) or (fixed and aperture < label.aperture * (1 - 1e-9)):
+        raise ValueError(f"{file}: is made for an aperture of {label.aperture:g} mm, not {aperture:g} mm")
+    return Element(label.profile, torch.tensor(0.5 * aperture, dtype=torch.float64), glass or label.glass)
+
+
+def _flat(path, label: Label | None, aperture: float, glass: Glass | None, pitch, span) -> Element:
     profile = read_heights(path, pitch=pitch or (label and label.pitch), span=tuple(span) if span else None)
     profile = dataclasses.replace(profile, heights=profile.heights.double(), pitch=profile.pitch.double())
     counts = (2 * len(profile.heights),) if isinstance(profile, Rings) else profile.heights.shape
@@ -81,20 +127,12 @@ def read_element(
             f"{path}: the heights are {across:.6g} mm across, less than the aperture of {aperture:g} mm; "
             f"give `aperture={across:.6g}`"
         )
-    if isinstance(glass, str):
-        glass = find_glass(glass, user=tuple(catalog))
     if glass is None and label is None:
         raise ValueError(
             f"{path}: does not say its material (there is no {_label_of(path).name} beside it); give `glass=NAME`, as "
             "PMMA, or `index=N` for each wavelength where that is taken"
         )
-    element = Element(profile, torch.tensor(0.5 * aperture, dtype=torch.float64), glass or label.glass)
-    if not (design_wavelength or levels):
-        return element
-    design = design_wavelength or (label and label.design_wavelength)
-    if not design:
-        raise ValueError(f"{path}: does not say what it was made for; give `design_wavelength`")
-    return wrapped(element, design, levels=levels)
+    return Element(profile, torch.tensor(0.5 * aperture, dtype=torch.float64), glass or label.glass)
 
 
 def read_label(path: str | os.PathLike) -> Label | None:
@@ -108,7 +146,9 @@ def read_label(path: str | os.PathLike) -> Label | None:
         if FORMULAS[found["formula"]].count != len(coefficients):
             raise ValueError(f"{len(coefficients)} coefficients of {found['formula']}")
         span = found["wavelength_range"]
-        numbers = {key: float(found[key]) for key in ("design_wavelength", "pitch", "aperture")}
+        profile = _profile_of(found)
+        sizes = ("design_wavelength", "aperture", *([] if profile else ["pitch"]))
+        numbers = {key: float(found[key]) for key in sizes}
         if not all(0 < number < float("inf") for number in numbers.values()):
             raise ValueError(f"found {numbers}, expected numbers above 0")
         glass = Glass(
@@ -121,8 +161,17 @@ def read_label(path: str | os.PathLike) -> Label | None:
     except (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
         words = f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
         raise HeightMapError(f"is no label of a height map ({words}); remove it", str(file)) from error
-    return Label(glass, **numbers)
+    return Label(glass, **numbers, profile=profile)
+
+
+def _profile_of(document: dict) -> EvenPowers | Zernike | None:
+    if "profile" not in document:
+        return None
+    coefficients = torch.tensor(document["coefficients_of_profile"], dtype=torch.float64)
+    if coefficients.dim() != 1 or not len(coefficients) or not bool(torch.isfinite(coefficients).all()):
+        raise ValueError("expected a list of coefficients")
+    return _PROFILES[document["profile"]](coefficients)
 
 
 def _label_of(path: str | os.PathLike) -> Path:
-    return Path(f"{path}.json")
+    return Path(path) if Path(path).suffix.lower() == SMOOTH else Path(f"{path}.json")

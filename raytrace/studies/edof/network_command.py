@@ -32,7 +32,12 @@ def options(parser: argparse.ArgumentParser) -> None:
         "--rows", metavar="ROW", nargs="+", default=("fresnel", "hybrid"), help="baselines (default fresnel hybrid)"
     )
     parser.add_argument(
-        "--elements", metavar="FILE", nargs="+", type=file_name, default=(), help="heights of rings in files"
+        "--elements",
+        metavar="FILE",
+        nargs="+",
+        type=file_name,
+        default=(),
+        help="elements in files, heights of rings or smooth",
     )
     add_options(parser, Settings)
     pictures(parser, PICTURES, "seed", settings=Settings, limit=80)

@@ -42,7 +42,7 @@ def options(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=file_name,
         default=(),
-        help="heights of rings in files, judged beside the rows, as those of docs/wave/elements",
+        help="elements in files, heights of rings or smooth, judged beside the rows, as those of docs/wave/elements",
     )
     add_options(parser, Settings)
     pictures(parser, PICTURES, "seed", settings=Settings, limit=80)

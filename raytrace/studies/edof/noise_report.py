@@ -41,8 +41,8 @@ from raytrace.studies.edof.training import EdofCamera
 from raytrace.studies.edof.world import ClosedForm, World, kernels, transfer
 from raytrace.studies.pictures import Pictures
 from raytrace.studies.publish import publish
-from raytrace.wave.element import Element, Rings, as_made
-from raytrace.wave.element_file import read_element, write_element
+from raytrace.wave.element import Element, Rings, as_made, is_flat
+from raytrace.wave.element_file import SMOOTH, read_element, write_element
 from raytrace.words import did_you_mean
 
 
@@ -134,7 +134,7 @@ def noise(arguments: argparse.Namespace) -> OverNoise:
         fixed |= judge_files(arguments.elements, settings, kept)
         bar = progress(todo, "learned element")
         learned = {unit: judge_learned(unit, settings, train, root, kept) for unit in bar}
-        elements = _best_rings(todo, learned, settings, train, root)
+        elements = _best_learned(todo, learned, settings, train, root)
     found = OverNoise(list(scores(fixed, learned, banks, settings)), {one.name: len(one.powers) for one in banks})
     if arguments.docs:
         _publish(found, elements, settings, arguments)
@@ -233,23 +233,25 @@ def judge_files(files: Sequence[str], settings: Settings, kept: Kept) -> dict[tu
     return found
 
 
-def _best_rings(
+def _best_learned(
     todo: Sequence[Unit],
     learned: Mapping[Unit, tuple[float, dict[str, Errors]]],
     settings: Settings,
     train: Pictures,
     root: Path,
 ) -> dict[str, Element]:
-    """Of every row of rings and noise the element that is kept, as it is made, by the name of its file."""
+    """Of every row and noise the element that is kept, rings as they are made, by the name of its file."""
     best: dict[tuple[str, float], Unit] = {}
     for unit in todo:
         other = best.get((unit.row, unit.noise))
-        if ROWS[unit.row].learning["kind"] == "rings" and (other is None or learned[unit][0] < learned[other][0]):
+        one_element = ROWS[unit.row].learning["kind"] != "zernike"
+        if one_element and (other is None or learned[unit][0] < learned[other][0]):
             best[unit.row, unit.noise] = unit
     found = {}
     for (row, own), unit in best.items():
-        (element,) = learn_unit(unit, settings, train, root).variables()
-        found[f"{row}-{own:g}.npy"] = as_made(detached(element))
+        element = detached(learn_unit(unit, settings, train, root).variables()[0])
+        name, made = (".npy", as_made(element)) if is_flat(element) else (SMOOTH, element)
+        found[f"{row}-{own:g}{name}"] = made
     return found
 
 
@@ -293,7 +295,7 @@ def scores(
 
 
 def publish_elements(elements: Mapping[str, Element], docs: Path) -> None:
-    """Heights by file name, in `wave/elements` beside the page, to be judged again by anyone."""
+    """Elements by file name, in `wave/elements` beside the page, to be judged again by anyone."""
     beside = docs / "wave" / "elements"
     beside.mkdir(parents=True, exist_ok=True)
     for name, element in elements.items():
@@ -328,9 +330,10 @@ def _parts(found: OverNoise, command: str) -> list[str]:
         picture("wave/noise.png", f"Gain over the Fresnel lens on {shown}, bands: 95 % intervals over the pictures."),
         *(part for filter in FILTERS for part in _tables(found, shown, filter)),
         *(part for name in others for part in _tables(found, name, "wiener", only_gain=True)),
-        "All figures: [noise.csv](wave/noise.csv). Heights of the rings that were kept stand in "
+        "All figures: [noise.csv](wave/noise.csv). Elements that were kept stand in "
         "[wave/elements](wave/elements), to be judged again, on dead leaves or on pictures of one's own:",
-        "    raytrace wave noise --rows fresnel --elements docs/wave/elements/learned-0.01.npy --noises 0.01",
+        "    raytrace wave noise --rows fresnel --elements docs/wave/elements/learned-0.01.npy "
+        "docs/wave/elements/learned-smooth-0.01.json --noises 0.01",
     ]
 
 
