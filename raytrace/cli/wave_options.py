@@ -50,8 +50,8 @@ def element(parser: argparse.ArgumentParser) -> None:
         metavar="NAME|FILE",
         type=file_name,
         default="singlet",
-        help=f"{', '.join(ELEMENTS)} (default singlet), a height map: .npy, .csv, .png, .tif, .dat, .grd, or a smooth one: "
-        ".json",
+        help=f"{', '.join(ELEMENTS)} (default singlet), or a file: heights as .npy, .csv, .png, .tif, .dat, .grd, a "
+        "smooth element as .json",
     )
     group.add_argument(
         "--focus",
