@@ -139,7 +139,7 @@ def test_experiment_starts_where_it_is_told():
     assert by_start["rms"].wavelengths.tolist() == [float(wavelength)]
     slow = lens_at_start(lens, Settings(f_number=5.0))
     assert slow.aperture.kind == "image_f_number"
-    with pytest.raises(ValueError, match="start 'middle': expected paraxial, rms, spectral or a sensor distance"):
+    with pytest.raises(ValueError, match="start 'middle': expected paraxial, rms, spectral, gaussian or a "):
         lens_at_start(lens, Settings(start="middle"))
 
 

@@ -245,7 +245,7 @@ WRONG = {
     "range": (["--near", "60000"], "--near 60000 is not nearer than --far 50000"),
     "start": (
         ["--start", "somewhere"],
-        "start 'somewhere': expected paraxial, rms, spectral or a sensor distance in mm",
+        "start 'somewhere': expected paraxial, rms, spectral, gaussian or a sensor distance in mm",
     ),
     "depth": (["--depth", "3"], "expected an even depth"),
     "batch": (["--batch", "99"], "8 pictures to train on, 4 crops of each, do not fill one batch of 99"),
@@ -270,7 +270,10 @@ def test_errors_are_one_line(run, pictures, options, message):
     ("arguments", "message"),
     [
         (("double_gauss",), "no folder to keep the run in: give -o FOLDER"),
-        (("comparing", "double_gauss", "-o", "out"), "expected LENS, compare LENS, sweep LENS or retrain LENS"),
+        (
+            ("comparing", "double_gauss", "-o", "out"),
+            "expected LENS, or compare, sweep, spaces, fields, retrain LENS; did you mean compare?",
+        ),
         (("compare", "double_gauss", "--model", "drt", "-o", "out"), "--model belongs to codesign LENS"),
         (("compare", "double_gauss", "--loss", "spectral", "-o", "out"), "--loss spectral belongs to codesign LENS"),
         (("compare", "double_gauss", "--report-only", "-o", "out"), "out: no study was begun here"),

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
+from raytrace.camera.held import held, solved
 from raytrace.camera.limits import limits_of, violation
 from raytrace.optics.paraxial import first_order
 from raytrace.system.lens import Lens
@@ -49,6 +50,8 @@ class Variables(nn.Module):
     vary: "sensor", and lists like "thickness:5,6,10 curvature:1-4 a4:3", of the file's surface numbers; beside
         thickness, curvature and conic every number that the surface has by its kind (`places.places`).
     bounds: by name ("sensor", "curvature_3"), smallest and largest number of the lens; `project` keeps them.
+    hold: "efl" keeps the focal length of the lens, "efl=100" that one in mm: the last variable of `vary` that changes
+        it is then no parameter but solved for (`held`), and its bounds count in `violation`.
     glass_thickness, air_thickness: least and greatest in mm at the axis; edge: least of glass at its edge; by default
     they go with the size of the lens (`limits_of`). `violation` says how far the lens is from them.
     """
@@ -59,37 +62,71 @@ class Variables(nn.Module):
         vary: str = "sensor",
         *,
         bounds: Mapping[str, tuple[float, float]] | None = None,
+        hold: str = "",
         glass_thickness: tuple[float, float] | None = None,
         air_thickness: tuple[float, float] | None = None,
         edge: float | None = None,
     ):
         super().__init__()
         self.lens = lens
-        self.variables = parse(lens, vary)
+        every = parse(lens, vary)
+        self.held = held(hold, lens, every, _with_value)
+        self.variables = tuple(one for one in every if self.held is None or one is not self.held.by)
+        self.names = tuple(variable.name for variable in every)
         self.bounds = dict(bounds or {})
         self.limits = limits_of(lens, glass=glass_thickness, air=air_thickness, edge=edge)
-        unknown = set(self.bounds) - {variable.name for variable in self.variables}
+        unknown = set(self.bounds) - set(self.names)
         if unknown:
             raise BadVariables(f"bounds for {', '.join(sorted(unknown))}, not among the variables: {vary}")
         for variable in self.variables:
             start = torch.zeros((), dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
             self.register_parameter(variable.name, nn.Parameter(start))
+        if beyond := self.beyond():
+            raise BadVariables(
+                f"hold {hold!r}: {beyond}; hold another focal length, or end `vary` with another variable"
+            )
 
     def forward(self) -> Lens:
         """The lens with its variables where they are now."""
-        surfaces = list(self.lens.surfaces)
+        lens = self._free()
+        return lens if self.held is None else _with_value(lens, self.held.by, self._solved(lens))
+
+    def _free(self) -> Lens:
+        """The lens with what is not solved for."""
+        lens = self.lens
         for variable in self.variables:
-            changed = with_number(surfaces[variable.surface], variable.place, self.number(variable))
-            surfaces[variable.surface] = changed
-        return dataclasses.replace(self.lens, surfaces=tuple(surfaces))
+            lens = _with_value(lens, variable, self.number(variable))
+        return lens
+
+    def _solved(self, lens: Lens) -> Tensor:
+        """The number that is solved for, of the lens with all others."""
+        return solved(lens, self.held.focal_length, lambda value: _with_value(lens, self.held.by, value))
 
     def number(self, variable: Variable) -> Tensor:
         """The lens's number, 1/mm or mm."""
+        if self.held is not None and variable is self.held.by:
+            return self._solved(self._free())
         return variable.start + variable.unit * getattr(self, variable.name)
 
+    @torch.no_grad()
     def numbers(self) -> dict[str, float]:
         """Every variable as the lens has it, by name."""
-        return {variable.name: float(self.number(variable).detach()) for variable in self.variables}
+        every = (*self.variables, *([] if self.held is None else [self.held.by]))
+        found = {variable.name: float(self.number(variable)) for variable in every}
+        return {name: found[name] for name in self.names}
+
+    @torch.no_grad()
+    def beyond(self) -> str:
+        """What of the number that is solved for lies beyond its bounds; "" for nothing."""
+        if self.held is None:
+            return ""
+        value, (low, high) = float(self.number(self.held.by)), self._range()
+        return "" if low <= value <= high else f"{self.held.by.name} would be {value:.6g}, not from {low:g} to {high:g}"
+
+    def _range(self) -> tuple[float, float]:
+        """Bounds of the number that is solved for: a thickness without any is no less than 0."""
+        least = 0.0 if self.held.by.kind == "thickness" else -math.inf
+        return self.bounds.get(self.held.by.name, (least, math.inf))
 
     @torch.no_grad()
     def project(self) -> None:
@@ -100,8 +137,21 @@ class Variables(nn.Module):
                 getattr(self, variable.name).clamp_(min(low, high), max(low, high))
 
     def violation(self) -> Tensor:
-        """How far the lens is from its limits, mm² (`limits.violation`)."""
-        return violation(self(), self.limits)
+        """How far the lens is from its limits, mm² (`limits.violation`), and what is solved for from its bounds."""
+        lens = self()
+        lacks = violation(lens, self.limits)
+        if self.held is None:
+            return lacks
+        value, unit = number_at(lens.surfaces[self.held.by.surface], self.held.by.place), self.held.by.unit
+        low, high = self._range()
+        return lacks + ((low - value).clamp_min(0) / unit).square() + ((value - high).clamp_min(0) / unit).square()
+
+
+def _with_value(lens: Lens, variable: Variable, value: Tensor) -> Lens:
+    """The lens with one of its variables at a value, in units of the lens."""
+    surfaces = list(lens.surfaces)
+    surfaces[variable.surface] = with_number(surfaces[variable.surface], variable.place, value)
+    return dataclasses.replace(lens, surfaces=tuple(surfaces))
 
 
 def parse(lens: Lens, vary: str) -> tuple[Variable, ...]:

@@ -20,6 +20,7 @@ from raytrace.studies.pictures import Pictures, crop
 _FIRST_STEP = 0.02
 #: Sensors that a scan tries, by model; those of one focus have one optimum, and Gaussians seldom two.
 _SCANNED = {"gaussian": 17, "drt": 81}  # 16 µm apart for the double Gauss at F/3
+_SETTLED = 1e-6  # of the error: a descent that gains less is at its end
 _BETTER = 1e-4  # of the error: so much less a scan must promise for a second descent
 
 
@@ -108,15 +109,17 @@ def optimise_closed_form(camera: Camera, spectrum: Tensor, *, distances: Tensor 
         parts.append((float(error.detach()), float(penalty.detach())))
         return error + penalty
 
-    # Errors are of 1e-3 and variables of millimetres: the default tolerance (2e-9 of 1) would stop too soon.
-    found = minimise(
-        list(variables.parameters()),
-        whole,
-        unit=_FIRST_STEP,
-        bounds=[_parameter_bounds(variables, variable) for variable in variables.variables],
-        tolerance=1e-11,
-    )
+    def descend() -> Descent:
+        # Errors are of 1e-3 and variables of millimetres: the default tolerance (2e-9 of 1) would stop too soon.
+        bounds = [_parameter_bounds(variables, variable) for variable in variables.variables]
+        return minimise(list(variables.parameters()), whole, unit=_FIRST_STEP, bounds=bounds, tolerance=1e-11)
+
+    found = descend()
+    # A penalty on what is solved for has a kink where it begins, at which the search stops too soon: it begins anew.
+    while variables.held is not None and found.course[0] - found.course[-1] > _SETTLED * found.course[-1]:
+        found = descend()
     names = tuple(one.name for one, at_end in zip(variables.variables, found.at_end, strict=True) if at_end)
+    names += (variables.held.by.name,) if variables.beyond() else ()
     errors, penalties = zip(*parts, strict=True)
     return Course(errors, penalties, names, _no_optimum(camera, found, names))
 
@@ -190,7 +193,7 @@ def _no_optimum(camera: Camera, found: Descent, at_end: tuple[str, ...]) -> str:
     variables = camera.variables
     if found.is_flat:
         return "no optimum: where the search began, the loss does not change with the variables"
-    if at_end and ("sensor" in at_end or len(at_end) == len(variables.variables)):
+    if at_end and ("sensor" in at_end or len(at_end) == len(variables.names)):
         ranges = (f"{name} from {low:g} to {high:g}" for name in at_end for low, high in [variables.bounds[name]])
         return f"no optimum inside {', '.join(ranges)}: the loss still falls at its end"
     return out_of_focus(camera)

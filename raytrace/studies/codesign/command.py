@@ -13,8 +13,9 @@ DESCRIPTION = """\
 Learn the sensor distance (or any variables) of a lens together with a network that restores its pictures. Step 1
 learns both with the PSFs of one model; step 2 freezes the lens and goes on with the network on PSFs of traced rays,
 as long as step 1. `compare` runs every model and seed and writes tables, figures and a page about them; `sweep` finds
-the optima of the closed form at several apertures, noises, normalisations, starts and numbers of rays; `retrain` trains
-fresh networks on the lenses that compare found, each alike, and tells their losses apart seed by seed.
+the optima of the closed form at several apertures, noises, normalisations, starts and numbers of rays; `spaces` those
+of several variables in boxes of bounds, the focal length held and free; `fields` those over several fields; `retrain`
+trains fresh networks on the lenses that compare found, each alike, and tells their losses apart seed by seed.
 
 Models: paraxial (a Gaussian as wide as the paraxial blur), fourier (diffraction of the paraxial wavefront), gaussian
 (Gaussian DRT: centroid and covariance of traced rays), drt (differentiable ray tracing: the rays themselves). Closed
@@ -32,10 +33,12 @@ EXAMPLES = """examples:
   raytrace codesign compare double_gauss --data pictures --seeds 0 1 2 -o study --docs docs
   raytrace codesign compare double_gauss --data pictures -o study --docs docs --report-only
   raytrace codesign sweep double_gauss --data pictures --docs docs
+  raytrace codesign spaces double_gauss --vary sensor thickness:2,9 --box thickness_2:0.1,1 thickness_9:0.1,1 -o out
+  raytrace codesign fields double_gauss --field 0 9.8 14 --size 51 --data pictures --docs docs
   raytrace codesign retrain double_gauss --sensors docs/codesign/table2.csv --data pictures -o fresh --docs docs"""
 
 _SCENE = (
-    *("vary", "bounds", "glass_thickness", "air_thickness", "edge", "start", "focus_distance", "f_number"),
+    *("vary", "bounds", "hold", "glass_thickness", "air_thickness", "edge", "start", "focus_distance", "f_number"),
     *("wavelengths", "wavelength_weights", "near", "far", "spread", "fields", "pixel", "size"),
     *("normalise", "rho", "noise", "tol", "rays", "sampling"),
 )
@@ -46,14 +49,17 @@ _FORMS = {
     "": ("single", "single"),
     "compare": ("compare", "compare"),
     "sweep": ("sweep_page", "sweep"),
+    "spaces": ("spaces_page", "spaces"),
+    "fields": ("fields_page", "fields"),
     "retrain": ("retrain_page", "retrain_all"),
 }
 _BELONG = {
     "models": ("compare", "retrain"),
     "seeds": ("compare", "retrain"),
     "report_only": ("compare", "retrain"),
-    "docs": ("compare", "sweep", "retrain"),
-    "page": ("compare", "retrain"),
+    "docs": ("compare", "sweep", "spaces", "fields", "retrain"),
+    "page": ("compare", "spaces", "retrain"),
+    "box": ("spaces",),
     "sensors": ("retrain",),
     "model": ("",),
     "seed": ("",),
@@ -62,14 +68,14 @@ _BELONG = {
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    parser.usage = "raytrace codesign [compare | sweep | retrain] LENS [-o FOLDER] [options]"
+    parser.usage = "raytrace codesign [compare | sweep | spaces | fields | retrain] LENS [-o FOLDER] [options]"
     parser.add_argument(
         "words",
         metavar="LENS",
         type=file_name,
         nargs="+",
         help="lens file, or the name of a shipped lens; before it `compare` runs all models and seeds, "
-        "`sweep` finds optima of the closed form, `retrain` compares known lenses",
+        "`sweep`, `spaces` and `fields` find optima of the closed form, `retrain` compares known lenses",
     )
     catalog(parser)
     json(parser)
@@ -102,7 +108,7 @@ def options(parser: argparse.ArgumentParser) -> None:
         help="RED-Net of 10 layers of 32 maps (default), or of 30 layers of 64 maps",
     )
     add_options(training, Settings, *_TRAINING)
-    _compare(parser.add_argument_group("compare, sweep and retrain"))
+    _compare(parser.add_argument_group("compare, sweep, spaces, fields and retrain"))
 
 
 def _compare(group) -> None:
@@ -118,16 +124,26 @@ def _compare(group) -> None:
         "--seeds", metavar="N", type=seed_number, nargs="+", help="of the runs (default 0 1 2; of retrain 0 to 4)"
     )
     group.add_argument("--sensors", metavar="TABLE", type=file_name, help="table2.csv of the lenses to retrain on")
+    group.add_argument(
+        "--box",
+        metavar="NAME:LOW,HIGH",
+        nargs="+",
+        action="append",
+        help="of spaces: bounds to search in; several boxes",
+    )
     documents(group, "the page and of codesign/ (default: FOLDER)")
     group.add_argument(
-        "--page", metavar="NAME", type=file_name, help="NAME.md and NAME/ there, for a second study (default codesign)"
+        "--page",
+        metavar="NAME",
+        type=file_name,
+        help="NAME.md and NAME/ there, for a second study (default codesign, of spaces codesign_air_spaces)",
     )
     group.add_argument("--report-only", action="store_true", help="train nothing, write what the runs say so far")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """One model; with the word `compare` all of them; with `sweep` the closed form by what the paper leaves open; with
-    `retrain` fresh networks for the lenses of a comparison."""
+    """One model; with the word `compare` all of them; with `sweep` the closed form by what the paper leaves open, with
+    `spaces` by boxes of bounds, with `fields` over fields; with `retrain` fresh networks for lenses of a comparison."""
     from raytrace.cli.door import CommandError
     from raytrace.shards import processes
 
@@ -135,14 +151,16 @@ def run(arguments: argparse.Namespace) -> None:
     form = before[0] if before else ""
     if len(before) > 1 or form not in _FORMS:
         raise CommandError(
-            f"{' '.join(arguments.words)}: expected LENS, compare LENS, sweep LENS or retrain LENS"
+            f"{' '.join(arguments.words)}: expected LENS, or {', '.join(filter(None, _FORMS))} LENS"
             f"{did_you_mean(form, _FORMS)}"
         )
     for name, forms in _BELONG.items():
         if form not in forms and getattr(arguments, name) not in (None, False):
             raise CommandError(f"--{name.replace('_', '-')} belongs to {' and '.join(map(_spelled, forms))}")
     if form and arguments.loss == "spectral":
-        raise CommandError("--loss spectral belongs to codesign LENS; compare and sweep use the closed form anyway")
+        raise CommandError(
+            "--loss spectral belongs to codesign LENS; compare, sweep, spaces and fields use the closed form anyway"
+        )
     module, name = _FORMS[form]
     if arguments.loss == "spectral":
         name = "spectral"

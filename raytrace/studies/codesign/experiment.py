@@ -29,9 +29,15 @@ from raytrace.maths.grid import grid
 from raytrace.maths.result import plain
 from raytrace.optics.focus import focused, real_image_distance
 from raytrace.studies.codesign import conjugates
-from raytrace.studies.codesign.closed_form import even_distances, least_of_closed_form, out_of_focus, power_spectrum
+from raytrace.studies.codesign.closed_form import (
+    Course,
+    even_distances,
+    least_of_closed_form,
+    out_of_focus,
+    power_spectrum,
+)
 from raytrace.studies.codesign.plain_rays import PlainRays, points
-from raytrace.studies.codesign.settings import Settings
+from raytrace.studies.codesign.settings import GAUSSIAN, Settings
 from raytrace.studies.descent import NoOptimum
 from raytrace.studies.pictures import Pictures, crop, draws
 from raytrace.system.lens import Lens, with_object_distance, with_sensor_distance, with_wavelengths
@@ -89,13 +95,13 @@ def lens_at_start(lens: Lens, settings: Settings) -> Lens:
         raise ValueError(f"{len(weights)} weights of {len(wavelengths)} wavelengths; expected one ≥ 0 for each")
     lens = with_wavelengths(lens, wavelengths, weights).at(f_number=settings.f_number)
     real_image_distance(lens, wavelengths.new_tensor([settings.near, settings.far]))  # refuses what has none
-    if settings.start in ("paraxial", "rms", "spectral"):
+    if settings.start in ("paraxial", "rms", "spectral", GAUSSIAN):
         return focused(lens, settings.focus_distance, on="rms" if settings.start == "rms" else "paraxial")
     try:
         return with_sensor_distance(with_object_distance(lens, settings.focus_distance), float(settings.start))
     except ValueError as error:
         raise ValueError(
-            f"start {settings.start!r}: expected paraxial, rms, spectral or a sensor distance in mm"
+            f"start {settings.start!r}: expected paraxial, rms, spectral, gaussian or a sensor distance in mm"
         ) from error
 
 
@@ -105,6 +111,7 @@ def variables(lens: Lens, settings: Settings) -> Variables:
         lens_at_start(lens, settings),
         settings.vary,
         bounds=parse_bounds(settings.bounds),
+        hold=settings.hold,
         glass_thickness=parse_range(settings.glass_thickness) if settings.glass_thickness else None,
         air_thickness=parse_range(settings.air_thickness) if settings.air_thickness else None,
         edge=settings.edge,
@@ -133,6 +140,16 @@ def camera(lens: Lens, settings: Settings) -> Camera:
         rho=settings.rho,
         network_dtype=torch.bfloat16 if settings.precision == "bfloat16" else None,
     )
+
+
+def begin(own: Camera, settings: Settings, spectrum: Tensor) -> Course:
+    """Bring the variables of a camera to the optimum of a closed form: of its own model, or of Gaussian DRT, as
+    `settings.start` says."""
+    model = "gaussian" if settings.start == GAUSSIAN else settings.model
+    first = camera(own.variables.lens, dataclasses.replace(settings, model=model))
+    course, _ = least_of_closed_form(first, spectrum, distances=even_distances(first, spread=settings.spread))
+    own.variables.load_state_dict(first.variables.state_dict())
+    return course
 
 
 @dataclasses.dataclass(frozen=True)
@@ -337,10 +354,9 @@ def usual(settings: Settings) -> dict:
 
 def _steps(own: Camera, pictures: Pictures, settings: Settings, folder: Path, about: dict, name: str):
     run = _run(settings, folder, about, name)
-    if settings.start == "spectral" and name == STEPS[0] and not run.checkpoint.exists():
+    if settings.start in ("spectral", GAUSSIAN) and name == STEPS[0] and not run.checkpoint.exists():
         size = settings.patch + settings.size - 1
-        spectrum = power_spectrum(pictures, size, crops=settings.crops, seed=settings.seed)
-        course, _ = least_of_closed_form(own, spectrum, distances=even_distances(own, spread=settings.spread))
+        course = begin(own, settings, power_spectrum(pictures, size, crops=settings.crops, seed=settings.seed))
         if course.no_optimum:
-            warnings.warn(f"start spectral: {course.no_optimum}", NoOptimum, stacklevel=2)
+            warnings.warn(f"start {settings.start}: {course.no_optimum}", NoOptimum, stacklevel=2)
     yield from optimise(own, pictures, settings, run)

@@ -28,7 +28,7 @@ _TITLES = {
 }  # fmt: skip
 _SWEEP_MARKS = (10, 100, 20, 50, 30, 15, 25, 40, 70, 35, 200, 18, 12, 14, 16, 22)
 _CROWDED = 6  # values of a factor, whose marks are turned from there on
-_LIFT = {"paraxial": -3, "fourier": 3}
+_LIFT = {"fourier": 5, "gaussian": -2}  # points, of a label from its line: the lines of the first two nearly touch
 
 #: Values over steps or distances, one list for each seed.
 Curves = Mapping[str, Sequence[Sequence[float]]]

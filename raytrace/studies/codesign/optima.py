@@ -9,8 +9,8 @@ from torch import Tensor
 
 from raytrace.studies.codesign import conjugates
 from raytrace.studies.codesign.closed_form import camera_error, even_distances, least_of_closed_form
-from raytrace.studies.codesign.experiment import camera
-from raytrace.studies.codesign.settings import AFTER_PARAXIAL, Settings
+from raytrace.studies.codesign.experiment import begin, camera
+from raytrace.studies.codesign.settings import AFTER_PARAXIAL, GAUSSIAN, Settings
 from raytrace.system.lens import Lens
 
 
@@ -62,6 +62,8 @@ class Optimum(Place):
 def closed_form(lens: Lens, settings: Settings, spectrum: Tensor) -> Optimum:
     """The optimum of the model of the settings. spectrum: `power_spectrum` of the pictures."""
     own = camera(lens, settings)
+    if settings.start == GAUSSIAN:
+        begin(own, settings, spectrum)
     distances = even_distances(own, spread=settings.spread)
     course, downhill = least_of_closed_form(own, spectrum, distances=distances)
     with torch.no_grad():

@@ -8,6 +8,7 @@ from raytrace.studies.options import option
 
 MODELS = ("paraxial", "fourier", "gaussian", "drt")
 AFTER_PARAXIAL = "gaussian-after-paraxial"
+GAUSSIAN = "gaussian"  # a model, and a start: where its closed form has its optimum
 #: What the rows of a study are called in tables and figures.
 NAMES = dict(
     zip(
@@ -40,10 +41,16 @@ class Settings(options.Settings):
     edge: float | None = option(
         None, "least of elements at the edge (default 1/100); a lack is a penalty in mm²", "MIN", type=positive_finite
     )
+    hold: str = option(
+        "",
+        "what the last of --vary that changes it is solved for: efl (the file's focal length) or efl=100",
+        "NAME=VALUE",
+        nargs="+",
+    )
     start: str = option(
         "paraxial",
         "where the sensor begins: paraxial (default; the image of --focus-distance), rms (its least RMS spot), "
-        "spectral (the optimum of the closed form), or a sensor distance",
+        "spectral (the optimum of the closed form), gaussian (that of Gaussian DRT), or a sensor distance",
         "PLACE",
     )
     focus_distance: float = option(25e3, "of --start (default 25000); inf allowed", "MM", type=positive)

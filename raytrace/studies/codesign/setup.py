@@ -68,7 +68,7 @@ class Experiment:
 
 def experiment(arguments: argparse.Namespace, settings: Settings) -> Experiment:
     """Open the lens, refuse what cannot be simulated, then read the pictures."""
-    path, lens = find_lens(arguments.lens), _lens(arguments)
+    path, lens = find_lens(arguments.lens), lens_of_file(arguments)
     if settings.near >= settings.far:
         raise CommandError(f"--near {settings.near:g} is not nearer than --far {settings.far:g}")
     field_points(settings.fields, like=lens)  # refuses angles of 90 degrees
@@ -106,7 +106,7 @@ def settings_of(arguments: argparse.Namespace, begun: Path | None = None) -> Set
     preset = PRESETS[arguments.preset]
     given = {name: value for name, value in vars(arguments).items() if value is not None}
     given = {"depth": preset.depth, "width": preset.width} | given | _light(arguments)
-    given |= {name: " ".join(given[name]) for name in ("vary", "bounds") if name in given}
+    given |= {name: " ".join(given[name]) for name in ("vary", "bounds", "hold") if name in given}
     if "fields" in given:
         if any(x for x, _ in given["fields"]):
             raise CommandError("--field X,Y: co-design takes field points along y, --field Y")
@@ -127,13 +127,13 @@ def _light(arguments: argparse.Namespace) -> dict[str, Sequence[float]]:
         return {"wavelengths": wavelengths, "wavelength_weights": weights or [1.0] * len(wavelengths)}
     if wavelengths or weights:
         raise CommandError("--file-wavelengths takes the file's own: leave out --wavelength and --wavelength-weights")
-    lens = _lens(arguments)
+    lens = lens_of_file(arguments)
     order = sorted(range(len(lens.wavelengths)), key=lambda k: k != lens.primary_wavelength)
     names = ("wavelengths", "wavelength_weights")
     return {name: getattr(lens, name)[order].tolist() for name in names}
 
 
-def _lens(arguments: argparse.Namespace) -> Lens:
+def lens_of_file(arguments: argparse.Namespace) -> Lens:
     """The lens as its file has it: what options change of it is part of the settings."""
     return open_lens(argparse.Namespace(lens=arguments.lens, catalog=arguments.catalog))
 

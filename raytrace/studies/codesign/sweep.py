@@ -6,20 +6,15 @@ Every factor is varied alone, then aperture and others together.
 
 import dataclasses
 import itertools
-import json
-import math
-import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from pathlib import Path
 
 from torch import Tensor
 
-from raytrace.maths.result import plain
 from raytrace.studies.codesign import optima
+from raytrace.studies.codesign.kept import Kept, found_once
 from raytrace.studies.codesign.optima import Place, closed_form
 from raytrace.studies.codesign.settings import MODELS, Settings
 from raytrace.studies.codesign.study import PAPER
-from raytrace.studies.options import read
 from raytrace.system.lens import Lens
 
 DEFAULT, COMBINED = "default", "combination"
@@ -59,6 +54,8 @@ FACTORS = (
 #: Factors that are varied together, and the apertures tried with them: closely where the rim's aberration changes sign.
 TOGETHER = {
     ("f_number", "noise", "normalise", "spread"): (1.7, 1.74, 1.76, 1.8, 1.9, 2.0, 2.4, 3.0, 4.0),
+    ("f_number", "rays"): (1.7, 1.74, 1.76, 1.78, 1.8, 1.85, 1.9, 2.0, 3.0),
+    ("f_number", "hexapolar"): (1.7, 1.74, 1.76, 1.78, 1.8, 1.85, 1.9, 2.0, 3.0),
 }
 
 
@@ -148,31 +145,6 @@ def _of_model(settings: Settings, model: str) -> Settings:
 _REACH = {("paraxial",): ("rho",), _TRACED: ("rays", "sampling")}
 
 
-@dataclasses.dataclass(frozen=True)
-class Kept:
-    """Optima in a file of lines of JSON, [settings, optimum], of which one that was begun is no more than not there."""
-
-    path: Path
-
-    def read(self) -> dict[Settings, dict]:
-        lines = self.path.read_text(encoding="utf-8").split("\n")[:-1] if self.path.exists() else []
-        pairs = map(json.loads, lines)
-        return {read(Settings, settings): _numbers(optimum) for settings, optimum in pairs}
-
-    def add(self, settings: Settings, optimum: dict) -> None:
-        """Write one more, behind what is whole."""
-        if self.path.exists():
-            whole = self.path.read_bytes().rpartition(b"\n")
-            os.truncate(self.path, len(whole[0]) + len(whole[1]))
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps([dataclasses.asdict(settings), plain(optimum)]) + "\n")
-
-
-def _numbers(optimum: dict) -> dict:
-    """An optimum as it was written; a focus at infinity is null there."""
-    return {name: math.inf if value is None else value for name, value in optimum.items()}
-
-
 def sweep(
     lens: Lens,
     settings: Settings,
@@ -186,16 +158,13 @@ def sweep(
 
     spectrum: `power_spectrum` of the pictures; progress: wraps the cases, for a bar.
     """
-    known = {} if kept is None else kept.read()
-    found = []
-    for case in progress(cases(settings, factors)):
-        if case.settings not in known:
-            optimum = closed_form(lens, case.settings, spectrum)
-            known[case.settings] = {name: getattr(optimum, name) for name in optima.COLUMNS}
-            if kept is not None:
-                kept.add(case.settings, known[case.settings])
-        found.append(Row(**known[case.settings], factor=case.factor, value=case.value))
-    return found
+
+    def find(own: Settings) -> dict:
+        optimum = closed_form(lens, own, spectrum)
+        return {name: getattr(optimum, name) for name in optima.COLUMNS}
+
+    pairs = found_once(cases(settings, factors), find, progress=progress, kept=kept)
+    return [Row(**found, factor=case.factor, value=case.value) for case, found in pairs]
 
 
 def readings(rows: Sequence[Row]) -> list[Reading]:

@@ -19,13 +19,13 @@ from raytrace.maths.result import Result, plain
 from raytrace.pages import picture
 from raytrace.studies.codesign.claims import is_of_paper
 from raytrace.studies.codesign.closed_form import SPECTRUM_COLUMNS, spectrum_rows
+from raytrace.studies.codesign.kept import Kept
 from raytrace.studies.codesign.setup import Experiment, experiment, settings_of
 from raytrace.studies.codesign.sweep import (
     COLUMNS,
     COMBINED,
     SCALE_COLUMNS,
     TOGETHER,
-    Kept,
     Reading,
     Row,
     by_scale,
@@ -45,6 +45,7 @@ from raytrace.studies.codesign.sweep_parts import (
     focus_table,
     metres,
     penalty_table,
+    rays_table,
     scale_table,
     spoken,
     verdict,
@@ -118,7 +119,7 @@ class Sweep(Result):
             "the sensor at which the best linear filter that does not know the object distance errs least, the best "
             "of several descents. Each factor is varied alone (ρ, the σ of the paraxial model over the radius of its "
             "blur, is of that model only; a few plain rays instead of all light are of the traced models only), then "
-            f"{' and '.join(spoken(names) for names in TOGETHER)} together. All rows: "
+            f"{', '.join(f'{spoken(names)} together' for names in TOGETHER)}. All rows: "
             "[sweep.csv](codesign/sweep.csv); the spectrum: [spectrum.csv](codesign/spectrum.csv). The experiment is "
             "that of [codesign.md](codesign.md).",
             *(answer if self.of_paper else []),
@@ -131,6 +132,7 @@ class Sweep(Result):
             penalty_table(alone),
             *([ELSEWHERE, descents(found)] if any(map(elsewhere, found)) else []),
             *(["## The size of the pictures", *scale_table(self.scales)] if self.scales else []),
+            *rays_table(found),
             *(beam(self.given) if self.given.lens is not None else []),
             *(["## Varied together", *combinations(together, self.of_paper)] if together else []),
         ]

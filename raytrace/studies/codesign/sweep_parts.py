@@ -190,6 +190,39 @@ def combinations(found: Sequence[Reading], of_paper: bool) -> list[str]:
     ]
 
 
+RAYS = "## A few plain rays, by aperture"
+
+
+def rays_table(found: Sequence[Reading]) -> list[str]:
+    """Focus of the traced models by aperture and by how many rays there are, where both were varied together."""
+    by_text = {one.text: one for one in found}
+    kinds = [(one, value) for one in FACTORS if one.field == "rays" or one.name == "rays" for value in one.values]
+    apertures = dict.fromkeys(
+        one.text.split(", ")[0] for one in found if one.text.endswith(" rays") and ", " in one.text
+    )
+    if not apertures:
+        return []
+    parts = [RAYS]
+    for model in ("gaussian", "drt"):
+        lines = [
+            (
+                aperture,
+                *(
+                    _pair(by_text[text].of[model]) if text in by_text else "–"
+                    for text in (aperture, *(f"{aperture}, {factor.text.format(n)}" for factor, n in kinds))
+                ),
+            )
+            for aperture in apertures
+        ]
+        header = (NAMES[model], "all light", *(factor.text.format(n) for factor, n in kinds))
+        parts.append(grid(header, lines))
+    told = (
+        "Focus of the optimum in m: paraxial conjugate / least RMS spot. Hexapolar: the least whole rings with as many "
+        "rays, 19, 61 and 271."
+    )
+    return [*parts, told]
+
+
 def _rise(one: Reading, model: str) -> float:
     """Relative rise of the root mean square error from a model's own PSFs to DRT PSFs."""
     row = one.of[model]
@@ -306,6 +339,9 @@ def _signed(value: float) -> str:
 
 
 def spoken(names: Sequence[str]) -> str:
-    known = {"f_number": "aperture", "normalise": "normalisation", "spread": "distances", "hexapolar": "hexapolar rays"}
+    known = {
+        **{"f_number": "aperture", "normalise": "normalisation", "spread": "distances"},
+        **{"rays": "Sobol rays", "hexapolar": "hexapolar rays"},
+    }
     said = [known.get(name, name) for name in names]
     return f"{', '.join(said[:-1])} and {said[-1]}"

@@ -1,0 +1,133 @@
+"""A focal length held: by a number that is solved for, exact in the lens, its derivatives and its bounds."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from raytrace.camera.training import Run
+from raytrace.camera.variables import BadVariables, Variables, parse_bounds
+from raytrace.optics.paraxial import first_order
+from raytrace.studies.codesign.closed_form import camera_error, even_distances, power_spectrum
+from raytrace.studies.codesign.experiment import camera, optimise
+from raytrace.studies.codesign.optima import closed_form
+from raytrace.studies.codesign.settings import Settings
+from raytrace.studies.pictures import dead_leaves
+
+MICROMETRE = 1e-3
+SPACES = "sensor thickness:2,9,5,6"
+SMALL = Settings(depth=2, width=2, patch=16, size=7, epochs=1, batch=4, crops=2, vary=SPACES, hold="efl")
+
+
+@torch.no_grad()
+def efl(lens):
+    return float(first_order(lens).effective_focal_length)
+
+
+def moved(variables, **by):
+    with torch.no_grad():
+        for name, change in by.items():
+            variables.get_parameter(name).add_(change)
+    return variables
+
+
+@pytest.mark.parametrize(
+    ("vary", "solved"),
+    [
+        (SPACES, "thickness_6"),
+        ("thickness:2,9 sensor", "thickness_9"),
+        ("curvature:1,10 conic:3 sensor", "curvature_10"),  # a conic has no power
+        ("thickness:5 curvature:4", "curvature_4"),
+    ],
+)
+def test_the_last_variable_with_power_holds_the_efl(lens, vary, solved):
+    variables = Variables(lens, vary, hold="efl")
+    assert variables.held.by.name == solved
+    assert solved not in dict(variables.named_parameters())
+    assert list(variables.numbers()) == list(Variables(lens, vary).numbers())
+    for name, one in list(variables.named_parameters()):
+        moved(variables, **{name: 0.2 if name.startswith(("thickness", "sensor")) else 0.02})
+        assert one.grad is None
+    assert efl(variables()) == pytest.approx(efl(lens), rel=1e-12)
+    assert variables.numbers()[solved] != pytest.approx(Variables(lens, vary).numbers()[solved], rel=1e-6)
+
+
+def test_another_focal_length_in_mm(lens):
+    assert efl(Variables(lens, SPACES, hold="efl=100")()) == pytest.approx(100, rel=1e-12)
+
+
+def test_derivatives_through_what_is_solved_for(lens):
+    """Of the lens alone, and of the error of its pictures, to central differences."""
+    variables = Variables(lens, "thickness:2,9,5,6 curvature:1", hold="efl")
+    free = {name: one for name, one in variables.named_parameters()}
+
+    def numbers(*values):
+        surfaces = torch.func.functional_call(variables, dict(zip(free, values, strict=True)), ()).surfaces
+        return surfaces[6].thickness + surfaces[1].curvature
+
+    given = [torch.full_like(one, 0.05).requires_grad_() for one in free.values()]
+    assert torch.autograd.gradcheck(numbers, given, eps=1e-5, rtol=1e-6)
+    own = camera(lens, dataclasses.replace(SMALL, model="gaussian"))
+    spectrum, distances = power_spectrum(dead_leaves(4, size=48), 22), even_distances(own, 5)
+    own.plan()
+    slope = torch.autograd.grad(camera_error(own, spectrum, distances), own.variables.thickness_2)[0]
+    either_side = []
+    for change in (1e-3, -2e-3):
+        moved(own.variables, thickness_2=change)
+        either_side.append(float(camera_error(own, spectrum, distances).detach()))
+    assert float(slope) == pytest.approx((either_side[0] - either_side[1]) / 2e-3, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("vary", "hold", "bounds", "message"),
+    [
+        ("sensor", "efl", {}, "none of the variables changes the focal length; vary a thickness or a curvature"),
+        (SPACES, "f_number=3", {}, "hold 'f_number=3': expected efl, the focal length of the file, or one in mm"),
+        (SPACES, "efl=x", {}, "hold 'efl=x': expected efl"),
+        (SPACES, "efl=80", {}, "hold 'efl=80': thickness_6 would be -"),
+        (
+            SPACES,
+            "efl=99",
+            {"thickness_6": (12.0, 13.0)},
+            "thickness_6 would be 11.*, not from 12 to 13; hold another",
+        ),
+    ],
+)
+def test_what_cannot_be_held_is_refused(lens, vary, hold, bounds, message):
+    with pytest.raises(BadVariables, match=message):
+        Variables(lens, vary, hold=hold, bounds=bounds)
+
+
+def test_bounds_of_what_is_solved_for_are_a_penalty(lens):
+    """The square of what it lacks, mm²; no step of an optimiser clamps it, for it is no parameter."""
+    variables = Variables(lens, SPACES, hold="efl", bounds={"thickness_6": (12.4, 12.5)})
+    assert (float(variables.violation().detach()), variables.beyond()) == (0.0, "")
+    moved(variables, thickness_5=0.3)  # on the axis only the sum of both spaces about the stop counts
+    assert variables.numbers()["thickness_6"] == pytest.approx(12.4281 - 0.3, abs=1e-6)
+    assert float(variables.violation().detach()) == pytest.approx((12.4 - 12.1281) ** 2, rel=1e-3)
+    assert variables.beyond().startswith("thickness_6 would be 12.128")
+    variables.project()
+    assert efl(variables()) == pytest.approx(efl(lens), rel=1e-12)
+
+
+def test_the_closed_form_holds_it_to_a_micrometre_within_all_bounds(lens):
+    """With so little room for the spaces about the stop that the one that is solved for stands at an end."""
+    bounds = "thickness_2:0.1,1.5 thickness_9:0.1,1.5 thickness_5:14.2,14.3 thickness_6:12.4,12.5"
+    settings = dataclasses.replace(SMALL, model="gaussian", size=21, bounds=bounds)
+    found = closed_form(lens, settings, power_spectrum(dead_leaves(4, size=64), 36))
+    assert efl(found.lens) == pytest.approx(efl(lens), abs=MICROMETRE)
+    for name, (low, high) in parse_bounds(bounds).items():
+        assert low - MICROMETRE <= found.variables[name] <= high + MICROMETRE
+    assert {"thickness_5", "thickness_6"} <= set(found.at_end)
+    assert found.no_optimum == ""
+
+
+def test_training_holds_it(lens, tmp_path):
+    """Every step of Adam, and a run that goes on knows its variables."""
+    settings = dataclasses.replace(SMALL, model="gaussian", rate_optics=0.01)
+    own = camera(lens, settings)
+    records = [record for _, record in optimise(own, dead_leaves(8, size=48), settings, Run(tmp_path / "run", {}))]
+    assert len(records) == 4
+    assert records[-1]["thickness_6"] != records[0]["thickness_6"]
+    assert efl(own.variables()) == pytest.approx(efl(lens), abs=MICROMETRE)
+    assert "variables.thickness_6" not in own.state_dict()
