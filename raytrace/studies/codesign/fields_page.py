@@ -28,6 +28,8 @@ from raytrace.studies.codesign.settings import MODELS, NAMES
 from raytrace.studies.codesign.setup import Experiment, experiment, settings_of
 from raytrace.studies.publish import publish
 
+_UNITS = {"angle": "degrees"}
+
 
 @dataclasses.dataclass(frozen=True)
 class Fields(Result):
@@ -62,7 +64,8 @@ class Fields(Result):
             "# Co-design over the field",
             " ".join([f"    raytrace codesign fields {self.given.name} --data DIR --docs docs", *settings.words()]),
             "The experiment of [codesign.md](codesign.md) in closed form, with objects at the fields "
-            f"{_fields(settings.fields)} and one filter for all distances and fields; PSFs are about their chief ray. "
+            f"{_fields(settings.fields)} ({_UNITS.get(self.given.lens.fields.kind, 'mm')}) and one filter for all "
+            "distances and fields; PSFs are about their chief ray. "
             f"{self.given.name}, {settings.near / 1e3:g} to {settings.far / 1e3:g} m, the spectrum of "
             f"{len(self.given.train)} {self.given.kind}.",
             "## Optima",
