@@ -157,6 +157,29 @@ def learn_element(
     yield from train(camera, optimizer, loss, steps=settings.steps, run=run, every=every)
 
 
+def adam(
+    parameters: Iterable[nn.Parameter],
+    error: Callable[[int], Tensor],
+    *,
+    steps: int,
+    rate: float,
+    progress: Callable[[Iterable], Iterable] = iter,
+) -> Iterator[float]:
+    """Steps of Adam down the error of each step, kept nowhere; its value comes before the parameters change.
+
+    rate: falls to 0 as a cosine.
+    """
+    optimizer = torch.optim.Adam(parameters, lr=rate)
+    for step in progress(range(steps)):
+        for group in optimizer.param_groups:
+            group["lr"] = rate * scheduled("cosine", step / steps)
+        optimizer.zero_grad()
+        value = error(step)
+        value.backward()
+        yield float(value.detach())
+        optimizer.step()
+
+
 def scheduled(schedule: str, place: float) -> float:
     """What is left of a rate at a place from 0 to 1 of the way: a function of the step alone, so that runs resume."""
     return {"constant": 1.0, "linear": 1 - place, "cosine": 0.5 * (1 + math.cos(math.pi * place))}[schedule]

@@ -9,8 +9,9 @@ the loop: gradients pass them as if they were not there (straight-through).
 """
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import torch
@@ -22,7 +23,7 @@ from raytrace.camera.training import DamagedRun, load_state, read_json
 from raytrace.maths.value import detached
 from raytrace.studies import options
 from raytrace.studies.edof.settings import Settings
-from raytrace.studies.edof.training import begin, scheduled
+from raytrace.studies.edof.training import adam, begin
 from raytrace.studies.edof.world import ClosedForm, World, expected_error, scene, spectrum, transfer
 from raytrace.studies.edof.world import kernels as kernels_of
 from raytrace.studies.pictures import draws
@@ -130,21 +131,22 @@ def learn_on(
     rate: µm a step, falling to 0 as a cosine.
     """
     variables = PhaseVariables(element)
-    optimizer = torch.optim.Adam(variables.parameters(), lr=rate)
     best, least = element, math.inf
-    for step in progress(range(steps + 1)):
-        error = judge.error(variables()[0])
-        if float(error.detach()) < least:
-            least = float(error.detach())
-            best = element.with_numbers(variables.numbers().detach().clone())
-        if step == steps:
-            break
-        for group in optimizer.param_groups:
-            group["lr"] = rate * scheduled("cosine", step / steps)
-        optimizer.zero_grad()
-        error.backward()
-        optimizer.step()
+
+    def error(step: int = 0) -> Tensor:
+        return judge.error(variables()[0])
+
+    course = adam(variables.parameters(), error, steps=steps, rate=rate, progress=progress)
+    for found in itertools.chain(course, _after(error)):
+        if found < least:
+            best, least = element.with_numbers(variables.numbers().detach().clone()), found
     return best
+
+
+def _after(error: Callable[[], Tensor]) -> Iterator[float]:
+    """The error when its turn comes: of what the last step has left."""
+    with torch.no_grad():
+        yield float(error())
 
 
 # --- the learned element

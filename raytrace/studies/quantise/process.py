@@ -16,7 +16,7 @@ from torch import Tensor
 from raytrace.camera.phase import PhaseVariables
 from raytrace.maths.value import detached
 from raytrace.studies.edof.noise import Unit
-from raytrace.studies.edof.training import scheduled
+from raytrace.studies.edof.training import adam
 from raytrace.studies.edof.world import ClosedForm
 from raytrace.studies.pictures import draws
 from raytrace.wave.element import Element, as_made, with_tolerance
@@ -89,13 +89,12 @@ def learn_depths(
 ) -> Element:
     """Adam from a wrapped element, with errors of height; rate: µm a step, falling to 0 as a cosine."""
     variables = PhaseVariables(start, tolerance=process.tolerance)
-    optimizer = torch.optim.Adam(variables.parameters(), lr=rate)
-    for step in progress(range(steps)):
-        for group in optimizer.param_groups:
-            group["lr"] = rate * scheduled("cosine", step / steps)
-        optimizer.zero_grad()
-        expected(variables(draw=_generator(seed, step))).backward()
-        optimizer.step()
+
+    def error(step: int) -> Tensor:
+        return expected(variables(draw=_generator(seed, step)))
+
+    for _ in adam(variables.parameters(), error, steps=steps, rate=rate, progress=progress):
+        pass
     return detached(variables()[0])
 
 

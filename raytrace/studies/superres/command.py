@@ -30,6 +30,17 @@ def _factor(text: str) -> int:
     return int(text)
 
 
+def cameras():
+    """--wavelength, a field of settings."""
+    help = "wavelengths of one camera, µm (default 0.55); given again, another camera"
+    return option(([0.55],), help, "UM", type=positive_finite, action="append")
+
+
+def sensor_noise():
+    """--noise, a field of settings."""
+    return option(0.001, "of the sensor, white is 1", "S")
+
+
 @dataclasses.dataclass(frozen=True)
 class Settings(rows.Settings):
     """wavelength: of every camera; places: of the small scene's copies, each number of them a plate of its own."""
@@ -37,14 +48,8 @@ class Settings(rows.Settings):
     factor: tuple[int, ...] = option(
         (2,), "sensor pixels, in pixels of the picture: 2 (default) or 3", "S", type=_factor
     )
-    wavelength: tuple[list[float], ...] = option(
-        ([0.55],),
-        "wavelengths of one camera, µm (default 0.55); given again, another camera",
-        "UM",
-        type=positive_finite,
-        action="append",
-    )
-    noise: float = option(0.001, "of the sensor, white is 1", "S")
+    wavelength: tuple[list[float], ...] = cameras()
+    noise: float = sensor_noise()
     places: tuple[int, ...] = option((3, 4), "default both: 3 4", "V", type=int, choices=(3, 4))
     steps: int = option(40, "of learning")
     starts: int = option(1, "random starts of the full-frame element", type=whole(0))

@@ -3,9 +3,10 @@
 import argparse
 import dataclasses
 
-from raytrace.cli.options import json, output_folder, plot, positive_finite
+from raytrace.cli.options import json, output_folder, plot
 from raytrace.studies import options as rows
 from raytrace.studies.options import add_options, documents, option, pictures
+from raytrace.studies.superres.command import cameras, sensor_noise
 
 SUMMARY = "learn places of a small scene that nobody prescribes"
 DESCRIPTION = """\
@@ -23,14 +24,8 @@ EXAMPLES = """examples:
 class Settings(rows.Settings):
     """wavelength: of every camera; spread: RMS of the random starts."""
 
-    wavelength: tuple[list[float], ...] = option(
-        ([0.55],),
-        "wavelengths of one camera, µm (default 0.55); given again, another camera",
-        "UM",
-        type=positive_finite,
-        action="append",
-    )
-    noise: float = option(0.001, "of the sensor, white is 1", "S")
+    wavelength: tuple[list[float], ...] = cameras()
+    noise: float = sensor_noise()
     spread: tuple[float, ...] = option((0.1, 0.5), "RMS of random starts in waves (default 0.1 0.5)", "RMS")
     starts: int = option(3, "random starts of each")
     steps: int = option(150, "of learning")
