@@ -12,6 +12,7 @@ PLACES = {
     "table": "edof.table_command",
     "noise": "edof.noise_command",
     "network": "edof.network_command",
+    "free": "edof.free_command",
     "superres": "superres.command",
     "discover": "superres.discover_command",
     "quantise": "quantise.command",

@@ -18,7 +18,7 @@ EXAMPLES = """examples:
 
 SUBCOMMANDS = (
     Command.of("cli.wave_psf"),
-    *map(command, ("focus", "edof", "table", "noise", "network", "superres", "discover", "quantise", "etch")),
+    *map(command, ("focus", "edof", "table", "noise", "network", "free", "superres", "discover", "quantise", "etch")),
 )
 
 

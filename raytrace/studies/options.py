@@ -45,7 +45,9 @@ class Settings:
             value = getattr(self, field.name)
             if field.metadata and value != field.default:
                 name = (field.metadata["name"] or field.name).replace("_", "-")
-                found.append(f"--{name} {' '.join(f'{one:g}' for one in value) if isinstance(value, tuple) else value}")
+                if isinstance(value, tuple):
+                    value = " ".join(one if isinstance(one, str) else f"{one:g}" for one in value)
+                found.append(f"--{name} {value}")
         return found
 
 

@@ -18,6 +18,13 @@ from raytrace.wave.psf import ElementPsf
 _LEARNED = ("learned", "learned-16", "learned-smooth")
 #: Panels of the figure over noise, by filter.
 NOISE_TITLES = {"wiener": "Wiener filter, 1 m", "blind": "depth-invariant filter"}
+#: Lines of the figure of free heights.
+_FREE = {
+    "control": "rings learned on",
+    "rings": "free, from rings",
+    "cubic": "free, from cubic",
+    "random": "free, from random",
+}
 _MARGIN = 1e-5  # of the brightest pixel, what is black
 
 
@@ -91,6 +98,27 @@ def noise_figure(found) -> Figure:
     axes[0].set_ylabel("PSNR over that of the Fresnel lens (dB)")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right center", fontsize=7.5)
+    return figure
+
+
+@styled
+def free_figure(found) -> Figure:
+    """Of every map a line: its heights, and its kernels over depth; found: a `Freed`."""
+    world, columns = World(), len(World().depths) + 1
+    figure = new_figure(1.75 * columns, 1.85 * len(found.shown))
+    axes = figure.subplots(len(found.shown), columns, squeeze=False)
+    half = 500 * world.pixel * world.size
+    for line, (row, shown) in zip(axes, found.shown.items(), strict=True):
+        wave = line[0].imshow(shown.heights, cmap="viridis", origin="lower")
+        line[0].set_ylabel(_FREE[row], fontsize=8)
+        figure.colorbar(wave, ax=line[0], location="left", fraction=0.05, pad=0.16).ax.tick_params(labelsize=6)
+        for panel, kernel, depth in zip(line[1:], shown.kernels, world.depths, strict=True):
+            logarithm = np.log10(np.maximum(kernel / shown.kernels.max(), _MARGIN))
+            panel.imshow(logarithm, cmap="inferno", vmin=np.log10(_MARGIN), vmax=0, extent=(-half, half, -half, half))
+            panel.set_title(depth_text(depth, "∞"), fontsize=8)
+    for panel in axes.flat:
+        panel.set(xticks=[], yticks=[])
+    axes[0, 0].set_title("heights beyond\na smooth lens, µm", fontsize=8)
     return figure
 
 
