@@ -16,6 +16,7 @@ from raytrace.formats import read_lens
 from raytrace.media.glass import AIR, MIRROR, Glass, constant
 from raytrace.merit.merit import Evaluation
 from raytrace.merit.model import Model
+from raytrace.optics.paraxial import first_order
 from raytrace.optics.scene import Scene, scene
 from raytrace.system.intent import Row
 from raytrace.system.lens import Fields, Lens, SystemAperture
@@ -283,6 +284,11 @@ def _solve(rows: list[list[Decimal]]) -> list[Decimal]:
             if k != j:
                 rows[k] = [x - rows[k][j] * y for x, y in zip(rows[k], rows[j], strict=True)]
     return [row[-1] for row in rows]
+
+
+def focal_length(lens: Lens) -> float:
+    """Effective focal length, mm."""
+    return float(first_order(lens).effective_focal_length.detach())
 
 
 def relative_l1(found: torch.Tensor, expected: torch.Tensor) -> float:

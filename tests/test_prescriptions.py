@@ -5,6 +5,7 @@ The oracle is the focal length that each source itself states.
 
 import pytest
 import torch
+from problems import focal_length
 
 from raytrace.formats import LensFileError, table_read
 from raytrace.formats.source import Place, decode
@@ -67,10 +68,6 @@ stop       8.300     1      0      21.3
 
 def read(text: str, system: str = SYSTEM, **options):
     return table_read.read(system + text, "lens.csv", **options)
-
-
-def focal_length(lens) -> float:
-    return float(first_order(lens).effective_focal_length)
 
 
 def summilux(headings: str, order: str = "No R d n V") -> str:
