@@ -155,7 +155,7 @@ def test_the_page_has_the_figures_of_its_table():
 @pytest.mark.slow
 def test_the_command_learns_judges_and_goes_on(capsys, monkeypatch, tmp_path):
     monkeypatch.setattr(report, "_LEAVES", 4)
-    words = ["wave", "free", "--rings", str(DOCS / "wave/elements/learned-0.01.npy"), "--start", "rings"]
+    words = ["wave", "free", "--from", str(DOCS / "wave/elements/learned-0.01.npy"), "--start", "rings"]
     words += ["--feature", "0.01", "--steps", "2", "-o", str(tmp_path / "run"), "--docs", str(tmp_path), "--json"]
     assert main(words) == 0
     first = json.loads(capsys.readouterr().out)

@@ -28,7 +28,7 @@ from raytrace.words import did_you_mean
 DIFFERENT = {
     "--rays": "a fixed form of trace is a table of rays; elsewhere a number, of bench several",
     "--output": "a folder, where what a command makes is a run; height maps may be pictures",
-    "--start": "compare chooses from two places, codesign takes a distance, too",
+    "--start": "compare chooses from two places, wave free several, codesign takes a distance, too",
     "--element": "named elements, kinds that are learned, and several of either",
     "--levels": "quantise compares several",
     "--tolerance": "quantise compares several",

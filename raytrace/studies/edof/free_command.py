@@ -15,8 +15,8 @@ free, learned from rings with a small random change, from a cubic plate on a len
 beside them the same rings learned on for as many steps. Judged on pictures behind two filters; gains with their 95 %
 intervals. FOLDER keeps what is learned: the same command goes on where it was stopped."""
 EXAMPLES = """examples:
-  raytrace wave free --rings docs/wave/elements/learned-0.01.npy --start rings --feature 0.01 --steps 20 -o free
-  raytrace wave free --rings docs/wave/elements/learned-0.01.npy --data pictures --limit 400 -o free --docs docs"""
+  raytrace wave free --from docs/wave/elements/learned-0.01.npy --start rings --feature 0.01 --steps 20 -o free
+  raytrace wave free --from docs/wave/elements/learned-0.01.npy --data pictures --limit 400 -o free --docs docs"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +38,8 @@ class Settings(rows.Settings):
 
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--rings",
+        "--from",
+        dest="rings",
         metavar="FILE",
         type=file_name,
         required=True,

@@ -111,7 +111,7 @@ def free(arguments: argparse.Namespace) -> Freed:
     settings, root = Settings.of(vars(arguments)), Path(arguments.folder)
     rings = read_element(arguments.rings, aperture=2 * World().radius)
     if not isinstance(rings.profile, Rings):
-        raise CommandError(f"--rings {arguments.rings}: holds pixels; expected rings")
+        raise CommandError(f"--from {arguments.rings}: holds no rings; expected heights of rings")
     contents, train = contents_of(arguments)
     S = spectrum(periodic(train, 256))
     elements = {"given": rings, "cut": as_pixels(rings, settings.feature)}
@@ -194,7 +194,7 @@ def _shown(element: Element, settings: Settings) -> Shown:
 
 
 def _publish(found: Freed, arguments: argparse.Namespace) -> None:
-    words = ["--rings docs/wave/elements/learned-0.01.npy" if Path(arguments.rings).name == "learned-0.01.npy" else ""]
+    words = ["--from docs/wave/elements/learned-0.01.npy" if Path(arguments.rings).name == "learned-0.01.npy" else ""]
     words += [f"--data DIR --limit {arguments.limit}"] if arguments.data else []
     command = " ".join(["raytrace wave free", *filter(None, words), *found.settings.words(), "-o FOLDER --docs docs"])
     tables = {"free.csv": table([row.record() for row in found.rows], floats=lambda number: round(number, 4))}
