@@ -1,5 +1,7 @@
 """`raytrace bench trace` runs end to end, and its high-precision reference agrees with the package. No timings."""
 
+import contextlib
+import io
 import json
 import math
 from dataclasses import asdict
@@ -39,9 +41,16 @@ def tensor(*numbers: float) -> torch.Tensor:
     return torch.tensor(numbers if len(numbers) > 1 else numbers[0], dtype=torch.float64)
 
 
-def test_json_is_one_document_with_errors_beside_every_speed(capsys):
-    assert main([*TINY, "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
+@pytest.fixture(scope="module")
+def document():
+    """The one JSON document of the default run."""
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        assert main([*TINY, "--json"]) == 0
+    return json.loads(out.getvalue())
+
+
+def test_json_is_one_document_with_errors_beside_every_speed(document):
     assert document["surfaces"] == 12
     assert document["machine"]["torch threads"] == 1
     rows = document["rows"]
@@ -58,9 +67,8 @@ def test_json_is_one_document_with_errors_beside_every_speed(capsys):
         assert row["ratio"] is None
 
 
-def test_other_systems_stand_beside_plain_conics(capsys):
-    assert main([*TINY, "--json"]) == 0
-    rows = json.loads(capsys.readouterr().out)["beyond"]
+def test_other_systems_stand_beside_plain_conics(document, capsys):
+    rows = document["beyond"]
     assert [row["system"] for row in rows] == [name for name in beyond.SYSTEMS for _ in range(4)]
     for row in rows:
         assert row["speed"] > 0

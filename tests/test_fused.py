@@ -267,6 +267,7 @@ def probe(folder: Path, count: int, **environment) -> subprocess.CompletedProces
     return done
 
 
+@pytest.mark.slow
 def test_it_is_compiled_once_for_work_that_is_worth_it(tmp_path):
     """A small batch compiles nothing; a large one does, says so, and the next process finds it on disk."""
     assert probe(tmp_path, 100).stdout == "False\n"

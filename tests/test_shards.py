@@ -166,6 +166,7 @@ def test_torchrun_writes_what_the_command_writes_once(command, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one.npz", "one.png", "two.npz", "two.png"]
 
 
+@pytest.mark.slow
 def test_a_killed_process_ends_the_job_with_one_line_and_no_file(tmp_path):
     words = ("psf", "double_gauss", "--model", "gaussian", "--field", "0", "14", "-o", "kernels.npz")
     done = run_function(f"kill_itself(*{words!r})", folder=tmp_path)
@@ -177,6 +178,7 @@ def test_a_killed_process_ends_the_job_with_one_line_and_no_file(tmp_path):
     assert (done.stdout, [path.name for path in tmp_path.iterdir()]) == ("", ["script"])
 
 
+@pytest.mark.slow
 def test_a_refusal_is_said_once(tmp_path):
     done = begin("-m", "raytrace", "psf", "double_gaus", folder=tmp_path)
     assert done.returncode != 0

@@ -64,6 +64,7 @@ def test_checkpoints_by_time_change_no_number(tmp_path):
     assert (tmp_path / "whole/log.csv").read_bytes() == (tmp_path / "parts/log.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_killed_process_leaves_a_run_that_goes_on(tmp_path):
     """kill -9 in the middle, twice; the end is that of a run that was never killed."""
     script = textwrap.dedent(f"""

@@ -172,6 +172,7 @@ def test_rays_and_waves_of_a_defocused_element_have_the_same_half_energy_radius(
     assert gap.max() < (0.1 if distance == 500 else 0.06)
 
 
+@pytest.mark.slow
 def test_rays_and_waves_of_an_element_of_extended_depth_have_the_same_encircled_energy():
     """30 waves of r⁴ on 23 waves of defocus: no sharp rim, and the curves agree to 2 % from 0.1 a on."""
     extended = singlet() + vector(0.0, -30 * WAVE / (PMMA - 1) / 2.5**4, 0.0, 0.0)
