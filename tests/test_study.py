@@ -35,7 +35,7 @@ from raytrace.studies.codesign.study import (
     run_folder,
     run_settings,
     settled,
-    step_time,
+    step_times,
     summaries,
 )
 from raytrace.studies.pictures import dead_leaves
@@ -340,14 +340,15 @@ def test_blur_of_an_almost_paraxial_lens_is_that_of_similar_triangles(lens):
         assert blur == pytest.approx(expected, rel=0.01)  # spherical aberration, 1/1000 of that at F/3
 
 
-def test_time_of_a_step_leaves_the_camera_as_it_was(lens, pictures):
-    settings = dataclasses.replace(SMALL, model="paraxial")
-    own = camera(lens, settings)
-    before = {key: value.clone() for key, value in own.state_dict().items()}
-    found = step_time(own, batch(pictures, settings, [0, 1, 2, 3], 0), repeats=2)
-    assert min(found.psf, found.image, found.network) > 0
-    assert all(torch.equal(value, before[key]) for key, value in own.state_dict().items())
-    assert all(parameter.grad is None for parameter in own.parameters())
+def test_time_of_a_step_leaves_the_cameras_as_they_were(lens, pictures):
+    cameras = [camera(lens, dataclasses.replace(SMALL, model=model)) for model in ("paraxial", "drt")]
+    before = [{key: value.clone() for key, value in own.state_dict().items()} for own in cameras]
+    found = step_times(cameras, batch(pictures, SMALL, [0, 1, 2, 3], 0), repeats=2)
+    assert [one.model for one in found] == ["paraxial", "drt"]
+    assert all(min(one.psf, one.image, one.network) > 0 for one in found)
+    for own, state in zip(cameras, before, strict=True):
+        assert all(torch.equal(value, state[key]) for key, value in own.state_dict().items())
+        assert all(parameter.grad is None for parameter in own.parameters())
 
 
 # ---------------------------------------------------------------- the page

@@ -102,7 +102,8 @@ def _report(
     say("the closed form, and the time of a step, of every model")
     spectrum = given.spectrum()
     best = optima.closed_forms(given.lens, given.settings, spectrum, models)
-    times = [runs.step_time(camera(given.lens, s), batch(given.train, s, list(range(s.batch)), 0)) for s in own]
+    crops = batch(given.train, given.settings, list(range(given.settings.batch)), 0)
+    times = runs.step_times([camera(given.lens, s) for s in own], crops)
     blur = _blur(given, study, found)
     drawn = _training_figures(given, study, found) | _lens_figures(given, study, found, blur)
     drawn |= _scan_figure(given, spectrum, best, found)

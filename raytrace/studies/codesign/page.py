@@ -221,7 +221,7 @@ def _times(report: Report) -> str:
     lines = [(NAMES[one.model], *(f"{ms:.1f}" for ms in (one.psf, one.image, one.network))) for one in report.times]
     about = ", ".join(f"{key} {value}" for key, value in report.machine.items())
     table = grid(("model", "PSFs (ms)", "image (ms)", "network (ms)"), lines)
-    return f"{table}\n\nA batch, forward and backward, median of several: {about}."
+    return f"{table}\n\nA batch, forward and backward, median of several, the models in turns: {about}."
 
 
 def _spread(one: Summary, column: str, digits: int) -> str:

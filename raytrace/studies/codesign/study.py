@@ -202,25 +202,41 @@ class StepTime:
     network: float
 
 
-def step_time(camera: Camera, batch: Batch, *, repeats: int = 5) -> StepTime:
-    """What the parts of one step cost with this camera and batch; the camera is left as it was, without gradients."""
+def step_times(cameras: Sequence[Camera], batch: Batch, *, repeats: int = 5) -> list[StepTime]:
+    """What the parts of one step cost with each camera, in turns: a machine that slows down slows all of them.
+
+    The cameras are left as they were, without gradients.
+    """
+    before = [copy.deepcopy(own.variables.state_dict()) for own in cameras]
+    parts = [_parts(own, batch) for own in cameras]
+    times = [{part: [] for part in own} for own in parts]
+    for _ in range(repeats):
+        for own, taken in zip(parts, times, strict=True):
+            for part, work in own.items():
+                taken[part].extend(_timed(work, 4 if part == "psf" else 1))  # the shortest, and what models differ by
+    for own, state in zip(cameras, before, strict=True):
+        own.variables.load_state_dict(state)
+        own.zero_grad(set_to_none=True)
+    return [
+        StepTime(own.model, **{part: statistics.median(ms) for part, ms in taken.items()})
+        for own, taken in zip(cameras, times, strict=True)
+    ]
+
+
+def _parts(camera: Camera, batch: Batch) -> dict[str, Callable[[], None]]:
+    """The work of a step, forward and backward, each part by itself."""
     kernels = camera.kernels(batch.distance).detach().to(batch.picture.dtype).requires_grad_()
     image = camera.image(batch.picture, batch.distance).detach().requires_grad_()
-    before = copy.deepcopy(camera.variables.state_dict())
 
     def psf() -> None:
         _nudge(camera)
         camera.kernels(batch.distance).square().sum().backward()
 
-    found = StepTime(
-        model=camera.model,
-        psf=_median(psf, 4 * repeats),  # the shortest, and what models are compared by
-        image=_median(lambda: blur(batch.picture, kernels).square().sum().backward(), repeats),
-        network=_median(lambda: camera.restore(image).square().sum().backward(), repeats),
-    )
-    camera.variables.load_state_dict(before)
-    camera.zero_grad(set_to_none=True)
-    return found
+    return {
+        "psf": psf,
+        "image": lambda: blur(batch.picture, kernels).square().sum().backward(),
+        "network": lambda: camera.restore(image).square().sum().backward(),
+    }
 
 
 @torch.no_grad()
@@ -230,11 +246,12 @@ def _nudge(camera: Camera) -> None:
         parameter.add_(1e-9)
 
 
-def _median(work: Callable[[], None], repeats: int) -> float:
-    work()  # the first call plans and fills caches
+def _timed(work: Callable[[], None], repeats: int) -> list[float]:
+    """Times in ms, after a call that plans and fills caches."""
+    work()
     times = []
     for _ in range(repeats):
         start = time.perf_counter()
         work()
         times.append(1e3 * (time.perf_counter() - start))
-    return statistics.median(times)
+    return times
