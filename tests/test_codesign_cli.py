@@ -322,6 +322,7 @@ def test_compare_writes_the_table_and_the_page(run, pictures):
         with open(f"study/{row['model']}-3/joint/log.csv", newline="") as file:
             course = [float(step["sensor"]) for step in csv.DictReader(file)]
         assert float(row["sensor_last_epochs_mm"]) == pytest.approx(sum(course) / len(course))  # of one epoch
+        assert float(row["sensor_range_last_epochs_mm"]) == pytest.approx(max(course) - min(course))
     begun = read(f"study/{after}-3/joint/settings.json")
     assert (begun["model"], float(begun["start"])) == ("gaussian", kept["paraxial"]["sensor_mm"])
     document = json.loads(out)

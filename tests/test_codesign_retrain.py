@@ -52,6 +52,12 @@ def test_what_all_seeds_share_is_no_noise():
     assert effects(found)[0].low > 0.009
 
 
+def test_effects_at_object_distances_are_those_of_the_losses_there():
+    one, other = effects(losses_of(gaussian=[1.0, 2.0], drt=[1.01, 2.04]), losses=("50000", "10000"))
+    assert (one.loss, other.loss) == ("50000", "10000")
+    assert one.mean == other.mean == pytest.approx(0.015)
+
+
 def test_only_seeds_that_both_lenses_have_are_compared():
     found = [
         one for one in losses_of(gaussian=[1.0, 2.0, 3.0], drt=[1.1, 2.0, 9.0]) if (one.model, one.seed) != ("drt", 2)
@@ -110,6 +116,11 @@ def test_the_command_trains_fresh_networks_on_frozen_lenses(retraining, tmp_path
     assert "Unfinished" not in page
     with Path("docs/second/retrain.csv").open(newline="") as file:
         assert len(list(csv.DictReader(file))) == 4
+    with Path("docs/second/retrain_distance.csv").open(newline="") as file:
+        losses = {(row["model"], row["seed"], row["distance_m"]): float(row["l1"]) for row in csv.DictReader(file)}
+    for one in document["rows"]:
+        for distance, loss in one["by_distance"].items():
+            assert losses[one["model"], str(one["seed"]), str(float(distance) / 1e3)] == loss
     code, out, err = retraining(*command, "--seeds", "0", "1", "2", "--report-only")
     assert code == 0, err
     assert "not finished: paraxial 2, gaussian 2" in out

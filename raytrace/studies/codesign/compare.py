@@ -106,7 +106,10 @@ def _report(
     times = runs.step_times([camera(given.lens, s) for s in own], crops)
     blur = _blur(given, study, found)
     drawn = _training_figures(given, study, found) | _lens_figures(given, study, found, blur)
-    drawn |= _scan_figure(given, spectrum, best, found)
+    scanned = _scan(given, spectrum, best, found)
+    if scanned:
+        ends = {one.model: one.mean["sensor_mm"] for one in runs.summaries(found)}
+        drawn["scan.png"] = figures.scan_figure(*scanned, ends)
     report = Report(
         lens=given.name,
         pictures=f"{len(given.train)} {given.kind} to train on, {len(given.test)} to test",
@@ -135,6 +138,16 @@ def _report(
         ),
         "spectral.csv": table(best, optima.COLUMNS),
     }
+    if scanned:
+        sensors, errors = scanned
+        tables["scan.csv"] = table(
+            [
+                {"model": model, "sensor_mm": sensor, "error": error}
+                for model, own in errors.items()
+                for sensor, error in zip(sensors, own, strict=True)
+            ],
+            ("model", "sensor_mm", "error"),
+        )
     publish(docs / f"{page}.md", page, report.parts(), tables=tables, figures=drawn)
     return report
 
@@ -204,20 +217,18 @@ def _lens_figures(
     }
 
 
-def _scan_figure(
+def _scan(
     given: Experiment, spectrum: Tensor, best: Sequence[optima.Optimum], found: Sequence[Outcome]
-) -> Mapping[str, figures.Figure]:
-    """The closed form over the sensor's place, if the sensor is what varies."""
+) -> tuple[list[float], dict[str, list[float]]] | None:
+    """Sensors in mm, and errors of the closed form there by model; None unless the sensor alone is what varies."""
     if given.settings.vary.split() != ["sensor"] or not best:
-        return {}
-    ends = {one.model: one.mean["sensor_mm"] for one in runs.summaries(found)}
+        return None
     start = float(lens_at_start(given.lens, given.settings).surfaces[-2].thickness)
-    places = [start, *(one.sensor_mm for one in best), *ends.values()]
+    places = [start, *(one.sensor_mm for one in best), *(one.mean["sensor_mm"] for one in runs.summaries(found))]
     margin = 0.15 * (max(places) - min(places)) + 0.02
     sensors = np.linspace(min(places) - margin, max(places) + margin, 41).tolist()
     own = {m: camera(given.lens, dataclasses.replace(given.settings, model=m)) for m in MODELS}
     distances = {m: even_distances(own[m], spread=given.settings.spread) for m in MODELS}
-    errors = {
+    return sensors, {
         one.model: scan(own[one.model], spectrum, sensors, distances[one.model]) for one in best if one.model in MODELS
     }
-    return {"scan.png": figures.scan_figure(sensors, errors, ends)}

@@ -51,7 +51,8 @@ _DECAYS: dict[str, Callable[[float], float]] = {
     "none": lambda part: 1.0,
     "cosine": lambda part: 0.5 * (1 + math.cos(math.pi * part)),
 }
-_OF_STUDY = ("sensor_last_epochs_mm", "focus_last_epochs_m")  # of an outcome; not in its file
+#: Of an outcome; not in its file.
+_OF_STUDY = ("sensor_last_epochs_mm", "sensor_range_last_epochs_mm", "focus_last_epochs_m")
 _INFINITE = ("focus_paraxial_m", "focus_rms_m")  # of an outcome; null in its file
 
 
@@ -63,7 +64,8 @@ class Outcome:
     l1_before: between the two, the network of step 1 on DRT PSFs. focus_paraxial_m, focus_rms_m: object distance from
     vertex 1 in focus, of paraxial rays and of least RMS spot. by_distance: L1 with DRT PSFs after step 2. penalty: mm²
     of what thicknesses lack (`limits.violation`), no part of the losses; no_optimum: why the lens is none of least loss
-    ("" where nothing speaks against it). *_last_epochs: means over the end of step 1, which a study adds.
+    ("" where nothing speaks against it). *_last_epochs: means over the end of step 1, and over what the sensor
+    moves there, which a study adds.
     """
 
     model: str
@@ -79,6 +81,7 @@ class Outcome:
     penalty: float = 0.0
     no_optimum: str = ""
     sensor_last_epochs_mm: float = math.nan
+    sensor_range_last_epochs_mm: float = math.nan
     focus_last_epochs_m: float = math.nan
 
     def document(self) -> dict:

@@ -180,7 +180,8 @@ def _table(report: Report) -> str:
         f"{grid(header, lines)}\n\nMean ± standard deviation over seeds, of test pictures; every model of a seed sees "
         "the same crops, distances and noise. Focus is the object distance from vertex 1 whose image is on the sensor: "
         f"the paraxial one, or that of least RMS spot{_OF_PAPER if of_paper else ''}."
-        f" Rows one by one: [table2.csv]({report.folder}/table2.csv); by object distance: "
+        f" Rows one by one, with the range of the sensor in the last two epochs of step 1: "
+        f"[table2.csv]({report.folder}/table2.csv); by object distance: "
         f"[distance.csv]({report.folder}/distance.csv)."
     )
 
@@ -210,9 +211,12 @@ def _closed_form(report: Report) -> str:
         )
         for one in report.optima
     ]
+    scanned = (
+        f"; over the sensor distance: [scan.csv]({report.folder}/scan.csv)" if "scan.png" in report.figures else ""
+    )
     return (
         f"{grid(header, lines)}\n\nMean square error of a pixel behind the best linear filter that does not know the "
-        f"object distance, for pictures of this power spectrum: [spectral.csv]({report.folder}/spectral.csv)."
+        f"object distance, for pictures of this power spectrum: [spectral.csv]({report.folder}/spectral.csv){scanned}."
         f"{f' {_SWEEP}' if report.sweep else ''}"
     )
 

@@ -46,6 +46,9 @@ class Retrained:
 COLUMNS = ("model", "seed", "sensor_mm", "l1", "l1_last_epochs")
 LOSSES = COLUMNS[3:]
 
+#: Columns of `retrain_distance.csv`.
+DISTANCE_COLUMNS = ("model", "seed", "distance_m", "l1")
+
 
 @dataclasses.dataclass(frozen=True)
 class Effect:
@@ -143,16 +146,19 @@ def retrained(folder: Path) -> Retrained | None:
         raise DamagedRun(f"{path}: not what a run found ({error})") from error
 
 
-def effects(found: Sequence[Retrained], reference: str = "gaussian") -> list[Effect]:
-    """The effect of every other lens, in every loss, where two seeds at least have both."""
+def effects(found: Sequence[Retrained], reference: str = "gaussian", losses: Sequence[str] = LOSSES) -> list[Effect]:
+    """The effect of every other lens, in every loss, where two seeds at least have both.
+
+    losses: columns, or keys of `by_distance`.
+    """
     models = [model for model in dict.fromkeys(one.model for one in found) if model != reference]
-    pairs = [(model, loss, _ratios(found, model, reference, loss)) for loss in LOSSES for model in models]
+    pairs = [(model, loss, _ratios(found, model, reference, loss)) for loss in losses for model in models]
     return [_effect(model, reference, loss, ratios) for model, loss, ratios in pairs if len(ratios) > 1]
 
 
 def _ratios(found: Sequence[Retrained], model: str, reference: str, loss: str) -> list[float]:
     """Loss over that of the reference, less 1, of every seed that has both."""
-    of = {(one.model, one.seed): getattr(one, loss) for one in found}
+    of = {(one.model, one.seed): getattr(one, loss) if loss in LOSSES else one.by_distance[loss] for one in found}
     seeds = sorted({seed for name, seed in of if name == model} & {seed for name, seed in of if name == reference})
     return [of[model, seed] / of[reference, seed] - 1 for seed in seeds]
 
@@ -163,6 +169,15 @@ def _effect(model: str, reference: str, loss: str, ratios: Sequence[float]) -> E
     reach = float(scipy.stats.t.ppf(0.5 + _CONFIDENCE / 2, count - 1)) * error
     p = float(2 * scipy.stats.t.sf(abs(mean) / error, count - 1)) if error else float(mean == 0)
     return Effect(model, reference, loss, count, mean, mean - reach, mean + reach, p)
+
+
+def distance_rows(found: Sequence[Retrained]) -> list[dict[str, str | float]]:
+    """Losses of test pictures by lens, seed and object distance."""
+    return [
+        dict(zip(DISTANCE_COLUMNS, (one.model, one.seed, float(distance) / 1e3, loss), strict=True))
+        for one in found
+        for distance, loss in one.by_distance.items()
+    ]
 
 
 def means(found: Sequence[Retrained]) -> dict[str, dict[str, tuple[float, float]]]:

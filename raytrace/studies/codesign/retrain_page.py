@@ -11,14 +11,15 @@ from raytrace.cli.run import present
 from raytrace.files import table
 from raytrace.maths.result import Result, plain
 from raytrace.pages import grid
-from raytrace.studies.codesign.claims import percent
 from raytrace.studies.codesign.experiment import usual
 from raytrace.studies.codesign.retrain import (
     COLUMNS,
+    DISTANCE_COLUMNS,
     LOSSES,
     STEP,
     Effect,
     Retrained,
+    distance_rows,
     effects,
     means,
     retrain,
@@ -47,6 +48,10 @@ class Footing(Result):
     @property
     def effects(self) -> list[Effect]:
         return effects(self.found)
+
+    @property
+    def effects_by_distance(self) -> list[Effect]:
+        return effects(self.found, losses=sorted({z for one in self.found for z in one.by_distance}, key=float))
 
     def document(self) -> dict:
         return plain(
@@ -94,7 +99,7 @@ class Footing(Result):
             "Test pictures: by the last iterate. Batches of the last two epochs: each before the network learned from "
             f"it. Network by network: [retrain.csv]({folder}/retrain.csv).",
             "## Over object distance",
-            _by_distance(self.found),
+            _by_distance(self.effects_by_distance, folder),
         ]
 
 
@@ -137,20 +142,19 @@ def _fine(part: float) -> str:
     return f"{100 * part:+.2f} %"
 
 
-def _by_distance(found: Sequence[Retrained]) -> str:
-    """Mean loss of test pictures by object distance, relative to Gaussian DRT's lens at the same seeds."""
-    distances = sorted({float(z) for one in found for z in one.by_distance})
-    of = {(one.model, one.seed): {float(z): loss for z, loss in one.by_distance.items()} for one in found}
-    lines = []
-    for model in dict.fromkeys(one.model for one in found):
-        seeds = [seed for name, seed in of if name == model and ("gaussian", seed) in of]
-        if model == "gaussian" or not seeds:
-            continue
-        ratios = [sum(of[model, k][z] / of["gaussian", k][z] - 1 for k in seeds) / len(seeds) for z in distances]
-        lines.append((NAMES[model], len(seeds), *map(percent, ratios)))
-    header = ("lens of", "seeds", *(f"{z / 1e3:g} m" for z in distances))
-    told = "Mean loss of test pictures over that of Gaussian DRT's lens, less 1."
-    return f"{grid(header, lines)}\n\n{told}" if lines else ""
+def _by_distance(found: Sequence[Effect], folder: str) -> str:
+    if not found:
+        return "Two seeds of two lenses are needed."
+    rows: dict[tuple[str, int], list[str]] = {}
+    for one in found:
+        cell = f"{100 * one.mean:+.1f} ± {100 * (one.high - one.mean):.1f}"
+        rows.setdefault((NAMES[one.model], one.seeds), []).append(cell)
+    header = ("lens of", "seeds", *(f"{float(z) / 1e3:g} m" for z in dict.fromkeys(one.loss for one in found)))
+    return (
+        f"{grid(header, [(*key, *cells) for key, cells in rows.items()])}\n\nLoss of test pictures more than Gaussian "
+        "DRT's in per cent, with half the interval of 95 % as above. Network by network: "
+        f"[retrain_distance.csv]({folder}/retrain_distance.csv)."
+    )
 
 
 def retrain_all(arguments: argparse.Namespace) -> None:
@@ -174,7 +178,11 @@ def retrain_all(arguments: argparse.Namespace) -> None:
     footing = Footing(given, sensors, found, tuple(key for key, one in runs.items() if one is None))
     page = Path(arguments.docs or study) / f"{arguments.page or 'codesign'}_retrain.md"
     folder = arguments.page or "codesign"
-    publish(page, folder, footing.parts(folder), tables={"retrain.csv": table(found, COLUMNS)}, figures={})
+    tables = {
+        "retrain.csv": table(found, COLUMNS),
+        "retrain_distance.csv": table(distance_rows(found), DISTANCE_COLUMNS),
+    }
+    publish(page, folder, footing.parts(folder), tables=tables, figures={})
     present(footing, arguments)
 
 

@@ -36,7 +36,7 @@ _CHOICE = 16  # patches of which the one with most contrast is shown
 #: Columns of `table2.csv`.
 COLUMNS = (
     *("model", "seed", "l1_joint", "l1_drt", "focus_paraxial_m", "focus_rms_m", "sensor_mm"),
-    *("sensor_last_epochs_mm", "focus_last_epochs_m"),
+    *("sensor_last_epochs_mm", "sensor_range_last_epochs_mm", "focus_last_epochs_m"),
 )
 LAST = 2  # epochs of step 1 that are averaged beside the last iterate
 
@@ -72,7 +72,7 @@ def outcomes(study: Path, models: Sequence[str], seeds: Sequence[int]) -> list[O
 def with_last_epochs(
     study: Path, found: Sequence[Outcome], epochs: int, focus: Callable[[float], float] | None
 ) -> list[Outcome]:
-    """Outcomes with the mean place of the sensor over the last two epochs of step 1, and its focus by `focus`.
+    """Outcomes with the mean place of the sensor over the last two epochs of step 1, its range, and focus by `focus`.
 
     At a constant rate the last iterate jitters about its place. Runs without a sensor that varies stay as they are.
     """
@@ -80,8 +80,14 @@ def with_last_epochs(
     for one in found:
         (course,) = (*courses(study, [one], "sensor").values(), [[]])[0]
         if course and focus is not None:
-            place = statistics.fmean(course[-min(LAST, epochs) * (len(course) // epochs) :])
-            one = dataclasses.replace(one, sensor_last_epochs_mm=place, focus_last_epochs_m=focus(place))
+            last = course[-min(LAST, epochs) * (len(course) // epochs) :]
+            place = statistics.fmean(last)
+            one = dataclasses.replace(
+                one,
+                sensor_last_epochs_mm=place,
+                sensor_range_last_epochs_mm=max(last) - min(last),
+                focus_last_epochs_m=focus(place),
+            )
         result.append(one)
     return result
 
