@@ -15,7 +15,9 @@ from raytrace.studies.codesign.retrain import (
     effects,
     last_epochs,
     sensors_of,
+    settings_of_lens,
 )
+from raytrace.studies.codesign.settings import Settings
 from raytrace.studies.pictures import dead_leaves
 
 _LITTLE = "--depth 4 --width 4 --patch 16 --size 7 --epochs 3 --crops 2 --batch 4 --precision float32"
@@ -70,6 +72,12 @@ def test_only_seeds_that_both_lenses_have_are_compared():
 def test_the_last_two_epochs_of_a_log():
     assert last_epochs([9, 9, 5, 5, 1, 3], 3) == 3.5
     assert last_epochs([4, 6], 1) == 5
+
+
+def test_networks_see_all_light_at_the_sensor_as_it_is():
+    """Whatever chose the lens: a few rays, bounds that the sensor is beyond, a focal length held by a space."""
+    begun = Settings(vary="sensor thickness:2", bounds="sensor:57,57.5", hold="efl", rays=12, noise=0.05)
+    assert settings_of_lens(begun, 57.8, 3) == Settings(model="drt", start="57.8", seed=3, noise=0.05)
 
 
 def test_sensors_are_means_over_seeds(tmp_path):

@@ -58,6 +58,19 @@ def test_of_two_starts_the_better_one_is_compared_with_the_sensor_alone():
     assert (gaussian.model, drt.model) == ("gaussian", "drt")
 
 
+def test_all_light_says_where_the_sensor_is_best_within_its_bounds(lens, monkeypatch):
+    """Behind thicknesses that twelve rays chose; what is DRT's own optimum of the sensor is not sought again."""
+    sought = []
+    monkeypatch.setattr(module, "closed_form", lambda lens, settings, spectrum: sought.append(settings))
+    found = Optimum("drt", 57.8, 33.0, 20.0, 0.01, 0.01, lens=lens)
+    within = dataclasses.replace(SETTINGS, bounds=f"{SETTINGS.bounds} {BOX}", rays=12, model="gaussian")
+    module._refocused(found, within, None)
+    alone = Settings(model="drt", bounds="sensor:50,60")
+    module._refocused(found, dataclasses.replace(alone, rays=12), None)
+    assert sought == [alone, alone]
+    assert module._refocused(found, alone, None) is found
+
+
 @pytest.fixture
 def quick(command, monkeypatch):
     """The command with optima that cost nothing: the lens as the search begins."""
