@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 from raytrace.cli import main
 from raytrace.files import shipped, write_table
@@ -252,6 +253,33 @@ def test_the_command_writes_table_figure_and_page(quick, capsys):
     assert "the paraxial conjugate: Gaussian DRT focused nearer than paraxial in 0 of" in capsys.readouterr().out
     assert Path("docs/codesign_sweep.md").read_text(encoding="utf-8") == f"{text.rstrip()}\nBy hand.\n"
     assert KEPT in text
+
+
+def test_with_a_folder_all_optima_are_kept_those_of_resized_pictures_too(quick, monkeypatch, capsys):
+    command = ["codesign", "sweep", "double_gauss", "--limit", "2", "-o", "out", "--json"]
+    assert main(command) == 0
+    first = json.loads(capsys.readouterr().out)
+    monkeypatch.setattr(module, "closed_form", lambda *given: pytest.fail("sought again"))
+    assert main(command) == 0
+    assert json.loads(capsys.readouterr().out) == first
+    assert {one["scale"] for one in first["scales"]} == set(module.SCALES)
+
+
+def test_pictures_too_small_for_the_least_scale_are_refused_before_anything_is_sought(quick, monkeypatch, capsys):
+    """84 pixels of a patch and its margin, at 0.75 times the size: 111 are one too few."""
+    Path("pictures").mkdir()
+    for number, sample in enumerate(dead_leaves(2, size=111).samples):
+        Image.fromarray(sample).save(f"pictures/{number}.png")
+    instantly = module.closed_form
+    monkeypatch.setattr(module, "closed_form", lambda *given: pytest.fail("sought"))
+    command = ["codesign", "sweep", "double_gauss", "--data", "pictures", "-o", "out"]
+    assert main(command) == 1
+    said = capsys.readouterr().err
+    assert "none of 2 pictures has 112 × 112 pixels, a patch and its margin where pictures are made 0.75 times" in said
+    for number, sample in enumerate(dead_leaves(2, size=112).samples):
+        Image.fromarray(sample).save(f"pictures/{number}.png")
+    monkeypatch.setattr(module, "closed_form", instantly)
+    assert main(command) == 0
 
 
 def test_optima_are_kept_and_not_sought_again(quick, monkeypatch):
