@@ -10,7 +10,7 @@ from raytrace.camera.training import Run
 from raytrace.camera.variables import BadVariables, Variables, parse_bounds
 from raytrace.formats import read_lens
 from raytrace.optics.sequence import media
-from raytrace.studies.codesign.closed_form import camera_error, even_distances, power_spectrum
+from raytrace.studies.codesign.closed_form import camera_error, even_distances, optimise_closed_form, power_spectrum
 from raytrace.studies.codesign.experiment import camera, optimise
 from raytrace.studies.codesign.optima import closed_form
 from raytrace.studies.codesign.settings import Settings
@@ -139,6 +139,17 @@ def test_the_closed_form_holds_it_to_a_micrometre_within_all_bounds(lens):
         assert low - MICROMETRE <= found.variables[name] <= high + MICROMETRE
     assert {"thickness_5", "thickness_6"} <= set(found.at_end)
     assert found.no_optimum == ""
+
+
+def test_a_held_space_below_nothing_is_told_with_the_end_of_the_sensor(lens):
+    """It has no bounds of its own, while the sensor stands at an end of its bounds."""
+    bounds = "sensor:57,57.1 thickness_5:26.8,27"  # 26.68 mm is all the space about the stop
+    own = camera(lens, dataclasses.replace(SMALL, vary="sensor thickness:5,6", bounds=bounds, start="57.1"))
+    spectrum, distances = power_spectrum(dead_leaves(4, size=48), 22), even_distances(own, 5)
+    found = optimise_closed_form(own, spectrum, distances=distances)
+    assert {"sensor", "thickness_6"} <= set(found.at_end)
+    assert "no optimum inside sensor from 57 to 57.1, " in found.no_optimum
+    assert "thickness_6 from 0 to inf: the loss still falls at its end" in found.no_optimum
 
 
 def test_training_holds_it(lens, tmp_path):

@@ -194,7 +194,9 @@ def _no_optimum(camera: Camera, found: Descent, at_end: tuple[str, ...]) -> str:
     if found.is_flat:
         return "no optimum: where the search began, the loss does not change with the variables"
     if at_end and ("sensor" in at_end or len(at_end) == len(variables.names)):
-        ranges = (f"{name} from {low:g} to {high:g}" for name in at_end for low, high in [variables.bounds[name]])
+        # Without bounds of its own only a thickness that is solved for has an end.
+        bounds = [variables.bounds.get(name, (0.0, math.inf)) for name in at_end]
+        ranges = [f"{name} from {low:g} to {high:g}" for name, (low, high) in zip(at_end, bounds, strict=True)]
         return f"no optimum inside {', '.join(ranges)}: the loss still falls at its end"
     return out_of_focus(camera)
 
