@@ -11,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
+from raytrace.camera.training import DamagedRun
 from raytrace.cli import main
 from raytrace.files import shipped, write_table
 from raytrace.formats import read_lens
@@ -298,6 +299,26 @@ def test_optima_are_kept_and_not_sought_again(quick, monkeypatch):
     assert kept.path.read_text().splitlines(keepends=True) == lines
     assert len(sweep(None, SMALL, spectrum, kept=kept)) == len(first)
     assert len(sought) == 3
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ("[{", "Expecting property name"),
+        ("[{}]", "not enough values"),
+        ('[{"colour": 1}, {}]', "unexpected keyword argument 'colour'"),
+        ("[1, 2]", "'int' object has no attribute 'items'"),
+        ('[{"vary": {}}, {}]', "unhashable"),
+        ("\udcff", "can't decode byte 0xff"),
+    ],
+)
+def test_a_damaged_line_of_kept_optima_is_named(line, reason, tmp_path):
+    kept = Kept(tmp_path / "optima.jsonl")
+    kept.add(SMALL, {"error": 0.01})
+    with kept.path.open("a", encoding="utf-8", errors="surrogateescape") as file:
+        file.write(f"{line}\n")
+    with pytest.raises(DamagedRun, match=rf"optima.jsonl: line 2 holds no settings .*{reason}.*; delete it"):
+        kept.read()
 
 
 @pytest.mark.parametrize(
