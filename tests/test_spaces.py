@@ -118,6 +118,8 @@ def test_the_command_writes_table_and_page_and_goes_on(quick, monkeypatch):
         (["--box", "thickness_2:3"], "'thickness_2:3': expected a variable and its bounds"),
         (["--box", "thickness_5:13,15"], "bounds for thickness_5, not among the variables"),
         (["--model", "drt", "--box", BOX], "--model belongs to codesign LENS"),
+        (["--box", *BOX.split(), "--page", "codesign"], "--page codesign: the page or the table of another form"),
+        (["--box", *BOX.split(), "--page", "sweep"], "--page sweep: the page or the table of another form"),
     ],
 )
 def test_boxes_and_options_that_do_not_fit(quick, options, message):

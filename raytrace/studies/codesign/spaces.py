@@ -59,7 +59,7 @@ class Row(optima.Place):
 _FOUND = (*optima.COLUMNS, "refocused_mm", "error_refocused", "efl_mm", "at_bound", "variables")
 
 
-def columns(settings: Settings, rows: Sequence[Row]) -> tuple[str, ...]:
+def columns(rows: Sequence[Row]) -> tuple[str, ...]:
     """Columns of the table of all rows."""
     first = ("box", "hold", "model", "start", "error", "error_drt", "error_refocused", "efl_mm", "sensor_mm")
     own = dict.fromkeys(name for row in rows for name in row.document() if name.endswith("_mm") and name not in first)
