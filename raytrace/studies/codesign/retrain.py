@@ -17,11 +17,11 @@ from raytrace.camera.training import DamagedRun, Record, Run, read_json
 from raytrace.files import write_json
 from raytrace.studies.codesign.experiment import Progress, camera, held_out_error, optimise, usual
 from raytrace.studies.codesign.settings import NAMES, Settings
+from raytrace.studies.codesign.study import of_last_epochs
 from raytrace.studies.pictures import Pictures
 from raytrace.system.lens import Lens
 
 STEP = "retrain"
-LAST = 2  # epochs that are averaged beside the last iterate
 _CONFIDENCE = 0.95
 
 
@@ -133,7 +133,7 @@ def retrain(
 
 def last_epochs(values: Sequence[float], epochs: int) -> float:
     """Mean of a column of a log of so many epochs over the last two of them."""
-    return statistics.fmean(values[-min(LAST, epochs) * (len(values) // epochs) :])
+    return statistics.fmean(of_last_epochs(values, epochs))
 
 
 def retrained(folder: Path) -> Retrained | None:

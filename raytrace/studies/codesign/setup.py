@@ -26,6 +26,7 @@ from raytrace.shards import share
 from raytrace.studies.codesign.closed_form import power_spectrum
 from raytrace.studies.codesign.experiment import STEPS, Outcome, camera, lens_at_start, outcome, run_model, variables
 from raytrace.studies.codesign.settings import Settings
+from raytrace.studies.options import read
 from raytrace.studies.pictures import Pictures, dead_leaves, pictures, resized, split
 from raytrace.system.lens import Lens, check, field_points
 
@@ -167,6 +168,12 @@ def _agreed(choose: Callable[[], str]) -> str:
 def recorded(path: Path) -> dict:
     """A `settings.json`, empty if there is none."""
     return read_json(path) if path.exists() else {}
+
+
+def recorded_settings(path: Path) -> Settings:
+    """The settings in a `settings.json`; those that it does not have are as by default."""
+    known = {field.name for field in dataclasses.fields(Settings)}
+    return read(Settings, {name: value for name, value in recorded(path).items() if name in known})
 
 
 def _leaves(arguments: argparse.Namespace, least: int) -> Pictures:
