@@ -102,6 +102,20 @@ def test_the_command_writes_tables_and_page_and_goes_on(quick, monkeypatch):
     assert written["off_axis"].read_text() == before
 
 
+def test_times_are_of_one_thread(quick, monkeypatch):
+    """Of processor time, the sum over threads; behind it there are as many as before."""
+    threads, timed = [2], []
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads[-1])
+    monkeypatch.setattr(torch, "set_num_threads", threads.append)
+    monkeypatch.setattr(module, "_median_ms", lambda *given: timed.append(threads[-1]) or 1.0)
+    monkeypatch.setattr(module, "error_by_field", lambda own, *given: torch.zeros(own.fields.shape[1]))
+    monkeypatch.setattr(fields_page, "_energies", lambda *given: [])
+    code, _, err = quick("--field", "0", "9.8")
+    assert (code, threads, set(timed)) == (0, [2, 1, 2], {1}), err
+    assert "one thread; " in (page := Path("docs/codesign_off_axis.md").read_text(encoding="utf-8"))
+    assert "torch threads 1" in page
+
+
 def test_a_field_is_needed(quick):
     code, out, err = quick()
     assert (code, out, len(err.splitlines())) == (1, "", 1)

@@ -121,7 +121,10 @@ TIME_COLUMNS = ("model", "field", "milliseconds")
 
 
 def times(lens: Lens, settings: Settings, *, batch: int = 32) -> list[dict[str, float | str]]:
-    """Median processor time in ms of the PSFs of an equal part of a batch at each field, and of their derivatives."""
+    """Median processor time in ms of the PSFs of an equal part of a batch at each field, and of their derivatives.
+
+    In as many threads as torch has: processor time is the sum over them.
+    """
     count, rows = -(-batch // len(settings.fields)), []
     for model in MODELS:
         own = camera(lens, dataclasses.replace(settings, model=model))
