@@ -34,7 +34,7 @@ from raytrace.studies.codesign.sweep import (
     sweep,
 )
 from raytrace.studies.codesign.sweep_page import Sweep
-from raytrace.studies.codesign.sweep_parts import answers
+from raytrace.studies.codesign.sweep_parts import answers, beam
 from raytrace.studies.pictures import dead_leaves
 
 SMALL = Settings(depth=2, width=2, patch=16, size=7, crops=2)
@@ -191,6 +191,14 @@ def test_the_page_answers_and_keeps_what_was_written_below():
     assert "## Where the descent" not in yes
     elsewhere = [dataclasses.replace(one, downhill_mm=one.sensor_mm + 0.1 * (one.model == "drt")) for one in rows]
     assert "| F/4 | DRT | 57.7600 | 57.8600 | 50.0 |" in markdown(found_of(elsewhere).parts())
+
+
+@pytest.mark.parametrize(("distance", "told"), [(25e3, "25 m"), (4e3, "4 m"), (math.inf, "infinity")])
+def test_vignetting_is_of_the_beam_from_the_distance_of_focus(lens, distance, told):
+    settings = dataclasses.replace(SMALL, focus_distance=distance)
+    _, table, about = beam(dataclasses.replace(found_of([]).given, settings=settings, lens=lens))
+    assert about.startswith(f"Of the beam on the axis from {told}, by the semi-diameters")
+    assert "| F/1.6 |" in table
 
 
 def test_the_published_page_is_what_its_table_says():
