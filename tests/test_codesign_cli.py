@@ -276,6 +276,7 @@ def test_errors_are_one_line(run, pictures, options, message):
         ),
         (("compare", "double_gauss", "--model", "drt", "-o", "out"), "--model belongs to codesign LENS"),
         (("compare", "double_gauss", "--loss", "spectral", "-o", "out"), "--loss spectral belongs to codesign LENS"),
+        (("double_gauss", "--loss", "spectral", "--resume", "-o", "out"), "--resume belongs to training"),
         (("compare", "double_gauss", "--report-only", "-o", "out"), "out: no study was begun here"),
     ],
 )

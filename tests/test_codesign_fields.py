@@ -10,6 +10,7 @@ import torch
 
 from raytrace.pages import kept_of, markdown
 from raytrace.studies.codesign import fields as module
+from raytrace.studies.codesign import fields_page
 from raytrace.studies.codesign.closed_form import camera_error, even_distances, power_spectrum
 from raytrace.studies.codesign.experiment import camera
 from raytrace.studies.codesign.fields import Row, camera_at, cases, energies, error_by_field
@@ -52,12 +53,28 @@ def test_light_in_windows_is_that_of_smaller_windows_and_some_more(lens):
     assert smaller[0]["energy_nearest"] == pytest.approx(rows[1]["energy_nearest"], rel=1e-2)
 
 
+def test_a_few_rays_choose_a_lens_and_all_light_judges_it(lens, monkeypatch):
+    monkeypatch.setattr(module, "closed_form", instantly)
+    monkeypatch.setattr(module, "even_distances", lambda own, *given, **named: even_distances(own, 2))
+    monkeypatch.setattr(fields_page, "energies", lambda own, sizes, spread: energies(own, sizes)[0]["energy_nearest"])
+    spectrum = power_spectrum(dead_leaves(2, size=48), 24)
+    found = []
+    for rays in (None, 12):
+        settings = dataclasses.replace(SMALL, size=9, rays=rays, tol=0.1, model="drt")
+        row = Row("drt", 57.7, 33.0, 20.0, 0.01, 0.01, window=9, fields=settings.fields)
+        given = Experiment(lens, "double_gauss", settings, (), (), {}, "pictures")
+        found.append((module._found(lens, settings, spectrum)["by_field"], fields_page._energies(given, [row])))
+    assert found[0] == found[1]
+
+
+def instantly(lens, settings, spectrum):
+    """An optimum that costs nothing."""
+    return Optimum(settings.model, 57.7 + len(settings.model) / 1e3, 33.0, 20.0, 0.01, 0.012, downhill_mm=57.8)
+
+
 @pytest.fixture
 def quick(command, monkeypatch):
     """The command with optima that cost nothing, at two distances."""
-
-    def instantly(lens, settings, spectrum):
-        return Optimum(settings.model, 57.7 + len(settings.model) / 1e3, 33.0, 20.0, 0.01, 0.012, downhill_mm=57.8)
 
     monkeypatch.setattr(module, "closed_form", instantly)
     monkeypatch.setattr(module, "even_distances", lambda own, *given, **named: even_distances(own, 2))
@@ -83,6 +100,20 @@ def test_the_command_writes_tables_and_page_and_goes_on(quick, monkeypatch):
     monkeypatch.setattr(module, "closed_form", lambda *given: pytest.fail("sought again"))
     assert quick("--field", "0", "9.8")[0] == 0
     assert written["off_axis"].read_text() == before
+
+
+def test_times_are_of_one_thread(quick, monkeypatch):
+    """Of processor time, the sum over threads; behind it there are as many as before."""
+    threads, timed = [2], []
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads[-1])
+    monkeypatch.setattr(torch, "set_num_threads", threads.append)
+    monkeypatch.setattr(module, "_median_ms", lambda *given: timed.append(threads[-1]) or 1.0)
+    monkeypatch.setattr(module, "error_by_field", lambda own, *given: torch.zeros(own.fields.shape[1]))
+    monkeypatch.setattr(fields_page, "_energies", lambda *given: [])
+    code, _, err = quick("--field", "0", "9.8")
+    assert (code, threads, set(timed)) == (0, [2, 1, 2], {1}), err
+    assert "one thread; " in (page := Path("docs/codesign_off_axis.md").read_text(encoding="utf-8"))
+    assert "torch threads 1" in page
 
 
 def test_a_field_is_needed(quick):

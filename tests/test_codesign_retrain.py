@@ -10,12 +10,15 @@ import pytest
 from PIL import Image
 
 from raytrace.camera.training import DamagedRun
+from raytrace.studies.codesign import retrain_page
 from raytrace.studies.codesign.retrain import (
     Retrained,
     effects,
     last_epochs,
     sensors_of,
+    settings_of_lens,
 )
+from raytrace.studies.codesign.settings import Settings
 from raytrace.studies.pictures import dead_leaves
 
 _LITTLE = "--depth 4 --width 4 --patch 16 --size 7 --epochs 3 --crops 2 --batch 4 --precision float32"
@@ -72,6 +75,12 @@ def test_the_last_two_epochs_of_a_log():
     assert last_epochs([4, 6], 1) == 5
 
 
+def test_networks_see_all_light_at_the_sensor_as_it_is():
+    """Whatever chose the lens: a few rays, bounds that the sensor is beyond, a focal length held by a space."""
+    begun = Settings(vary="sensor thickness:2", bounds="sensor:57,57.5", hold="efl", rays=12, noise=0.05)
+    assert settings_of_lens(begun, 57.8, 3) == Settings(model="drt", start="57.8", seed=3, noise=0.05)
+
+
 def test_sensors_are_means_over_seeds(tmp_path):
     table = tmp_path / "table2.csv"
     table.write_text("model,seed,sensor_mm\ngaussian,0,57.5\nparaxial,0,57.8\ngaussian,1,57.7\n")
@@ -95,7 +104,8 @@ def test_the_command_trains_fresh_networks_on_frozen_lenses(retraining, tmp_path
     for number, sample in enumerate(dead_leaves(10, size=48).samples):
         Image.fromarray(sample).save(pictures / f"{number}.png")
     Path("table2.csv").write_text("model,seed,sensor_mm\nparaxial,0,57.77\ngaussian,0,57.57\n")
-    command = ("--sensors", "table2.csv", "--data", pictures, "-o", "fresh", "--docs", "docs", *SMALL)
+    told = ("--data", pictures, "-o", "fresh")
+    command = ("--sensors", "table2.csv", *told, "--docs", "docs", *SMALL)
     code, out, err = retraining(*command, "--seeds", "0", "1", "--page", "second", "--json")
     assert code == 0, err
     document = json.loads(out)
@@ -114,6 +124,13 @@ def test_the_command_trains_fresh_networks_on_frozen_lenses(retraining, tmp_path
     page = Path("docs/second_retrain.md").read_text(encoding="utf-8")
     assert "| lens of | loss | seeds | more than Gaussian DRT's | p |" in page
     assert "Unfinished" not in page
+    assert " --docs docs --seeds 0 1 --page second --" in page
+    code, out, err = retraining(*told, "--docs", "again", "--page", "second", "--report-only", "--json")
+    assert (code, json.loads(out)) == (0, document), err  # what was begun, by the settings that are kept
+    assert Path("again/second_retrain.md").read_text(encoding="utf-8") == page
+    code, out, err = retraining(*told, "--models", "paraxial", "--report-only")
+    assert code == 0, err
+    assert "-o FOLDER --docs docs --models paraxial --seeds 0 1 --" in Path("fresh/codesign_retrain.md").read_text()
     with Path("docs/second/retrain.csv").open(newline="") as file:
         assert len(list(csv.DictReader(file))) == 4
     with Path("docs/second/retrain_distance.csv").open(newline="") as file:
@@ -129,6 +146,24 @@ def test_the_command_trains_fresh_networks_on_frozen_lenses(retraining, tmp_path
     code, _, err = retraining(*command, "--seeds", "0")
     assert code == 1
     assert "fresh holds another run: sensors was" in err
+
+
+def test_a_report_of_no_study_leaves_the_page_that_is_there(retraining):
+    Path("table2.csv").write_text("model,seed,sensor_mm\nparaxial,0,57.77\n")
+    told = ("--docs", "docs", "--report-only", "--limit", "10", *SMALL)
+    code, out, err = retraining("--sensors", "table2.csv", "-o", "fersh", *told)
+    assert (code, out, err) == (1, "", "raytrace: error: fersh: no study was begun here\n")
+    assert not Path("docs").exists()
+    assert not Path("fersh").exists()
+
+
+def test_lenses_that_are_not_in_the_table_are_named(retraining, monkeypatch):
+    monkeypatch.setattr(retrain_page, "_train", lambda *given: pytest.fail("trained"))
+    Path("table2.csv").write_text("model,seed,sensor_mm\nparaxial,0,57.77\ngaussian,0,57.57\n")
+    models = ("--models", "paraxial", "drt", "fourier")
+    code, _, err = retraining("--sensors", "table2.csv", "-o", "fresh", *models, "--limit", "10")
+    assert code == 1
+    assert err == "raytrace: error: table2.csv: no lens of drt, fourier; --models of paraxial, gaussian\n"
 
 
 def test_without_a_table_of_lenses_it_says_what_is_missing(retraining):

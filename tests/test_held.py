@@ -8,7 +8,9 @@ from problems import focal_length
 
 from raytrace.camera.training import Run
 from raytrace.camera.variables import BadVariables, Variables, parse_bounds
-from raytrace.studies.codesign.closed_form import camera_error, even_distances, power_spectrum
+from raytrace.formats import read_lens
+from raytrace.optics.sequence import media
+from raytrace.studies.codesign.closed_form import camera_error, even_distances, optimise_closed_form, power_spectrum
 from raytrace.studies.codesign.experiment import camera, optimise
 from raytrace.studies.codesign.optima import closed_form
 from raytrace.studies.codesign.settings import Settings
@@ -73,12 +75,34 @@ def test_derivatives_through_what_is_solved_for(lens):
     assert float(slope) == pytest.approx((either_side[0] - either_side[1]) / 2e-3, rel=1e-4)
 
 
+def test_a_lens_that_is_afocal_without_the_number_has_finite_derivatives():
+    """A plano-convex singlet: with thin glass 1/f = (n - 1)(c₂ - c₃), so that c₃ follows c₂ one to one."""
+    lens = read_lens("singlet")
+    variables = Variables(lens, "thickness:2 curvature:2,3", hold="efl")
+    assert variables.held.by.name == "curvature_3"
+    assert variables.numbers()["curvature_3"] == pytest.approx(float(lens.surfaces[3].curvature), rel=1e-12)
+    found = variables().surfaces[3].curvature
+    thicker, bent = torch.autograd.grad(found, [variables.thickness_2, variables.curvature_2])
+    assert float(thicker) == 0  # the power of the first surface is none
+    number = next(one for one in variables.variables if one.name == "curvature_2")
+    gap = 5.0 / float(media(lens, lens.wavelengths[lens.primary_wavelength])[2])
+    power = 1 / focal_length(lens)
+    assert float(bent) / number.unit == pytest.approx(1 - gap * power, rel=1e-9)  # φ₂ + φ₃ - (t/n) φ₂ φ₃ = φ
+
+
+def test_a_diverging_lens_is_held(lens):
+    variables = Variables(lens, "curvature:10", hold="efl=-200")
+    assert focal_length(variables()) == pytest.approx(-200, rel=1e-12)
+
+
 @pytest.mark.parametrize(
     ("vary", "hold", "bounds", "message"),
     [
         ("sensor", "efl", {}, "none of the variables changes the focal length; vary a thickness or a curvature"),
         (SPACES, "f_number=3", {}, "hold 'f_number=3': expected efl, the focal length of the file, or one in mm"),
         (SPACES, "efl=x", {}, "hold 'efl=x': expected efl"),
+        (SPACES, "efl=0", {}, "hold 'efl=0': expected efl, the focal length of the file, or one in mm"),
+        (SPACES, "efl=1e400", {}, "hold 'efl=1e400': expected efl"),
         (SPACES, "efl=80", {}, "hold 'efl=80': thickness_6 would be -"),
         (
             SPACES,
@@ -115,6 +139,17 @@ def test_the_closed_form_holds_it_to_a_micrometre_within_all_bounds(lens):
         assert low - MICROMETRE <= found.variables[name] <= high + MICROMETRE
     assert {"thickness_5", "thickness_6"} <= set(found.at_end)
     assert found.no_optimum == ""
+
+
+def test_a_held_space_below_nothing_is_told_with_the_end_of_the_sensor(lens):
+    """It has no bounds of its own, while the sensor stands at an end of its bounds."""
+    bounds = "sensor:57,57.1 thickness_5:26.8,27"  # 26.68 mm is all the space about the stop
+    own = camera(lens, dataclasses.replace(SMALL, vary="sensor thickness:5,6", bounds=bounds, start="57.1"))
+    spectrum, distances = power_spectrum(dead_leaves(4, size=48), 22), even_distances(own, 5)
+    found = optimise_closed_form(own, spectrum, distances=distances)
+    assert {"sensor", "thickness_6"} <= set(found.at_end)
+    assert "no optimum inside sensor from 57 to 57.1, " in found.no_optimum
+    assert "thickness_6 from 0 to inf: the loss still falls at its end" in found.no_optimum
 
 
 def test_training_holds_it(lens, tmp_path):

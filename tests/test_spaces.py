@@ -58,6 +58,19 @@ def test_of_two_starts_the_better_one_is_compared_with_the_sensor_alone():
     assert (gaussian.model, drt.model) == ("gaussian", "drt")
 
 
+def test_all_light_says_where_the_sensor_is_best_within_its_bounds(lens, monkeypatch):
+    """Behind thicknesses that twelve rays chose; what is DRT's own optimum of the sensor is not sought again."""
+    sought = []
+    monkeypatch.setattr(module, "closed_form", lambda lens, settings, spectrum: sought.append(settings))
+    found = Optimum("drt", 57.8, 33.0, 20.0, 0.01, 0.01, lens=lens)
+    within = dataclasses.replace(SETTINGS, bounds=f"{SETTINGS.bounds} {BOX}", rays=12, model="gaussian")
+    module._refocused(found, within, None)
+    alone = Settings(model="drt", bounds="sensor:50,60")
+    module._refocused(found, dataclasses.replace(alone, rays=12), None)
+    assert sought == [alone, alone]
+    assert module._refocused(found, alone, None) is found
+
+
 @pytest.fixture
 def quick(command, monkeypatch):
     """The command with optima that cost nothing: the lens as the search begins."""
@@ -105,6 +118,8 @@ def test_the_command_writes_table_and_page_and_goes_on(quick, monkeypatch):
         (["--box", "thickness_2:3"], "'thickness_2:3': expected a variable and its bounds"),
         (["--box", "thickness_5:13,15"], "bounds for thickness_5, not among the variables"),
         (["--model", "drt", "--box", BOX], "--model belongs to codesign LENS"),
+        (["--box", *BOX.split(), "--page", "codesign"], "--page codesign: the page or the table of another form"),
+        (["--box", *BOX.split(), "--page", "sweep"], "--page sweep: the page or the table of another form"),
     ],
 )
 def test_boxes_and_options_that_do_not_fit(quick, options, message):

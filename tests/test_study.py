@@ -192,6 +192,19 @@ def test_gains_at_distances_are_those_over_the_better_of_both():
     assert f"{100 * (0.0524 / 0.040 - 1):+.1f} % at 50 m" in claims(found, ())[everywhere].figures
 
 
+def test_a_claim_that_is_not_answered_says_why():
+    """Not by a run that is missing where all have ended, but more than the sensor varied, or at other distances."""
+    told = {one.text: one for one in claims(paper(), TIMES, dataclasses.replace(SEEN, settled={}))}
+    early, near = (told[number_of(text)] for text in ("The focus is near", "All lose less at 10 m"))
+    assert (early.holds, early.figures) == (None, "told where the sensor alone varies")
+    assert (near.holds, near.figures) == (None, "no losses at 10 and 15 m")
+    nothing = {one.text: one for one in claims([], (), SEEN)}
+    assert nothing[number_of("Paraxial and Fourier optics agree")].figures == "no finished run of paraxial"
+    fewer = dataclasses.replace(SEEN, settled={"paraxial": 0.3})
+    runs = {one.text: one for one in claims(paper()[:2], TIMES, fewer)}
+    assert runs[number_of("The focus is near")].figures == "no finished run of fourier"
+
+
 def test_what_a_course_is_settled_after():
     assert settled([25.0, 30.0, 33.0, 34.0, 34.5]) == 0.4
     assert settled([34.0, 34.0]) == 0
@@ -388,6 +401,8 @@ def test_the_page_names_settings_that_are_not_usual():
     begun = dataclasses.replace(report.settings, start="spectral", rho=0.3, bounds="sensor:57,58")
     page_of_begun = markdown(dataclasses.replace(report, settings=begun).parts())
     assert "from the optimum of the closed form" in page_of_begun
+    gaussian = markdown(dataclasses.replace(report, settings=dataclasses.replace(begun, start="gaussian")).parts())
+    assert "from the optimum of the closed form of Gaussian DRT. " in gaussian
     assert "--start spectral" in page_of_begun
     assert "--rho 0.3" in page_of_begun
     assert "--bounds sensor:57,58" in page_of_begun

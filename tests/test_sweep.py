@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
+from raytrace.camera.training import DamagedRun
 from raytrace.cli import main
 from raytrace.files import shipped, write_table
 from raytrace.formats import read_lens
@@ -32,7 +34,7 @@ from raytrace.studies.codesign.sweep import (
     sweep,
 )
 from raytrace.studies.codesign.sweep_page import Sweep
-from raytrace.studies.codesign.sweep_parts import answers
+from raytrace.studies.codesign.sweep_parts import answers, beam
 from raytrace.studies.pictures import dead_leaves
 
 SMALL = Settings(depth=2, width=2, patch=16, size=7, crops=2)
@@ -191,6 +193,14 @@ def test_the_page_answers_and_keeps_what_was_written_below():
     assert "| F/4 | DRT | 57.7600 | 57.8600 | 50.0 |" in markdown(found_of(elsewhere).parts())
 
 
+@pytest.mark.parametrize(("distance", "told"), [(25e3, "25 m"), (4e3, "4 m"), (math.inf, "infinity")])
+def test_vignetting_is_of_the_beam_from_the_distance_of_focus(lens, distance, told):
+    settings = dataclasses.replace(SMALL, focus_distance=distance)
+    _, table, about = beam(dataclasses.replace(found_of([]).given, settings=settings, lens=lens))
+    assert about.startswith(f"Of the beam on the axis from {told}, by the semi-diameters")
+    assert "| F/1.6 |" in table
+
+
 def test_the_published_page_is_what_its_table_says():
     """Above the mark to the letter, from the rows of sweep.csv."""
     docs = Path(__file__).parents[1] / "docs"
@@ -254,6 +264,33 @@ def test_the_command_writes_table_figure_and_page(quick, capsys):
     assert KEPT in text
 
 
+def test_with_a_folder_all_optima_are_kept_those_of_resized_pictures_too(quick, monkeypatch, capsys):
+    command = ["codesign", "sweep", "double_gauss", "--limit", "2", "-o", "out", "--json"]
+    assert main(command) == 0
+    first = json.loads(capsys.readouterr().out)
+    monkeypatch.setattr(module, "closed_form", lambda *given: pytest.fail("sought again"))
+    assert main(command) == 0
+    assert json.loads(capsys.readouterr().out) == first
+    assert {one["scale"] for one in first["scales"]} == set(module.SCALES)
+
+
+def test_pictures_too_small_for_the_least_scale_are_refused_before_anything_is_sought(quick, monkeypatch, capsys):
+    """84 pixels of a patch and its margin, at 0.75 times the size: 111 are one too few."""
+    Path("pictures").mkdir()
+    for number, sample in enumerate(dead_leaves(2, size=111).samples):
+        Image.fromarray(sample).save(f"pictures/{number}.png")
+    instantly = module.closed_form
+    monkeypatch.setattr(module, "closed_form", lambda *given: pytest.fail("sought"))
+    command = ["codesign", "sweep", "double_gauss", "--data", "pictures", "-o", "out"]
+    assert main(command) == 1
+    said = capsys.readouterr().err
+    assert "none of 2 pictures has 112 × 112 pixels, a patch and its margin where pictures are made 0.75 times" in said
+    for number, sample in enumerate(dead_leaves(2, size=112).samples):
+        Image.fromarray(sample).save(f"pictures/{number}.png")
+    monkeypatch.setattr(module, "closed_form", instantly)
+    assert main(command) == 0
+
+
 def test_optima_are_kept_and_not_sought_again(quick, monkeypatch):
     """A sweep that was stopped in the middle of a line goes on behind the one before; ∞ is read as it was."""
     kept, spectrum = Kept(Path("optima.jsonl")), torch.ones(22, 22, dtype=torch.float64)
@@ -270,6 +307,26 @@ def test_optima_are_kept_and_not_sought_again(quick, monkeypatch):
     assert kept.path.read_text().splitlines(keepends=True) == lines
     assert len(sweep(None, SMALL, spectrum, kept=kept)) == len(first)
     assert len(sought) == 3
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ("[{", "Expecting property name"),
+        ("[{}]", "not enough values"),
+        ('[{"colour": 1}, {}]', "unexpected keyword argument 'colour'"),
+        ("[1, 2]", "'int' object has no attribute 'items'"),
+        ('[{"vary": {}}, {}]', "unhashable"),
+        ("\udcff", "can't decode byte 0xff"),
+    ],
+)
+def test_a_damaged_line_of_kept_optima_is_named(line, reason, tmp_path):
+    kept = Kept(tmp_path / "optima.jsonl")
+    kept.add(SMALL, {"error": 0.01})
+    with kept.path.open("a", encoding="utf-8", errors="surrogateescape") as file:
+        file.write(f"{line}\n")
+    with pytest.raises(DamagedRun, match=rf"optima.jsonl: line 2 holds no settings .*{reason}.*; delete it"):
+        kept.read()
 
 
 @pytest.mark.parametrize(

@@ -18,9 +18,6 @@ from raytrace.system.lens import Lens
 from raytrace.system.naming import parse_range
 from raytrace.words import did_you_mean
 
-#: Rows that hold for all rows below them.
-_SETTING = ("CONF", "PRIM")
-
 
 @dataclass(frozen=True)
 class Merit:

@@ -81,9 +81,15 @@ def claims(found: Sequence[Outcome], times: Sequence[StepTime], seen: Seen = _NO
     return [_answered(evidence, *row) for row in CLAIMS]
 
 
+class _Untold(LookupError):
+    """Why a claim cannot be answered, in words."""
+
+
 def _answered(evidence: Evidence, text: str, criterion: str, judge: Callable[[Evidence], tuple[bool, str]]) -> Claim:
     try:
         return Claim(text, criterion, *judge(evidence))
+    except _Untold as why:
+        return Claim(text, criterion, None, str(why))
     except KeyError as missing:
         return Claim(text, criterion, None, f"no finished run of {missing.args[0]}")
 
@@ -204,13 +210,15 @@ def _less_at_10_than_15_m(given: Evidence) -> tuple[bool, str]:
     distances, losses = losses_by_distance(given.runs)
     near, next_one = (distances.index(z) if z in distances else None for z in (10e3, 15e3))
     if near is None or next_one is None:
-        raise KeyError("the losses at 10 and 15 m")
+        raise _Untold("no losses at 10 and 15 m")
     of = {model: [statistics.fmean(column) for column in zip(*losses[model], strict=True)] for model in PAPER}
     told = "; ".join(f"{NAMES[model]} {of[model][near]:.4f} and {of[model][next_one]:.4f}" for model in PAPER)
     return all(of[model][near] < of[model][next_one] for model in PAPER), told
 
 
 def _settled(given: Evidence) -> tuple[bool, str]:
+    if given.runs and not given.seen.settled:
+        raise _Untold("told where the sensor alone varies")
     found = {model: given.seen.settled[model] for model in PAPER}
     return max(found.values()) <= 0.5, ", ".join(f"{NAMES[model]} after {part:.0%}" for model, part in found.items())
 

@@ -3,7 +3,7 @@
 import copy
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -50,17 +50,6 @@ def spectrum_rows(spectrum: Tensor) -> list[dict[str, float]]:
     mean = ((mean + across) / 2).tolist()
     half = len(mean) // 2 + 1
     return [{"row": i, "column": j, "power": mean[i][j]} for i in range(half) for j in range(i, half)]
-
-
-def spectrum_of_rows(rows: Sequence[Mapping[str, float]], size: int) -> Tensor:
-    """The spectrum (size, size) of such a table."""
-    place = torch.arange(size)
-    place = torch.minimum(place, size - place)
-    quarter = torch.zeros(size // 2 + 1, size // 2 + 1, dtype=torch.float64)
-    for one in rows:
-        i, j = int(one["row"]), int(one["column"])
-        quarter[i, j] = quarter[j, i] = float(one["power"])
-    return quarter[place[:, None], place]
 
 
 def camera_error(camera: Camera, spectrum: Tensor, distances: Tensor) -> Tensor:
@@ -194,7 +183,9 @@ def _no_optimum(camera: Camera, found: Descent, at_end: tuple[str, ...]) -> str:
     if found.is_flat:
         return "no optimum: where the search began, the loss does not change with the variables"
     if at_end and ("sensor" in at_end or len(at_end) == len(variables.names)):
-        ranges = (f"{name} from {low:g} to {high:g}" for name in at_end for low, high in [variables.bounds[name]])
+        # Without bounds of its own only a thickness that is solved for has an end.
+        bounds = [variables.bounds.get(name, (0.0, math.inf)) for name in at_end]
+        ranges = [f"{name} from {low:g} to {high:g}" for name, (low, high) in zip(at_end, bounds, strict=True)]
         return f"no optimum inside {', '.join(ranges)}: the loss still falls at its end"
     return out_of_focus(camera)
 

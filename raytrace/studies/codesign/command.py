@@ -136,7 +136,8 @@ def _compare(group) -> None:
         "--page",
         metavar="NAME",
         type=file_name,
-        help="NAME.md and NAME/ there, for a second study (default codesign, of spaces codesign_air_spaces)",
+        help="of a second study there: NAME.md (of retrain NAME_retrain.md) and NAME/ (default codesign); of spaces "
+        "NAME.md, its table in codesign/ (default codesign_air_spaces)",
     )
     group.add_argument("--report-only", action="store_true", help="train nothing, write what the runs say so far")
 
@@ -161,6 +162,8 @@ def run(arguments: argparse.Namespace) -> None:
         raise CommandError(
             "--loss spectral belongs to codesign LENS; compare, sweep, spaces and fields use the closed form anyway"
         )
+    if arguments.resume and arguments.loss == "spectral":
+        raise CommandError("--resume belongs to training: --loss spectral is done at once, leave one of both out")
     module, name = _FORMS[form]
     if arguments.loss == "spectral":
         name = "spectral"

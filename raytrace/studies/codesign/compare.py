@@ -19,18 +19,17 @@ from raytrace.studies.codesign.claims import Seen, is_of_paper
 from raytrace.studies.codesign.closed_form import even_distances, scan
 from raytrace.studies.codesign.experiment import STEPS, Outcome, batch, camera, lens_at_start, outcome, usual
 from raytrace.studies.codesign.page import CAPTIONS, Report
-from raytrace.studies.codesign.settings import AFTER_PARAXIAL, MODELS, NAMES, Settings
+from raytrace.studies.codesign.settings import AFTER_PARAXIAL, MODELS, NAMES
 from raytrace.studies.codesign.setup import (
     Experiment,
     conjugates,
     experiment,
     focus_of,
-    recorded,
+    recorded_settings,
     refuse_too_few,
     settings_of,
     train_run,
 )
-from raytrace.studies.options import read
 from raytrace.studies.pictures import dead_leaves
 from raytrace.studies.publish import publish
 
@@ -43,7 +42,7 @@ def compare(arguments: argparse.Namespace) -> None:
     begun = study / "settings.json"
     if (arguments.resume or arguments.report_only) and not begun.exists():
         raise CommandError(f"{study}: no study was begun here")
-    given = experiment(arguments, _recorded_settings(begun) if arguments.report_only else settings_of(arguments, begun))
+    given = experiment(arguments, recorded_settings(begun) if arguments.report_only else settings_of(arguments, begun))
     refuse_too_few(given)
     common = {k: v for k, v in dataclasses.asdict(given.settings).items() if k not in ("model", "seed")}
     Run(
@@ -64,14 +63,9 @@ def compare(arguments: argparse.Namespace) -> None:
         raise CommandError("no model has an optimum; see the warnings, and choose other --near, --far, --bounds")
 
 
-def _recorded_settings(path: Path) -> Settings:
-    known = {field.name for field in dataclasses.fields(Settings)}
-    return read(Settings, {key: value for key, value in recorded(path).items() if key in known})
-
-
 def _asked(arguments: argparse.Namespace, study: Path) -> tuple[list[str], list[int]]:
     """Models, in the order of the table, and seeds: those asked for; for a mere report those that were begun."""
-    begun = [(row, int(path.name[len(row) + 1 :])) for row in NAMES for path in study.glob(f"{row}-[0-9]*")]
+    begun = runs.begun(study)
     usual_models, usual_seeds = list(MODELS), [0, 1, 2]
     if arguments.report_only and begun:
         usual_models, usual_seeds = [row for row, _ in begun], sorted({seed for _, seed in begun})

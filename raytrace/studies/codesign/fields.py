@@ -78,7 +78,7 @@ def fields(
 
 def _found(lens: Lens, settings: Settings, spectrum: Tensor) -> dict:
     found = closed_form(lens, settings, spectrum)
-    own = camera_at(lens, found.sensor_mm, dataclasses.replace(settings, model="drt"))
+    own = camera_at(lens, found.sensor_mm, dataclasses.replace(settings, model="drt", rays=None))
     by_field = error_by_field(own, spectrum, even_distances(own, spread=settings.spread))
     return {**{name: getattr(found, name) for name in optima.COLUMNS}, "by_field": by_field.tolist()}
 
@@ -121,7 +121,10 @@ TIME_COLUMNS = ("model", "field", "milliseconds")
 
 
 def times(lens: Lens, settings: Settings, *, batch: int = 32) -> list[dict[str, float | str]]:
-    """Median processor time in ms of the PSFs of an equal part of a batch at each field, and of their derivatives."""
+    """Median processor time in ms of the PSFs of an equal part of a batch at each field, and of their derivatives.
+
+    In as many threads as torch has: processor time is the sum over them.
+    """
     count, rows = -(-batch // len(settings.fields)), []
     for model in MODELS:
         own = camera(lens, dataclasses.replace(settings, model=model))

@@ -1,9 +1,12 @@
 """What the field does to the choice of a lens: optima over fields, as text, document, tables and page."""
 
 import argparse
+import contextlib
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+
+import torch
 
 from raytrace.camera.training import Run, share
 from raytrace.cli.door import CommandError, say
@@ -168,7 +171,9 @@ def fields(arguments: argparse.Namespace) -> None:
     )
     if share().rank:
         return  # the first process writes
-    found = Fields(rows, _energies(given, rows), times(given.lens, settings), given, machine())
+    with _one_thread():
+        taken, about = times(given.lens, settings), machine()
+    found = Fields(rows, _energies(given, rows), taken, given, about)
     documents = [row.document() for row in rows]
     names = (*COLUMNS, *(name for name in documents[0] if name.startswith("error_drt_at_")))
     tables = {
@@ -184,9 +189,20 @@ def fields(arguments: argparse.Namespace) -> None:
             say(f"warning: {row.window} pixels, {_fields(row.fields)}, {row.model}: {row.no_optimum}")
 
 
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """One thread of torch for a while: processor time is the sum over threads."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
 def _energies(given: Experiment, rows: Sequence[Row]) -> list[dict[str, float]]:
     """In windows from the usual size to that of the settings, at DRT's optimum."""
-    settings = dataclasses.replace(given.settings, model="drt", normalise="energy")
+    settings = dataclasses.replace(given.settings, model="drt", rays=None, normalise="energy")
     (drt,) = (row for row in rows if row.model == "drt" and _place(row) == (settings.size, settings.fields))
     sizes = [*range(min(21, settings.size), settings.size, 10), settings.size]
     return energies(camera_at(given.lens, drt.sensor_mm, settings), sizes, spread=settings.spread)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol, TypeVar
 
+from raytrace.camera.training import DamagedRun
 from raytrace.maths.result import plain
 from raytrace.studies.codesign.settings import Settings
 from raytrace.studies.options import read
@@ -20,9 +21,16 @@ class Kept:
     path: Path
 
     def read(self) -> dict[Settings, dict]:
-        lines = self.path.read_text(encoding="utf-8").split("\n")[:-1] if self.path.exists() else []
-        pairs = map(json.loads, lines)
-        return {read(Settings, settings): _numbers(optimum) for settings, optimum in pairs}
+        """All optima that are whole. Raises DamagedRun."""
+        lines, found = self.path.read_bytes().split(b"\n")[:-1] if self.path.exists() else [], {}
+        for number, line in enumerate(lines, 1):
+            try:
+                settings, optimum = json.loads(line)
+                found[read(Settings, settings)] = _numbers(optimum)
+            except (ValueError, TypeError, AttributeError, RecursionError) as error:
+                words = f"line {number} holds no settings and their optimum ({error})"
+                raise DamagedRun(f"{self.path}: {words}; delete it, and that one is sought anew") from error
+        return found
 
     def add(self, settings: Settings, optimum: dict) -> None:
         """Write one more, behind what is whole."""

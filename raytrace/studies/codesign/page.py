@@ -9,7 +9,7 @@ from raytrace.pages import grid, picture, shown
 from raytrace.studies.codesign.claims import Claim, Seen, claims, penalty, percent
 from raytrace.studies.codesign.experiment import Outcome
 from raytrace.studies.codesign.optima import Optimum
-from raytrace.studies.codesign.settings import NAMES, Settings
+from raytrace.studies.codesign.settings import GAUSSIAN, NAMES, Settings
 from raytrace.studies.codesign.study import PAPER, StepTime, Summary, rows, summaries
 
 #: Figures of the page, by file name: what each shows.
@@ -123,6 +123,7 @@ def _experiment(report: Report) -> str:
         "paraxial": f"the paraxial image of {s.focus_distance / 1e3:g} m",
         "rms": f"the least RMS spot of an object at {s.focus_distance / 1e3:g} m",
         "spectral": "the optimum of the closed form",
+        GAUSSIAN: "the optimum of the closed form of Gaussian DRT",
     }.get(s.start, f"{s.start} mm")
     where = "the axis" if s.fields == (0.0,) else f"the fields {_listed(s.fields)}"
     weights = f" weighted {_listed(s.wavelength_weights)}" if len(s.wavelengths) > 1 else ""

@@ -22,10 +22,10 @@ _BLUR = 0.25  # of a ray of `drt`, half width in pixels: what makes it different
 
 
 def points(sampling: str, count: int, *, seed: int = 0) -> Tensor:
-    """Pupil points (2, P): `count` of "sobol" or "random", or the least whole rings of "hexapolar" with as many."""
+    """Pupil points (2, P): `count` of "sobol", or the least whole rings of "hexapolar" with as many."""
     if sampling == "hexapolar":
         return pupil.hexapolar(next(n for n in itertools.count(1) if 1 + 3 * n * (n + 1) >= count))[0]
-    return {"sobol": pupil.sobol, "random": pupil.random}[sampling](count, seed=seed)[0]
+    return pupil.sobol(count, seed=seed)[0]
 
 
 class PlainRays(Camera):

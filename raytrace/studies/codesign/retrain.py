@@ -17,11 +17,11 @@ from raytrace.camera.training import DamagedRun, Record, Run, read_json
 from raytrace.files import write_json
 from raytrace.studies.codesign.experiment import Progress, camera, held_out_error, optimise, usual
 from raytrace.studies.codesign.settings import NAMES, Settings
+from raytrace.studies.codesign.study import of_last_epochs
 from raytrace.studies.pictures import Pictures
 from raytrace.system.lens import Lens
 
 STEP = "retrain"
-LAST = 2  # epochs that are averaged beside the last iterate
 _CONFIDENCE = 0.95
 
 
@@ -89,8 +89,9 @@ def sensors_of(path: str | Path) -> dict[str, float]:
 
 
 def settings_of_lens(settings: Settings, sensor: float, seed: int) -> Settings:
-    """Settings of one network: DRT PSFs, the sensor held."""
-    return dataclasses.replace(settings, model="drt", vary="sensor", start=repr(sensor), seed=seed)
+    """Settings of one network: DRT PSFs of all light, the sensor held wherever it is, whatever chose the lens."""
+    whole = dataclasses.replace(settings, model="drt", rays=None, vary="sensor", bounds="", hold="")
+    return dataclasses.replace(whole, start=repr(sensor), seed=seed)
 
 
 def retrain(
@@ -132,7 +133,7 @@ def retrain(
 
 def last_epochs(values: Sequence[float], epochs: int) -> float:
     """Mean of a column of a log of so many epochs over the last two of them."""
-    return statistics.fmean(values[-min(LAST, epochs) * (len(values) // epochs) :])
+    return statistics.fmean(of_last_epochs(values, epochs))
 
 
 def retrained(folder: Path) -> Retrained | None:

@@ -2,7 +2,7 @@
 
 import argparse
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from raytrace.camera.training import Run, share
@@ -28,7 +28,16 @@ from raytrace.studies.codesign.retrain import (
     settings_of_lens,
 )
 from raytrace.studies.codesign.settings import NAMES, Settings
-from raytrace.studies.codesign.setup import Experiment, experiment, follow, refuse_too_few, settings_of
+from raytrace.studies.codesign.setup import (
+    Experiment,
+    experiment,
+    follow,
+    recorded,
+    recorded_settings,
+    refuse_too_few,
+    settings_of,
+)
+from raytrace.studies.codesign.study import begun as begun_runs
 from raytrace.studies.publish import publish
 
 _SEEDS = (0, 1, 2, 3, 4)
@@ -82,7 +91,7 @@ class Footing(Result):
     def parts(self, folder: str) -> list[str]:
         """The page, whose table is in the folder."""
         s, begun = self.given.settings, f"{len(self.found)} of {len(self.found) + len(self.missing)}"
-        words = " ".join([*([] if folder == "codesign" else [f"--page {folder}"]), *s.words()])
+        words = " ".join([*self._asked(), *([] if folder == "codesign" else [f"--page {folder}"]), *s.words()])
         aperture = "the file's aperture" if s.f_number is None else f"F/{s.f_number:g}"
         return [
             "# Co-design: the lenses on an equal footing",
@@ -101,6 +110,14 @@ class Footing(Result):
             "## Over object distance",
             _by_distance(self.effects_by_distance, folder),
         ]
+
+    def _asked(self) -> list[str]:
+        """Lenses and seeds as options of the command, where they are not all of the table and the usual ones."""
+        every = [*((one.model, one.seed) for one in self.found), *self.missing]
+        models, seeds = {model for model, _ in every}, sorted({seed for _, seed in every})
+        chosen = [model for model in self.sensors if model in models]
+        found = [] if len(chosen) == len(self.sensors) else [f"--models {' '.join(chosen)}"]
+        return found if tuple(seeds) == _SEEDS else [*found, f"--seeds {' '.join(map(str, seeds))}"]
 
 
 def _losses(given: Footing) -> str:
@@ -159,14 +176,18 @@ def _by_distance(found: Sequence[Effect], folder: str) -> str:
 
 def retrain_all(arguments: argparse.Namespace) -> None:
     """Train what is missing, seed by seed, then write table and page from what is there."""
-    if not (arguments.folder and arguments.sensors):
+    if not (arguments.folder and (arguments.sensors or arguments.report_only)):
         raise CommandError("give the table of the lenses, --sensors table2.csv, and a folder for the runs, -o FOLDER")
-    study, sensors = Path(arguments.folder), sensors_of(arguments.sensors)
-    given = experiment(arguments, settings_of(arguments, study / "settings.json"))
+    study = Path(arguments.folder)
+    begun = study / "settings.json"
+    if arguments.report_only and "sensors" not in recorded(begun):
+        raise CommandError(f"{study}: no study was begun here")
+    sensors = sensors_of(arguments.sensors) if arguments.sensors else recorded(begun)["sensors"]
+    models, seeds = _asked(arguments, study, sensors)
+    given = experiment(arguments, recorded_settings(begun) if arguments.report_only else settings_of(arguments, begun))
     refuse_too_few(given)
     common = {k: v for k, v in dataclasses.asdict(given.settings).items() if k not in ("model", "seed", "start")}
     Run(study, {**common, **given.about, "sensors": sensors}, usual=usual(given.settings))
-    models, seeds = [m for m in sensors if m in (arguments.models or sensors)], arguments.seeds or _SEEDS
     asked = [(row, seed) for seed in seeds for row in models]
     for number, (row, seed) in enumerate(asked if not arguments.report_only else (), 1):
         own = settings_of_lens(given.settings, sensors[row], seed)
@@ -184,6 +205,22 @@ def retrain_all(arguments: argparse.Namespace) -> None:
     }
     publish(page, folder, footing.parts(folder), tables=tables, figures={})
     present(footing, arguments)
+
+
+def _asked(
+    arguments: argparse.Namespace, study: Path, sensors: Mapping[str, float]
+) -> tuple[Sequence[str], Sequence[int]]:
+    """Lenses, in the order of the table, and seeds: those asked for; for a mere report those that were begun."""
+    unknown = [model for model in arguments.models or () if model not in sensors]
+    if unknown:
+        raise CommandError(
+            f"{arguments.sensors or study}: no lens of {', '.join(unknown)}; --models of {', '.join(sensors)}"
+        )
+    usual_models, usual_seeds = list(sensors), list(_SEEDS)
+    if arguments.report_only and (runs := [(row, seed) for row, seed in begun_runs(study) if row in sensors]):
+        usual_models, usual_seeds = [row for row, _ in runs], sorted({seed for _, seed in runs})
+    models = [model for model in sensors if model in (arguments.models or usual_models)]
+    return models, list(dict.fromkeys(arguments.seeds or usual_seeds))
 
 
 def _train(given: Experiment, settings: Settings, folder: Path, row: str, label: str) -> None:

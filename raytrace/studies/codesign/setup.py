@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import hashlib
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -25,6 +26,7 @@ from raytrace.shards import share
 from raytrace.studies.codesign.closed_form import power_spectrum
 from raytrace.studies.codesign.experiment import STEPS, Outcome, camera, lens_at_start, outcome, run_model, variables
 from raytrace.studies.codesign.settings import Settings
+from raytrace.studies.options import read
 from raytrace.studies.pictures import Pictures, dead_leaves, pictures, resized, split
 from raytrace.system.lens import Lens, check, field_points
 
@@ -66,8 +68,11 @@ class Experiment:
         return power_spectrum(resized(self.train, scale), own.patch + own.size - 1, crops=own.crops, seed=own.seed)
 
 
-def experiment(arguments: argparse.Namespace, settings: Settings) -> Experiment:
-    """Open the lens, refuse what cannot be simulated, then read the pictures."""
+def experiment(arguments: argparse.Namespace, settings: Settings, *, smallest: float = 1.0) -> Experiment:
+    """Open the lens, refuse what cannot be simulated, then read the pictures.
+
+    smallest: what pictures are resized by at the least; a patch and its margin are still to fit.
+    """
     path, lens = find_lens(arguments.lens), lens_of_file(arguments)
     if settings.near >= settings.far:
         raise CommandError(f"--near {settings.near:g} is not nearer than --far {settings.far:g}")
@@ -83,12 +88,26 @@ def experiment(arguments: argparse.Namespace, settings: Settings) -> Experiment:
     except ValueError as error:
         raise CommandError(f"{path}: {error}") from error
     FORMATS[".zmx"].write(begun, str(path), catalogs=catalogs(arguments))  # refuses what a learned lens could not keep
-    given, kind = pictures(arguments, settings.patch + settings.size - 1, lambda: _leaves(arguments, settings))
+    patch = settings.patch + settings.size - 1
+    least = math.ceil(patch / smallest)
+    given, kind = pictures(arguments, patch, lambda: _leaves(arguments, least))
+    given = _large_enough(given, least, smallest)
     about = {
         "lens": f"{path.stem}, sha256 {hashlib.sha256(path.read_bytes()).hexdigest()[:16]}",
         "pictures": f"{len(given)}, blake2 {_digest(given)}",
     }
     return Experiment(lens, path.stem, settings, *split(given), about, kind, catalogs(arguments))
+
+
+def _large_enough(given: Pictures, least: int, scale: float) -> Pictures:
+    """Pictures of at least `least` × `least` pixels, for patches of pictures `scale` times as large."""
+    kept = [one for one in zip(given.samples, given.names, strict=True) if min(one[0].shape) >= least]
+    if not kept:
+        raise CommandError(
+            f"none of {len(given)} pictures has {least} × {least} pixels, a patch and its margin where pictures are "
+            f"made {scale:g} times as large; give larger ones or a smaller --patch"
+        )
+    return Pictures(*zip(*kept, strict=True))
 
 
 def refuse_too_few(given: Experiment) -> None:
@@ -151,8 +170,14 @@ def recorded(path: Path) -> dict:
     return read_json(path) if path.exists() else {}
 
 
-def _leaves(arguments: argparse.Namespace, settings: Settings) -> Pictures:
-    count, size = arguments.limit or _LEAVES, max(256, settings.patch + settings.size - 1)
+def recorded_settings(path: Path) -> Settings:
+    """The settings in a `settings.json`; those that it does not have are as by default."""
+    known = {field.name for field in dataclasses.fields(Settings)}
+    return read(Settings, {name: value for name, value in recorded(path).items() if name in known})
+
+
+def _leaves(arguments: argparse.Namespace, least: int) -> Pictures:
+    count, size = arguments.limit or _LEAVES, max(256, least)
     say(f"no --data: training on {count} pictures of dead leaves, discs that hide one another")
     leaves = [dead_leaves(1, size=size, seed=seed).samples[0] for seed in progress(range(count), "dead leaf")]
     return Pictures(tuple(leaves), tuple(f"dead leaves {seed}" for seed in range(count)))

@@ -59,7 +59,7 @@ class Row(optima.Place):
 _FOUND = (*optima.COLUMNS, "refocused_mm", "error_refocused", "efl_mm", "at_bound", "variables")
 
 
-def columns(settings: Settings, rows: Sequence[Row]) -> tuple[str, ...]:
+def columns(rows: Sequence[Row]) -> tuple[str, ...]:
     """Columns of the table of all rows."""
     first = ("box", "hold", "model", "start", "error", "error_drt", "error_refocused", "efl_mm", "sensor_mm")
     own = dict.fromkeys(name for row in rows for name in row.document() if name.endswith("_mm") and name not in first)
@@ -69,8 +69,7 @@ def columns(settings: Settings, rows: Sequence[Row]) -> tuple[str, ...]:
 
 def cases(settings: Settings, boxes: Sequence[str]) -> list[Case]:
     """All optima: of the sensor only, then in every box with the focal length held and free; of DRT from two starts."""
-    own_bounds = [word for word in settings.bounds.split() if word.startswith("sensor:")]
-    alone = dataclasses.replace(settings, vary="sensor", bounds=" ".join(own_bounds), hold="")
+    alone = _sensor_alone(settings)
     found = [Case(0, dataclasses.replace(alone, model=model)) for model in MODELS]
     for number, box in enumerate(boxes, 1):
         bounds = f"{settings.bounds} {box}".strip()
@@ -79,6 +78,12 @@ def cases(settings: Settings, boxes: Sequence[str]) -> list[Case]:
             found += [Case(number, dataclasses.replace(within, model=model)) for model in MODELS]
             found += [Case(number, dataclasses.replace(within, model="drt", start=GAUSSIAN))]
     return found
+
+
+def _sensor_alone(settings: Settings) -> Settings:
+    """The settings with the sensor as the only variable, within its own bounds."""
+    bounds = [word for word in settings.bounds.split() if word.startswith("sensor:")]
+    return dataclasses.replace(settings, vary="sensor", bounds=" ".join(bounds), hold="")
 
 
 def spaces(
@@ -107,10 +112,10 @@ def _found(lens: Lens, settings: Settings, spectrum: Tensor) -> dict:
 
 
 def _refocused(found: Optimum, settings: Settings, spectrum: Tensor) -> Optimum:
-    """The optimum of the sensor alone with DRT PSFs, behind the thicknesses that were found."""
-    if found.model == "drt" and settings.vary == "sensor":
+    """The optimum of the sensor alone with DRT PSFs of all light, behind the thicknesses that were found."""
+    if found.model == "drt" and settings.vary == "sensor" and settings.rays is None:
         return found
-    alone = dataclasses.replace(settings, model="drt", vary="sensor", bounds="", hold="", start="paraxial")
+    alone = dataclasses.replace(_sensor_alone(settings), model="drt", rays=None, start="paraxial")
     return closed_form(found.lens, alone, spectrum)
 
 

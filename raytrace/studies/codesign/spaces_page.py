@@ -24,11 +24,13 @@ from raytrace.studies.codesign.spaces import spaces as spaces_all
 from raytrace.studies.publish import publish
 
 _PAGE = "codesign_air_spaces"
+#: Pages of the other forms, which have the tables of these names in codesign/.
+_TAKEN = ("codesign", "codesign_sweep", "codesign_off_axis", "codesign_retrain")
 
 
 @dataclasses.dataclass(frozen=True)
 class Spaces(Result):
-    """The optima in all boxes, of bounds as words; by: the variable that holds the focal length; table: its file."""
+    """The optima in all boxes, of bounds as words; page: its name, without suffix."""
 
     rows: Sequence[Row]
     boxes: Sequence[str]
@@ -54,6 +56,7 @@ class Spaces(Result):
 
     @property
     def table(self) -> str:
+        """The file of all rows, beside the page."""
         return f"{self.page.removeprefix('codesign_')}.csv"
 
     @property
@@ -174,6 +177,9 @@ def spaces(arguments: argparse.Namespace) -> None:
     """Find all optima, then write table and page; with -o they are kept, and not sought again."""
     if not (arguments.docs or arguments.folder):
         raise CommandError("no folder to write to: give --docs DOCS or -o FOLDER")
+    page = arguments.page or _PAGE
+    if page in (name for taken in _TAKEN for name in (taken, taken.removeprefix("codesign_"))):
+        raise CommandError(f"--page {page}: the page or the table of another form; give a name of its own, as {_PAGE}")
     boxes = [" ".join(words) for words in arguments.box or ()]
     if not boxes:
         raise CommandError("no box to search in: give --box thickness_5:13,15 thickness_6:11,13, once for each")
@@ -189,12 +195,12 @@ def spaces(arguments: argparse.Namespace) -> None:
     )
     if share().rank:
         return  # the first process writes
-    found = Spaces(rows, boxes, given, arguments.page or _PAGE)
+    found = Spaces(rows, boxes, given, page)
     documents = [row.document() for row in rows]
-    names = columns(settings, rows)
+    names = columns(rows)
     lines = [{name: one.get(name) for name in names} for one in documents]
-    page = Path(arguments.docs or folder) / f"{found.page}.md"
-    publish(page, "codesign", found.parts(), tables={found.table: table(lines, names)}, figures={})
+    written = Path(arguments.docs or folder) / f"{page}.md"
+    publish(written, "codesign", found.parts(), tables={found.table: table(lines, names)}, figures={})
     present(found, arguments)
     for row in rows:
         if row.no_optimum:

@@ -24,7 +24,7 @@ from raytrace.optics.spot import spot_of
 from raytrace.optics.trace import trace_lens
 from raytrace.studies.codesign.experiment import STEPS, Batch, Outcome, batch, outcome
 from raytrace.studies.codesign.experiment import camera as camera_at_start
-from raytrace.studies.codesign.settings import AFTER_PARAXIAL, Settings
+from raytrace.studies.codesign.settings import AFTER_PARAXIAL, NAMES, Settings
 from raytrace.studies.pictures import Pictures
 from raytrace.system.lens import Lens, with_object_distance
 
@@ -38,7 +38,7 @@ COLUMNS = (
     *("model", "seed", "l1_joint", "l1_drt", "focus_paraxial_m", "focus_rms_m", "sensor_mm"),
     *("sensor_last_epochs_mm", "sensor_range_last_epochs_mm", "focus_last_epochs_m"),
 )
-LAST = 2  # epochs of step 1 that are averaged beside the last iterate
+_LAST = 2  # epochs that are averaged beside the last iterate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +63,12 @@ def run_settings(study: Path, row: str, seed: int, settings: Settings) -> Settin
     return before and dataclasses.replace(settings, model="gaussian", seed=seed, start=repr(before.sensor_mm))
 
 
+def begun(study: Path) -> list[tuple[str, int]]:
+    """(row, seed) of the runs that have a folder, in the order of the table."""
+    of = {row: [path.name.removeprefix(f"{row}-") for path in study.glob(f"{row}-[0-9]*")] for row in NAMES}
+    return [(row, int(seed)) for row, seeds in of.items() for seed in seeds if seed.isdecimal()]
+
+
 def outcomes(study: Path, models: Sequence[str], seeds: Sequence[int]) -> list[Outcome]:
     """The finished runs of a study, each with its row as its model."""
     found = [(model, outcome(run_folder(study, model, seed))) for model in models for seed in seeds]
@@ -80,7 +86,7 @@ def with_last_epochs(
     for one in found:
         (course,) = (*courses(study, [one], "sensor").values(), [[]])[0]
         if course and focus is not None:
-            last = course[-min(LAST, epochs) * (len(course) // epochs) :]
+            last = of_last_epochs(course, epochs)
             place = statistics.fmean(last)
             one = dataclasses.replace(
                 one,
@@ -90,6 +96,11 @@ def with_last_epochs(
             )
         result.append(one)
     return result
+
+
+def of_last_epochs(course: Sequence[float], epochs: int) -> Sequence[float]:
+    """The part of a column of a log of so many epochs that is of the last two of them."""
+    return course[-min(_LAST, epochs) * (len(course) // epochs) :]
 
 
 def settled(course: Sequence[float], near: float = 2.0) -> float:

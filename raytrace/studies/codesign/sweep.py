@@ -6,7 +6,8 @@ Every factor is varied alone, then aperture and others together.
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 
 from torch import Tensor
 
@@ -159,12 +160,18 @@ def sweep(
     spectrum: `power_spectrum` of the pictures; progress: wraps the cases, for a bar.
     """
 
+    pairs = found_once(cases(settings, factors), _finder(lens, spectrum), progress=progress, kept=kept)
+    return [Row(**found, factor=case.factor, value=case.value) for case, found in pairs]
+
+
+def _finder(lens: Lens, spectrum: Tensor) -> Callable[[Settings], dict]:
+    """What finds the optimum of settings, by the names of its columns."""
+
     def find(own: Settings) -> dict:
         optimum = closed_form(lens, own, spectrum)
         return {name: getattr(optimum, name) for name in optima.COLUMNS}
 
-    pairs = found_once(cases(settings, factors), find, progress=progress, kept=kept)
-    return [Row(**found, factor=case.factor, value=case.value) for case, found in pairs]
+    return find
 
 
 def readings(rows: Sequence[Row]) -> list[Reading]:
@@ -194,17 +201,24 @@ SCALES = (0.75, 1.0, 1.5, 2.0, 2.5)
 SCALE_COLUMNS = ("scale", "deviation", "model", "sensor_mm", "focus_paraxial_m", "rms_error", "rms_error_drt")
 
 
-def by_scale(lens: Lens, settings: Settings, spectrum: Callable[[float], Tensor]) -> list[dict[str, float | str]]:
+def by_scale(
+    lens: Lens,
+    settings: Settings,
+    spectrum: Callable[[float], Tensor],
+    *,
+    kept: Mapping[float, Kept] = MappingProxyType({}),
+) -> list[dict[str, float | str]]:
     """Optima for pictures resized before patches are cut: errors as roots of mean squares, of pictures from 0 to 1.
 
-    spectrum: of pictures of so many times the size; deviation: theirs about the mean of each patch.
+    spectrum: of pictures of so many times the size; deviation: theirs about the mean of each patch; kept: by scale.
     """
     rows = []
     for scale in SCALES:
         power = spectrum(scale)
         deviation = float((power.mean() - power[0, 0] / power.numel()).sqrt())
-        for model in MODELS:
-            found = closed_form(lens, _of_model(settings, model), power)
-            values = (scale, deviation, model, found.sensor_mm, found.focus_paraxial_m)
-            rows.append(dict(zip(SCALE_COLUMNS, (*values, found.error**0.5, found.error_drt**0.5), strict=True)))
+        own = [Case("scale", f"{scale:g}", _of_model(settings, model)) for model in MODELS]
+        for case, found in found_once(own, _finder(lens, power), kept=kept.get(scale)):
+            values = (scale, deviation, case.settings.model, found["sensor_mm"], found["focus_paraxial_m"])
+            errors = (found["error"] ** 0.5, found["error_drt"] ** 0.5)
+            rows.append(dict(zip(SCALE_COLUMNS, (*values, *errors), strict=True)))
     return rows

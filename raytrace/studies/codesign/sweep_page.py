@@ -25,6 +25,7 @@ from raytrace.studies.codesign.sweep import (
     COLUMNS,
     COMBINED,
     SCALE_COLUMNS,
+    SCALES,
     TOGETHER,
     Reading,
     Row,
@@ -142,13 +143,15 @@ def sweep(arguments: argparse.Namespace) -> None:
     """Find all optima, then write table, figure and page; with -o they are kept, and not sought again."""
     if not (arguments.docs or arguments.folder):
         raise CommandError("no folder to write to: give --docs DOCS or -o FOLDER")
-    given = experiment(arguments, settings_of(arguments))
+    given = experiment(arguments, settings_of(arguments), smallest=min(SCALES))
     spectrum = given.spectrum()
-    kept = _kept(given, arguments.folder) if arguments.folder and not share().rank else None
-    rows = sweep_all(given.lens, given.settings, spectrum, progress=lambda cases: progress(cases, "case"), kept=kept)
+    kept = _kept(given, arguments.folder) if arguments.folder and not share().rank else {}
+    rows = sweep_all(
+        given.lens, given.settings, spectrum, progress=lambda cases: progress(cases, "case"), kept=kept.get(1.0)
+    )
     if share().rank:
         return  # the first process writes
-    scales = by_scale(given.lens, given.settings, given.spectrum)
+    scales = by_scale(given.lens, given.settings, given.spectrum, kept=kept)
     found, docs = Sweep(rows, given, is_of_paper(given.lens), scales), Path(arguments.docs or arguments.folder)
     tables = {
         "sweep.csv": table(rows, COLUMNS),
@@ -164,6 +167,8 @@ def sweep(arguments: argparse.Namespace) -> None:
         raise CommandError("no case has an optimum; see the warnings, and choose other --near, --far, --bounds")
 
 
-def _kept(given: Experiment, folder: str) -> Kept:
-    """Optima of this lens and these pictures in a folder. Raises OtherSettings for one of others."""
-    return Kept(Run(folder, given.about).folder / "optima.jsonl")
+def _kept(given: Experiment, folder: str) -> dict[float, Kept]:
+    """Optima of this lens and these pictures in a folder, by the scale of the pictures. Raises OtherSettings for one of
+    others."""
+    own = Run(folder, given.about).folder
+    return {scale: Kept(own / ("optima.jsonl" if scale == 1 else f"optima_{scale:g}.jsonl")) for scale in SCALES}

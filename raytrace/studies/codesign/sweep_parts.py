@@ -8,6 +8,7 @@ from raytrace.pages import grid, shown
 from raytrace.studies.codesign.claims import SIMPLE, percent
 from raytrace.studies.codesign.conjugates import vignetted
 from raytrace.studies.codesign.experiment import lens_at_start
+from raytrace.studies.codesign.plain_rays import points
 from raytrace.studies.codesign.settings import MODELS, NAMES
 from raytrace.studies.codesign.setup import Experiment
 from raytrace.studies.codesign.study import PAPER
@@ -153,9 +154,13 @@ def beam(given: Experiment) -> list[str]:
     return [
         "## What vignettes",
         grid(header, rows),
-        "Of the beam on the axis from 25 m, by the semi-diameters of the file. They are not applied here: all light of "
-        "the aperture passes.",
+        f"Of the beam on the axis from {_distance(given.settings.focus_distance)}, by the semi-diameters of the file. "
+        "They are not applied here: all light of the aperture passes.",
     ]
+
+
+def _distance(millimetres: float) -> str:
+    return f"{millimetres / 1e3:g} m" if math.isfinite(millimetres) else "infinity"
 
 
 ELSEWHERE = "## Where the descent from the start ends at another optimum"
@@ -216,9 +221,10 @@ def rays_table(found: Sequence[Reading]) -> list[str]:
         ]
         header = (NAMES[model], "all light", *(factor.text.format(n) for factor, n in kinds))
         parts.append(grid(header, lines))
+    *most, last = (points("hexapolar", int(n)).shape[1] for factor, n in kinds if factor.name == "hexapolar")
     told = (
         "Focus of the optimum in m: paraxial conjugate / least RMS spot. Hexapolar: the least whole rings with as many "
-        "rays, 19, 61 and 271."
+        f"rays, {', '.join(map(str, most))} and {last}."
     )
     return [*parts, told]
 
