@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ import torch
 from raytrace.camera.deconvolve import blind_density, blind_error, blind_filter, psnr
 from raytrace.camera.training import OtherSettings
 from raytrace.cli import main
-from raytrace.studies.edof import report
+from raytrace.studies.edof import free_report, noise_report, report
 from raytrace.studies.edof.noise import (
     Bank,
     Unit,
@@ -25,6 +26,7 @@ from raytrace.studies.edof.noise import (
 from raytrace.studies.edof.noise_command import Settings
 from raytrace.studies.edof.noise_report import Kept, scores
 from raytrace.studies.edof.octant import Octant, fits
+from raytrace.studies.edof.table import Content
 from raytrace.studies.edof.world import (
     ClosedForm,
     World,
@@ -37,6 +39,7 @@ from raytrace.studies.edof.world import (
     transfer,
 )
 from raytrace.studies.pictures import dead_leaves
+from raytrace.studies.quantise import process_report
 from raytrace.wave.designs import aim, baseline
 from raytrace.wave.plan import plan
 from raytrace.wave.psf import psf
@@ -44,6 +47,7 @@ from raytrace.wave.psf import psf
 SMALL = World(depths=(500.0, 1000.0, math.inf), wavelengths=(0.5, 0.6), size=63, pixel=0.00738)
 PICTURES = periodic(dead_leaves(8, size=64, seed=5, smallest=2.5), 128)
 S = spectrum(PICTURES)
+LEARNED = str(Path(__file__).parents[1] / "docs/wave/elements/learned-0.01.npy")
 
 
 @pytest.mark.parametrize("name", ["singlet", "fresnel", "hybrid"])
@@ -164,8 +168,25 @@ def test_the_start_of_least_expected_error_is_kept(tmp_path):
         assert own.gain.value == own.starts[0] == pytest.approx(own.psnr - base.psnr)
         assert own.gain.low < own.gain.value < own.gain.high
         assert len(own.starts) == 2
-    with pytest.raises(OtherSettings):
-        Kept(tmp_path, [Bank.of("leaves", PICTURES[:4], PICTURES[4:])])
+    for train, test in ((PICTURES[:4], PICTURES[4:]), (PICTURES[:4], PICTURES[5:])):
+        with pytest.raises(OtherSettings):
+            Kept(tmp_path, [Bank.of("leaves", train, test)])
+
+
+@pytest.mark.parametrize(
+    "words", [("noise", "--rows", "learned"), ("etch",), ("free", "--from", LEARNED)], ids=lambda words: words[0]
+)
+def test_other_pictures_are_refused_before_anything_is_learned(words, capsys, monkeypatch, tmp_path):
+    """What was judged of some pictures stands in the folder: with others nothing is learned on, nothing written."""
+    contents = [Content("leaves", PICTURES[:4], PICTURES[4:])], dead_leaves(4, size=256)
+    for module in (noise_report, process_report, free_report):
+        monkeypatch.setattr(module, "contents_of", lambda arguments: contents)
+    for module, name in ((noise_report, "learn_unit"), (process_report, "etched"), (free_report, "learn_free")):
+        monkeypatch.setattr(module, name, lambda *given, **how: pytest.fail("learned"))
+    Kept(tmp_path / "judged", [Bank.of("leaves", PICTURES[:5], PICTURES[5:])])
+    assert main(["wave", *words, "-o", str(tmp_path)]) == 1
+    assert "judged holds another run: pictures was" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["judged"]
 
 
 @pytest.mark.slow

@@ -114,13 +114,13 @@ def free(arguments: argparse.Namespace) -> Freed:
         raise CommandError(f"--from {arguments.rings}: holds no rings; expected heights of rings")
     contents, train = contents_of(arguments)
     S = spectrum(periodic(train, 256))
+    banks = [Bank.of(content.name, content.train, content.test) for content in contents]
+    del contents
+    kept = Kept(root / "judged", banks)  # refuses other pictures before anything is learned
     elements = {"given": rings, "cut": as_pixels(rings, settings.feature)}
     for start in ("control", *settings.starts):
         case = Case(start, settings.noise, settings.feature, settings.steps, settings.rate, settings.seed)
         elements[start] = _learned(case, rings, S, root)
-    banks = [Bank.of(content.name, content.train, content.test) for content in contents]
-    del contents
-    kept = Kept(root / "judged", banks)
     noise = Noise.of({"noise": (settings.noise,), "seed": settings.seed})
     base = judge_baselines(["fresnel"], noise, banks, kept)["fresnel", settings.noise]
     found = {row: _judged(row, element, S, settings, kept) for row, element in progress(list(elements.items()), "map")}

@@ -22,6 +22,7 @@ from raytrace.studies.edof.noise_report import title_of
 from raytrace.studies.edof.report import contents_of
 from raytrace.studies.edof.table import ROWS, Content
 from raytrace.studies.edof.world import World, kernels, spectrum, transfer
+from raytrace.studies.pictures import digest
 from raytrace.studies.publish import publish
 from raytrace.wave.element import Element
 from raytrace.wave.element_file import read_element
@@ -86,9 +87,9 @@ def networks(arguments: argparse.Namespace) -> Networks:
         baselines = ", ".join(row for row in ROWS if not ROWS[row].learning)
         raise CommandError(f"--rows {' '.join(unknown)}: expected {baselines}")
     content = contents_of(arguments)[0][-1 if arguments.data else 0]
-    found = {}
+    found, mark = {}, digest([*content.train.numpy(), *content.test.numpy()])
     for name, elements in _elements(arguments, settings, content):
-        found[name] = _judged(name, elements, content, settings, Path(arguments.folder))
+        found[name] = _judged(name, elements, content, mark, settings, Path(arguments.folder))
     result = Networks(_rows(found, settings), min(_RESTORED, len(content.test)), content.name, settings.noise)
     if arguments.docs:
         words = [f"--rows {' '.join(arguments.rows)}", *(["--elements FILES"] if arguments.elements else [])]
@@ -111,9 +112,9 @@ def _elements(
 
 
 def _judged(
-    name: str, elements: tuple[Element, ...], content: Content, settings: Settings, root: Path
+    name: str, elements: tuple[Element, ...], content: Content, mark: str, settings: Settings, root: Path
 ) -> dict[str, Tensor]:
-    """Errors (B, D, W) behind the filter and behind both."""
+    """Errors (B, D, W) behind the filter and behind both; mark: `digest` of all the content's pictures."""
     made: list[Filtered] = []
 
     def camera() -> Filtered:
@@ -124,7 +125,7 @@ def _judged(
         return made[0]
 
     numbers = b"".join(element.numbers.detach().numpy().tobytes() for element in elements)
-    about = {"noise": settings.noise, "content": content.name, "pictures": len(content.train)}
+    about = {"noise": settings.noise, "content": content.name, "pictures": mark}
     about |= {"element": hashlib.sha256(numbers).hexdigest()[:16]}
     folder = root / f"{name}-{settings.noise:g}"
     network = learn_network(

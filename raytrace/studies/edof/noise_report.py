@@ -125,11 +125,11 @@ def noise(arguments: argparse.Namespace) -> OverNoise:
     todo = list(units(rows, settings.noise, settings.starts))
     with tempfile.TemporaryDirectory() as unkept:
         root = Path(arguments.folder or unkept)
-        for unit in todo:
-            learn_unit(unit, settings, train, root)
         banks = [Bank.of(content.name, content.train, content.test) for content in contents]
         del contents
-        kept = Kept(root / "judged", banks)
+        kept = Kept(root / "judged", banks)  # refuses other pictures before anything is learned
+        for unit in todo:
+            learn_unit(unit, settings, train, root)
         fixed = judge_baselines(rows, settings, banks, kept)
         fixed |= judge_files(arguments.elements, settings, kept)
         bar = progress(todo, "learned element")
@@ -161,8 +161,7 @@ class Kept:
 
     def __init__(self, folder: Path, banks: Sequence[Bank]):
         self.banks, self._forms = banks, {}
-        marks = {bank.name: hashlib.sha256(bank.powers.numpy().tobytes()).hexdigest()[:16] for bank in banks}
-        self.folder = Run(folder, {"pictures": marks}).folder
+        self.folder = Run(folder, {"pictures": {bank.name: bank.mark for bank in banks}}).folder
 
     def transfer(self, elements: Sequence[Element]) -> Tensor:
         """H (D, W, n, n) of learned elements, whatever the noise; of rings what heights do not change is kept."""

@@ -20,7 +20,7 @@ from raytrace.studies.edof.settings import Settings
 from raytrace.studies.edof.table import ROWS, Content, elements_of, records, table_of
 from raytrace.studies.edof.training import EdofCamera, begin, learn_element
 from raytrace.studies.edof.world import Judged, Quality, World, depth_text, kernels, periodic, quality, spectrum
-from raytrace.studies.pictures import Pictures, dead_leaves, pictures, split
+from raytrace.studies.pictures import Pictures, dead_leaves, digest, pictures, split
 from raytrace.studies.publish import publish
 from raytrace.wave.element import Element, as_made, as_pixels
 from raytrace.wave.element_file import write_element
@@ -124,7 +124,14 @@ def learn(settings: Settings, world: World, train: Pictures, folder: Path, label
     """A learned camera, trained as far as is left, with a bar."""
     S = spectrum(periodic(train, settings.size))
     try:
-        camera, run = begin(settings, world, S, folder, progress=lambda given: progress(given, "start", what=label))
+        camera, run = begin(
+            settings,
+            world,
+            S,
+            folder,
+            pictures=digest(train.samples),
+            progress=lambda given: progress(given, "start", what=label),
+        )
         bar, last = None, None
         for step, record in learn_element(camera, train, settings, run):
             bar = bar or progress(settings.steps, what=label, initial=step)

@@ -17,7 +17,7 @@ from raytrace.maths.result import Result
 from raytrace.pages import grid, picture
 from raytrace.studies.edof.noise import Interval, drawn, gain
 from raytrace.studies.edof.world import World, periodic, spectrum
-from raytrace.studies.pictures import Pictures, dead_leaves, pictures, split
+from raytrace.studies.pictures import Pictures, dead_leaves, digest, pictures, split
 from raytrace.studies.publish import publish
 from raytrace.studies.superres.discover import (
     SIDE,
@@ -122,7 +122,8 @@ def _camera(
 ) -> list[Plated]:
     world = world_of(colours, noise=settings.noise)
     error = Error(world, moments(spectrum(periodic(train, 192))), _FACTOR)
-    run = Run(folder, {"world": dataclasses.asdict(error.world), "steps": settings.steps, "pictures": len(train)})
+    about = {"world": dataclasses.asdict(error.world), "steps": settings.steps, "pictures": digest(train.samples)}
+    run = Run(folder, about)
     todo = starts(world, spreads=settings.spread, seeds=settings.starts, factor=_FACTOR)
     plates = []
     for title, path, learned in progress(todo, "plate"):
