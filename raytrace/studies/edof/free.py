@@ -7,7 +7,6 @@ up symmetry brings.
 
 import dataclasses
 import functools
-import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from raytrace.camera.phase import PhaseVariables
 from raytrace.camera.training import Record, Run, Share, load_state, read_state, train
 from raytrace.files import write_atomically
 from raytrace.maths.value import detached
-from raytrace.studies.edof.noise import best_strengths
+from raytrace.studies.edof.noise import best_strengths, mark_of_elements
 from raytrace.studies.edof.training import scheduled
 from raytrace.studies.edof.world import ClosedForm, World, expected_error, scene, transfer
 from raytrace.studies.pictures import draws
@@ -161,8 +160,7 @@ def learn_free(
     every: int = 20,
 ) -> Element:
     """The element of a case, from its folder, learned as far as is left by Adam, whose rate falls as a cosine."""
-    mark = hashlib.sha256(rings.numbers.detach().numpy().tobytes()).hexdigest()[:16]
-    run = Run(case.folder(root), dataclasses.asdict(case) | {"rings": mark})
+    run = Run(case.folder(root), dataclasses.asdict(case) | {"rings": mark_of_elements([rings])})
     camera, state = camera_of(case, rings, S, run.folder), run.load()
     if state is not None and state["step"] >= case.steps:
         load_state(camera, state, run.checkpoint)

@@ -2,8 +2,7 @@
 
 import argparse
 import dataclasses
-import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import torch
@@ -17,15 +16,14 @@ from raytrace.maths.result import Result
 from raytrace.pages import grid
 from raytrace.studies.edof.network import Filtered, errors_behind, learn_network, patches
 from raytrace.studies.edof.network_command import Settings
-from raytrace.studies.edof.noise import Interval, best_strengths, cases, drawn, gain, mean_psnr
-from raytrace.studies.edof.noise_report import title_of
+from raytrace.studies.edof.noise import Interval, best_strengths, cases, drawn, gain, mark_of_elements, mean_psnr
+from raytrace.studies.edof.noise_report import elements_in
 from raytrace.studies.edof.report import contents_of
-from raytrace.studies.edof.table import ROWS, Content
+from raytrace.studies.edof.table import ROWS, Content, title_of
 from raytrace.studies.edof.world import World, kernels, spectrum, transfer
 from raytrace.studies.pictures import digest
 from raytrace.studies.publish import publish
 from raytrace.wave.element import Element
-from raytrace.wave.element_file import read_element
 
 _TRAINED, _RESTORED = 100, 24  # pictures
 
@@ -86,9 +84,10 @@ def networks(arguments: argparse.Namespace) -> Networks:
     if unknown:
         baselines = ", ".join(row for row in ROWS if not ROWS[row].learning)
         raise CommandError(f"--rows {' '.join(unknown)}: expected {baselines}")
+    files = elements_in(arguments.elements)
     content = contents_of(arguments)[0][-1 if arguments.data else 0]
     found, mark = {}, digest([*content.train.numpy(), *content.test.numpy()])
-    for name, elements in _elements(arguments, settings, content):
+    for name, elements in _elements(arguments, files, settings, content):
         found[name] = _judged(name, elements, content, mark, settings, Path(arguments.folder))
     result = Networks(_rows(found, settings), min(_RESTORED, len(content.test)), content.name, settings.noise)
     if arguments.docs:
@@ -101,14 +100,14 @@ def networks(arguments: argparse.Namespace) -> Networks:
 
 
 def _elements(
-    arguments: argparse.Namespace, settings: Settings, content: Content
+    arguments: argparse.Namespace, files: Mapping[str, Element], settings: Settings, content: Content
 ) -> Iterator[tuple[str, tuple[Element, ...]]]:
     cubic = any(row.startswith("cubic") for row in arguments.rows)
     strengths = best_strengths([settings.noise], spectrum(content.train)) if cubic else {}
     for row, elements, _ in cases(arguments.rows, [settings.noise], strengths):
         yield row, elements
-    for file in arguments.elements:
-        yield Path(file).stem, (read_element(file, aperture=2 * World().radius),)
+    for name, element in files.items():
+        yield name, (element,)
 
 
 def _judged(
@@ -124,9 +123,8 @@ def _judged(
             made.append(Filtered.of(H, spectrum(content.train), settings.noise))
         return made[0]
 
-    numbers = b"".join(element.numbers.detach().numpy().tobytes() for element in elements)
     about = {"noise": settings.noise, "content": content.name, "pictures": mark}
-    about |= {"element": hashlib.sha256(numbers).hexdigest()[:16]}
+    about |= {"element": mark_of_elements(elements)}
     folder = root / f"{name}-{settings.noise:g}"
     network = learn_network(
         folder,

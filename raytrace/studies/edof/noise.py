@@ -64,7 +64,19 @@ def mark_of(*values: Tensor) -> str:
     """A hash of all their numbers."""
     found = hashlib.blake2b(digest_size=8)
     for own in values:
+        found.update(f"{tuple(own.shape)}".encode())
         found.update(own.detach().contiguous().numpy())
+    return found.hexdigest()
+
+
+def mark_of_elements(elements: Sequence[Element]) -> str:
+    """A hash of all that decides what they do to light: numbers, kind and size of the profile, the glass."""
+    found = hashlib.blake2b(digest_size=8)
+    for element in elements:
+        profile, glass, period = element.profile, element.glass, element.period
+        numbers = [getattr(profile, field.name) for field in dataclasses.fields(profile)]
+        numbers += [element.radius, glass.coefficients, *([] if period is None else [period])]
+        found.update(f"{type(profile).__name__} {element.levels} {glass.formula} {mark_of(*numbers)}".encode())
     return found.hexdigest()
 
 

@@ -2,7 +2,7 @@
 
 import argparse
 import dataclasses
-import hashlib
+import functools
 import io
 import json
 import tempfile
@@ -31,12 +31,14 @@ from raytrace.studies.edof.noise import (
     drawn,
     errors_of,
     gain,
+    mark_of,
+    mark_of_elements,
     mean_psnr,
     units,
 )
 from raytrace.studies.edof.noise_command import Settings
 from raytrace.studies.edof.report import contents_of, learn
-from raytrace.studies.edof.table import ROWS
+from raytrace.studies.edof.table import ROWS, title_of
 from raytrace.studies.edof.training import EdofCamera
 from raytrace.studies.edof.world import ClosedForm, World, kernels, transfer
 from raytrace.studies.pictures import Pictures
@@ -44,12 +46,6 @@ from raytrace.studies.publish import publish
 from raytrace.wave.element import Element, Rings, as_made, is_flat
 from raytrace.wave.element_file import SMOOTH, read_element, write_element
 from raytrace.words import did_you_mean
-
-
-def title_of(row: str) -> str:
-    """Of a row of the table, or of a file."""
-    return ROWS[row].title if row in ROWS else row
-
 
 TITLES = {"wiener": "Wiener filter of the PSF at 1 m", "blind": "best depth-invariant filter"}
 WAVELENGTH = 0.55  # µm: of the design
@@ -120,7 +116,7 @@ class OverNoise(Result):
 
 def noise(arguments: argparse.Namespace) -> OverNoise:
     """Learn what is left to learn, judge everything; the page where --docs asks for it."""
-    settings, rows = Settings.of(vars(arguments)), _rows(arguments.rows)
+    settings, rows, files = Settings.of(vars(arguments)), _rows(arguments.rows), elements_in(arguments.elements)
     contents, train = contents_of(arguments)
     todo = list(units(rows, settings.noise, settings.starts))
     with tempfile.TemporaryDirectory() as unkept:
@@ -131,7 +127,7 @@ def noise(arguments: argparse.Namespace) -> OverNoise:
         for unit in todo:
             learn_unit(unit, settings, train, root)
         fixed = judge_baselines(rows, settings, banks, kept)
-        fixed |= judge_files(arguments.elements, settings, kept)
+        fixed |= judge_files(files, settings, kept)
         bar = progress(todo, "learned element")
         learned = {unit: judge_learned(unit, settings, train, root, kept) for unit in bar}
         elements = _best_learned(todo, learned, settings, train, root)
@@ -168,9 +164,10 @@ class Kept:
         S = self.banks[0].spectrum
         if len(elements) > 1 or not isinstance(elements[0].profile, Rings):
             return transfer(kernels(elements, World()), S.shape[-1])
-        mark = elements[0].glass.name, float(elements[0].profile.pitch)
+        own = elements[0]
+        mark = own.glass.formula, mark_of(own.glass.coefficients, own.profile.pitch, own.radius)
         if mark not in self._forms:
-            whole = dataclasses.replace(elements[0], period=None, levels=0)
+            whole = dataclasses.replace(own, period=None, levels=0)
             self._forms[mark] = ClosedForm((whole,), World(), S)
         return self._forms[mark].transfer(elements)
 
@@ -219,16 +216,32 @@ def judge_baselines(
     return found
 
 
-def judge_files(files: Sequence[str], settings: Settings, kept: Kept) -> dict[tuple[str, float], dict[str, Errors]]:
-    """Errors of elements in files of heights, by the name of the file and noise."""
-    found = {}
+def elements_in(files: Sequence[str]) -> dict[str, Element]:
+    """Elements in files, of heights or smooth, by the name that they have in tables: of the file without its suffix.
+
+    Raises CommandError for two of one name, or one of the name of a row.
+    """
+    by: dict[str, str] = {}
     for file in files:
-        element = read_element(file, aperture=2 * World().radius)
-        mark = hashlib.sha256(element.numbers.numpy().tobytes()).hexdigest()[:16]
-        H = kept.transfer((element,))
+        name = Path(file).stem
+        if name in ROWS:
+            raise CommandError(f"--elements {file}: {name} is the row {ROWS[name].title!r}; give the file another name")
+        if name in by:
+            raise CommandError(f"--elements {by[name]} {file}: both would be {name}; give one of them another name")
+        by[name] = file
+    return {name: read_element(file, aperture=2 * World().radius) for name, file in by.items()}
+
+
+def judge_files(
+    elements: Mapping[str, Element], settings: Settings, kept: Kept
+) -> dict[tuple[str, float], dict[str, Errors]]:
+    """Errors of elements in files, by name and noise."""
+    found = {}
+    for name, element in elements.items():
+        mark, H = mark_of_elements([element]), functools.cache(lambda element=element: kept.transfer((element,)))
         for own in settings.noise:
             world = dataclasses.replace(World(), noise=own)
-            found[Path(file).stem, own] = kept.find(f"file-{mark}-{own:g}", world, lambda H=H: H)
+            found[name, own] = kept.find(f"file-{mark}-{own:g}", world, H)
     return found
 
 
