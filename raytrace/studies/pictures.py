@@ -48,6 +48,11 @@ def digest(samples: Sequence[np.ndarray]) -> str:
     return f"{len(samples)}, blake2 {found.hexdigest()}"
 
 
+def pictures_of(kind: str) -> str:
+    """What pictures are called that are of a kind, one of leaves or "pictures"."""
+    return kind if kind == "pictures" else f"pictures of {kind}"
+
+
 def draws(*key: int) -> np.random.Generator:
     """Random numbers of a key of whole numbers ≥ 0, independent of those of every other key."""
     return np.random.Generator(np.random.Philox(np.random.SeedSequence(key)))

@@ -26,8 +26,8 @@ from raytrace.wave.designs import Aim, aim, baseline
 from raytrace.wave.element import Element, Pixels, Zernike, as_pixels, excess_index, features, path
 
 _CHANGE, _SMOOTH = 33, 34  # last numbers of the keys of random starts
-_TERMS = 36  # of Noll's polynomials, piston and tilts left out
-_WHITE = 0.02  # µm, of every pixel's random change
+TERMS, SPREAD = 36, 0.5  # Noll's polynomials, piston and tilts left out, of a random start; µm RMS of each
+WHITE = 0.02  # µm, of every pixel's random change
 _NODES = 3  # per pixel of the sensor while learning; 4 to be judged
 
 
@@ -74,7 +74,7 @@ def _cubic(rings: Element, pitch: float, made_for: Aim, noise: float, seed: int,
 
 
 def _random(rings: Element, pitch: float, made_for: Aim, noise: float, seed: int, S: Tensor) -> Element:
-    random = 5e-4 * torch.as_tensor(draws(seed, _SMOOTH).standard_normal(_TERMS)).to(rings.radius)
+    random = 1e-3 * SPREAD * torch.as_tensor(draws(seed, _SMOOTH).standard_normal(TERMS)).to(rings.radius)
     random[:3] = 0
     plate = Element(Zernike(random), rings.radius, rings.glass)
     return as_map((*baseline("singlet", made_for), plate), rings, pitch, made_for.wavelength)
@@ -144,7 +144,7 @@ def camera_of(case: Case, rings: Element, S: Tensor, folder: Path) -> FreeCamera
     element = _start(case, rings, S, folder)
     camera = FreeCamera(element, (ClosedForm if case.start == "control" else PixelForm), case.world(), S)
     if case.start != "control":
-        change = _WHITE * draws(case.seed, _CHANGE).standard_normal(tuple(element.numbers.shape))
+        change = WHITE * draws(case.seed, _CHANGE).standard_normal(tuple(element.numbers.shape))
         with torch.no_grad():
             camera.variables.change.copy_(torch.as_tensor(change))
     return camera

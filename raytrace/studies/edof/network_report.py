@@ -14,14 +14,16 @@ from raytrace.cli.progress import progress
 from raytrace.files import table, write_json
 from raytrace.maths.result import Result
 from raytrace.pages import grid
+from raytrace.studies.edof.command import LIMIT
 from raytrace.studies.edof.network import Filtered, errors_behind, learn_network, patches
-from raytrace.studies.edof.network_command import Settings
+from raytrace.studies.edof.network_command import USUAL, Settings
 from raytrace.studies.edof.noise import Interval, best_strengths, cases, drawn, gain, mark_of_elements, mean_psnr
-from raytrace.studies.edof.noise_report import elements_in
+from raytrace.studies.edof.noise_report import element_words, elements_in
 from raytrace.studies.edof.report import contents_of
 from raytrace.studies.edof.table import ROWS, Content, title_of
 from raytrace.studies.edof.world import World, kernels, spectrum, transfer
-from raytrace.studies.pictures import digest
+from raytrace.studies.options import picture_words
+from raytrace.studies.pictures import digest, pictures_of
 from raytrace.studies.publish import publish
 from raytrace.wave.element import Element
 
@@ -50,9 +52,10 @@ class Behind:
 
 @dataclasses.dataclass(frozen=True)
 class Networks(Result):
-    """Every element; pictures: how many were restored."""
+    """Every element; trained, pictures: how many were learned from, and restored."""
 
     rows: list[Behind]
+    trained: int
     pictures: int
     kind: str
     noise: float
@@ -89,11 +92,12 @@ def networks(arguments: argparse.Namespace) -> Networks:
     found, mark = {}, digest([*content.train.numpy(), *content.test.numpy()])
     for name, elements in _elements(arguments, files, settings, content):
         found[name] = _judged(name, elements, content, mark, settings, Path(arguments.folder))
-    result = Networks(_rows(found, settings), min(_RESTORED, len(content.test)), content.name, settings.noise)
+    counts = min(_TRAINED, len(content.train)), min(_RESTORED, len(content.test))
+    result = Networks(_rows(found, settings), *counts, content.name, settings.noise)
     if arguments.docs:
-        words = [f"--rows {' '.join(arguments.rows)}", *(["--elements FILES"] if arguments.elements else [])]
-        words += [f"--data DIR --limit {arguments.limit}"] if arguments.data else []
-        parts = _parts(result, " ".join(["raytrace wave network", *words, *settings.words(), "-o FOLDER --docs docs"]))
+        words = [f"--rows {' '.join(arguments.rows)}"] if tuple(arguments.rows) != USUAL else []
+        words += [*element_words(arguments), *picture_words(arguments, LIMIT), *settings.words()]
+        parts = _parts(result, " ".join(["raytrace wave network", *words, "-o FOLDER --docs docs"]))
         tables = {"network.csv": table([row.record() for row in result.rows], floats=lambda n: round(n, 4))}
         publish(Path(arguments.docs) / "wave_network.md", "wave", parts, tables=tables, figures={})
     return result
@@ -169,9 +173,10 @@ def _parts(found: Networks, command: str) -> list[str]:
         f"    {command}",
         "Camera, depths and colours of [wave_edof.md](wave_edof.md). Elements stay as they are; behind the best "
         "depth-invariant filter stands a network of 10,000 weights (RED-Net, 6 layers of 16 maps), told neither depth "
-        f"nor colour, learned from patches of {_TRAINED} {found.kind} at depths drawn, noise {found.noise:g}. Judged "
-        f"on {found.pictures} others, all depths and colours, noise drawn once and the same for both. PSNR in dB, mean "
-        "over depths; in brackets the interval of 95 % of 2,000 samples of the pictures drawn with replacement.",
+        f"nor colour, learned from patches of {found.trained} {pictures_of(found.kind)} at depths drawn, noise "
+        f"{found.noise:g}. Judged on {found.pictures} others, all depths and colours, noise drawn once and the same "
+        "for both. PSNR in dB, mean over depths; in brackets the interval of 95 % of 2,000 samples of the pictures "
+        "drawn with replacement.",
         grid(found.header, found.lines()),
         "All figures: [network.csv](wave/network.csv).",
     ]

@@ -20,6 +20,7 @@ from raytrace.files import table, write_atomically, write_json
 from raytrace.maths.result import Result
 from raytrace.maths.value import detached
 from raytrace.pages import grid, picture
+from raytrace.studies.edof.command import LIMIT
 from raytrace.studies.edof.noise import (
     FILTERS,
     Bank,
@@ -41,8 +42,9 @@ from raytrace.studies.edof.report import contents_of, learn
 from raytrace.studies.edof.table import ROWS, title_of
 from raytrace.studies.edof.training import EdofCamera
 from raytrace.studies.edof.world import ClosedForm, World, kernels, transfer
+from raytrace.studies.options import picture_words
 from raytrace.studies.pictures import Pictures
-from raytrace.studies.publish import publish
+from raytrace.studies.publish import publish, published
 from raytrace.wave.element import Element, Rings, as_made, is_flat
 from raytrace.wave.element_file import SMOOTH, read_element, write_element
 from raytrace.words import did_you_mean
@@ -314,19 +316,28 @@ def publish_elements(elements: Mapping[str, Element], docs: Path) -> None:
         write_element(element, beside / name, design_wavelength=WAVELENGTH)
 
 
+def element_words(arguments: argparse.Namespace) -> list[str]:
+    """--elements as they were given."""
+    files = [published(file, arguments.docs) for file in arguments.elements]
+    return [f"--elements {' '.join(files)}"] if files else []
+
+
 def _publish(
     found: OverNoise, elements: Mapping[str, Element], settings: Settings, arguments: argparse.Namespace
 ) -> None:
     publish_elements(elements, Path(arguments.docs))
     records = [score.record() for score in found.scores]
     tables = {"noise.csv": table(records, floats=lambda number: round(number, 4))}
-    words = [f"--data DIR --limit {arguments.limit}"] if arguments.data else []
-    words += [f"--rows {' '.join(arguments.rows)}"] if arguments.rows else []
-    parts = _parts(found, " ".join(["raytrace wave noise", *words, *settings.words(), "-o FOLDER --docs docs"]))
+    words = [f"--rows {' '.join(arguments.rows)}"] if arguments.rows else []
+    words += element_words(arguments)
+    words += [*picture_words(arguments, LIMIT), *settings.words()]
+    command = " ".join(["raytrace wave noise", *words, "-o FOLDER --docs docs"])
+    parts = _parts(found, list(elements), command)
     publish(Path(arguments.docs) / "wave_noise.md", "wave", parts, tables=tables, figures={"noise.png": found.plot()})
 
 
-def _parts(found: OverNoise, command: str) -> list[str]:
+def _parts(found: OverNoise, files: Sequence[str], command: str) -> list[str]:
+    """files: names of those that hold the elements that were kept."""
     shown = "pictures" if "pictures" in found.pictures else next(iter(found.pictures))
     counted = ", ".join(f"{count} of {name}" for name, count in found.pictures.items())
     others = [name for name in found.pictures if name != shown]
@@ -342,11 +353,23 @@ def _parts(found: OverNoise, command: str) -> list[str]:
         picture("wave/noise.png", f"Gain over the Fresnel lens on {shown}, bands: 95 % intervals over the pictures."),
         *(part for filter in FILTERS for part in _tables(found, shown, filter)),
         *(part for name in others for part in _tables(found, name, "wiener", only_gain=True)),
-        "All figures: [noise.csv](wave/noise.csv). Elements that were kept stand in "
-        "[wave/elements](wave/elements), to be judged again, on dead leaves or on pictures of one's own:",
-        "    raytrace wave noise --rows fresnel --elements docs/wave/elements/learned-0.01.npy "
-        "docs/wave/elements/learned-smooth-0.01.json --noises 0.01",
+        "All figures: [noise.csv](wave/noise.csv).",
+        *_again(found, files),
     ]
+
+
+def _again(found: OverNoise, files: Sequence[str]) -> Iterable[str]:
+    """The command that judges what was kept at one noise, that of the table if it was asked for."""
+    if not files:
+        return
+    noises = {one.noise for one in found.scores}
+    noise = World.noise if World.noise in noises else min(noises)
+    own = [f"docs/wave/elements/{name}" for name in files if Path(name).stem.endswith(f"-{noise:g}")]
+    yield (
+        "Elements that were kept stand in [wave/elements](wave/elements), to be judged again, on dead leaves or on "
+        "pictures of one's own:"
+    )
+    yield f"    raytrace wave noise --rows fresnel --elements {' '.join(own)} --noises {noise:g}"
 
 
 def _tables(found: OverNoise, content: str, filter: str, *, only_gain: bool = False) -> Iterable[str]:

@@ -14,6 +14,7 @@ from raytrace.files import table
 from raytrace.maths.result import Result
 from raytrace.maths.value import detached
 from raytrace.pages import grid, picture
+from raytrace.studies.edof.command import LIMIT
 from raytrace.studies.edof.noise import FILTERS, Bank, Errors, Interval, drawn, gain, mean_psnr
 from raytrace.studies.edof.noise_command import Settings as Noise
 from raytrace.studies.edof.noise_report import (
@@ -26,6 +27,7 @@ from raytrace.studies.edof.noise_report import (
 )
 from raytrace.studies.edof.report import contents_of
 from raytrace.studies.edof.world import ClosedForm, World, periodic, spectrum
+from raytrace.studies.options import picture_words
 from raytrace.studies.pictures import Pictures, digest
 from raytrace.studies.publish import publish
 from raytrace.studies.quantise.process import Case, cases, etch_rings, under_errors
@@ -211,7 +213,7 @@ def _publish(
     found: Etching, elements: Mapping[str, Element], settings: Settings, arguments: argparse.Namespace
 ) -> None:
     publish_elements(elements, Path(arguments.docs))
-    words = [f"--data DIR --limit {arguments.limit}"] if arguments.data else []
+    words = picture_words(arguments, LIMIT)
     command = " ".join(["raytrace wave etch", *words, *settings.words(), "-o FOLDER --docs docs"])
     tables = {"etch.csv": table([row.record() for row in found.rows], floats=lambda number: round(number, 4))}
     figures = {"etch.png": found.plot()}
