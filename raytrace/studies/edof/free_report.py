@@ -23,7 +23,7 @@ from raytrace.studies.edof.noise import FILTERS, Bank, Errors, Interval, drawn, 
 from raytrace.studies.edof.noise_command import Settings as Noise
 from raytrace.studies.edof.noise_report import TITLES, Kept, judge_baselines
 from raytrace.studies.edof.report import contents_of
-from raytrace.studies.edof.world import ClosedForm, World, depth_text, periodic, spectrum
+from raytrace.studies.edof.world import WAVELENGTH, ClosedForm, World, depth_text, periodic, spectrum
 from raytrace.studies.options import picture_words
 from raytrace.studies.publish import publish, published
 from raytrace.wave.element import Element, Rings, as_pixels
@@ -31,7 +31,6 @@ from raytrace.wave.element_file import read_element
 
 _SHOWN = 500  # pixels of a drawn map along each side
 _LENS = 4  # even powers of r, from a constant on, that are taken out of drawn heights
-_MIDDLE = 0.55  # µm: of the kernels that are drawn
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,7 +177,7 @@ def _rows(
 @torch.no_grad()
 def _shown(element: Element, settings: Settings) -> Shown:
     pixels = as_pixels(element, settings.feature) if isinstance(element.profile, Rings) else element
-    world = dataclasses.replace(World(), wavelengths=(_MIDDLE,))
+    world = dataclasses.replace(World(), wavelengths=(WAVELENGTH,))
     kernels = PixelForm((pixels,), world, torch.ones(1), dtype=torch.float32).kernels((pixels,))
     every = max(1, len(pixels.numbers) // _SHOWN)
     heights = 1e3 * pixels.numbers[::every, ::every].numpy()

@@ -41,7 +41,7 @@ from raytrace.studies.edof.noise_command import Settings
 from raytrace.studies.edof.report import contents_of, learn
 from raytrace.studies.edof.table import ROWS, title_of
 from raytrace.studies.edof.training import EdofCamera
-from raytrace.studies.edof.world import ClosedForm, World, kernels, transfer
+from raytrace.studies.edof.world import WAVELENGTH, ClosedForm, World, kernels, transfer
 from raytrace.studies.options import picture_words
 from raytrace.studies.pictures import Pictures
 from raytrace.studies.publish import publish, published
@@ -50,7 +50,6 @@ from raytrace.wave.element_file import SMOOTH, read_element, write_element
 from raytrace.words import did_you_mean
 
 TITLES = {"wiener": "Wiener filter of the PSF at 1 m", "blind": "best depth-invariant filter"}
-WAVELENGTH = 0.55  # µm: of the design
 _PUBLISHED = ROWS["learned"].published - ROWS["fresnel"].published
 
 

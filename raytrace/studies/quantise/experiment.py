@@ -24,13 +24,12 @@ from raytrace.maths.value import detached
 from raytrace.studies import options
 from raytrace.studies.edof.settings import Settings
 from raytrace.studies.edof.training import adam, begin
-from raytrace.studies.edof.world import ClosedForm, World, expected_error, scene, spectrum, transfer
+from raytrace.studies.edof.world import WAVELENGTH, ClosedForm, World, expected_error, scene, spectrum, transfer
 from raytrace.studies.edof.world import kernels as kernels_of
 from raytrace.studies.pictures import draws
 from raytrace.wave.element import Element, Pixels, Rings, period, with_tolerance, wrapped
 from raytrace.wave.scene import residual
 
-WAVELENGTH = 0.55  # µm: at which heights are wrapped, and whose period is stepped
 _POINTS = 400_000  # over the aperture, of equal area
 _DRAW = 24  # last number of the key of a draw of errors
 
