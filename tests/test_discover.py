@@ -6,9 +6,11 @@ import pytest
 import torch
 
 from raytrace.camera.deconvolve import psnr
+from raytrace.camera.training import OtherSettings
 from raytrace.cli import main
 from raytrace.studies.edof.world import periodic, spectrum
-from raytrace.studies.pictures import dead_leaves
+from raytrace.studies.pictures import dead_leaves, split
+from raytrace.studies.superres import discover_report
 from raytrace.studies.superres.discover import (
     WINDOW,
     Error,
@@ -21,6 +23,7 @@ from raytrace.studies.superres.discover import (
     random_path,
     starts,
 )
+from raytrace.studies.superres.discover_command import Settings
 from raytrace.studies.superres.experiment import world_of
 
 PICTURES = periodic(dead_leaves(6, size=64), 96)
@@ -98,6 +101,18 @@ def test_a_plate_comes_to_show_the_scene_more_than_once():
     path = random_path(WORLD, 0.1, seed=0)
     inside = path != 0
     assert float(path[inside].square().mean().sqrt()) == pytest.approx(0.055e-3, rel=0.02)
+
+
+def test_plates_are_kept_for_their_pictures(monkeypatch, tmp_path):
+    """As many others are refused."""
+    monkeypatch.setattr(
+        discover_report, "starts", lambda *given, **how: starts(WORLD, spreads=(), seeds=0, factor=2)[:1]
+    )
+    own, others = (split(dead_leaves(4, size=96, seed=seed)) for seed in (0, 1))
+    for _ in range(2):
+        discover_report._camera(Settings(), "550 nm", (0.55,), *own, tmp_path)
+    with pytest.raises(OtherSettings, match="pictures was"):
+        discover_report._camera(Settings(), "550 nm", (0.55,), *others, tmp_path)
 
 
 @pytest.mark.slow

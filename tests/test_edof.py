@@ -10,9 +10,11 @@ import torch
 from raytrace.camera.deconvolve import blind_filter, errors, psnr, wiener
 from raytrace.camera.phase import PhaseVariables
 from raytrace.camera.training import OtherSettings
+from raytrace.cli.door import CommandError
 from raytrace.maths.zernike import polynomials
 from raytrace.media.glass import index
 from raytrace.studies.edof import table as edof_table
+from raytrace.studies.edof.report import learn
 from raytrace.studies.edof.settings import Settings
 from raytrace.studies.edof.table import STRENGTHS, Content, elements_of, records, table_of
 from raytrace.studies.edof.training import begin, learn_element, radial_powers, scheduled
@@ -29,7 +31,7 @@ from raytrace.studies.edof.world import (
     spectrum,
     transfer,
 )
-from raytrace.studies.pictures import dead_leaves
+from raytrace.studies.pictures import dead_leaves, digest
 from raytrace.wave.designs import aim, baseline
 from raytrace.wave.element import Element, EvenPowers, height
 from raytrace.wave.psf import psf
@@ -38,7 +40,7 @@ from raytrace.wave.psf import psf
 SMALL = World(depths=(500.0, 1000.0, math.inf), wavelengths=(0.55,), size=63, pixel=0.00738)
 LEAVES = dead_leaves(8, size=64, seed=5, smallest=2.5)
 PICTURES = periodic(LEAVES, 128)
-S = spectrum(PICTURES)
+S, OF_LEAVES = spectrum(PICTURES), digest(LEAVES.samples)
 QUICK = Settings(kind="smooth", terms=4, starts=1, start_steps=5, steps=12, size=128, rate=0.05)
 
 
@@ -121,7 +123,7 @@ def test_a_run_that_is_broken_off_ends_as_if_it_had_not_been(tmp_path, change):
     ends = []
     for name, stop in (("whole", None), ("broken", 7)):
         for _ in range(1 if stop is None else 2):
-            camera, run = begin(settings, SMALL, S, tmp_path / name)
+            camera, run = begin(settings, SMALL, S, tmp_path / name, pictures=OF_LEAVES)
             for step, _record in learn_element(camera, LEAVES, settings, run, every=5):
                 if step == stop:
                     stop = None
@@ -130,13 +132,24 @@ def test_a_run_that_is_broken_off_ends_as_if_it_had_not_been(tmp_path, change):
         assert [row["step"] for row in run.rows()] == list(range(settings.steps))
     assert all(torch.equal(a, b) for a, b in zip(*ends, strict=True))
     with pytest.raises(OtherSettings, match="rate was"):
-        begin(dataclasses.replace(settings, rate=0.01), SMALL, S, tmp_path / "whole")
+        begin(dataclasses.replace(settings, rate=0.01), SMALL, S, tmp_path / "whole", pictures=OF_LEAVES)
+
+
+def test_a_run_is_that_of_its_pictures(tmp_path):
+    """As many others are refused, whether it has finished or not."""
+    settings, others = dataclasses.replace(QUICK, steps=1), dead_leaves(8, size=64, seed=6, smallest=2.5)
+    learn(settings, SMALL, LEAVES, tmp_path, "finished")
+    for _ in range(2):
+        with pytest.raises(CommandError, match=f"pictures was '8, blake2 .*, now '{digest(others.samples)}'"):
+            learn(settings, SMALL, others, tmp_path, "others")
+        (tmp_path / "checkpoint.pt").unlink(missing_ok=True)
+    learn(settings, SMALL, LEAVES, tmp_path, "begun")
 
 
 def test_pictures_teach_the_filter_of_the_original(tmp_path):
     """Weight and target depth move with the heights, and the loss of the same draws falls."""
     settings = dataclasses.replace(QUICK, loss="images", restoration="towards", steps=25, batch=4)
-    camera, run = begin(settings, SMALL, S, tmp_path / "run")
+    camera, run = begin(settings, SMALL, S, tmp_path / "run", pictures=OF_LEAVES)
     first = [float(camera.v), float(camera.t), camera.variables.change.detach().clone()]
     losses = [record["loss"] for _, record in learn_element(camera, LEAVES, settings, run)]
     assert float(camera.v) != first[0]
@@ -148,7 +161,7 @@ def test_pictures_teach_the_filter_of_the_original(tmp_path):
 def test_a_network_learns_behind_the_filter(tmp_path):
     """It begins as nothing at all, and both it and the element move."""
     settings = dataclasses.replace(QUICK, loss="images", restoration="network", steps=4, batch=2)
-    camera, run = begin(settings, SMALL, S, tmp_path / "run")
+    camera, run = begin(settings, SMALL, S, tmp_path / "run", pictures=OF_LEAVES)
     with torch.no_grad():
         noise = torch.zeros(2, 1, 128, 128, dtype=torch.float64)
         both = camera(PICTURES[:2], torch.tensor([0, 2]), noise)
@@ -167,7 +180,7 @@ def test_every_kind_of_element_is_learned(tmp_path, kind, levels):
     settings = dataclasses.replace(
         QUICK, kind=kind, levels=levels, terms=11 if kind == "zernike" else 4, pitch=0.02, steps=6, spread=0.05
     )
-    camera, run = begin(settings, SMALL, S, tmp_path / "run")
+    camera, run = begin(settings, SMALL, S, tmp_path / "run", pictures=OF_LEAVES)
     with torch.no_grad():
         before = float(expected_error(camera.transfer(), S, SMALL.noise))
     for _ in learn_element(camera, LEAVES, settings, run):
@@ -220,14 +233,14 @@ def test_errors_of_height_are_drawn_anew_at_every_step(tmp_path):
     losses = {}
     for name, change in {"off": {"tolerance": 0.0}, "on": {}, "again": {}, "seed": {"seed": 1}}.items():
         settings = dataclasses.replace(still, **change)
-        camera, run = begin(settings, SMALL, S, tmp_path / name)
+        camera, run = begin(settings, SMALL, S, tmp_path / name, pictures=OF_LEAVES)
         losses[name] = [record["loss"] for _, record in learn_element(camera, LEAVES, settings, run)]
     assert np.ptp(losses["off"]) < 1e-9 * losses["off"][0]
     assert len(set(losses["on"])) == 4
     assert losses["again"] == losses["on"]
     assert not set(losses["seed"]) & set(losses["on"])
     with pytest.raises(ValueError, match="belongs to rings"):
-        begin(dataclasses.replace(QUICK, tolerance=1e-4), SMALL, S, tmp_path / "smooth")
+        begin(dataclasses.replace(QUICK, tolerance=1e-4), SMALL, S, tmp_path / "smooth", pictures=OF_LEAVES)
 
 
 def test_mirrored():
@@ -265,7 +278,7 @@ def test_the_order_that_was_published(tmp_path):
     content = Content("leaves", pictures[:8], pictures[8:])
     spectrum_ = spectrum(content.train)
     settings = Settings(steps=60, starts=2)
-    camera, run = begin(settings, world, spectrum_, tmp_path / "run")
+    camera, run = begin(settings, world, spectrum_, tmp_path / "run", pictures=OF_LEAVES)
     for _ in learn_element(camera, LEAVES, settings, run):
         pass
     with torch.no_grad():

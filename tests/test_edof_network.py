@@ -7,9 +7,11 @@ import pytest
 import torch
 
 from raytrace.camera.network import RedNet, RedNetShape
+from raytrace.camera.training import Run
 from raytrace.cli import main
 from raytrace.studies.edof import network_report, report
 from raytrace.studies.edof.network import Filtered, errors_behind, learn_network, patches
+from raytrace.studies.edof.table import Content
 from raytrace.studies.edof.world import World, periodic, spectrum, transfer
 from raytrace.studies.edof.world import scene as scene_of
 from raytrace.studies.pictures import dead_leaves
@@ -66,6 +68,24 @@ def test_a_network_learns_what_the_filter_leaves(tmp_path):
     found = errors_behind(own, network, PICTURES[:3])
     assert float(found["network"].mean()) < float(found["filter"].mean())
     assert float(found["network"][:, 1].mean()) < 0.98 * float(found["filter"][:, 1].mean())  # in focus
+
+
+def test_a_network_is_that_of_its_pictures(capsys, monkeypatch, tmp_path):
+    """Kept errors too: as many others, to learn from or to restore, are refused."""
+    errors = {name: torch.ones(2, 3, 1, dtype=torch.float64) for name in ("filter", "network")}
+    monkeypatch.setattr(network_report, "World", lambda: SMALL)
+    monkeypatch.setattr(network_report, "learn_network", lambda folder, data, about, **how: Run(folder, about))
+    monkeypatch.setattr(network_report, "errors_behind", lambda *given, **how: errors)
+
+    def judged(train, test) -> int:
+        content = Content("sharp leaves", PICTURES[train], PICTURES[test])
+        monkeypatch.setattr(network_report, "contents_of", lambda arguments: ([content], None))
+        return main(["wave", "network", "--rows", "fresnel", "-o", str(tmp_path)])
+
+    assert judged([0, 1], [2, 3]) == judged([0, 1], [2, 3]) == 0
+    for others in (([0, 4], [2, 3]), ([0, 1], [2, 4])):
+        assert judged(*others) == 1
+        assert "pictures was '4, blake2" in capsys.readouterr().err
 
 
 def test_baselines_alone_are_rows(capsys):

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,9 +11,11 @@ import torch
 from raytrace.camera.deconvolve import blind_density, blind_error, blind_filter, psnr
 from raytrace.camera.training import OtherSettings
 from raytrace.cli import main
-from raytrace.studies.edof import report
+from raytrace.studies.edof import free_report, noise_report, report
 from raytrace.studies.edof.noise import (
+    FILTERS,
     Bank,
+    Interval,
     Unit,
     best_strengths,
     cases,
@@ -23,8 +26,9 @@ from raytrace.studies.edof.noise import (
     units,
 )
 from raytrace.studies.edof.noise_command import Settings
-from raytrace.studies.edof.noise_report import Kept, scores
+from raytrace.studies.edof.noise_report import Kept, OverNoise, Score, judge_files, scores
 from raytrace.studies.edof.octant import Octant, fits
+from raytrace.studies.edof.table import Content
 from raytrace.studies.edof.world import (
     ClosedForm,
     World,
@@ -37,13 +41,17 @@ from raytrace.studies.edof.world import (
     transfer,
 )
 from raytrace.studies.pictures import dead_leaves
+from raytrace.studies.quantise import process_report
 from raytrace.wave.designs import aim, baseline
+from raytrace.wave.element import Element, Zernike, as_rings
+from raytrace.wave.element_file import write_element
 from raytrace.wave.plan import plan
 from raytrace.wave.psf import psf
 
 SMALL = World(depths=(500.0, 1000.0, math.inf), wavelengths=(0.5, 0.6), size=63, pixel=0.00738)
 PICTURES = periodic(dead_leaves(8, size=64, seed=5, smallest=2.5), 128)
 S = spectrum(PICTURES)
+LEARNED = str(Path(__file__).parents[1] / "docs/wave/elements/learned-0.01.npy")
 
 
 @pytest.mark.parametrize("name", ["singlet", "fresnel", "hybrid"])
@@ -164,8 +172,75 @@ def test_the_start_of_least_expected_error_is_kept(tmp_path):
         assert own.gain.value == own.starts[0] == pytest.approx(own.psnr - base.psnr)
         assert own.gain.low < own.gain.value < own.gain.high
         assert len(own.starts) == 2
-    with pytest.raises(OtherSettings):
-        Kept(tmp_path, [Bank.of("leaves", PICTURES[:4], PICTURES[4:])])
+    for train, test in ((PICTURES[:4], PICTURES[4:]), (PICTURES[:4], PICTURES[5:])):
+        with pytest.raises(OtherSettings):
+            Kept(tmp_path, [Bank.of("leaves", train, test)])
+
+
+@pytest.mark.parametrize(
+    "words", [("noise", "--rows", "learned"), ("etch",), ("free", "--from", LEARNED)], ids=lambda words: words[0]
+)
+def test_other_pictures_are_refused_before_anything_is_learned(words, capsys, monkeypatch, tmp_path):
+    """What was judged of some pictures stands in the folder: with others nothing is learned on, nothing written."""
+    contents = [Content("leaves", PICTURES[:4], PICTURES[4:])], dead_leaves(4, size=256)
+    for module in (noise_report, process_report, free_report):
+        monkeypatch.setattr(module, "contents_of", lambda arguments: contents)
+    for module, name in ((noise_report, "learn_unit"), (process_report, "etched"), (free_report, "learn_free")):
+        monkeypatch.setattr(module, name, lambda *given, **how: pytest.fail("learned"))
+    Kept(tmp_path / "judged", [Bank.of("leaves", PICTURES[:5], PICTURES[5:])])
+    assert main(["wave", *words, "-o", str(tmp_path)]) == 1
+    assert "judged holds another run: pictures was" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["judged"]
+
+
+def test_files_are_judged_by_all_that_bends_light(monkeypatch, tmp_path):
+    """Kept errors are those of the glass, pitch, radius and kind; of an element met before nothing is made anew."""
+    kept, made = Kept(tmp_path, [Bank.of("leaves", PICTURES[:5], PICTURES[5:])]), []
+    flat = torch.ones(1, 1, 128, 128, dtype=torch.complex128)
+    monkeypatch.setattr(noise_report, "World", lambda: dataclasses.replace(SMALL, depths=(1000.0,), wavelengths=(0.5,)))
+    monkeypatch.setattr(kept, "transfer", lambda elements: made.append(elements) or flat)
+    (one,) = baseline("singlet", aim())
+    rings = as_rings(one, 0.01)
+    coarser = dataclasses.replace(rings.profile, pitch=2 * rings.profile.pitch)
+    others = [
+        one,
+        rings,
+        dataclasses.replace(one, glass=rings_of_silica().glass),
+        dataclasses.replace(rings, profile=coarser),
+    ]
+    others += [
+        dataclasses.replace(one, radius=0.5 * one.radius),
+        dataclasses.replace(one, profile=Zernike(one.numbers)),
+    ]
+    for element in (*others, *others):
+        found = judge_files({"one": element}, Settings(noise=(0.01, 0.02)), kept)
+        assert list(found) == [("one", 0.01), ("one", 0.02)]
+    assert len(made) == len(others)
+
+
+def rings_of_silica() -> Element:
+    (element,) = baseline("fresnel", aim())
+    return element
+
+
+@pytest.mark.parametrize("command", ["noise", "network"])
+def test_files_of_one_name_are_refused(command, capsys, tmp_path):
+    """Two of one stem, and one of the name of a row: nothing would tell them apart in a table."""
+    write_element(rings_of_silica(), tmp_path / "fresnel.npy", design_wavelength=0.55)
+    words = ["wave", command, "-o", str(tmp_path / "run"), "--elements"]
+    assert main([*words, LEARNED, f"{tmp_path}/learned-0.01.json"]) == 1
+    assert f"--elements {LEARNED} {tmp_path}/learned-0.01.json: both would be learned-0.01" in capsys.readouterr().err
+    assert main([*words, str(tmp_path / "fresnel.npy")]) == 1
+    assert "fresnel is the row 'Fresnel lens'; give the file another name" in capsys.readouterr().err
+
+
+def test_the_figure_over_noise_draws_files_by_their_names():
+    one = Interval(1.0, 0.9, 1.1)
+    rows = [
+        Score("sharp leaves", filter, 0.01, row, 20.0, one) for filter in FILTERS for row in ("fresnel", "own-0.01")
+    ]
+    figure = OverNoise(rows, {"sharp leaves": 8}).plot()
+    assert "own-0.01" in [text.get_text() for legend in figure.legends for text in legend.get_texts()]
 
 
 @pytest.mark.slow

@@ -6,12 +6,15 @@ import math
 import pytest
 import torch
 
+from raytrace.camera.training import OtherSettings
 from raytrace.cli import main
 from raytrace.media.catalog import find_glass
 from raytrace.studies.edof import report
 from raytrace.studies.edof.world import ClosedForm, World, periodic, spectrum
 from raytrace.studies.pictures import dead_leaves
+from raytrace.studies.quantise import process_report
 from raytrace.studies.quantise.process import Case, cases, etch_rings, move_levels, under_errors
+from raytrace.studies.quantise.process_command import Settings
 from raytrace.wave.element import Element, EvenPowers, Rings, period
 from raytrace.wave.etching import Process, matched, relief
 
@@ -124,6 +127,17 @@ def test_every_process_once_before_any_a_second_time():
     assert [one.start for one in found] == [0] * 4 + [1] * 4
     assert found[1] == Case(1, 16, 0.01, 0)
     assert (found[1].row, found[1].model.row) == ("etched-1-16", "learned")
+
+
+def test_what_is_etched_is_that_of_its_pictures(monkeypatch, tmp_path):
+    """A folder of other leaves is refused, finished or not."""
+    case, settings = Case(1, 4, 0.01, 0), Settings()
+    monkeypatch.setattr(process_report, "learn_unit", lambda *given: pytest.fail("learned"))
+    for _ in range(2):
+        with pytest.raises(pytest.fail.Exception):
+            process_report.etched(case, settings, dead_leaves(2, size=16), tmp_path)
+    with pytest.raises(OtherSettings, match="pictures was '2, blake2"):
+        process_report.etched(case, settings, dead_leaves(2, size=16, seed=1), tmp_path)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from raytrace.studies import pictures
-from raytrace.studies.pictures import NoPictures, Pictures, crop, dead_leaves, draws, files, order, read, split
+from raytrace.studies.pictures import NoPictures, Pictures, crop, dead_leaves, digest, draws, files, order, read, split
 
 
 @pytest.fixture
@@ -78,6 +78,16 @@ def test_an_epoch_takes_as_many_crops_of_every_picture():
     shades = [round(255 * float(crop(pictures, i, epoch=0, size=8)[0, 0])) for i in range(12)]
     assert sorted(shades) == [0] * 4 + [50] * 4 + [100] * 4
     assert sorted(order(12, epoch=0)) == list(range(12))
+
+
+def test_a_digest_tells_pictures_apart():
+    """Every pixel, shape, kind of number and place counts; copies and views are the same."""
+    one = np.arange(6, dtype=np.uint8).reshape(2, 3)
+    assert digest([one, one + 1]) == digest((one.copy(), np.flip(np.flip(one + 1))))
+    assert digest([one, one]).startswith("2, blake2 ")
+    others = [one + (one == 5), one.reshape(3, 2), one.astype(np.int8), one.T, one[::-1]]
+    assert len({digest([one]), *(digest([other]) for other in others)}) == 6
+    assert digest([one, one + 1]) != digest([one + 1, one])
 
 
 def test_dead_leaves_laid_by_leaf_and_by_pixel_are_the_same(monkeypatch):

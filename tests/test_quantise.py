@@ -9,6 +9,8 @@ import torch
 
 from raytrace.cli import main
 from raytrace.media.catalog import find_glass
+from raytrace.studies.edof.report import learn
+from raytrace.studies.edof.settings import Settings
 from raytrace.studies.edof.world import World, expected_error, periodic, quality, scene, spectrum, transfer
 from raytrace.studies.pictures import dead_leaves
 from raytrace.studies.quantise.experiment import (
@@ -174,6 +176,21 @@ def test_pixels_are_made_as_rings_are(tmp_path, suffix):
 def test_what_is_no_run_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"no settings.json; expected the folder of a run"):
         read(tmp_path, spectrum(PICTURES))
+
+
+def test_a_run_is_read_with_other_pictures_and_not_begun_with_them(tmp_path):
+    """The element as it was learned; of a run that has no start yet none is sought by pictures that are not its own."""
+    leaves, folder = dead_leaves(4, size=48, seed=1), tmp_path / "run"
+    settings = Settings(terms=3, pitch=0.02, starts=1, start_steps=2, steps=2, size=96)
+    own = dataclasses.replace(WORLD, size=47)
+    camera = learn(settings, own, leaves, folder, "run")
+    element, world = read(folder, spectrum(PICTURES))
+    assert world == own
+    assert torch.equal(element.numbers, camera.variables()[0].numbers)
+    (folder / "start.pt").unlink()
+    with pytest.raises(ValueError, match=r"no start.pt; let `raytrace wave edof` finish"):
+        read(folder, spectrum(PICTURES))
+    assert not (folder / "start.pt").exists()
 
 
 def test_radial_elements_only():

@@ -10,8 +10,9 @@ from raytrace.cli.options import count, file_name, positive_finite, seed_number
 _READ = {int: {"type": count, "metavar": "N"}, float: {"type": positive_finite}}
 
 
-def option(default, help: str, metavar: str | None = None, *, name: str = "", **spelling):
-    """A field of settings that is an option of the command, by default --FIELD; spelling: what else argparse takes.
+def option(default, help: str, metavar: str | None = None, *, name: str = "", unit: float = 1.0, **spelling):
+    """A field of settings that is an option of the command, by default --FIELD; unit: of the option, in that of the
+    field; spelling: what else argparse takes.
 
     Whole numbers are above 0, others finite too, and a tuple takes one or more, where `type` does not say otherwise.
     The parser leaves None where the option is not given: the help ends with the default, unless it says it itself.
@@ -23,7 +24,8 @@ def option(default, help: str, metavar: str | None = None, *, name: str = "", **
         help = f"{help} (default {usual})"
     given = {"metavar": metavar} if metavar else {}
     several = {"nargs": "+"} if is_tuple else {}
-    return dataclasses.field(default=default, metadata={"name": name, "help": help} | read | several | given | spelling)
+    about = {"name": name, "help": help, "unit": unit}
+    return dataclasses.field(default=default, metadata=about | read | several | given | spelling)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,15 +42,28 @@ class Settings:
 
     def words(self) -> list[str]:
         """What is not as by default, as options of the command."""
-        found = []
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if field.metadata and value != field.default:
-                name = (field.metadata["name"] or field.name).replace("_", "-")
-                if isinstance(value, tuple):
-                    value = " ".join(one if isinstance(one, str) else f"{one:g}" for one in value)
-                found.append(f"--{name} {value}")
-        return found
+        given = [(field, getattr(self, field.name)) for field in dataclasses.fields(self) if field.metadata]
+        return [word for field, value in given if value != field.default for word in _words(field, value)]
+
+
+def _words(field: dataclasses.Field, value) -> list[str]:
+    """An option as it is given."""
+    name, unit = _spelled(field.name, field.metadata), field.metadata["unit"]
+    if isinstance(value, bool):
+        return [f"--{name}" if value else f"--no-{name}"]
+    if field.metadata.get("action") == "append":
+        return [f"--{name} {_text(one)}" for one in value]
+    return [f"--{name} {_text(value) if unit == 1 else f'{value / unit:.12g}'}"]
+
+
+def _text(value) -> str:
+    if isinstance(value, tuple | list):
+        return " ".join(one if isinstance(one, str) else f"{one:.12g}" for one in value)
+    return str(value)
+
+
+def _spelled(name: str, about: Mapping) -> str:
+    return (about["name"] or name).replace("_", "-")
 
 
 def read(kind: type, document: Mapping):
@@ -60,8 +75,9 @@ def add_options(group, settings: type[Settings], *names: str) -> None:
     """The options of the fields of these names, of all that this kind of settings adds if none are given."""
     fields = {field.name: dict(field.metadata) for field in dataclasses.fields(settings) if field.metadata}
     for name in names or [name for name in settings.__annotations__ if name in fields]:
-        spelled = (fields[name].pop("name") or name).replace("_", "-")
-        group.add_argument(f"--{spelled}", dest=name, **fields[name])
+        spelled = _spelled(name, fields[name])
+        taken = {key: value for key, value in fields[name].items() if key not in ("name", "unit")}
+        group.add_argument(f"--{spelled}", dest=name, **taken)
 
 
 def whole(least: int) -> Callable[[str], int]:
@@ -85,6 +101,12 @@ def pictures(parser, what: str, *names: str, settings: type[Settings] = Settings
     usual = f" (default {limit})" if limit else ""
     group.add_argument("--limit", metavar="N", type=count, default=limit, help=f"take N of them, evenly{usual}")
     add_options(group, settings, *names)
+
+
+def picture_words(arguments: argparse.Namespace, limit: int) -> list[str]:
+    """--data and --limit as they were given, the folder not named; limit: the default."""
+    limited = [f"--limit {arguments.limit}"] if arguments.limit != limit else []
+    return [*(["--data DIR"] if arguments.data else []), *limited]
 
 
 def documents(group, what: str) -> None:

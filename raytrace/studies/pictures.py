@@ -7,6 +7,7 @@ process or on many, in a first run or in a resumed one.
 import argparse
 import dataclasses
 import functools
+import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
@@ -36,6 +37,20 @@ class Pictures:
 
     def __len__(self) -> int:
         return len(self.samples)
+
+
+def digest(samples: Sequence[np.ndarray]) -> str:
+    """How many pictures, and a hash of all their pixels: what a run is known by that learns from them."""
+    found = hashlib.blake2b(digest_size=8)
+    for sample in samples:
+        found.update(f"{sample.dtype} {sample.shape}".encode())
+        found.update(np.ascontiguousarray(sample))
+    return f"{len(samples)}, blake2 {found.hexdigest()}"
+
+
+def pictures_of(kind: str) -> str:
+    """What pictures are called that are of a kind, one of leaves or "pictures"."""
+    return kind if kind == "pictures" else f"pictures of {kind}"
 
 
 def draws(*key: int) -> np.random.Generator:

@@ -9,6 +9,15 @@ from raytrace.pages import write_page
 from raytrace.plot.style import save
 
 
+def published(file: str | Path, docs: str | Path) -> str:
+    """A file as the command of a page names it: below docs/ where it lies there, as it was given, or by its name alone
+    where that was from the root of this machine."""
+    path, root = Path(file), Path(docs).resolve()
+    if path.resolve().is_relative_to(root):
+        return (Path("docs") / path.resolve().relative_to(root)).as_posix()
+    return path.name if path.is_absolute() else path.as_posix()
+
+
 def publish(page: Path, folder: str, parts: Iterable[str], *, tables: Mapping[str, str], figures: Mapping) -> None:
     """Write a page anew above what it keeps. tables (CSV), figures (of matplotlib): by file name, in the folder."""
     beside = page.parent / folder

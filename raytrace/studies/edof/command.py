@@ -26,6 +26,7 @@ EXAMPLES = """examples:
   raytrace wave edof --data pictures --steps 300 -o run"""
 
 PICTURES = "folder of pictures of 256 × 256 pixels or more; four fifths make the filters, the others are restored"
+LIMIT = 80  # of them
 _DEPTHS = (500.0, 2000 / 3, 1000.0, 2000.0, float("inf"))
 
 
@@ -48,7 +49,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     )
     learning = ("loss", "restoration", "optimizer", "schedule", "rate", "steps", "starts")
     add_options(parser.add_argument_group("learning"), Settings, *learning)
-    pictures(parser, PICTURES, "seed", limit=80)
+    pictures(parser, PICTURES, "seed", limit=LIMIT)
     output_folder(parser, "folder of the run", required=True)
     json(parser)
     plot(parser, "height map, PSFs over depth and colour, PSNR over depth")

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from raytrace.plot.style import FIELD_COLOURS, GREY, INK, array, new_figure, styled, wavelength_colours
 from raytrace.studies.edof.scene import Deep
-from raytrace.studies.edof.table import ROWS
+from raytrace.studies.edof.table import ROWS, title_of
 from raytrace.studies.edof.world import Judged, Quality, World, depth_text
 from raytrace.studies.figures import picture as show
 from raytrace.wave.element import Element, height
@@ -85,7 +85,7 @@ def noise_figure(found) -> Figure:
             noises = sorted(own)
             gains = [own[noise].gain for noise in noises]
             look = _look(row, list(rows))
-            panel.plot(noises, [one.value for one in gains], label=ROWS[row].title, **look)
+            panel.plot(noises, [one.value for one in gains], label=title_of(row), **look)
             low, high = ([getattr(one, end) for one in gains] for end in ("low", "high"))
             panel.fill_between(noises, low, high, color=look["color"], alpha=0.13, lw=0)
         published = ROWS["learned"].published - ROWS["fresnel"].published

@@ -7,7 +7,6 @@ up symmetry brings.
 
 import dataclasses
 import functools
-import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from raytrace.camera.phase import PhaseVariables
 from raytrace.camera.training import Record, Run, Share, load_state, read_state, train
 from raytrace.files import write_atomically
 from raytrace.maths.value import detached
-from raytrace.studies.edof.noise import best_strengths
+from raytrace.studies.edof.noise import best_strengths, mark_of_elements
 from raytrace.studies.edof.training import scheduled
 from raytrace.studies.edof.world import ClosedForm, World, expected_error, scene, transfer
 from raytrace.studies.pictures import draws
@@ -27,8 +26,8 @@ from raytrace.wave.designs import Aim, aim, baseline
 from raytrace.wave.element import Element, Pixels, Zernike, as_pixels, excess_index, features, path
 
 _CHANGE, _SMOOTH = 33, 34  # last numbers of the keys of random starts
-_TERMS = 36  # of Noll's polynomials, piston and tilts left out
-_WHITE = 0.02  # µm, of every pixel's random change
+TERMS, SPREAD = 36, 0.5  # Noll's polynomials, piston and tilts left out, of a random start; µm RMS of each
+WHITE = 0.02  # µm, of every pixel's random change
 _NODES = 3  # per pixel of the sensor while learning; 4 to be judged
 
 
@@ -75,7 +74,7 @@ def _cubic(rings: Element, pitch: float, made_for: Aim, noise: float, seed: int,
 
 
 def _random(rings: Element, pitch: float, made_for: Aim, noise: float, seed: int, S: Tensor) -> Element:
-    random = 5e-4 * torch.as_tensor(draws(seed, _SMOOTH).standard_normal(_TERMS)).to(rings.radius)
+    random = 1e-3 * SPREAD * torch.as_tensor(draws(seed, _SMOOTH).standard_normal(TERMS)).to(rings.radius)
     random[:3] = 0
     plate = Element(Zernike(random), rings.radius, rings.glass)
     return as_map((*baseline("singlet", made_for), plate), rings, pitch, made_for.wavelength)
@@ -145,7 +144,7 @@ def camera_of(case: Case, rings: Element, S: Tensor, folder: Path) -> FreeCamera
     element = _start(case, rings, S, folder)
     camera = FreeCamera(element, (ClosedForm if case.start == "control" else PixelForm), case.world(), S)
     if case.start != "control":
-        change = _WHITE * draws(case.seed, _CHANGE).standard_normal(tuple(element.numbers.shape))
+        change = WHITE * draws(case.seed, _CHANGE).standard_normal(tuple(element.numbers.shape))
         with torch.no_grad():
             camera.variables.change.copy_(torch.as_tensor(change))
     return camera
@@ -161,8 +160,7 @@ def learn_free(
     every: int = 20,
 ) -> Element:
     """The element of a case, from its folder, learned as far as is left by Adam, whose rate falls as a cosine."""
-    mark = hashlib.sha256(rings.numbers.detach().numpy().tobytes()).hexdigest()[:16]
-    run = Run(case.folder(root), dataclasses.asdict(case) | {"rings": mark})
+    run = Run(case.folder(root), dataclasses.asdict(case) | {"rings": mark_of_elements([rings])})
     camera, state = camera_of(case, rings, S, run.folder), run.load()
     if state is not None and state["step"] >= case.steps:
         load_state(camera, state, run.checkpoint)

@@ -16,20 +16,21 @@ from raytrace.cli.progress import progress
 from raytrace.files import table
 from raytrace.maths.result import Result
 from raytrace.pages import grid, picture
-from raytrace.studies.edof.free import STARTS, Case, PixelForm, departure, learn_free
+from raytrace.studies.edof.command import LIMIT
+from raytrace.studies.edof.free import SPREAD, STARTS, TERMS, WHITE, Case, PixelForm, departure, learn_free
 from raytrace.studies.edof.free_command import Settings
 from raytrace.studies.edof.noise import FILTERS, Bank, Errors, Interval, drawn, gain, mean_psnr
 from raytrace.studies.edof.noise_command import Settings as Noise
 from raytrace.studies.edof.noise_report import TITLES, Kept, judge_baselines
 from raytrace.studies.edof.report import contents_of
-from raytrace.studies.edof.world import ClosedForm, World, periodic, spectrum
-from raytrace.studies.publish import publish
+from raytrace.studies.edof.world import WAVELENGTH, ClosedForm, World, depth_text, periodic, spectrum
+from raytrace.studies.options import picture_words
+from raytrace.studies.publish import publish, published
 from raytrace.wave.element import Element, Rings, as_pixels
 from raytrace.wave.element_file import read_element
 
 _SHOWN = 500  # pixels of a drawn map along each side
 _LENS = 4  # even powers of r, from a constant on, that are taken out of drawn heights
-_MIDDLE = 0.55  # µm: of the kernels that are drawn
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,13 +115,13 @@ def free(arguments: argparse.Namespace) -> Freed:
         raise CommandError(f"--from {arguments.rings}: holds no rings; expected heights of rings")
     contents, train = contents_of(arguments)
     S = spectrum(periodic(train, 256))
+    banks = [Bank.of(content.name, content.train, content.test) for content in contents]
+    del contents
+    kept = Kept(root / "judged", banks)  # refuses other pictures before anything is learned
     elements = {"given": rings, "cut": as_pixels(rings, settings.feature)}
     for start in ("control", *settings.starts):
         case = Case(start, settings.noise, settings.feature, settings.steps, settings.rate, settings.seed)
         elements[start] = _learned(case, rings, S, root)
-    banks = [Bank.of(content.name, content.train, content.test) for content in contents]
-    del contents
-    kept = Kept(root / "judged", banks)
     noise = Noise.of({"noise": (settings.noise,), "seed": settings.seed})
     base = judge_baselines(["fresnel"], noise, banks, kept)["fresnel", settings.noise]
     found = {row: _judged(row, element, S, settings, kept) for row, element in progress(list(elements.items()), "map")}
@@ -176,7 +177,7 @@ def _rows(
 @torch.no_grad()
 def _shown(element: Element, settings: Settings) -> Shown:
     pixels = as_pixels(element, settings.feature) if isinstance(element.profile, Rings) else element
-    world = dataclasses.replace(World(), wavelengths=(_MIDDLE,))
+    world = dataclasses.replace(World(), wavelengths=(WAVELENGTH,))
     kernels = PixelForm((pixels,), world, torch.ones(1), dtype=torch.float32).kernels((pixels,))
     every = max(1, len(pixels.numbers) // _SHOWN)
     heights = 1e3 * pixels.numbers[::every, ::every].numpy()
@@ -192,11 +193,17 @@ def _shown(element: Element, settings: Settings) -> Shown:
 
 # --- the page
 
+_ON = f"on a lens for {depth_text(World.design)}"
+_BEGUN = {
+    "rings": "from the learned rings",
+    "cubic": f"from the cubic plate of best strength {_ON}",
+    "random": f"from random polynomials (Noll's up to {TERMS}, {SPREAD:g} µm RMS each) {_ON}",
+}
+
 
 def _publish(found: Freed, arguments: argparse.Namespace) -> None:
-    words = ["--from docs/wave/elements/learned-0.01.npy" if Path(arguments.rings).name == "learned-0.01.npy" else ""]
-    words += [f"--data DIR --limit {arguments.limit}"] if arguments.data else []
-    command = " ".join(["raytrace wave free", *filter(None, words), *found.settings.words(), "-o FOLDER --docs docs"])
+    words = [f"--from {published(arguments.rings, arguments.docs)}", *picture_words(arguments, LIMIT)]
+    command = " ".join(["raytrace wave free", *words, *found.settings.words(), "-o FOLDER --docs docs"])
     tables = {"free.csv": table([row.record() for row in found.rows], floats=lambda number: round(number, 4))}
     figures = {"free.png": found.plot()}
     publish(Path(arguments.docs) / "wave_free.md", "wave", _parts(found, command), tables=tables, figures=figures)
@@ -207,16 +214,17 @@ def _parts(found: Freed, command: str) -> list[str]:
     counted = ", ".join(f"{count} of {name}" for name, count in found.pictures.items())
     own = found.settings
     across = round(2 * World().radius / own.feature)
+    size = 4e-6 * across**2  # MB, in single precision
+    begun = ", ".join(_BEGUN[start] for start in own.starts)
     return [
         "# Free heights, symmetry not assumed",
         f"    {command}",
         "Camera, depths and colours of [wave_edof.md](wave_edof.md), pictures and intervals of "
         f"[wave_noise.md](wave_noise.md), noise {own.noise:g}. Maps of {across:,} × {across:,} pixels of "
         f"{1e3 * own.feature:g} µm of fused silica, every height free, learned by the expected error of the best "
-        f"depth-invariant filter: {own.steps} steps of Adam from the learned rings, from the cubic plate of best "
-        "strength and from random polynomials (Noll's up to 36, 0.5 µm RMS each), the last two on a lens for 1 m; each "
-        "with a random change of 20 nm RMS of every pixel. *Rings learned on*: the same rings, as many steps of the "
-        "same rate, round. *Expected*: PSNR of the closed form on sharp leaves, which all are learned for. *Not "
+        f"depth-invariant filter: {own.steps} steps of Adam {begun}; each with a random change of "
+        f"{1e3 * WHITE:g} nm RMS of every pixel. *Rings learned on*: the same rings, as many steps of the same rate, "
+        "round. *Expected*: PSNR of the closed form on sharp leaves, which all are learned for. *Not "
         f"round*: what is left of the heights without their mean over each ring. Restored: {counted}; filters are "
         "made for others.",
         picture(
@@ -228,5 +236,5 @@ def _parts(found: Freed, command: str) -> list[str]:
             for filter in FILTERS
             for part in (f"## {name[0].upper()}{name[1:]}, {TITLES[filter]}", grid(_HEADER, found.lines(name, filter)))
         ),
-        "All figures: [free.csv](wave/free.csv). A learned map takes 25 MB and does not ship.",
+        f"All figures: [free.csv](wave/free.csv). A learned map takes {size:.2g} MB and does not ship.",
     ]

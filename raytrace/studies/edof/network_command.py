@@ -5,7 +5,7 @@ import dataclasses
 
 from raytrace.cli.options import file_name, json, output_folder
 from raytrace.studies import options as rows
-from raytrace.studies.edof.command import PICTURES
+from raytrace.studies.edof.command import LIMIT, PICTURES
 from raytrace.studies.options import add_options, documents, option, pictures
 
 SUMMARY = "what a small network brings behind the filter of an element"
@@ -15,8 +15,10 @@ nor colour: what it brings to baselines and to elements in files, which stay as 
 judged on others; gains with their 95 % intervals over pictures drawn with replacement. FOLDER keeps the networks: the
 same command goes on where it was stopped."""
 EXAMPLES = """examples:
-  raytrace wave network --rows fresnel --steps 50 -o networks
+  raytrace wave network --rows fresnel --steps 50 -o trial
   raytrace wave network --elements docs/wave/elements/learned-0.01.npy --data pictures -o networks --docs docs"""
+
+USUAL = ("fresnel", "hybrid")  # rows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,7 +31,7 @@ class Settings(rows.Settings):
 
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--rows", metavar="ROW", nargs="+", default=("fresnel", "hybrid"), help="baselines (default fresnel hybrid)"
+        "--rows", metavar="ROW", nargs="+", default=USUAL, help=f"baselines (default {' '.join(USUAL)})"
     )
     parser.add_argument(
         "--elements",
@@ -40,7 +42,7 @@ def options(parser: argparse.ArgumentParser) -> None:
         help="elements in files, heights of rings or smooth",
     )
     add_options(parser, Settings)
-    pictures(parser, PICTURES, "seed", settings=Settings, limit=80)
+    pictures(parser, PICTURES, "seed", settings=Settings, limit=LIMIT)
     output_folder(parser, "folder of networks", required=True)
     documents(parser, "wave_network.md and wave/")
     json(parser)

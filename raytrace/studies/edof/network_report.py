@@ -2,8 +2,7 @@
 
 import argparse
 import dataclasses
-import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import torch
@@ -15,16 +14,18 @@ from raytrace.cli.progress import progress
 from raytrace.files import table, write_json
 from raytrace.maths.result import Result
 from raytrace.pages import grid
+from raytrace.studies.edof.command import LIMIT
 from raytrace.studies.edof.network import Filtered, errors_behind, learn_network, patches
-from raytrace.studies.edof.network_command import Settings
-from raytrace.studies.edof.noise import Interval, best_strengths, cases, drawn, gain, mean_psnr
-from raytrace.studies.edof.noise_report import title_of
+from raytrace.studies.edof.network_command import USUAL, Settings
+from raytrace.studies.edof.noise import Interval, best_strengths, cases, drawn, gain, mark_of_elements, mean_psnr
+from raytrace.studies.edof.noise_report import element_words, elements_in
 from raytrace.studies.edof.report import contents_of
-from raytrace.studies.edof.table import ROWS, Content
+from raytrace.studies.edof.table import ROWS, Content, title_of
 from raytrace.studies.edof.world import World, kernels, spectrum, transfer
+from raytrace.studies.options import picture_words
+from raytrace.studies.pictures import digest, pictures_of
 from raytrace.studies.publish import publish
 from raytrace.wave.element import Element
-from raytrace.wave.element_file import read_element
 
 _TRAINED, _RESTORED = 100, 24  # pictures
 
@@ -51,9 +52,10 @@ class Behind:
 
 @dataclasses.dataclass(frozen=True)
 class Networks(Result):
-    """Every element; pictures: how many were restored."""
+    """Every element; trained, pictures: how many were learned from, and restored."""
 
     rows: list[Behind]
+    trained: int
     pictures: int
     kind: str
     noise: float
@@ -85,35 +87,37 @@ def networks(arguments: argparse.Namespace) -> Networks:
     if unknown:
         baselines = ", ".join(row for row in ROWS if not ROWS[row].learning)
         raise CommandError(f"--rows {' '.join(unknown)}: expected {baselines}")
+    files = elements_in(arguments.elements)
     content = contents_of(arguments)[0][-1 if arguments.data else 0]
-    found = {}
-    for name, elements in _elements(arguments, settings, content):
-        found[name] = _judged(name, elements, content, settings, Path(arguments.folder))
-    result = Networks(_rows(found, settings), min(_RESTORED, len(content.test)), content.name, settings.noise)
+    found, mark = {}, digest([*content.train.numpy(), *content.test.numpy()])
+    for name, elements in _elements(arguments, files, settings, content):
+        found[name] = _judged(name, elements, content, mark, settings, Path(arguments.folder))
+    counts = min(_TRAINED, len(content.train)), min(_RESTORED, len(content.test))
+    result = Networks(_rows(found, settings), *counts, content.name, settings.noise)
     if arguments.docs:
-        words = [f"--rows {' '.join(arguments.rows)}", *(["--elements FILES"] if arguments.elements else [])]
-        words += [f"--data DIR --limit {arguments.limit}"] if arguments.data else []
-        parts = _parts(result, " ".join(["raytrace wave network", *words, *settings.words(), "-o FOLDER --docs docs"]))
+        words = [f"--rows {' '.join(arguments.rows)}"] if tuple(arguments.rows) != USUAL else []
+        words += [*element_words(arguments), *picture_words(arguments, LIMIT), *settings.words()]
+        parts = _parts(result, " ".join(["raytrace wave network", *words, "-o FOLDER --docs docs"]))
         tables = {"network.csv": table([row.record() for row in result.rows], floats=lambda n: round(n, 4))}
         publish(Path(arguments.docs) / "wave_network.md", "wave", parts, tables=tables, figures={})
     return result
 
 
 def _elements(
-    arguments: argparse.Namespace, settings: Settings, content: Content
+    arguments: argparse.Namespace, files: Mapping[str, Element], settings: Settings, content: Content
 ) -> Iterator[tuple[str, tuple[Element, ...]]]:
     cubic = any(row.startswith("cubic") for row in arguments.rows)
     strengths = best_strengths([settings.noise], spectrum(content.train)) if cubic else {}
     for row, elements, _ in cases(arguments.rows, [settings.noise], strengths):
         yield row, elements
-    for file in arguments.elements:
-        yield Path(file).stem, (read_element(file, aperture=2 * World().radius),)
+    for name, element in files.items():
+        yield name, (element,)
 
 
 def _judged(
-    name: str, elements: tuple[Element, ...], content: Content, settings: Settings, root: Path
+    name: str, elements: tuple[Element, ...], content: Content, mark: str, settings: Settings, root: Path
 ) -> dict[str, Tensor]:
-    """Errors (B, D, W) behind the filter and behind both."""
+    """Errors (B, D, W) behind the filter and behind both; mark: `digest` of all the content's pictures."""
     made: list[Filtered] = []
 
     def camera() -> Filtered:
@@ -123,9 +127,8 @@ def _judged(
             made.append(Filtered.of(H, spectrum(content.train), settings.noise))
         return made[0]
 
-    numbers = b"".join(element.numbers.detach().numpy().tobytes() for element in elements)
-    about = {"noise": settings.noise, "content": content.name, "pictures": len(content.train)}
-    about |= {"element": hashlib.sha256(numbers).hexdigest()[:16]}
+    about = {"noise": settings.noise, "content": content.name, "pictures": mark}
+    about |= {"element": mark_of_elements(elements)}
     folder = root / f"{name}-{settings.noise:g}"
     network = learn_network(
         folder,
@@ -170,9 +173,10 @@ def _parts(found: Networks, command: str) -> list[str]:
         f"    {command}",
         "Camera, depths and colours of [wave_edof.md](wave_edof.md). Elements stay as they are; behind the best "
         "depth-invariant filter stands a network of 10,000 weights (RED-Net, 6 layers of 16 maps), told neither depth "
-        f"nor colour, learned from patches of {_TRAINED} {found.kind} at depths drawn, noise {found.noise:g}. Judged "
-        f"on {found.pictures} others, all depths and colours, noise drawn once and the same for both. PSNR in dB, mean "
-        "over depths; in brackets the interval of 95 % of 2,000 samples of the pictures drawn with replacement.",
+        f"nor colour, learned from patches of {found.trained} {pictures_of(found.kind)} at depths drawn, noise "
+        f"{found.noise:g}. Judged on {found.pictures} others, all depths and colours, noise drawn once and the same "
+        "for both. PSNR in dB, mean over depths; in brackets the interval of 95 % of 2,000 samples of the pictures "
+        "drawn with replacement.",
         grid(found.header, found.lines()),
         "All figures: [network.csv](wave/network.csv).",
     ]

@@ -7,6 +7,7 @@ far a mean over them is to be trusted. Gains are paired: both elements on the sa
 """
 
 import dataclasses
+import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -59,6 +60,26 @@ def units(rows: Sequence[str], noises: Sequence[float], starts: int) -> Iterator
 # --- what an element is worth on many pictures
 
 
+def mark_of(*values: Tensor) -> str:
+    """A hash of all their numbers."""
+    found = hashlib.blake2b(digest_size=8)
+    for own in values:
+        found.update(f"{tuple(own.shape)}".encode())
+        found.update(own.detach().contiguous().numpy())
+    return found.hexdigest()
+
+
+def mark_of_elements(elements: Sequence[Element]) -> str:
+    """A hash of all that decides what they do to light: numbers, kind and size of the profile, the glass."""
+    found = hashlib.blake2b(digest_size=8)
+    for element in elements:
+        profile, glass, period = element.profile, element.glass, element.period
+        numbers = [getattr(profile, field.name) for field in dataclasses.fields(profile)]
+        numbers += [element.radius, glass.coefficients, *([] if period is None else [period])]
+        found.update(f"{type(profile).__name__} {element.levels} {glass.formula} {mark_of(*numbers)}".encode())
+    return found.hexdigest()
+
+
 @dataclasses.dataclass(frozen=True)
 class Bank:
     """A content's pictures: S (n, n) of those that filters are made for, P (B, n, n) the power of each restored one."""
@@ -66,6 +87,11 @@ class Bank:
     name: str
     spectrum: Tensor
     powers: Tensor
+
+    @property
+    def mark(self) -> str:
+        """What it is known by: of filters' pictures and of restored ones."""
+        return mark_of(self.spectrum, self.powers)
 
     @classmethod
     def of(cls, name: str, train: Tensor, test: Tensor) -> "Bank":

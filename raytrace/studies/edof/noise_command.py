@@ -5,7 +5,7 @@ import dataclasses
 
 from raytrace.cli.options import file_name, json, output_folder
 from raytrace.studies import options as rows
-from raytrace.studies.edof.command import PICTURES
+from raytrace.studies.edof.command import LIMIT, PICTURES
 from raytrace.studies.options import add_options, documents, option, pictures
 
 SUMMARY = "elements of extended depth of field over noise"
@@ -17,12 +17,12 @@ replacement. What is learned is kept in FOLDER, if one is given: the same comman
 EXAMPLES = """examples:
   raytrace wave noise --noises 0.01 --starts 1 --rows fresnel learned -o noise
   raytrace wave noise --rows fresnel --elements docs/wave/elements/learned-0.01.npy --noises 0.01
-  raytrace wave noise --data pictures --limit 400 -o noise --docs docs"""
+  raytrace wave noise --data pictures --limit 400 -o noise-of-pictures --docs docs"""
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings(rows.Settings):
-    """seed: of dead leaves, of how pictures are split and drawn."""
+    """seed: of dead leaves, and of the samples of pictures that intervals are made from; starts have their own."""
 
     noise: tuple[float, ...] = option(
         (0.001, 0.002, 0.005, 0.01, 0.02),
@@ -31,7 +31,7 @@ class Settings(rows.Settings):
         name="noises",
     )
     starts: int = option(5, "random starts of every learned element")
-    steps: int = option(150, "of learning")
+    steps: int = option(300, "of learning")
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -45,7 +45,7 @@ def options(parser: argparse.ArgumentParser) -> None:
         help="elements in files, heights of rings or smooth, judged beside the rows, as those of docs/wave/elements",
     )
     add_options(parser, Settings)
-    pictures(parser, PICTURES, "seed", settings=Settings, limit=80)
+    pictures(parser, PICTURES, "seed", settings=Settings, limit=LIMIT)
     output_folder(parser, "folder of learned elements, and of what is judged")
     documents(parser, "wave_noise.md and wave/")
     json(parser)

@@ -2,7 +2,7 @@
 
 import argparse
 import dataclasses
-import hashlib
+import functools
 import io
 import json
 import tempfile
@@ -20,6 +20,7 @@ from raytrace.files import table, write_atomically, write_json
 from raytrace.maths.result import Result
 from raytrace.maths.value import detached
 from raytrace.pages import grid, picture
+from raytrace.studies.edof.command import LIMIT
 from raytrace.studies.edof.noise import (
     FILTERS,
     Bank,
@@ -31,28 +32,24 @@ from raytrace.studies.edof.noise import (
     drawn,
     errors_of,
     gain,
+    mark_of,
+    mark_of_elements,
     mean_psnr,
     units,
 )
 from raytrace.studies.edof.noise_command import Settings
 from raytrace.studies.edof.report import contents_of, learn
-from raytrace.studies.edof.table import ROWS
+from raytrace.studies.edof.table import ROWS, title_of
 from raytrace.studies.edof.training import EdofCamera
-from raytrace.studies.edof.world import ClosedForm, World, kernels, transfer
+from raytrace.studies.edof.world import WAVELENGTH, ClosedForm, World, kernels, transfer
+from raytrace.studies.options import picture_words
 from raytrace.studies.pictures import Pictures
-from raytrace.studies.publish import publish
+from raytrace.studies.publish import publish, published
 from raytrace.wave.element import Element, Rings, as_made, is_flat
 from raytrace.wave.element_file import SMOOTH, read_element, write_element
 from raytrace.words import did_you_mean
 
-
-def title_of(row: str) -> str:
-    """Of a row of the table, or of a file."""
-    return ROWS[row].title if row in ROWS else row
-
-
 TITLES = {"wiener": "Wiener filter of the PSF at 1 m", "blind": "best depth-invariant filter"}
-WAVELENGTH = 0.55  # µm: of the design
 _PUBLISHED = ROWS["learned"].published - ROWS["fresnel"].published
 
 
@@ -120,18 +117,18 @@ class OverNoise(Result):
 
 def noise(arguments: argparse.Namespace) -> OverNoise:
     """Learn what is left to learn, judge everything; the page where --docs asks for it."""
-    settings, rows = Settings.of(vars(arguments)), _rows(arguments.rows)
+    settings, rows, files = Settings.of(vars(arguments)), _rows(arguments.rows), elements_in(arguments.elements)
     contents, train = contents_of(arguments)
     todo = list(units(rows, settings.noise, settings.starts))
     with tempfile.TemporaryDirectory() as unkept:
         root = Path(arguments.folder or unkept)
-        for unit in todo:
-            learn_unit(unit, settings, train, root)
         banks = [Bank.of(content.name, content.train, content.test) for content in contents]
         del contents
-        kept = Kept(root / "judged", banks)
+        kept = Kept(root / "judged", banks)  # refuses other pictures before anything is learned
+        for unit in todo:
+            learn_unit(unit, settings, train, root)
         fixed = judge_baselines(rows, settings, banks, kept)
-        fixed |= judge_files(arguments.elements, settings, kept)
+        fixed |= judge_files(files, settings, kept)
         bar = progress(todo, "learned element")
         learned = {unit: judge_learned(unit, settings, train, root, kept) for unit in bar}
         elements = _best_learned(todo, learned, settings, train, root)
@@ -161,17 +158,17 @@ class Kept:
 
     def __init__(self, folder: Path, banks: Sequence[Bank]):
         self.banks, self._forms = banks, {}
-        marks = {bank.name: hashlib.sha256(bank.powers.numpy().tobytes()).hexdigest()[:16] for bank in banks}
-        self.folder = Run(folder, {"pictures": marks}).folder
+        self.folder = Run(folder, {"pictures": {bank.name: bank.mark for bank in banks}}).folder
 
     def transfer(self, elements: Sequence[Element]) -> Tensor:
         """H (D, W, n, n) of learned elements, whatever the noise; of rings what heights do not change is kept."""
         S = self.banks[0].spectrum
         if len(elements) > 1 or not isinstance(elements[0].profile, Rings):
             return transfer(kernels(elements, World()), S.shape[-1])
-        mark = elements[0].glass.name, float(elements[0].profile.pitch)
+        own = elements[0]
+        mark = own.glass.formula, mark_of(own.glass.coefficients, own.profile.pitch, own.radius)
         if mark not in self._forms:
-            whole = dataclasses.replace(elements[0], period=None, levels=0)
+            whole = dataclasses.replace(own, period=None, levels=0)
             self._forms[mark] = ClosedForm((whole,), World(), S)
         return self._forms[mark].transfer(elements)
 
@@ -220,16 +217,32 @@ def judge_baselines(
     return found
 
 
-def judge_files(files: Sequence[str], settings: Settings, kept: Kept) -> dict[tuple[str, float], dict[str, Errors]]:
-    """Errors of elements in files of heights, by the name of the file and noise."""
-    found = {}
+def elements_in(files: Sequence[str]) -> dict[str, Element]:
+    """Elements in files, of heights or smooth, by the name that they have in tables: of the file without its suffix.
+
+    Raises CommandError for two of one name, or one of the name of a row.
+    """
+    by: dict[str, str] = {}
     for file in files:
-        element = read_element(file, aperture=2 * World().radius)
-        mark = hashlib.sha256(element.numbers.numpy().tobytes()).hexdigest()[:16]
-        H = kept.transfer((element,))
+        name = Path(file).stem
+        if name in ROWS:
+            raise CommandError(f"--elements {file}: {name} is the row {ROWS[name].title!r}; give the file another name")
+        if name in by:
+            raise CommandError(f"--elements {by[name]} {file}: both would be {name}; give one of them another name")
+        by[name] = file
+    return {name: read_element(file, aperture=2 * World().radius) for name, file in by.items()}
+
+
+def judge_files(
+    elements: Mapping[str, Element], settings: Settings, kept: Kept
+) -> dict[tuple[str, float], dict[str, Errors]]:
+    """Errors of elements in files, by name and noise."""
+    found = {}
+    for name, element in elements.items():
+        mark, H = mark_of_elements([element]), functools.cache(lambda element=element: kept.transfer((element,)))
         for own in settings.noise:
             world = dataclasses.replace(World(), noise=own)
-            found[Path(file).stem, own] = kept.find(f"file-{mark}-{own:g}", world, lambda H=H: H)
+            found[name, own] = kept.find(f"file-{mark}-{own:g}", world, H)
     return found
 
 
@@ -302,19 +315,28 @@ def publish_elements(elements: Mapping[str, Element], docs: Path) -> None:
         write_element(element, beside / name, design_wavelength=WAVELENGTH)
 
 
+def element_words(arguments: argparse.Namespace) -> list[str]:
+    """--elements as they were given."""
+    files = [published(file, arguments.docs) for file in arguments.elements]
+    return [f"--elements {' '.join(files)}"] if files else []
+
+
 def _publish(
     found: OverNoise, elements: Mapping[str, Element], settings: Settings, arguments: argparse.Namespace
 ) -> None:
     publish_elements(elements, Path(arguments.docs))
     records = [score.record() for score in found.scores]
     tables = {"noise.csv": table(records, floats=lambda number: round(number, 4))}
-    words = [f"--data DIR --limit {arguments.limit}"] if arguments.data else []
-    words += [f"--rows {' '.join(arguments.rows)}"] if arguments.rows else []
-    parts = _parts(found, " ".join(["raytrace wave noise", *words, *settings.words(), "-o FOLDER --docs docs"]))
+    words = [f"--rows {' '.join(arguments.rows)}"] if arguments.rows else []
+    words += element_words(arguments)
+    words += [*picture_words(arguments, LIMIT), *settings.words()]
+    command = " ".join(["raytrace wave noise", *words, "-o FOLDER --docs docs"])
+    parts = _parts(found, list(elements), command)
     publish(Path(arguments.docs) / "wave_noise.md", "wave", parts, tables=tables, figures={"noise.png": found.plot()})
 
 
-def _parts(found: OverNoise, command: str) -> list[str]:
+def _parts(found: OverNoise, files: Sequence[str], command: str) -> list[str]:
+    """files: names of those that hold the elements that were kept."""
     shown = "pictures" if "pictures" in found.pictures else next(iter(found.pictures))
     counted = ", ".join(f"{count} of {name}" for name, count in found.pictures.items())
     others = [name for name in found.pictures if name != shown]
@@ -330,11 +352,23 @@ def _parts(found: OverNoise, command: str) -> list[str]:
         picture("wave/noise.png", f"Gain over the Fresnel lens on {shown}, bands: 95 % intervals over the pictures."),
         *(part for filter in FILTERS for part in _tables(found, shown, filter)),
         *(part for name in others for part in _tables(found, name, "wiener", only_gain=True)),
-        "All figures: [noise.csv](wave/noise.csv). Elements that were kept stand in "
-        "[wave/elements](wave/elements), to be judged again, on dead leaves or on pictures of one's own:",
-        "    raytrace wave noise --rows fresnel --elements docs/wave/elements/learned-0.01.npy "
-        "docs/wave/elements/learned-smooth-0.01.json --noises 0.01",
+        "All figures: [noise.csv](wave/noise.csv).",
+        *_again(found, files),
     ]
+
+
+def _again(found: OverNoise, files: Sequence[str]) -> Iterable[str]:
+    """The command that judges what was kept at one noise, that of the table if it was asked for."""
+    if not files:
+        return
+    noises = {one.noise for one in found.scores}
+    noise = World.noise if World.noise in noises else min(noises)
+    own = [f"docs/wave/elements/{name}" for name in files if Path(name).stem.endswith(f"-{noise:g}")]
+    yield (
+        "Elements that were kept stand in [wave/elements](wave/elements), to be judged again, on dead leaves or on "
+        "pictures of one's own:"
+    )
+    yield f"    raytrace wave noise --rows fresnel --elements {' '.join(own)} --noises {noise:g}"
 
 
 def _tables(found: OverNoise, content: str, filter: str, *, only_gain: bool = False) -> Iterable[str]:

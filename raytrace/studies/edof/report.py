@@ -15,12 +15,14 @@ from raytrace.files import table as csv
 from raytrace.files import write_json
 from raytrace.maths.result import Result, called, plain
 from raytrace.pages import grid, picture
+from raytrace.studies.edof.command import LIMIT
 from raytrace.studies.edof.scene import deep, flat
 from raytrace.studies.edof.settings import Settings
 from raytrace.studies.edof.table import ROWS, Content, elements_of, records, table_of
 from raytrace.studies.edof.training import EdofCamera, begin, learn_element
 from raytrace.studies.edof.world import Judged, Quality, World, depth_text, kernels, periodic, quality, spectrum
-from raytrace.studies.pictures import Pictures, dead_leaves, pictures, split
+from raytrace.studies.options import picture_words
+from raytrace.studies.pictures import Pictures, dead_leaves, digest, pictures, pictures_of, split
 from raytrace.studies.publish import publish
 from raytrace.wave.element import Element, as_made, as_pixels
 from raytrace.wave.element_file import write_element
@@ -124,7 +126,14 @@ def learn(settings: Settings, world: World, train: Pictures, folder: Path, label
     """A learned camera, trained as far as is left, with a bar."""
     S = spectrum(periodic(train, settings.size))
     try:
-        camera, run = begin(settings, world, S, folder, progress=lambda given: progress(given, "start", what=label))
+        camera, run = begin(
+            settings,
+            world,
+            S,
+            folder,
+            pictures=digest(train.samples),
+            progress=lambda given: progress(given, "start", what=label),
+        )
         bar, last = None, None
         for step, record in learn_element(camera, train, settings, run):
             bar = bar or progress(settings.steps, what=label, initial=step)
@@ -212,7 +221,7 @@ def table(arguments: argparse.Namespace) -> Table:
     found = table_of(contents, elements, world, progress=lambda given: progress(given, "row"))
     if arguments.docs:
         drawn = _figures(found, elements, world, arguments.seed or 0)
-        parts = _parts(Table(found), world, _command(arguments), [name for name in CAPTIONS if name in drawn])
+        parts = _parts(Table(found), contents, world, _command(arguments), [name for name in CAPTIONS if name in drawn])
         rows = {"table.csv": csv(records(found), floats=lambda number: round(number, 3))}
         publish(Path(arguments.docs) / "wave_edof.md", "wave", parts, tables=rows, figures=drawn)
     return Table(found)
@@ -247,11 +256,9 @@ def _learned(
 
 
 def _command(arguments: argparse.Namespace) -> str:
-    words = [f"--data DIR --limit {arguments.limit}"] if arguments.data else []
-    for name in ("starts", "steps"):
-        given = getattr(arguments, name)
-        words += [f"--{name} {given}"] if given not in (None, getattr(Settings, name)) else []
-    words += [f"--also {' '.join(arguments.also)}"] if arguments.also else []
+    words = [f"--{name} {' '.join(given)}" for name in ("rows", "also") if (given := getattr(arguments, name))]
+    own = Settings.of({name: getattr(arguments, name) for name in ("steps", "starts", "seed")})
+    words += [*picture_words(arguments, LIMIT), *own.words()]
     return " ".join(["raytrace wave table", *words, "-o FOLDER --docs docs"])
 
 
@@ -274,9 +281,11 @@ def _figures(found, elements: Mapping[str, Sequence[Element]], world: World, see
     return made
 
 
-def _parts(table: Table, world: World, command: str, figures: Sequence[str]) -> list[str]:
+def _parts(table: Table, given: Sequence[Content], world: World, command: str, figures: Sequence[str]) -> list[str]:
     depths = ", ".join(map(depth_text, world.depths))
     colours = ", ".join(f"{1e3 * w:.0f}" for w in world.wavelengths)
+    judged = ", ".join(f"{len(one.test)} {pictures_of(one.name)}" for one in given)
+    others = ", ".join(str(len(one.train)) for one in given)
     contents = [(f"## {name[0].upper()}{name[1:]}", table.markdown(name)) for name in table.found]
     return [
         "# Extended depth of field with one phase element",
@@ -284,8 +293,8 @@ def _parts(table: Table, world: World, command: str, figures: Sequence[str]) -> 
         f"Aperture {2 * world.radius:g} mm, sensor at {world.sensor_distance:g} mm, {colours} nm, objects at {depths}; "
         f"pixels of {1e3 * world.pixel:g} µm, kernels of {world.size} × {world.size} pixels, light beyond them spread "
         f"evenly as haze; noise of standard deviation {world.noise:g}. All lenses are made for "
-        f"{world.design / 1e3:g} m at 550 nm. Filters are made for pictures other than those restored. Learned "
-        "elements know only the spectrum of sharp dead leaves.",
+        f"{world.design / 1e3:g} m at 550 nm. Judged on {judged}, expected over noise, none drawn; filters are "
+        f"made for {others} others. Learned elements know only the spectrum of sharp dead leaves.",
         *(part for parts in contents for part in parts),
         "Mean PSNR over depths in dB, in brackets the gain over the Fresnel lens. Worst: the worst depth, spread: the "
         "best less the worst, both behind the depth-invariant filter. Sitzmann 2018: as published by Sitzmann et "

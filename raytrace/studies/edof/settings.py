@@ -6,9 +6,11 @@ from raytrace.cli.options import positive_finite
 from raytrace.studies import options
 from raytrace.studies.options import option
 
+NANOMETRE = 1e-6  # mm
+
 
 def nanometres(text: str) -> float:
-    return 1e-6 * positive_finite(text)
+    return NANOMETRE * positive_finite(text)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,5 +47,9 @@ class Settings(options.Settings):
     batch: int = 4
     noise: tuple[float, float] = (0.01, 0.01)
     tolerance: float = option(
-        0.0, "heights of rings err by up to NM nm, drawn anew at every step (default 0)", "NM", type=nanometres
+        0.0,
+        "heights of rings err by up to NM nm, drawn anew at every step (default 0)",
+        "NM",
+        type=nanometres,
+        unit=NANOMETRE,
     )

@@ -50,6 +50,12 @@ ROWS = {
     ),
 }
 
+
+def title_of(row: str) -> str:
+    """Of a row of the table, or of a file."""
+    return ROWS[row].title if row in ROWS else row
+
+
 #: Strengths of cubic plates in waves that are tried; the best in closed form is taken.
 STRENGTHS = (5.0, 10.0, 15.0, 20.0, 30.0)
 

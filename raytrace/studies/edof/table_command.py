@@ -3,7 +3,7 @@
 import argparse
 
 from raytrace.cli.options import json, output_folder
-from raytrace.studies.edof.command import PICTURES
+from raytrace.studies.edof.command import LIMIT, PICTURES
 from raytrace.studies.edof.settings import Settings
 from raytrace.studies.options import add_options, documents, pictures
 
@@ -30,7 +30,7 @@ def options(parser: argparse.ArgumentParser) -> None:
         "learned-adadelta (the same by Adadelta), learned-zernike (22 polynomials, no symmetry, by Adadelta)",
     )
     add_options(parser, Settings, "steps", "starts")
-    pictures(parser, PICTURES, "seed", limit=80)
+    pictures(parser, PICTURES, "seed", limit=LIMIT)
     output_folder(parser, "folder of learned elements")
     documents(parser, "wave_edof.md and wave/")
     json(parser)

@@ -230,13 +230,15 @@ def begin(
     spectrum: Tensor,
     folder: str | Path,
     *,
+    pictures: str,
     progress: Callable[[Iterable], Iterable] = iter,
 ) -> tuple[EdofCamera, Run]:
     """The camera of a run as it begins and its folder; the start is found once and kept there.
 
+    pictures: `digest` of those that are learned from, whose spectrum it is.
     Raises training.OtherSettings where the folder was begun with others.
     """
-    run = Run(folder, {**dataclasses.asdict(settings), "world": dataclasses.asdict(world)})
+    run = Run(folder, {**dataclasses.asdict(settings), "world": dataclasses.asdict(world), "pictures": pictures})
     kept = run.folder / "start.pt"
     if kept.exists():
         variables = start(dataclasses.replace(settings, starts=0), world, spectrum)

@@ -29,6 +29,7 @@ from raytrace.wave.plan import plan
 from raytrace.wave.psf import ElementPsf, psf
 from raytrace.wave.scene import WaveScene, is_round
 
+WAVELENGTH = 0.55  # µm: that elements are designed for, and wrapped at
 _START = 21  # last number of the key of a random start
 
 

@@ -7,6 +7,7 @@ from raytrace.cli.options import file_name, json, output_folder, positive_finite
 from raytrace.studies import options as rows
 from raytrace.studies.options import add_options, documents, option, pictures, whole
 
+LIMIT = 16  # pictures
 SUMMARY = "what levels, wrapping and errors of height cost"
 DESCRIPTION = """\
 What fabrication costs: quantised heights (levels), wrapping to one wave of 0.55 µm, and errors of height. Light at
@@ -60,7 +61,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     add_options(parser.add_argument_group("height maps"), Settings, *of_files)
     add_options(parser, Settings, "levels", "tolerance", "wrap", "steps", "learn", "starts")
     what = "folder of pictures of 128 × 128 pixels or more; four fifths make the filters, the others are restored"
-    pictures(parser, what, "seed", limit=16)
+    pictures(parser, what, "seed", limit=LIMIT)
     documents(parser, "wave_quantise.md and wave/")
     output_folder(parser, "folder of the learned element")
     json(parser)

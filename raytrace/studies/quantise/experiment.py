@@ -24,13 +24,12 @@ from raytrace.maths.value import detached
 from raytrace.studies import options
 from raytrace.studies.edof.settings import Settings
 from raytrace.studies.edof.training import adam, begin
-from raytrace.studies.edof.world import ClosedForm, World, expected_error, scene, spectrum, transfer
+from raytrace.studies.edof.world import WAVELENGTH, ClosedForm, World, expected_error, scene, spectrum, transfer
 from raytrace.studies.edof.world import kernels as kernels_of
 from raytrace.studies.pictures import draws
 from raytrace.wave.element import Element, Pixels, Rings, period, with_tolerance, wrapped
 from raytrace.wave.scene import residual
 
-WAVELENGTH = 0.55  # µm: at which heights are wrapped, and whose period is stepped
 _POINTS = 400_000  # over the aperture, of equal area
 _DRAW = 24  # last number of the key of a draw of errors
 
@@ -155,21 +154,24 @@ def _after(error: Callable[[], Tensor]) -> Iterator[float]:
 def read(folder: str | Path, S: Tensor) -> tuple[Element, World]:
     """The element of a run's last checkpoint as it was learned, and its world.
 
-    Raises ValueError for a folder without a run, and for an element that is not in rings.
+    S: of whatever pictures, it was learned from its own. Raises ValueError for a folder without a run that was learned
+    on, and for an element that is not in rings.
     """
     written = Path(folder) / "settings.json"
     if not written.exists():
         raise ValueError(f"{folder}: no settings.json; expected the folder of a run of `raytrace wave edof`")
     given = read_json(written)
     try:
-        world, settings = options.read(World, given.pop("world")), options.read(Settings, given)
+        world, pictures = options.read(World, given.pop("world")), given.pop("pictures")
+        settings = options.read(Settings, given)
     except (KeyError, TypeError, AttributeError) as error:
         raise DamagedRun(f"{written}: no settings of `raytrace wave edof` ({error})") from error
-    camera, run = begin(settings, world, S, folder)
-    state = run.load()
-    if state is None:
-        raise ValueError(f"{run.folder}: no checkpoint; let `raytrace wave edof` finish")
-    load_state(camera, state, run.checkpoint)
+    # Before the run is begun here: a start that it does not have yet would be sought, and kept, by other pictures.
+    missing = [name for name in ("start.pt", "checkpoint.pt") if not (Path(folder) / name).exists()]
+    if missing:
+        raise ValueError(f"{folder}: no {missing[0]}; let `raytrace wave edof` finish")
+    camera, run = begin(settings, world, S, folder, pictures=pictures)
+    load_state(camera, run.load(), run.checkpoint)
     element = detached(camera.variables()[0])
     if not isinstance(element.profile, Rings):
         kind = type(element.profile).__name__

@@ -5,8 +5,8 @@ import dataclasses
 
 from raytrace.cli.options import json, output_folder
 from raytrace.studies import options as rows
-from raytrace.studies.edof.command import PICTURES
-from raytrace.studies.edof.settings import nanometres
+from raytrace.studies.edof.command import LIMIT, PICTURES
+from raytrace.studies.edof.settings import NANOMETRE, nanometres
 from raytrace.studies.options import add_options, documents, option, pictures, whole
 
 SUMMARY = "learn elements that a process of etching can make"
@@ -18,16 +18,17 @@ judged on pictures beside the Fresnel lens, the hybrid achromat and its model. T
 stopped."""
 EXAMPLES = """examples:
   raytrace wave etch --waves 1 --levels 16 --starts 1 -o noise
-  raytrace wave etch --data pictures --limit 400 -o noise --docs docs"""
+  raytrace wave etch --data pictures --limit 400 -o noise-of-pictures --docs docs"""
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings(rows.Settings):
-    """waves, levels, tolerance (mm): of the processes; noise, learn: as of `wave noise`; seed: of pictures."""
+    """waves, levels, tolerance (mm): of the processes; noise, learn: as of `wave noise`; seed: of dead leaves, and of
+    the samples of pictures that intervals are made from."""
 
     waves: tuple[int, ...] = option((1, 2), "relief in waves of 0.55 µm: 1 (1.2 µm) or more (default 1 2)", "M")
     levels: tuple[int, ...] = option((4, 8, 16), "of the relief (default 4 8 16)", "L", type=whole(2))
-    tolerance: float = option(2e-5, "heights err by up to NM nm (default 20)", "NM", type=nanometres)
+    tolerance: float = option(2e-5, "heights err by up to NM nm (default 20)", "NM", type=nanometres, unit=NANOMETRE)
     noise: tuple[float, ...] = option((0.01,), "standard deviations (default 0.01)", "S", name="noises")
     starts: int = option(5, "of each")
     steps: int = option(300, "of learning its depths")
@@ -37,7 +38,7 @@ class Settings(rows.Settings):
 
 def options(parser: argparse.ArgumentParser) -> None:
     add_options(parser, Settings)
-    pictures(parser, PICTURES, "seed", settings=Settings, limit=80)
+    pictures(parser, PICTURES, "seed", settings=Settings, limit=LIMIT)
     output_folder(parser, "folder of learned elements", required=True)
     documents(parser, "wave_etch.md and wave/")
     json(parser)

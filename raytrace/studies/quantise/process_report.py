@@ -14,6 +14,7 @@ from raytrace.files import table
 from raytrace.maths.result import Result
 from raytrace.maths.value import detached
 from raytrace.pages import grid, picture
+from raytrace.studies.edof.command import LIMIT
 from raytrace.studies.edof.noise import FILTERS, Bank, Errors, Interval, drawn, gain, mean_psnr
 from raytrace.studies.edof.noise_command import Settings as Noise
 from raytrace.studies.edof.noise_report import (
@@ -26,7 +27,8 @@ from raytrace.studies.edof.noise_report import (
 )
 from raytrace.studies.edof.report import contents_of
 from raytrace.studies.edof.world import ClosedForm, World, periodic, spectrum
-from raytrace.studies.pictures import Pictures
+from raytrace.studies.options import picture_words
+from raytrace.studies.pictures import Pictures, digest
 from raytrace.studies.publish import publish
 from raytrace.studies.quantise.process import Case, cases, etch_rings, under_errors
 from raytrace.studies.quantise.process_command import Settings
@@ -108,9 +110,10 @@ def etch(arguments: argparse.Namespace) -> Etching:
     settings, root = Settings.of(vars(arguments)), Path(arguments.folder)
     contents, train = contents_of(arguments)
     todo = list(cases(settings.waves, settings.levels, settings.noise, settings.starts))
-    elements = {case: etched(case, settings, train, root) for case in progress(todo, "process")}
     banks = [Bank.of(content.name, content.train, content.test) for content in contents]
-    kept = Kept(root / "judged", banks)
+    del contents
+    kept = Kept(root / "judged", banks)  # refuses other pictures before anything is learned
+    elements = {case: etched(case, settings, train, root) for case in progress(todo, "process")}
     names = {"noise": settings.noise, "starts": settings.starts, "steps": settings.learn}
     noise = Noise.of(names | {"seed": settings.seed})
     fixed = judge_baselines(list(BASES), noise, banks, kept)
@@ -133,6 +136,7 @@ def etched(case: Case, settings: Settings, train: Pictures, root: Path) -> Eleme
     """The element of a case, from its folder, or learned now."""
     folder = case.folder(root)
     asked = {name: getattr(settings, name) for name in ("steps", "moves", "tolerance", "learn")}
+    asked |= {"pictures": digest(train.samples)}
     file = Run(folder, asked | dataclasses.asdict(case)).folder / "heights.npy"
     if not file.exists():
         noise = Noise.of({"steps": settings.learn})
@@ -209,7 +213,7 @@ def _publish(
     found: Etching, elements: Mapping[str, Element], settings: Settings, arguments: argparse.Namespace
 ) -> None:
     publish_elements(elements, Path(arguments.docs))
-    words = [f"--data DIR --limit {arguments.limit}"] if arguments.data else []
+    words = picture_words(arguments, LIMIT)
     command = " ".join(["raytrace wave etch", *words, *settings.words(), "-o FOLDER --docs docs"])
     tables = {"etch.csv": table([row.record() for row in found.rows], floats=lambda number: round(number, 4))}
     figures = {"etch.png": found.plot()}

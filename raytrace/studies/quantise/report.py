@@ -17,9 +17,10 @@ from raytrace.pages import grid
 from raytrace.studies.edof.report import learn
 from raytrace.studies.edof.settings import Settings as Learning
 from raytrace.studies.edof.world import World, periodic, spectrum
-from raytrace.studies.pictures import Pictures, dead_leaves, pictures, split
-from raytrace.studies.publish import publish
-from raytrace.studies.quantise.command import Settings
+from raytrace.studies.options import picture_words
+from raytrace.studies.pictures import Pictures, dead_leaves, pictures, pictures_of, split
+from raytrace.studies.publish import publish, published
+from raytrace.studies.quantise.command import LIMIT, Settings
 from raytrace.studies.quantise.experiment import (
     WAYS,
     Judge,
@@ -38,6 +39,9 @@ from raytrace.wave.element_file import read_element
 from raytrace.wave.exchange import FORMATS
 from raytrace.words import did_you_mean
 
+_NAMED = ("fresnel", "learned")  # elements that are no files
+_SIDE = 128  # pixels of a picture
+
 
 @dataclasses.dataclass(frozen=True)
 class Etched:
@@ -52,9 +56,11 @@ class Etched:
 
 @dataclasses.dataclass(frozen=True)
 class Fabrication(Result):
-    """What levels and errors of height cost; kind: of the pictures."""
+    """What levels and errors of height cost; kind: of the pictures; trained, tested: how many."""
 
     kind: str
+    trained: int
+    tested: int
     etched: list[Etched]
     steps: list[Steps]
     tolerances: list[Tolerance]
@@ -66,7 +72,7 @@ class Fabrication(Result):
         return {name: [dataclasses.asdict(row) for row in rows] for name, rows in named.items()}
 
     def document(self) -> dict:
-        return {"pictures": self.kind, **self.tables()}
+        return {"pictures": self.kind, "trained": self.trained, "tested": self.tested, **self.tables()}
 
     def __str__(self) -> str:
         return "\n\n".join(map(_text, self.tables().values()))
@@ -75,11 +81,11 @@ class Fabrication(Result):
 def quantise(arguments: argparse.Namespace) -> Fabrication:
     """Efficiency, expected PSNR over levels and tolerances; write the page where --docs asks for it."""
     settings = Settings.of(vars(arguments))
-    given, kind = pictures(arguments, 128, lambda: dead_leaves(arguments.limit, size=128, seed=settings.seed))
+    given, kind = pictures(arguments, _SIDE, lambda: dead_leaves(arguments.limit, size=_SIDE, seed=settings.seed))
     train, test = split(given)
-    own, others = periodic(train, 256), periodic(test, 256)
+    own, others = periodic(train, 2 * _SIDE), periodic(test, 2 * _SIDE)
     S = spectrum(own)
-    found = Fabrication(kind, _etched(settings.levels), [], [])
+    found = Fabrication(kind, len(train), len(test), _etched(settings.levels), [], [])
     for name in settings.element:
         title, element, world = _element(settings, name, train, S, arguments.folder)
         judge, ways = Judge(world, S), _ways(settings, name)
@@ -103,7 +109,9 @@ def quantise(arguments: argparse.Namespace) -> Fabrication:
     if arguments.docs:
         kept = {"quantise.csv": "levels", "quantise_tolerance.csv": "tolerance"}
         rows = {name: table(found.tables()[own], floats=lambda n: round(n, 4)) for name, own in kept.items()}
-        parts = _parts(found, settings, ["--data DIR"] if arguments.data else [])
+        named = [name if name in _NAMED else published(name, arguments.docs) for name in settings.element]
+        words = [*picture_words(arguments, LIMIT), *dataclasses.replace(settings, element=tuple(named)).words()]
+        parts = _parts(found, settings, " ".join(["raytrace wave quantise", *words, "--docs docs"]))
         page, figures = Path(arguments.docs) / "wave_quantise.md", {"quantise.png": found.plot()}
         publish(page, "wave", parts, tables=rows, figures=figures)
     return found
@@ -124,7 +132,7 @@ def _element(
     if path.suffix.lower() not in FORMATS:
         raise CommandError(
             f"--element {name}: expected fresnel, learned, the folder of a run, or a height map "
-            f"({', '.join(FORMATS)}){did_you_mean(name, ('fresnel', 'learned'))}"
+            f"({', '.join(FORMATS)}){did_you_mean(name, _NAMED)}"
         )
     own = {option: getattr(settings, option) for option in ("aperture", "glass", "pitch", "span")}
     element = read_element(name, **own)
@@ -166,9 +174,11 @@ def _cell(value) -> str:
     return f"{value:.4f}" if isinstance(value, float) else str(value)
 
 
-def _parts(found: Fabrication, settings: Settings, more: Sequence[str]) -> list[str]:
-    words = [f"--element {' '.join(settings.element)} --levels {' '.join(map(str, settings.levels))}"]
-    words += [f"--tolerance {' '.join(f'{nm:g}' for nm in settings.tolerance)} --steps {settings.steps}", *more]
+def _parts(found: Fabrication, settings: Settings, command: str) -> list[str]:
+    learned = (
+        f" The element *learned*, {settings.learn} steps from the best of {settings.starts} random starts, knows the "
+        "spectrum of the same pictures."
+    )
     levels = [0, *settings.levels]
     header = ("element", "how made", *(f"{n} levels" if n else "any height" for n in levels))
     by = {(row.element, row.made, row.levels): row for row in found.steps}
@@ -188,16 +198,17 @@ def _parts(found: Fabrication, settings: Settings, more: Sequence[str]) -> list[
     ]  # fmt: skip
     return [
         "# What fabrication costs: levels, wrapping, errors of height",
-        f"    raytrace wave quantise {' '.join(words)} --docs docs",
+        f"    {command}",
         "![Efficiency, levels and tolerance](wave/quantise.png)",
         "## A kinoform at its focus",
         grid(("levels", "sinc²(1/L)", "efficiency, steps of any width", "efficiency, rings of 2 µm"), light),
         "Light at the focus over that of an ideal lens: 5 mm, f/7.1, 0.55 µm.",
         "## Levels",
         "Expected PSNR in dB, in closed form, over 0.5 m to infinity at 460, 550 and 640 nm, behind the best filter "
-        f"that knows no depth; {found.kind}, noise 0.01:",
+        f"that knows no depth, made for {found.trained} {pictures_of(found.kind)}, of each the middle {_SIDE} × "
+        f"{_SIDE} pixels and their mirror images, noise 0.01.{learned if 'learned' in settings.element else ''}",
         of("closed"),
-        "The same of test pictures that the filter was not made for, mean over depths:",
+        f"The same of {found.tested} others, restored by it, mean over depths, expected over noise:",
         of("restored"),
         "## Errors of height",
         "The height of every ring in error by a uniform random number within ±, five draws each:",

@@ -7,6 +7,7 @@ from raytrace.cli.options import json, plot, positive_finite
 from raytrace.studies import options as rows
 from raytrace.studies.options import add_options, documents, option, pictures, whole
 
+LIMIT = 16  # pictures
 SUMMARY = "pictures finer than the pixels of the sensor"
 DESCRIPTION = """\
 Pictures finer than the pixels of the sensor, from one exposure: 5 mm PMMA lens, sensor at 35.5 mm, one depth of 1 m,
@@ -58,7 +59,7 @@ class Settings(rows.Settings):
 def options(parser: argparse.ArgumentParser) -> None:
     add_options(parser, Settings)
     what = "folder of pictures of 96 × 96 pixels or more; four fifths make the filters, the others are restored"
-    pictures(parser, what, "seed", limit=16)
+    pictures(parser, what, "seed", limit=LIMIT)
     documents(parser, "wave_superres.md and wave/")
     plot(parser, "pictures and elements")
     json(parser)

@@ -18,26 +18,20 @@ from raytrace.camera.deconvolve import psnr
 from raytrace.camera.phase import PhaseVariables
 from raytrace.maths.value import detached
 from raytrace.maths.zernike import noll, polynomials
-from raytrace.media.catalog import find_glass
-from raytrace.media.glass import index
 from raytrace.optics.reuse import Memo
 from raytrace.studies.descent import minimise
-from raytrace.studies.edof.world import World, scene
+from raytrace.studies.edof.world import WAVELENGTH, World, scene
 from raytrace.studies.pictures import draws
-from raytrace.studies.superres.experiment import lens
-from raytrace.wave.element import Element, Pixels
+from raytrace.studies.superres.experiment import Elements, plated, summed, wedges
 from raytrace.wave.plan import plan
 from raytrace.wave.psf import psf
 
 SIDE, WINDOW = 16, 49  # pixels of the picture along the scene, and along the kernel
 _CELLS = 128  # of a plate, across the aperture
 _TERMS = 45  # Noll's polynomials of a random start
-_WAVELENGTH = 0.55  # µm: of the design
 _START = 28  # last number of the key of a random start
 _NEAR = 2  # pixels about a peak that belong to its place
 _LEAST = 0.04  # of the light: what a place holds
-
-Elements = tuple[Element, ...]
 
 
 def moments(S: Tensor, side: int = SIDE) -> Tensor:
@@ -88,14 +82,6 @@ def _inner(kernel: Tensor, root: Tensor, noise: float, factor: int) -> tuple[Ten
     return torch.linalg.cholesky(torch.eye(len(root), dtype=root.dtype) + seen.mT @ seen / noise**2), seen
 
 
-def plate(world: World, path: Tensor) -> Elements:
-    """The plate of a path (cells, cells) mm at 0.55 µm in contact with the plain lens."""
-    plain, glass = lens(world), find_glass("PMMA")
-    radius = plain[0].radius.detach()
-    excess = index(glass, path.new_tensor(_WAVELENGTH)) - 1
-    return Element(Pixels(path / excess, 2 * radius / _CELLS), radius, glass), *plain
-
-
 def random_path(world: World, waves: float, *, seed: int) -> Tensor:
     """Noll's polynomials from tilt on, drawn, of so many waves RMS in all: (cells, cells) mm."""
     line = (torch.arange(_CELLS, dtype=torch.float64) - 0.5 * (_CELLS - 1)) * (2 / _CELLS)
@@ -105,18 +91,7 @@ def random_path(world: World, waves: float, *, seed: int) -> Tensor:
     drawn = torch.as_tensor(draws(seed, _START).standard_normal(_TERMS - 1))
     path = torch.tensordot(drawn / drawn.norm(), shapes, 1)
     inside = line**2 + (line**2)[:, None] <= 1
-    return 1e-3 * _WAVELENGTH * waves * torch.where(inside, path, 0.0)
-
-
-def wedges(world: World, places: Tensor, *, seed: int = 0) -> Tensor:
-    """The phase of the sum of waves to places (V, 2), pixels from the axis, as a path (cells, cells) mm."""
-    line = (torch.arange(_CELLS, dtype=torch.float64) - 0.5 * (_CELLS - 1)) * (2 * world.radius / _CELLS)
-    u = places * (world.pixel / world.sensor_distance)
-    path = u[:, :1, None] * line[:, None] + u[:, 1:, None] * line
-    phase = 2 * math.pi / (1e-3 * _WAVELENGTH) * path
-    drawn = torch.as_tensor(draws(seed, len(places), _START).uniform(0, 2 * math.pi, len(places)))
-    total = torch.polar(torch.ones_like(phase), phase + drawn[:, None, None]).sum(0)
-    return 1e-3 * _WAVELENGTH / (2 * math.pi) * torch.angle(total)
+    return 1e-3 * WAVELENGTH * waves * torch.where(inside, path, 0.0)
 
 
 class Error:
@@ -124,7 +99,7 @@ class Error:
 
     def __init__(self, world: World, C: Tensor, factor: int):
         self.world, self.C, self.factor, self._memo = dataclasses.replace(world, size=WINDOW), C, factor, Memo()
-        self._plan = plan(self._scene(plate(world, torch.zeros(_CELLS, _CELLS).double())), engine="pupil",
+        self._plan = plan(self._scene(plated(world, torch.zeros(_CELLS, _CELLS).double())), engine="pupil",
                           samples=_CELLS, nodes=4)  # fmt: skip
 
     def _scene(self, elements: Elements):
@@ -182,7 +157,7 @@ class Found:
 
 def discover(name: str, path: Tensor, error: Error, *, steps: int) -> Found:
     """Heights of all cells from a plate's own to the least exact error; steps 0: the plate as it is."""
-    elements = plate(error.world, path)
+    elements = plated(error.world, path)
     before = float(error(elements).detach())
     variables = PhaseVariables(elements[0], unit=0.1, others=elements[1:])
     if steps:
@@ -200,7 +175,7 @@ def starts(world: World, *, spreads: Sequence[float], seeds: int, factor: int) -
     half = 0.5 * SIDE
     four = half * torch.tensor([[-1.0, -1], [-1, 1], [1, -1], [1, 1]]).double()
     four = four + 0.5 * factor * torch.tensor([[0.0, 0], [0, 1], [1, 0], [1, 1]]).double()
-    prescribed = wedges(world, four)
+    prescribed = summed(wedges(world, four, _CELLS), 0, len(four), _START)
     return [
         ("plain lens", flat, False),
         ("4 prescribed places", prescribed, False),

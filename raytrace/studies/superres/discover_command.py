@@ -8,6 +8,7 @@ from raytrace.studies import options as rows
 from raytrace.studies.options import add_options, documents, option, pictures
 from raytrace.studies.superres.command import cameras, sensor_noise
 
+LIMIT = 100  # pictures
 SUMMARY = "learn places of a small scene that nobody prescribes"
 DESCRIPTION = """\
 A plate before the plain lens, learned for a small scene on a dark ground by the exact error of the best linear
@@ -34,7 +35,7 @@ class Settings(rows.Settings):
 def options(parser: argparse.ArgumentParser) -> None:
     add_options(parser, Settings)
     what = "folder of pictures of 96 × 96 pixels or more; four fifths make the restoration, the others are restored"
-    pictures(parser, what, "seed", limit=100)
+    pictures(parser, what, "seed", limit=LIMIT)
     output_folder(parser, "folder of learned plates")
     documents(parser, "wave_discover.md and wave/")
     plot(parser, "kernels of the plates")

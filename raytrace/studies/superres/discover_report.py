@@ -17,7 +17,8 @@ from raytrace.maths.result import Result
 from raytrace.pages import grid, picture
 from raytrace.studies.edof.noise import Interval, drawn, gain
 from raytrace.studies.edof.world import World, periodic, spectrum
-from raytrace.studies.pictures import Pictures, dead_leaves, pictures, split
+from raytrace.studies.options import picture_words
+from raytrace.studies.pictures import Pictures, dead_leaves, digest, pictures, pictures_of, split
 from raytrace.studies.publish import publish
 from raytrace.studies.superres.discover import (
     SIDE,
@@ -29,7 +30,7 @@ from raytrace.studies.superres.discover import (
     moments,
     starts,
 )
-from raytrace.studies.superres.discover_command import Settings
+from raytrace.studies.superres.discover_command import LIMIT, Settings
 from raytrace.studies.superres.experiment import world_of
 
 _FACTOR = 2
@@ -106,15 +107,11 @@ def discover_places(arguments: argparse.Namespace) -> Discovered:
     result = Discovered(plates, len(test), kind, settings.noise)
     if arguments.docs:
         tables = {"discover.csv": table([one.record() for one in plates], floats=lambda n: round(n, 4))}
-        parts = _parts(result, " ".join(["raytrace wave discover", *_words(settings), "-o FOLDER --docs docs"]))
+        words = [*picture_words(arguments, LIMIT), *settings.words()]
+        parts = _parts(result, " ".join(["raytrace wave discover", *words, "-o FOLDER --docs docs"]))
         page = Path(arguments.docs) / "wave_discover.md"
         publish(page, "wave", parts, tables=tables, figures={"discover.png": result.plot()})
     return result
-
-
-def _words(settings: Settings) -> list[str]:
-    words = [f"--wavelength {' '.join(f'{w:g}' for w in colours)}" for colours in settings.wavelength]
-    return [*words, *dataclasses.replace(settings, wavelength=Settings.wavelength).words()]
 
 
 def _camera(
@@ -122,7 +119,8 @@ def _camera(
 ) -> list[Plated]:
     world = world_of(colours, noise=settings.noise)
     error = Error(world, moments(spectrum(periodic(train, 192))), _FACTOR)
-    run = Run(folder, {"world": dataclasses.asdict(error.world), "steps": settings.steps, "pictures": len(train)})
+    about = {"world": dataclasses.asdict(error.world), "steps": settings.steps, "pictures": digest(train.samples)}
+    run = Run(folder, about)
     todo = starts(world, spreads=settings.spread, seeds=settings.starts, factor=_FACTOR)
     plates = []
     for title, path, learned in progress(todo, "plate"):
@@ -175,10 +173,10 @@ def _parts(found: Discovered, command: str) -> list[str]:
         f"them to a pixel of the sensor, noise {found.noise:g}; 5 mm aperture, sensor at 35.5 mm, 1 m. Heights of a "
         "plate before the plain lens are learned by the exact error of the best linear restoration from all pixels of "
         "a wide sensor: neither places nor their number are part of it. *Expected*: that error as PSNR in dB; "
-        f"*restored*: of scenes out of {found.pictures} "
-        f"{'pictures' if found.kind == 'pictures' else 'pictures of dead leaves'} that the restoration was not made "
-        "for, its gain over the plain lens behind its own best restoration with the interval of 95 % of 2,000 samples "
-        "of the pictures; *places*: peaks that hold 4 % of the light or more, in the middle colour.",
+        f"*restored*: of scenes out of {found.pictures} {pictures_of(found.kind)} that the restoration was not made "
+        "for, expected over noise, its gain over the plain lens behind its own best restoration with the interval of "
+        "95 % of 2,000 samples of the pictures; *places*: peaks that hold 4 % of the light or more, in the middle "
+        "colour.",
         picture("wave/discover.png", "Kernels of the plates, logarithmic over three decades, circles at their places."),
         *(part for colours in found.cameras for part in (f"## {colours}", grid(_HEADER, found.lines(colours)))),
         "All figures: [discover.csv](wave/discover.csv).",

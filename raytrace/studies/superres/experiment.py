@@ -26,7 +26,7 @@ from raytrace.media.catalog import find_glass
 from raytrace.media.glass import index
 from raytrace.optics.reuse import Memo
 from raytrace.studies.descent import minimise
-from raytrace.studies.edof.world import World, scene, spectrum
+from raytrace.studies.edof.world import WAVELENGTH, World, scene, spectrum
 from raytrace.studies.pictures import Pictures, draws
 from raytrace.studies.superres.inversion import (
     bicubic,
@@ -46,7 +46,6 @@ from raytrace.wave.psf import psf
 #: Pixels of the picture along a small scene, of its dark border, and of the window of one place.
 FIELD, BORDER, TILE = 96, 16, 47
 _CELLS = 400  # of a plate, across the aperture
-_WAVELENGTH = 0.55  # µm: of the design
 _START = 23  # last number of the key of a random start
 
 Elements = tuple[Element, ...]
@@ -185,22 +184,38 @@ class Plate:
     places: tuple[tuple[int, int], ...]
     parts: Tensor
 
-    @property
-    def pitch(self) -> Tensor:
-        """Of the cells, mm."""
-        return 2 * lens(self.world)[0].radius / _CELLS
-
     def paths(self) -> Tensor:
-        """x·u/z (V, cells, cells) mm of the wedges."""
-        x = (torch.arange(_CELLS, dtype=torch.float64) - 0.5 * (_CELLS - 1)) * self.pitch
-        u = (torch.tensor(self.places) + self.parts) * (self.world.pixel / self.world.sensor_distance)
-        return u[:, :1, None] * x[:, None] + u[:, 1:, None] * x
+        """(V, cells, cells) mm of the wedges."""
+        return wedges(self.world, torch.tensor(self.places) + self.parts, _CELLS)
 
     def elements(self, path: Tensor) -> Elements:
-        """The plate of a path (cells, cells) mm at 0.55 µm, and the lens."""
-        plain, glass = lens(self.world), find_glass("PMMA")
-        excess = index(glass, path.new_tensor(_WAVELENGTH)) - 1
-        return Element(Pixels(path / excess, self.pitch), plain[0].radius, glass), *plain
+        """The plate of a path (cells, cells) mm, and the lens."""
+        return plated(self.world, path)
+
+
+def wedges(world: World, places: Tensor, cells: int) -> Tensor:
+    """x·u/z (V, cells, cells) mm of a wedge to each of places (V, 2), pixels of the picture from the axis."""
+    x = (torch.arange(cells, dtype=torch.float64) - 0.5 * (cells - 1)) * (2 * world.radius / cells)
+    u = places * (world.pixel / world.sensor_distance)
+    return u[:, :1, None] * x[:, None] + u[:, 1:, None] * x
+
+
+def plated(world: World, path: Tensor) -> Elements:
+    """The plate of PMMA of a path (cells, cells) mm at the design's wavelength, in contact with the plain lens."""
+    plain, glass = lens(world), find_glass("PMMA")
+    radius, excess = plain[0].radius.detach(), index(glass, path.new_tensor(WAVELENGTH)) - 1
+    return Element(Pixels(path / excess, 2 * radius / len(path)), radius, glass), *plain
+
+
+def summed(paths: Tensor, *key: int) -> Tensor:
+    """The phase of the waves of paths (V, cells, cells) mm, added, as a path (cells, cells) mm:
+
+    λ₀/2π · arg Σ_v exp(i (2π/λ₀ path_v + φ_v))     φ_v drawn by the key: in step, orders would meet at the places
+    """
+    phase = 2 * math.pi / (1e-3 * WAVELENGTH) * paths
+    drawn = torch.as_tensor(draws(*key).uniform(0, 2 * math.pi, len(paths)))
+    total = torch.polar(torch.ones_like(phase), phase + drawn[:, None, None]).sum(0)
+    return 1e-3 * WAVELENGTH / (2 * math.pi) * torch.angle(total)
 
 
 def sectors(plate: Plate) -> Elements:
@@ -213,14 +228,9 @@ def sectors(plate: Plate) -> Elements:
 
 
 def hologram(plate: Plate, *, seed: int = 0) -> Elements:
-    """The phase of all wedges' waves added: every place has the blur of the whole aperture, some light goes astray.
-
-    path = λ₀/2π · arg Σ_v exp(i (k₀ x·u_v/z + φ_v))     φ_v drawn: in step, orders would meet at the places
-    """
-    phase = 2 * math.pi / (1e-3 * _WAVELENGTH) * plate.paths()
-    drawn = torch.as_tensor(draws(seed, len(phase), _START).uniform(0, 2 * math.pi, len(phase)))
-    total = torch.polar(torch.ones_like(phase), phase + drawn[:, None, None]).sum(0)
-    return plate.elements(1e-3 * _WAVELENGTH / (2 * math.pi) * torch.angle(total))
+    """The phase of all wedges' waves added: every place has the blur of the whole aperture, some light goes astray."""
+    paths = plate.paths()
+    return plate.elements(summed(paths, seed, len(paths), _START))
 
 
 def learn_heights(plate: Plate, elements: Elements, S: Tensor, factor: int, *, steps: int = 30) -> Elements:

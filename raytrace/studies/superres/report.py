@@ -2,7 +2,7 @@
 
 import argparse
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from pathlib import Path
 
 from torch import Tensor
@@ -13,10 +13,13 @@ from raytrace.files import table
 from raytrace.maths.result import Result
 from raytrace.pages import grid
 from raytrace.studies.edof.world import World, periodic, spectrum
-from raytrace.studies.pictures import Pictures, dead_leaves, pictures, split
+from raytrace.studies.options import picture_words
+from raytrace.studies.pictures import Pictures, dead_leaves, pictures, pictures_of, split
 from raytrace.studies.publish import publish
-from raytrace.studies.superres.command import Settings
+from raytrace.studies.superres.command import LIMIT, Settings
 from raytrace.studies.superres.experiment import (
+    BORDER,
+    FIELD,
     Plate,
     Row,
     full_frame,
@@ -35,6 +38,12 @@ from raytrace.studies.superres.experiment import (
 )
 from raytrace.studies.superres.inversion import least_error
 
+_FIGURE = (
+    "![Restored pictures and kernels](wave/superres.png)",
+    "*Above, a scene that fills the sensor; below, a small one on a dark ground, shown at several places of one sensor "
+    "and inverted jointly. Kernels on a logarithmic scale of four decades.*",
+)
+_SIDE = 96  # pixels of a picture
 _NOISES = (0.0003, 0.001, 0.003, 0.01, 0.03)
 _KEYS = ("factor", "colours", "scene", "way", "closed", "restored", "gain")
 _COLUMNS = ("scene", "optics and restoration", "expected", "restored", "over bicubic")
@@ -85,10 +94,12 @@ class Block:
 
 @dataclasses.dataclass(frozen=True)
 class Superresolution(Result):
-    """Every camera; noise: of the sensor; kind: what was restored."""
+    """Every camera; noise: of the sensor; kind: what was restored; trained, tested: how many."""
 
     noise: float
     kind: str
+    trained: int
+    tested: int
     blocks: list[Block]
 
     FIGURE = "studies.superres.figures.superres_figure"
@@ -99,7 +110,8 @@ class Superresolution(Result):
              **one.small.document("small_scene")}
             for one in self.blocks
         ]  # fmt: skip
-        return {"noise": self.noise, "pictures": self.kind, "cameras": cameras}
+        about = {"noise": self.noise, "pictures": self.kind, "trained": self.trained, "tested": self.tested}
+        return about | {"cameras": cameras}
 
     def __str__(self) -> str:
         text = []
@@ -113,11 +125,11 @@ class Superresolution(Result):
 def superres(arguments: argparse.Namespace) -> Superresolution:
     """Learn, restore and compare; write the page where --docs asks for it."""
     settings = Settings.of(vars(arguments))
-    given, kind = pictures(arguments, 96, lambda: dead_leaves(arguments.limit, size=96, seed=settings.seed))
+    given, kind = pictures(arguments, _SIDE, lambda: dead_leaves(arguments.limit, size=_SIDE, seed=settings.seed))
     train, test = split(given)
     cameras = [(factor, tuple(colours)) for factor in settings.factor for colours in settings.wavelength]
     blocks = [_block(settings, factor, colours, train, test) for factor, colours in progress(cameras, "camera")]
-    found = Superresolution(settings.noise, kind, blocks)
+    found = Superresolution(settings.noise, kind, len(train), len(test), blocks)
     if arguments.docs:
         noises = _over_noise(settings, train, test)
         lines = [(one.factor, one.colours, *line) for one in blocks for line in one.lines]
@@ -127,14 +139,15 @@ def superres(arguments: argparse.Namespace) -> Superresolution:
         }
         # Pictures of others are not for pages.
         figures = {"superres.png": found.plot()} if kind == "dead leaves" else {}
-        parts = _parts(found, settings, ["--data DIR"] if arguments.data else [], noises)
+        words = [*picture_words(arguments, LIMIT), *settings.words()]
+        parts = _parts(found, settings, " ".join(["raytrace wave superres", *words, "--docs docs"]), noises, figures)
         publish(Path(arguments.docs) / "wave_superres.md", "wave", parts, tables=tables, figures=figures)
     return found
 
 
 def _block(settings: Settings, factor: int, colours: tuple[float, ...], train: Pictures, test: Pictures) -> Block:
     world = world_of(colours, noise=settings.noise)
-    own, others = periodic(train, 192), periodic(test, 192)
+    own, others = periodic(train, 2 * _SIDE), periodic(test, 2 * _SIDE)
     S = spectrum(own)
     best = learned_lens(world, S, factor, starts=settings.starts, steps=settings.steps, seed=settings.seed)
     elements = {"plain lens": lens(world), "learned": best}
@@ -178,26 +191,25 @@ def _over_noise(settings: Settings, train: Pictures, test: Pictures) -> list[dic
     return found
 
 
-def _parts(found: Superresolution, settings: Settings, more: Sequence[str], noises: Sequence[dict]) -> list[str]:
-    words = [f"--factor {' '.join(map(str, settings.factor))}"]
-    words += [f"--wavelength {' '.join(f'{w:g}' for w in colours)}" for colours in settings.wavelength]
-    words += [
-        f"--noise {settings.noise:g} --places {' '.join(map(str, settings.places))} --steps {settings.steps}",
-        *more,
-    ]
+def _parts(
+    found: Superresolution, settings: Settings, command: str, noises: Sequence[dict], figures: Container[str]
+) -> list[str]:
+    side = FIELD - 2 * BORDER
+    number = settings.starts
+    starts = f", and from {number} random start{'s' if number > 1 else ''} around it, the best kept" if number else ""
     cells = [[f"{one['noise']:g}", *(f"{value:.2f}" for value in list(one.values())[1:])] for one in noises]
     return [
         "# Super-resolution: pictures finer than the sensor's pixels, from one exposure",
-        f"    raytrace wave superres {' '.join(words)} --docs docs",
+        f"    {command}",
         f"A camera of 5 mm aperture with its sensor at 35.5 mm looks at scenes 1 m away. The picture has pixels of "
         f"3.69 µm, the sensor pixels 2 or 3 times as large, noise {settings.noise:g} (white is 1). Filters are made "
-        f"for some {found.kind} and restore others. PSNR in dB of restored test pictures, over all colours; "
-        "*expected*: the error of the filter in closed form, for pictures of the power spectrum it was made for; MMSE: "
-        "the linear filter of least mean square error; *over bicubic*: gain over the plain lens and bicubic "
-        "enlargement.",
-        "![Restored pictures and kernels](wave/superres.png)",
-        "*Above, a scene that fills the sensor; below, a small one on a dark ground, shown at several places of one "
-        "sensor and inverted jointly. Kernels on a logarithmic scale of four decades.*",
+        f"for {found.trained} {pictures_of(found.kind)} and restore {found.tested} others: of each the middle {_SIDE} "
+        f"× {_SIDE} pixels and their mirror images, of a small scene its middle {side} × {side}, noise drawn once. "
+        f"The learned element of the full frame begins from the plain lens{starts}. PSNR in dB of restored test "
+        "pictures, over all colours; *expected*: the error of the filter in closed form, for pictures of the power "
+        "spectrum it was made for; MMSE: the linear filter of least mean square error; *over bicubic*: gain over the "
+        "plain lens and bicubic enlargement.",
+        *(_FIGURE if "superres.png" in figures else ()),
         *(
             part
             for block in found.blocks
