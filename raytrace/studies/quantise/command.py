@@ -49,7 +49,7 @@ class Settings(rows.Settings):
         None, "of learned elements wrapped ones, or whole ones (default both)", action=argparse.BooleanOptionalAction
     )
     steps: int = option(
-        20, "of learning on as made, 4 times as many for the wraps (default 20; 0: none)", type=whole(0)
+        20, "of learning on as made, after 4 times as many with wraps alone (default 20; 0: none)", type=whole(0)
     )
     learn: int = option(60, "steps of the learned element")
     starts: int = option(2, "random starts of it")

@@ -231,14 +231,15 @@ def steps_of(
 ) -> tuple[list[Steps], dict[tuple[str, int], Element]]:
     """A row for any height and every number of levels, by every way of making; and what was made, by (way, levels).
 
-    steps: of learning on, 4 times as many for the wraps.
+    steps: of learning on quantised, after 4 times as many for the wraps; what is quantised afterwards learns on as long.
     """
-    looped = None
+    begun = {}
     if {"looped", "trained"} & set(ways):
-        looped = learn_on(made(element, 0, wrap=True), judge, steps=4 * steps, progress=progress)
+        begun["trained"] = learn_on(made(element, 0, wrap=True), judge, steps=4 * steps, progress=progress)
+        begun["looped"] = learn_on(begun["trained"], judge, steps=steps)
     rows, elements = [], {}
     for way, count in progress([(way, count) for way in ways for count in (0, *levels)]):
-        own = made(looped if way in ("looped", "trained") else element, count, wrap=way != "whole")
+        own = made(begun.get(way, element), count, wrap=way != "whole")
         if way == "trained":
             own = learn_on(own, judge, steps=steps)
         shown = judge.restored(own, test)
