@@ -231,7 +231,7 @@ def steps_of(
 ) -> tuple[list[Steps], dict[tuple[str, int], Element]]:
     """A row for any height and every number of levels, by every way of making; and what was made, by (way, levels).
 
-    steps: of learning on quantised, after 4 times as many for the wraps; what is quantised afterwards learns on as long.
+    steps: of learning on quantised, after 4 times as many for the wraps; as many for what is quantised afterwards.
     """
     begun = {}
     if {"looped", "trained"} & set(ways):
