@@ -27,7 +27,7 @@ from raytrace.studies.codesign.closed_form import power_spectrum
 from raytrace.studies.codesign.experiment import STEPS, Outcome, camera, lens_at_start, outcome, run_model, variables
 from raytrace.studies.codesign.settings import Settings
 from raytrace.studies.options import read
-from raytrace.studies.pictures import Pictures, dead_leaves, pictures, resized, split
+from raytrace.studies.pictures import Pictures, dead_leaves, digest, pictures, resized, split
 from raytrace.system.lens import Lens, check, field_points
 
 _LEAVES = 100  # pictures, where none are given
@@ -94,7 +94,7 @@ def experiment(arguments: argparse.Namespace, settings: Settings, *, smallest: f
     given = _large_enough(given, least, smallest)
     about = {
         "lens": f"{path.stem}, sha256 {hashlib.sha256(path.read_bytes()).hexdigest()[:16]}",
-        "pictures": f"{len(given)}, blake2 {_digest(given)}",
+        "pictures": digest(given.samples),
     }
     return Experiment(lens, path.stem, settings, *split(given), about, kind, catalogs(arguments))
 
@@ -181,14 +181,6 @@ def _leaves(arguments: argparse.Namespace, least: int) -> Pictures:
     say(f"no --data: training on {count} pictures of dead leaves, discs that hide one another")
     leaves = [dead_leaves(1, size=size, seed=seed).samples[0] for seed in progress(range(count), "dead leaf")]
     return Pictures(tuple(leaves), tuple(f"dead leaves {seed}" for seed in range(count)))
-
-
-def _digest(given: Pictures) -> str:
-    found = hashlib.blake2b(digest_size=8)
-    for sample in given.samples:
-        found.update(repr(sample.shape).encode())
-        found.update(np.ascontiguousarray(sample))
-    return found.hexdigest()
 
 
 def train_run(given: Experiment, settings: Settings, folder: Path, label: str) -> Outcome:
