@@ -122,28 +122,27 @@ def _report(
     tables = {
         "table2.csv": table(found, runs.COLUMNS),
         "distance.csv": table(runs.distance_rows(found), runs.DISTANCE_COLUMNS),
-        "blur.csv": table(
-            [
-                {"model": model, "distance_m": z, "diameter_um": 1e3 * width}
-                for model, own in blur.items()
-                for z, width in zip(report.seen.distances, own, strict=True)
-            ],
-            ("model", "distance_m", "diameter_um"),
-        ),
+        "blur.csv": _curves(("model", "distance_m", "diameter_um"), report.seen.distances, blur, 1e3),
         "spectral.csv": table(best, optima.COLUMNS),
     }
     if scanned:
-        sensors, errors = scanned
-        tables["scan.csv"] = table(
-            [
-                {"model": model, "sensor_mm": sensor, "error": error}
-                for model, own in errors.items()
-                for sensor, error in zip(sensors, own, strict=True)
-            ],
-            ("model", "sensor_mm", "error"),
-        )
+        tables["scan.csv"] = _curves(("model", "sensor_mm", "error"), *scanned)
     publish(docs / f"{page}.md", page, report.parts(), tables=tables, figures=drawn)
     return report
+
+
+def _curves(
+    columns: Sequence[str], places: Sequence[float], values: Mapping[str, Sequence[float]], scale: float = 1
+) -> str:
+    """A table of values of every model at places, a row for each."""
+    return table(
+        [
+            dict(zip(columns, (model, place, scale * value), strict=True))
+            for model, own in values.items()
+            for place, value in zip(places, own, strict=True)
+        ],
+        columns,
+    )
 
 
 def _training_figures(given: Experiment, study: Path, found: Sequence[Outcome]) -> Mapping[str, figures.Figure]:
