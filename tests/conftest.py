@@ -1,5 +1,6 @@
 """What all tests share: settings (hypothesis draws the same examples in every run), and fixtures."""
 
+import gc
 import json
 import os
 from typing import NamedTuple
@@ -24,6 +25,15 @@ settings.load_profile("reproducible")
 def _compiled_trace():
     """Tests trace as a user does who has compiled the trace before, whichever of them comes first."""
     prepare()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _imports_are_no_garbage():
+    """The collector leaves alone what imports and the collection of tests have made, instead of looking it through."""
+    gc.collect()
+    gc.freeze()
+    yield
+    gc.unfreeze()
 
 
 @pytest.fixture

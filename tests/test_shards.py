@@ -149,6 +149,7 @@ def test_two_processes_compute_what_one_does(tmp_path):
 COMMAND = ("psf", "double_gauss", "--model", "drt", "--rays", "200", "--field", "0", "14", "--json")
 
 
+@pytest.mark.slow
 def test_torchrun_writes_what_the_command_writes_once(command, tmp_path):
     code, out, _ = command(*COMMAND, "-o", "one.npz", "--plot", "one.png")
     assert code == 0
