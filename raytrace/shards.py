@@ -131,6 +131,17 @@ def _reduce(numbers: Tensor, operation: str) -> None:
 
 
 @contextlib.contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """So many threads of torch for a while."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextlib.contextmanager
 def processes() -> Iterator[Share]:
     """The processes of torchrun for a while; only the first one speaks. Without torchrun, this one.
 

@@ -17,6 +17,7 @@ import raytrace as rt
 from raytrace.cli import main
 from raytrace.cli import run as runner
 from raytrace.cli.commands import COMMANDS
+from raytrace.maths.result import Result
 from raytrace.optics.launch import launch
 from raytrace.optics.spot import spot_of
 from raytrace.optics.trace import trace_lens
@@ -472,3 +473,11 @@ def test_errors_speak_of_keywords_from_python_and_of_options_from_the_command(ca
     assert "--through-focus needs one spatial frequency: give --frequency" in capsys.readouterr().err
     assert main(["spot", "cooke_triplet", "--sampling", "sobol", "--rings", "4"]) == 1
     assert "--rings belongs to --sampling gauss, hexapolar; sobol takes --points" in capsys.readouterr().err
+
+
+def test_a_result_without_columns_says_that_it_is_no_table():
+    class Words(Result):
+        """Of words alone."""
+
+    with pytest.raises(TypeError, match=r"Words is no table; see its document\(\)"):
+        Words().to_frame()

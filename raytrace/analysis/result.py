@@ -1,5 +1,6 @@
 """What every analysis gives: a result that holds its lens, names its columns, and tells and draws itself."""
 
+import abc
 from typing import ClassVar
 
 import torch
@@ -98,14 +99,14 @@ def fine(places: Tensor) -> Tensor:
     return places.max() * torch.linspace(0, 1, _FINE, dtype=places.dtype, device=places.device)
 
 
-class OverField(Analysis):
+class OverField(Analysis, abc.ABC):
     """Curves over the field: their figure is drawn through many fields on the line to the outermost."""
 
     __slots__ = ()
 
+    @abc.abstractmethod
     def at(self, fields: Tensor) -> "OverField":
         """The same analysis at other fields (2, F), which need not be in reach."""
-        raise NotImplementedError
 
     def drawn(self) -> "OverField":
         refuse_axis(self.fields)

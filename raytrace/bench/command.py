@@ -8,10 +8,10 @@ from types import ModuleType
 
 import torch
 
-from raytrace.bench.measure import torch_threads
 from raytrace.bench.report import Asked, Measured
 from raytrace.cli.door import CommandError, open_lens, say
 from raytrace.pages import machine
+from raytrace.shards import torch_threads
 from raytrace.system.lens import Lens
 
 #: What every subject takes beside --json, --repeats and --no-peers.

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.bench.measure import field_rays, in_turns, nothing, slope, torch_threads, with_leaf, with_sensor_leaf
+from raytrace.bench.measure import field_rays, in_turns, nothing, slope, with_leaf, with_sensor_leaf
 from raytrace.formats import read_lens
 from raytrace.fused import prepare, tracing
 from raytrace.kernels import psf
@@ -20,6 +20,7 @@ from raytrace.maths.grid import grid
 from raytrace.maths.pupil import sobol
 from raytrace.optics.reuse import Memo, trace_bundle
 from raytrace.optics.trace import trace_lens
+from raytrace.shards import torch_threads
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.rays import Rays
 

@@ -4,11 +4,10 @@ A speed is rays × surfaces / s. Surfaces are those a ray is carried to: all of 
 image among them.
 """
 
-import contextlib
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 import torch
@@ -21,6 +20,7 @@ from raytrace.maths.pupil import sobol
 from raytrace.maths.value import to
 from raytrace.optics.launch import rays_of_field
 from raytrace.optics.trace import media, trace_lens, trace_surfaces
+from raytrace.shards import torch_threads
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface, is_even
@@ -264,17 +264,6 @@ def _worst(found: Sequence[float], expected: Sequence) -> float:
 def clock(threads: int) -> Callable[[], float]:
     """Processor time where one thread works, which neighbours on the machine lengthen little; else the time of day."""
     return time.process_time if threads == 1 else time.perf_counter
-
-
-@contextlib.contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """So many threads of torch for a while."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def seconds_of(job: Job, calls: int, threads: int) -> float:

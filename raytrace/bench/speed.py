@@ -30,7 +30,6 @@ from raytrace.bench.measure import (
     nothing,
     slope,
     surfaces_of,
-    torch_threads,
     with_sensor_leaf,
 )
 from raytrace.bench.processes import bytes_per_ray, spot_process_ratio, two_process_gain
@@ -45,6 +44,7 @@ from raytrace.optics.focus import spot_parabola
 from raytrace.optics.launch import rays_of_field
 from raytrace.optics.reuse import Memo, trace_bundle
 from raytrace.optics.trace import trace_lens
+from raytrace.shards import torch_threads
 from raytrace.system.build import lens as lens_of
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.rays import Rays

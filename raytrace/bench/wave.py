@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.bench.measure import clock, name_of, nothing, torch_threads
+from raytrace.bench.measure import clock, name_of, nothing
 from raytrace.bench.report import Asked, Measured, digits, table, yes
 from raytrace.cli.progress import progress
 from raytrace.kernels.dft import Aliased, phasor
@@ -24,6 +24,7 @@ from raytrace.maths.value import to
 from raytrace.media.glass import index
 from raytrace.optics.reuse import Memo
 from raytrace.pages import measured
+from raytrace.shards import torch_threads
 from raytrace.wave import radial
 from raytrace.wave.designs import aim, singlet
 from raytrace.wave.plan import AliasedSampling

@@ -44,8 +44,8 @@ class Result:
     FIGURE: ClassVar[str] = ""
 
     def columns(self) -> dict[str, Tensor]:
-        """Columns by name, broadcast against one another; nan where no ray arrives."""
-        raise NotImplementedError(f"{type(self).__name__} is no table")
+        """Columns by name, broadcast against one another; nan where no ray arrives. Raises TypeError: no table."""
+        raise TypeError(f"{type(self).__name__} is no table; see its document() for what it holds")
 
     def words(self) -> dict[str, Sequence[str]]:
         """What the numbers of a column, 0 and up, stand for, by the name of the column."""

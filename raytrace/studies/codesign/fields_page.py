@@ -1,12 +1,9 @@
 """What the field does to the choice of a lens: optima over fields, as text, document, tables and page."""
 
 import argparse
-import contextlib
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-
-import torch
 
 from raytrace.camera.training import Run, share
 from raytrace.cli.door import CommandError, say
@@ -15,6 +12,7 @@ from raytrace.cli.run import present
 from raytrace.files import table
 from raytrace.maths.result import Result, plain
 from raytrace.pages import grid, machine, measured, shown
+from raytrace.shards import torch_threads
 from raytrace.studies.codesign.claims import percent
 from raytrace.studies.codesign.fields import (
     COLUMNS,
@@ -171,7 +169,7 @@ def fields(arguments: argparse.Namespace) -> None:
     )
     if share().rank:
         return  # the first process writes
-    with _one_thread():
+    with torch_threads(1):  # processor time is the sum over threads
         taken, about = times(given.lens, settings), machine()
     found = Fields(rows, _energies(given, rows), taken, given, about)
     documents = [row.document() for row in rows]
@@ -187,17 +185,6 @@ def fields(arguments: argparse.Namespace) -> None:
     for row in rows:
         if row.no_optimum:
             say(f"warning: {row.window} pixels, {_fields(row.fields)}, {row.model}: {row.no_optimum}")
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """One thread of torch for a while: processor time is the sum over threads."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _energies(given: Experiment, rows: Sequence[Row]) -> list[dict[str, float]]:

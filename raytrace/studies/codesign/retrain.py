@@ -172,15 +172,6 @@ def _effect(model: str, reference: str, loss: str, ratios: Sequence[float]) -> E
     return Effect(model, reference, loss, count, mean, mean - reach, mean + reach, p)
 
 
-def distance_rows(found: Sequence[Retrained]) -> list[dict[str, str | float]]:
-    """Losses of test pictures by lens, seed and object distance."""
-    return [
-        dict(zip(DISTANCE_COLUMNS, (one.model, one.seed, float(distance) / 1e3, loss), strict=True))
-        for one in found
-        for distance, loss in one.by_distance.items()
-    ]
-
-
 def means(found: Sequence[Retrained]) -> dict[str, dict[str, tuple[float, float]]]:
     """Mean and standard deviation over seeds of every loss, by model."""
     models = dict.fromkeys(one.model for one in found)

@@ -19,7 +19,6 @@ from raytrace.studies.codesign.retrain import (
     STEP,
     Effect,
     Retrained,
-    distance_rows,
     effects,
     means,
     retrain,
@@ -38,6 +37,7 @@ from raytrace.studies.codesign.setup import (
     settings_of,
 )
 from raytrace.studies.codesign.study import begun as begun_runs
+from raytrace.studies.codesign.study import distance_rows
 from raytrace.studies.publish import publish
 
 _SEEDS = (0, 1, 2, 3, 4)
@@ -201,7 +201,7 @@ def retrain_all(arguments: argparse.Namespace) -> None:
     folder = arguments.page or "codesign"
     tables = {
         "retrain.csv": table(found, COLUMNS),
-        "retrain_distance.csv": table(distance_rows(found), DISTANCE_COLUMNS),
+        "retrain_distance.csv": table(distance_rows(found, DISTANCE_COLUMNS), DISTANCE_COLUMNS),
     }
     publish(page, folder, footing.parts(folder), tables=tables, figures={})
     present(footing, arguments)

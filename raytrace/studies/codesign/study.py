@@ -158,10 +158,10 @@ def losses_by_distance(found: Sequence[Outcome]) -> tuple[list[float], dict[str,
 DISTANCE_COLUMNS = ("model", "seed", "distance_m", "l1_drt")
 
 
-def distance_rows(found: Sequence[Outcome]) -> list[dict[str, str | float]]:
-    """Losses of test pictures with DRT PSFs after step 2, by model, seed and object distance."""
+def distance_rows(found: Sequence, columns: Sequence[str] = DISTANCE_COLUMNS) -> list[dict[str, str | float]]:
+    """Losses of test pictures by model, seed and object distance in m, of all that have `by_distance`, in mm."""
     return [
-        dict(zip(DISTANCE_COLUMNS, (one.model, one.seed, float(distance) / 1e3, loss), strict=True))
+        dict(zip(columns, (one.model, one.seed, float(distance) / 1e3, loss), strict=True))
         for one in found
         for distance, loss in one.by_distance.items()
     ]

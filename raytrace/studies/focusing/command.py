@@ -46,10 +46,9 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace):
     """A flat plate learns to be a lens."""
-    import torch
-
     from raytrace.cli.door import CommandError, refuse_suffix
     from raytrace.cli.progress import progress
+    from raytrace.shards import torch_threads
     from raytrace.studies.focusing.experiment import Setting, learn_to_focus
     from raytrace.wave.exchange import FORMATS
 
@@ -66,14 +65,11 @@ def run(arguments: argparse.Namespace):
         wavelength=arguments.wavelengths[0],
         samples=round(across / feature),
     )
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # arrays are small: a second thread would only wait
-    with progress(arguments.steps, what="learning") as bar:
+    # Arrays are small: a second thread would only wait.
+    with torch_threads(1), progress(arguments.steps, what="learning") as bar:
 
         def show(step: int, ratio: float) -> None:
             bar.set_postfix_str(f"peak {ratio:.3f} of the ideal lens's")
             bar.update(min(1, step))
 
-        found = learn_to_focus(setting, steps=arguments.steps, frames=_SHOWN, progress=show)
-    torch.set_num_threads(threads)
-    return found
+        return learn_to_focus(setting, steps=arguments.steps, frames=_SHOWN, progress=show)
