@@ -26,7 +26,7 @@ from raytrace.camera.variables import Variables
 from raytrace.kernels import MODELS, NotConverged, psf
 from raytrace.maths.grid import Grid, grid
 from raytrace.optics.reuse import Memo
-from raytrace.optics.scene import scene, trace_scene
+from raytrace.optics.scene import chief_landing, scene
 from raytrace.system.lens import Lens, field_points
 
 
@@ -114,8 +114,7 @@ class Camera(nn.Module):
         if bool((fields == 0).all()):
             return self.pixels
         primary = lens.wavelengths[lens.primary_wavelength][None]
-        rays = trace_scene(scene(lens, fields, distances, primary, self._memo), fields.new_zeros(2, 1))
-        chief = rays.position[:2, ..., 0, 0].expand(2, len(distances), fields.shape[1])
+        chief = chief_landing(scene(lens, fields, distances, primary, self._memo))[..., 0]
         return dataclasses.replace(self.pixels, centre=self.pixels.centre[:, None, None] + chief)
 
     def image(self, picture: Tensor, object_distances: Tensor, field: int = 0) -> Tensor:

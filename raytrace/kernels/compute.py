@@ -23,7 +23,7 @@ from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
 from raytrace.optics.losses import beam_hint, losses, warn_of_losses
 from raytrace.optics.reuse import Memo
-from raytrace.optics.scene import Scene, scene, trace_scene
+from raytrace.optics.scene import Scene, chief_landing, scene, symmetry
 from raytrace.shards import Share
 from raytrace.system.lens import Lens, field_points, with_object_distance
 
@@ -42,6 +42,7 @@ def psf(
     size: int | tuple[int, int] | None = None,
     grid: Grid | None = None,
     center: str | None = None,
+    window: str = "follows",
     tol: float | None = None,
     rays: int | None = None,
     order: int | None = None,
@@ -57,6 +58,11 @@ def psf(
 ) -> Psf:
     """PSFs of a lens, differentiable in every number of the lens, its sensor distance and the grid.
 
+    Derivatives are those of the returned numbers, the place of the window included. Two edges have no derivative: the
+    rim of a beam where rays miss a surface or are totally reflected, in all models; and, of plain rays (`rays` of
+    `drt`), every aperture: a ray that is clipped drops out at once, and the light that a moving rim gains or loses is
+    missing from the derivative.
+
     model: a name of MODELS, or "auto".
     fields: y, pairs (x, y) or (2, F) in the lens's kind of field, its own by default; object_distances: (D,) mm, inf
     allowed, the lens's by default; wavelengths: (W,) µm with wavelength_weights: (W,), the lens's own by default.
@@ -66,6 +72,10 @@ def psf(
     whose centre is (2,) or (2, D, F); center: what the grid's centre counts from: "axis", "chief" (the chief ray at the
     primary wavelength) or "centroid" (of the rays). By default "axis" for fields that are given, and "chief" for the
     lens's own, which may lie far from it.
+    window: "follows": a window about the chief ray or the centroid moves with it, in the derivatives too, so that a
+    shift of the image as a whole changes no kernel. "fixed": the derivatives hold the window where it is: they are
+    those of the light on the pixels of a sensor that does not move. The kernels are the same. On the axis, or with a
+    `grid` placed by its centre, both are the same.
     tol: bound on the estimated error, 0.01 by default; the coarsest order that meets it is returned. rays: instead,
     about that many rays per kernel (`drt`: plain Sobol rays), the error then estimated from half of them.
     order: instead, an order of the model's ladder, as `Psf.order` of an earlier call tells it: for loops, it estimates
@@ -82,7 +92,7 @@ def psf(
     NotConverged.
     """
     center = center or ("chief" if fields is None else "axis")
-    _check(model, center, normalise, tol=tol, rays=rays, order=order, grid=grid, pixel=pixel, size=size)
+    _check(model, center, window, normalise, tol=tol, rays=rays, order=order, grid=grid, pixel=pixel, size=size)
     like = lens.wavelengths
     framed = (grid, pixel, size) != (None, None, None)
     base = make_grid(like.new_tensor(pixel or PIXEL), size or SIZE) if grid is None else grid
@@ -103,7 +113,10 @@ def psf(
     def compute(chosen: Tensor) -> Psf:
         centre = base.centre[:, chosen] if base.centre.dim() > 1 else base.centre
         batch = scene(lens, fields, distances[chosen], wavelengths, memo)
-        centre = _with_centre(centre, _centre(batch, lens, center, shares), len(wavelengths))
+        place = _centre(batch, lens, center, shares)
+        if place is not None and window == "fixed":
+            place = place.detach()
+        centre = _with_centre(centre, place, len(wavelengths))
         return drive(batch, dataclasses.replace(base, centre=centre), kept)
 
     infinite = torch.isinf(distances)
@@ -192,9 +205,10 @@ def _of_its_window(kernel: Tensor) -> Tensor:
     return safe_divide(scaled, scaled.sum((-2, -1), keepdim=True))
 
 
-def _check(model: str, center: str, normalise: str, *, tol, rays, order, grid, pixel, size) -> None:
+def _check(model: str, center: str, window: str, normalise: str, *, tol, rays, order, grid, pixel, size) -> None:
     known = {"model": (model, ("auto", *MODELS)), "center": (center, ("axis", "chief", "centroid"))}
-    for name, (word, words) in {**known, "normalise": (normalise, ("energy", "window"))}.items():
+    known |= {"window": (window, ("follows", "fixed")), "normalise": (normalise, ("energy", "window"))}
+    for name, (word, words) in known.items():
         if word not in words:
             raise ValueError(f"{name} {word!r} is not known; expected {', '.join(words)}")
     for refused, said in (
@@ -237,16 +251,14 @@ def _check_batch(fields: Tensor, distances: Tensor, wavelengths: Tensor, weights
 
 
 def _centre(batch: Scene, lens: Lens, center: str, weights: Tensor) -> Tensor | None:
-    """Where the grids stand: None for the axis, else (2, D, F) mm, not differentiated: a sensor does not move."""
+    """Point of the sensor that the grids count from, with its derivatives: None for the axis, else (2, D, F) mm."""
     if center == "axis":
         return None
-    with torch.no_grad():
-        if center == "centroid":
-            pixel = make_grid(batch.wavelengths.new_tensor(1.0), 1)
-            return polychromatic(gaussian.kernels_alone(batch, pixel, order=6), weights, "").centroid
-        primary = lens.wavelengths[lens.primary_wavelength][None]
-        rays = trace_scene(dataclasses.replace(batch, wavelengths=primary), batch.fields.new_zeros(2, 1))
-        return rays.position[:2, :, :, 0, 0]
+    if center == "centroid" and symmetry(batch) != "round":
+        pixel = make_grid(batch.wavelengths.new_tensor(1.0), 1)
+        return polychromatic(gaussian.kernels_alone(batch, pixel, order=6), weights, "").centroid
+    primary = lens.wavelengths[lens.primary_wavelength][None]
+    return chief_landing(dataclasses.replace(batch, wavelengths=primary))[..., 0]
 
 
 def _with_centre(base: Tensor, place: Tensor | None, wavelengths: int) -> Tensor:

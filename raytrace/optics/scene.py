@@ -81,6 +81,17 @@ def cross_scene(scene: Scene, pupil: Tensor) -> list[Crossing]:
     return cross_bundle(_bundle(scene, pupil), scene.memo)
 
 
+def chief_landing(scene: Scene) -> Tensor:
+    """Points (2, D, F, W) mm of the sensor where the chief rays land, with their derivatives.
+
+    Where symmetry holds light on the axis, whatever the numbers of the lens are, they are constants, 0: models of round
+    light see that.
+    """
+    if symmetry(scene) == "round":
+        return scene.fields.new_zeros(2, *scene.shape)
+    return trace_scene(scene, scene.fields.new_zeros(2, 1)).position[:2, ..., 0]
+
+
 def _bundle(scene: Scene, pupil: Tensor) -> Bundle:
     lens = with_object_distance(scene.lens, scene.lens.surfaces[0].thickness[..., None])
     return lens, scene.fields[:, :, None, None], scene.wavelengths[:, None], pupil

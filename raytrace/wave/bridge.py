@@ -38,7 +38,7 @@ from raytrace.maths.value import to
 from raytrace.maths.zernike import noll
 from raytrace.media.glass import index
 from raytrace.optics.launch import rays_of_field
-from raytrace.optics.scene import Scene, scene, symmetry, trace_scene
+from raytrace.optics.scene import Scene, chief_landing, scene, symmetry
 from raytrace.optics.sequence import sequence_of
 from raytrace.optics.trace import media, trace_surfaces
 from raytrace.optics.vignetting import vignette
@@ -148,8 +148,9 @@ def hybrid_psf(
     """PSFs (D, F, W, rows, columns) of a lens that carries phase elements in contact at its stop, by waves.
 
     fields: y, pairs (x, y) or (2, F) in the lens's kind of field; object_distances: (D,) mm; wavelengths: (W,) µm; all
-    the lens's own by default. pixel, size: pitch in mm and number of pixels around the chief ray of each kernel. order,
-    derivatives and errors: of `kernels`.
+    the lens's own by default. pixel, size: pitch in mm and number of pixels around the chief ray of each kernel, which
+    they follow in the derivatives too; for a sensor that does not move, give `kernels` a grid. order, derivatives and
+    errors: of `kernels`.
     """
     like = lens.wavelengths
     fields = field_points(fields, like=lens)
@@ -158,10 +159,8 @@ def hybrid_psf(
         torch.as_tensor(t).to(like) for t in (distances, like if wavelengths is None else wavelengths)
     )
     view = scene(lens, fields, distances, colours)
-    with torch.no_grad():
-        chief = trace_scene(view, fields.new_zeros(2, 1)).position[:2, ..., 0].expand(2, *view.shape)
     parts = (elements,) if isinstance(elements, Element) else tuple(elements)
-    return kernels(view, parts, make_grid(like.new_tensor(pixel), size, chief), order=order)
+    return kernels(view, parts, make_grid(like.new_tensor(pixel), size, chief_landing(view)), order=order)
 
 
 def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: int = 0) -> Kernels:
