@@ -81,6 +81,18 @@ def test_the_command_is_the_verb(run):
     assert found.to_frame().half_energy_radius[0] == float(found.half_energy_radius)
 
 
+@pytest.mark.parametrize("engine", ["radial", "pupil"])
+def test_the_peak_does_not_depend_on_whether_the_window_is_even(engine):
+    """An even window has a corner of four pixels on the axis: 0.21 each, where a pixel about the axis holds 0.49."""
+    even, odd = (
+        rt.wave_psf("ideal", depths=[1000], wavelengths=[0.55], size=size, engine=engine, tol=1e-3) for size in (16, 15)
+    )
+    assert float(even.kernel.max()) < 0.5 * float(odd.kernel.max())
+    assert float(odd.peak) == float(odd.kernel.max()) == pytest.approx(0.492, abs=2e-3)
+    assert float(even.peak) == pytest.approx(float(odd.peak), rel=2e-3)  # by the error of the plan
+    assert even.document()["results"][0]["peak"] == float(even.peak)
+
+
 def test_kernels_of_an_element_at_hand_are_differentiable():
     (lens,) = rt.elements("singlet", aperture=1.0)
 

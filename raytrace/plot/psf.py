@@ -29,7 +29,7 @@ def psf_grid(found: Psf, *, close_up: CloseUp | None = None, log: bool = False) 
     Where its pixels were asked for, or its rays are plain, pixels are drawn; else the light itself in windows that it
     fills, with the edges of the pixels. close_up: that light, if it is there already.
     Kernels of each wavelength have a row each, fields outermost. log: four decades of brightness below the peak.
-    Below each: the energy inside the window of the kernel (or the energy it was normalised by), and its peak.
+    Below each: the energy inside the window of the kernel (or the energy it was normalised by), and of its brightest pixel.
     """
     if close_up is None and not found.framed and found.order is not None:
         close_up = light_of(found)
@@ -39,14 +39,14 @@ def psf_grid(found: Psf, *, close_up: CloseUp | None = None, log: bool = False) 
     title = ": ".join(filter(None, (found.lens.name, f"{found.model} PSF")))
     energy, kernels = _rows(array(found.energy), 0), _rows(array(found.kernel), 2)
     notes = [
-        [f"energy {e:.3f}, peak {kernel.max():.3g}" for e, kernel in zip(*row, strict=True)]
+        [f"energy {e:.3f}, max {kernel.max():.3g}" for e, kernel in zip(*row, strict=True)]
         for row in zip(energy, kernels, strict=True)
     ]
     pitch = float(found.grid.pitch)
     half = 0.5 * pitch * found.grid.columns
     if close_up is None:
         figure, _ = _panels(kernels, [[half] * len(distances)] * len(labels), distances, labels, notes, log)
-        return _worded(figure, title, [_window(found.grid), _brightness(log)])
+        return _worded(figure, title, [f"{_window(found.grid)}; max: light of the brightest pixel", _brightness(log)])
     drawn, each = _rows(array(close_up.light), 2), len(kernels) // close_up.half.shape[1]
     halves = np.repeat(array(close_up.half).T, each, 0)
     figure, axes = _panels(drawn, halves, distances, labels, notes, log)
@@ -56,7 +56,7 @@ def psf_grid(found: Psf, *, close_up: CloseUp | None = None, log: bool = False) 
         for d, panel in enumerate(row):
             _draw_pixels(panel, place[:, d], pitch, found.grid.columns, found.grid.rows)
     one = f"window {2e3 * halves.max():.3g} µm" if np.ptp(halves) == 0 else "windows by the width of the light"
-    drawn = f"{one}; energy and peak: of the {_window(found.grid)}, outlined where they lie inside"
+    drawn = f"{one}; energy and brightest pixel (max): of the {_window(found.grid)}, outlined where they lie inside"
     return _worded(figure, title, [drawn, _brightness(log)])
 
 

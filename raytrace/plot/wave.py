@@ -35,9 +35,9 @@ def psf_figure(found: ElementPsf) -> Figure:
     """Kernels over depth (rows) and wavelength (columns), each from black to its own peak in its own colour.
 
     With several wavelengths a last column shows them together, as a camera would see a white point: each with its own
-    share of the light, on one scale for the row. Below each: the light inside the window and in the brightest pixel.
+    share of the light, on one scale for the row. Below each: the light inside the window and its peak.
     """
-    kernels, energy = array(found.kernel), array(found.energy)
+    kernels, energy, peak = array(found.kernel), array(found.energy), array(found.peak)
     wavelengths = found.wavelengths.tolist()
     colours, together = wavelength_colours(wavelengths), len(wavelengths) > 1
     columns = len(wavelengths) + together
@@ -48,7 +48,7 @@ def psf_figure(found: ElementPsf) -> Figure:
             panel, kernel = axes[row][column], kernels[row, column]
             norm = PowerNorm(_GAMMA, vmin=0.0, vmax=kernel.max())
             panel.imshow(kernel, origin="lower", cmap=_dark(colours[column]), norm=norm, interpolation="nearest")
-            panel.set_xlabel(f"{100 * energy[row, column]:.1f} %, peak {kernel.max():.2g}", fontsize=7, color=GREY)
+            panel.set_xlabel(f"{100 * energy[row, column]:.1f} %, peak {peak[row, column]:.2g}", fontsize=7, color=GREY)
             if row == 0:
                 panel.set_title(f"{1e3 * wavelength:g} nm", color=colours[column])
         if together:
@@ -63,7 +63,7 @@ def psf_figure(found: ElementPsf) -> Figure:
     caption = (
         f"{found.grid.columns} × {found.grid.rows} pixels of {1e3 * float(found.pitch):g} µm; brightness ∝ "
         f"light^{_GAMMA:g}; "
-        "below each: share of the light inside the window, share in the brightest pixel"
+        "below each: share of the light inside the window, share in the brightest pixel or one on the axis"
     )
     figure.supxlabel(
         textwrap.fill(caption, int(16 * figure.get_figwidth())),

@@ -93,7 +93,10 @@ def wave_psf(
     )
     chosen = plan(scene, engine=engine, samples=samples, tol=tol)
     name = str(element) if not made else " + ".join(part.kind.words for part in parts)
-    return ElementPsf(_kernels(scene, chosen, progress), scene, chosen, name)
+    kernel, axial = _kernels(scene, chosen, progress), None
+    if size % 2 == 0:  # a corner of four pixels lies on the axis
+        axial = _kernels(dataclasses.replace(scene, grid=grid(_double(pixel), 1)), chosen, _silent)[..., 0, 0]
+    return ElementPsf(kernel, scene, chosen, name, axial)
 
 
 def elements(

@@ -31,6 +31,8 @@ class ElementPsf(Result):
 
     kernel: (D, W, rows, columns), light in each pixel, 1 = all through the aperture; scene: the camera; plan: how it
     was computed, with the predicted error, relative L2 of the worst kernel; element: its name.
+    axial: (D, W), light in one pixel centred on the axis, where the window has a corner or an edge of pixels there;
+    None where it was not computed, or is a pixel of the window.
     """
 
     FIGURE: ClassVar[str] = "plot.wave.element_figure"
@@ -39,6 +41,7 @@ class ElementPsf(Result):
     scene: WaveScene
     plan: Plan
     element: str = ""
+    axial: Tensor | None = None
 
     @property
     def depths(self) -> Tensor:
@@ -70,6 +73,15 @@ class ElementPsf(Result):
         return self.kernel.sum((-2, -1))
 
     @property
+    def peak(self) -> Tensor:
+        """(D, W): the most light in one pixel, of those of the window and one centred on the axis.
+
+        Light that is brightest on the axis has the same peak in windows of an even and of an odd number of pixels.
+        """
+        brightest = self.kernel.amax((-2, -1))
+        return brightest if self.axial is None else torch.maximum(brightest, self.axial)
+
+    @property
     def half_energy_radius(self) -> Tensor:
         """(D, W) mm about the axis that holds half of all light through the aperture; inf where the window does not.
 
@@ -85,7 +97,7 @@ class ElementPsf(Result):
             "depth": self.depths[:, None],
             "wavelength": self.wavelengths,
             "energy": self.energy,
-            "peak": self.kernel.amax((-2, -1)),
+            "peak": self.peak,
             "half_energy_radius": self.half_energy_radius,
         }
 
