@@ -29,7 +29,7 @@ def psf_grid(found: Psf, *, close_up: CloseUp | None = None, log: bool = False) 
     Where its pixels were asked for, or its rays are plain, pixels are drawn; else the light itself in windows that it
     fills, with the edges of the pixels. close_up: that light, if it is there already.
     Kernels of each wavelength have a row each, fields outermost. log: four decades of brightness below the peak.
-    Below each: the energy inside the window of the kernel (or the energy it was normalised by), and of its brightest pixel.
+    Below each: the energy inside the window (or that it was normalised by), and that of the brightest pixel.
     """
     if close_up is None and not found.framed and found.order is not None:
         close_up = light_of(found)
