@@ -1,5 +1,6 @@
 """The keywords of a .zmx file, a row each, and a text sorted by them: the system, the surfaces, what follows them."""
 
+import re
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -172,6 +173,24 @@ class Block:
             if keyword in self.records:
                 return self.records[keyword][-1]
         return None
+
+
+#: The name of a glass that a GLAS line leaves out: the medium is a model glass, or that of another surface.
+BLANK = "___BLANK"
+
+
+def is_blank(record: Record) -> bool:
+    """True for a GLAS line without the name of a glass."""
+    return record.words[:1] != () and record.words[0].upper() == BLANK
+
+
+def glass_source(block: Block) -> int | None:
+    """The number of the earlier surface whose medium is picked up: GLAS name 2 surface; None without a pickup."""
+    record = block.last("GLAS")
+    if not record or len(record.words) < 3 or record.words[1] != "2" or not re.fullmatch("[0-9]{1,6}", record.words[2]):
+        return None
+    source = int(record.words[2])
+    return source if source < block.place.surface else None
 
 
 class Sections(NamedTuple):

@@ -66,7 +66,7 @@ def read(
     names = tuple(name for record in found.system.all("GCAT") for name in record.words)
     at_hand = catalogs_at_hand(names, catalogs, report, packed)
     build = partial(zemax_surface.build, millimetres=unit, catalogs=at_hand, user=catalogs)
-    lens = _lens(found, [build(block, report=report) for block in found.surfaces], unit, report)
+    lens = _lens(found, [build(block, blocks=found.surfaces, report=report) for block in found.surfaces], unit, report)
     refuse_overflow(lens, file)
     _remarks(found, report)
     known = dict(zip(found.surfaces, lens.surfaces, strict=True))
@@ -74,7 +74,7 @@ def read(
     def rebuild(other: Sections) -> Lens:
         """The lens of changed records; what they were before is known."""
         draft = Draft(file, "zmx")
-        surfaces = [known.get(block) or build(block, report=draft) for block in other.surfaces]
+        surfaces = [known.get(block) or build(block, blocks=other.surfaces, report=draft) for block in other.surfaces]
         changed = _lens(other, surfaces, unit, draft)
         refuse_overflow(changed, file)
         return changed

@@ -8,7 +8,7 @@ from raytrace.formats import zemax_environment, zemax_intent_write, zemax_merit
 from raytrace.formats.media import catalogs_needed, is_code, is_left_out, listed_name
 from raytrace.formats.source import LensFileError, Place
 from raytrace.formats.spelling import exact, exact_list, one_line, thickness
-from raytrace.formats.zemax_keywords import FIELD_KINDS, FIELD_LISTS, NOTE_PIECE, SYSTEM_APERTURES
+from raytrace.formats.zemax_keywords import BLANK, FIELD_KINDS, FIELD_LISTS, NOTE_PIECE, SYSTEM_APERTURES
 from raytrace.formats.zemax_numbers import INVERSE, SurfaceType, numbers_of, spelled_inverse
 from raytrace.formats.zemax_operands_write import operand_lines, with_pickups
 from raytrace.formats.zemax_sags import stands_in_parameters
@@ -227,7 +227,7 @@ def _glass(glass: Glass, place: Place) -> list[str]:
         figures = exact_list(glass.coefficients, "model glass", place)
     else:
         return [f"  GLAS {listed_name(glass, place)} 0 0 1.5 40 0 0 0 0 0 0"]
-    flag, name = 1, listed_name(glass, place) if glass.name else "___BLANK"
+    flag, name = 1, listed_name(glass, place) if glass.name else BLANK
     if name.upper() in ("AIR", "MIRROR"):
         raise LensFileError(f"a glass of index {figures[0]} is named {name!r}; give it another name", place)
     if is_code(name) and exact_list(mil_glass(name).coefficients, "model glass", place) == figures:
