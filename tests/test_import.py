@@ -1,9 +1,16 @@
 """What lens files leave to be found: glasses that are picked up, fields beyond twelve, long waves."""
 
+import dataclasses
+
 import pytest
+import torch
 from test_zemax import file, read
 
-from raytrace.formats import read_lens, write_lens
+import raytrace as rt
+from raytrace.formats import LensFileError, read_lens, write_lens
+from raytrace.media.glass import ImplausibleWavelength, OutOfRange
+from raytrace.system.intent import Intent, Row
+from raytrace.system.lens import check_media
 
 #: A pickup of a medium with figures that are left from before.
 PICKUP = "GLAS {name} 2 0 1.5 40 0 0 0 0 0 0"
@@ -43,3 +50,54 @@ def test_a_pickup_of_another_glass_than_its_name_is_reported():
     assert report.warnings == (
         "lens.zmx:30, surface 2: GLAS SF5 is a pickup from surface 0, which has F2; SF5 is taken",
     )
+
+
+def test_fields_beyond_twelve_stand_in_lines_of_their_own(tmp_path):
+    """FEFD: x, y, weight and vignetting factors of the 13th and every further field; written so again, also in cm."""
+    y = list(range(12))
+    head = {
+        "FTYP": "FTYP 1 0 14 2 0 0 0",
+        "X": "XFLN " + " ".join("0" * 12),
+        "Y": f"YFLN {' '.join(map(str, y))}\nFENF 14 14\nFEFD 1 12 0.5 0 0 0 0.25 0\nFEFD 0 13 1 0 0 0 0 0",
+    }
+    text = file(**head).replace("DISZ INFINITY", "DISZ 100")
+    lens, report = read(text)
+    assert not report.warnings
+    assert lens.fields.y.tolist() == [*y, 12.0, 13.0]
+    assert lens.fields.x.tolist() == [0.0] * 12 + [1.0, 0.0]
+    assert lens.fields.weight.tolist() == [1.0] * 12 + [0.5, 1.0]
+    assert lens.fields.vignetting[3].tolist() == [0.0] * 12 + [0.25, 0.0]
+    for unit, scale in (("MM", 1.0), ("CM", 10.0)):
+        given = read(text.replace("UNIT MM", f"UNIT {unit}"))[0]
+        given = dataclasses.replace(given, intent=Intent(unit=scale, merit=(Row("EFFL"),)))
+        write_lens(given, tmp_path / "again.zmx")
+        assert f"FENF 14 14\nFEFD 1.0 12.0 0.5 0.0 0.0 0.0 0.25 0.0" in (tmp_path / "again.zmx").read_text()
+        again = read_lens(tmp_path / "again.zmx").fields
+        assert again.y.equal(given.fields.y)
+        assert again.vignetting.equal(given.fields.vignetting)
+    with pytest.raises(LensFileError, match=r":7: XFLN has 13 values for 14 fields"):
+        read(text.replace("\nFEFD 0 13 1 0 0 0 0 0", ""))
+
+
+@pytest.mark.parametrize("suffix", [".zmx", ".seq", ".csv"])
+def test_a_file_of_millimetre_waves_is_believed(suffix, tmp_path):
+    """The guard against nanometres is for what a person types; a file is warned of by the range of its glasses."""
+    lens, report = read(file(W1="WAVM 1 3000 1", W2="WAVM 2 856 1").replace("GLAS N-BK7", "GLAS ___BLANK 1 0 1.52 0 0"))
+    assert not report.warnings
+    write_lens(lens, tmp_path / f"lens{suffix}")
+    lens = read_lens(tmp_path / f"lens{suffix}")
+    assert lens.wavelengths.tolist() == [3000.0, 856.0]
+    rt.check(tmp_path / f"lens{suffix}")
+    assert rt.spot(lens.at(wavelengths=[2000.0])).rms_radius.isfinite().all()
+    assert rt.spot(lens).rms_radius.isfinite().all()
+    for wrong in (0.0, -1.0, float("inf"), 1e6):
+        with pytest.raises(ImplausibleWavelength):
+            lens.at(wavelengths=[wrong])
+
+
+def test_nanometres_that_a_person_types_are_refused():
+    row = [{"curvature": 0.02, "thickness": 5.0, "glass": 1.5}]
+    with pytest.raises(rt.BadPrescription, match=r"did you mean 0\.55"):
+        rt.lens(row, stop=1, f_number=5, wavelengths=[550.0])
+    with pytest.warns(OutOfRange, match="N-BK7"):
+        check_media(read(file(W1="WAVM 1 5 1"))[0], torch.tensor([5.0]))

@@ -106,7 +106,7 @@ def read_lens_with_report(
     if configuration is not None and configuration != lens.current_configuration:
         there = "a file of this format holds one"
         raise LensFileError(f"has no configuration {configuration}; {there}", Place(str(path)))
-    _refuse_other_units(lens, path)
+    _refuse_no_wavelengths(lens, path)
     varied = [Varied(str(operand), tuple(operand.values())) for operand in lens.operands if operand.name != "MOFF"]
     intent = Intent() if lens.intent is None else lens.intent
     report = dataclasses.replace(
@@ -192,7 +192,7 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
     a .zmx file does not bring back, such as blanks around it.
     """
     path = Path(path)
-    _refuse_other_units(lens, path)
+    _refuse_no_wavelengths(lens, path)
     form = _format(path, WRITTEN)
     content = form.write(lens, str(path), catalogs=tuple(catalogs))
     changed = _changed_texts(lens, content, form, path, tuple(catalogs))
@@ -205,9 +205,10 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
         raise LensFileError(error.strerror or str(error), Place(str(path))) from error
 
 
-def _refuse_other_units(lens: Lens, path: Path) -> None:
+def _refuse_no_wavelengths(lens: Lens, path: Path) -> None:
+    """Raises LensFileError for what is not above 0; the unit of a file is believed."""
     try:
-        check_unit(lens.wavelengths, (surface.glass for surface in lens.surfaces))
+        check_unit(lens.wavelengths, believed=lens.wavelengths)
     except ValueError as error:
         raise LensFileError(str(error), Place(str(path))) from error
 

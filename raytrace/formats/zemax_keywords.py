@@ -17,7 +17,7 @@ def _words(text: str) -> frozenset[str]:
 #: Keywords of the system and of a surface that are read; an aperture's are in the rows of `aperture.SHAPES`.
 SYSTEM_READ = _words(
     "VERS MODE NAME NOTE UNIT GCAT ENVD GFAC RAIM FTYP PWAV MNUM ENPD FNUM OBNA FLOA XFLN YFLN FWGN XFLD YFLD FWGT"
-    " SDMA VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN VDX VDY VCX VCY VAN WAVM WAVL WAVN WWGT WWGN"
+    " FEFD SDMA VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN VDX VDY VCX VCY VAN WAVM WAVL WAVN WWGT WWGN"
 )
 _SURFACE_READ = _words(
     "SURF TYPE CURV CONI DISZ GLAS DIAM STOP PARM COMM FLAP OBDC USAP USOB UDAD SCBD IGNR XDAT VCON VDSZ VPAR PPAR PZUP"
@@ -25,7 +25,7 @@ _SURFACE_READ = _words(
 )
 
 #: Keywords that may stand more than once in the system or in one surface.
-REPEATED = ("NOTE", "WAVM", "PARM", "UDAD", "XDAT", "PPAR", "VPAR", "SCBD")
+REPEATED = ("NOTE", "WAVM", "FEFD", "PARM", "UDAD", "XDAT", "PPAR", "VPAR", "SCBD")
 
 
 def _left_out(rows: dict[str, str]) -> dict[str, str]:
@@ -47,6 +47,7 @@ SYSTEM_IGNORED = _left_out(
         "comment on a field point; not carried": "FCOM",
         "entry of the vendor's catalog": "DBDT",
         "checksum of the program": "CSUM",
+        "number of fields, which FTYP states": "FENF",
     }
 )
 SURFACE_IGNORED = _left_out(
@@ -111,6 +112,9 @@ FIELD_LISTS = {
         for name in ("VDX", "VDY", "VCX", "VCY", "VAN")
     },
 }
+
+#: The lists of fields hold this many; a FEFD line holds a number of every list for each further field.
+FIELDS_IN_LISTS = 12
 
 #: OpticStudio cuts a long note into pieces of this many characters.
 NOTE_PIECE = 200
@@ -242,7 +246,21 @@ def sections(text: str, file: str, report: Draft) -> Sections:
             block = system
             _classify(record, system, SYSTEM_READ, SYSTEM_IGNORED, report)
     _warn_of_repeats([system, *surfaces], report)
+    _join_fields(system)
     return Sections(system, surfaces, tail)
+
+
+def _join_fields(system: Block) -> None:
+    """Put the fields beyond the twelfth (FEFD) behind those of the lists, each of which has a number in its line."""
+    further = system.all("FEFD")
+    for position, (keywords, default, what) in enumerate(FIELD_LISTS.values()) if further else ():
+        record = system.last(*keywords) or Record(keywords[0], (), "", further[0].place, False)
+        words = [*record.words[:FIELDS_IN_LISTS]]
+        words += [repr(default)] * (FIELDS_IN_LISTS - len(words))
+        for one in further:
+            one.number(position, what)
+            words.append(one.words[position])
+        system.records[record.keyword] = [record._replace(words=tuple(words))]
 
 
 def _next_surface(record: Record, surfaces: list[Block]) -> Block:

@@ -135,15 +135,21 @@ def check_wavelengths(glass: Glass, wavelengths: Tensor | Sequence[float] | floa
             warnings.warn(message, OutOfRange, stacklevel=2)
 
 
-def check_unit(wavelengths: Tensor, media: Iterable[Glass] = (), *, where: str = "") -> None:
+def check_unit(
+    wavelengths: Tensor, media: Iterable[Glass] = (), *, believed: Tensor | None = None, where: str = ""
+) -> None:
     """Refuse wavelengths in another unit than µm: shorter than hard x-rays, or longer than any glass lets through.
 
-    media: glasses whose range, where it reaches further, is believed. Raises ImplausibleWavelength, with a guess.
+    media: glasses whose range, where it reaches further, is believed. believed: wavelengths (...) known to be in µm, as
+    those of a lens file: up to ten times longer or shorter ones are, too. Raises ImplausibleWavelength, with a guess;
+    it refuses what is not above 0 and finite in any case.
     """
     spans = [medium.wavelength_range for medium in media if medium.wavelength_range]
-    shortest, longest = min([_SHORTEST, *(s[0] for s in spans)]), max([_LONGEST, *(s[1] for s in spans)])
+    known = [] if believed is None else [one for one in believed.detach().flatten().tolist() if 0 < one < math.inf]
+    shortest = min([_SHORTEST, *(s[0] for s in spans), *(0.1 * one for one in known)])
+    longest = max([_LONGEST, *(s[1] for s in spans), *(10 * one for one in known)])
     for wavelength in wavelengths.detach().flatten().tolist():
-        if not shortest <= wavelength <= longest:
+        if not (0 < wavelength < math.inf and shortest <= wavelength <= longest):
             guesses = (wavelength * factor for factor in _UNITS)
             guess = next((f"did you mean {g:.7g}?" for g in guesses if _LIKELY[0] <= g <= _LIKELY[1]), None)
             raise ImplausibleWavelength(
