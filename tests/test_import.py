@@ -71,7 +71,7 @@ def test_fields_beyond_twelve_stand_in_lines_of_their_own(tmp_path):
         given = read(text.replace("UNIT MM", f"UNIT {unit}"))[0]
         given = dataclasses.replace(given, intent=Intent(unit=scale, merit=(Row("EFFL"),)))
         write_lens(given, tmp_path / "again.zmx")
-        assert f"FENF 14 14\nFEFD 1.0 12.0 0.5 0.0 0.0 0.0 0.25 0.0" in (tmp_path / "again.zmx").read_text()
+        assert "FENF 14 14\nFEFD 1.0 12.0 0.5 0.0 0.0 0.0 0.25 0.0" in (tmp_path / "again.zmx").read_text()
         again = read_lens(tmp_path / "again.zmx").fields
         assert again.y.equal(given.fields.y)
         assert again.vignetting.equal(given.fields.vignetting)

@@ -38,6 +38,7 @@ def listed_glass(
     """
     if len(name) > _LONGEST:
         raise LensFileError(f"the glass {shown(name)} has {len(name)} characters; no glass has such a name", place)
+    catalogs = [catalog for catalog in catalogs if _is_readable(catalog, name, place, report)]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         glass = find_glass(name, catalogs=catalogs, user=user, where=str(place))
@@ -58,6 +59,21 @@ def listed_glass(
     return glass
 
 
+def _is_readable(catalog: str | Catalog, name: str, place: Place, report: Draft) -> bool:
+    """Whether a catalog's entry of a name can be read, if it has one; of a damaged one the report warns."""
+    if isinstance(catalog, Catalog):
+        try:
+            catalog.find(name)
+        except CatalogError as error:
+            report.warn(_left_out(catalog.name, error), Place(report.file))
+            return False
+    return True
+
+
+def _left_out(name: str, error: CatalogError) -> str:
+    return f"the catalog {name} that came with the lens is left out: {error}"
+
+
 #: Catalogs at hand by their names in capitals: where each stands, and what reads it.
 AtHand = Mapping[str, tuple[str, Callable[[], Catalog]]]
 
@@ -68,7 +84,7 @@ def beside(file: str) -> AtHand:
         found = sorted(path for path in Path(file).parent.iterdir() if path.suffix.lower() == ".agf" and path.is_file())
     except (OSError, ValueError):
         return {}
-    return {path.stem.upper(): (f"{path.name} beside the lens", partial(load, path)) for path in found}
+    return {path.stem.upper(): (f"{path.name} beside the lens", partial(load, path, listed=True)) for path in found}
 
 
 def catalogs_at_hand(
@@ -99,7 +115,7 @@ def _came(name: str, where: str, read: Callable[[], Catalog], report: Draft) -> 
         try:
             catalog = read()
         except CatalogError as error:
-            report.warn(f"the catalog {name} that came with the lens is left out: {error}", Place(report.file))
+            report.warn(_left_out(name, error), Place(report.file))
             return None
     for warning in caught:
         report.note(str(warning.message))

@@ -103,7 +103,8 @@ def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
 def _fields(lists: Sequence[Tensor], place: Place) -> list[str]:
     """The lists of fields, and a line for every field beyond those that they hold."""
     texts = [exact_list(numbers, row.what, place) for row, numbers in zip(FIELD_LISTS.values(), lists, strict=True)]
-    told = [f"{row.keywords[0]} {' '.join(text[:FIELDS_IN_LISTS])}" for row, text in zip(FIELD_LISTS.values(), texts)]
+    rows = zip(FIELD_LISTS.values(), texts, strict=True)
+    told = [f"{row.keywords[0]} {' '.join(text[:FIELDS_IN_LISTS])}" for row, text in rows]
     further = list(zip(*(text[FIELDS_IN_LISTS:] for text in texts), strict=True))
     count = FIELDS_IN_LISTS + len(further)
     return [*told, *([f"FENF {count} {count}"] if further else []), *(" ".join(["FEFD", *one]) for one in further)]

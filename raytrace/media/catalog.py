@@ -26,6 +26,7 @@ from typing import NamedTuple
 import torch
 
 from raytrace.files import shipped
+from raytrace.media import agf
 from raytrace.media.agf import Catalog as Catalog
 from raytrace.media.agf import CatalogError as CatalogError
 from raytrace.media.agf import CatalogWarning as CatalogWarning
@@ -195,19 +196,22 @@ def shipped_catalog(name: str) -> Catalog:
     return load(shipped_folder() / f"{shipped}.AGF")
 
 
-def load(path: str | Path) -> Catalog:
-    """The catalog of an AGF file, parsed again only when the file has changed. Raises CatalogError."""
+def load(path: str | Path, *, listed: bool = False) -> Catalog:
+    """The catalog of an AGF file, parsed again only when the file has changed. Raises CatalogError.
+
+    listed: a glass is parsed when it is asked for, and raises then.
+    """
     path = Path(path)
     try:
         state = path.stat()
     except OSError as error:
         raise CatalogError(f"{path}: cannot be read ({error.strerror}); expected a glass catalog (AGF)") from error
-    return _load(path.resolve(), state.st_mtime_ns, state.st_size)
+    return _load(path.resolve(), state.st_mtime_ns, state.st_size, listed)
 
 
 @lru_cache(maxsize=64)
-def _load(path: Path, modified: int, size: int) -> Catalog:
-    return read_agf(path)
+def _load(path: Path, modified: int, size: int, listed: bool) -> Catalog:
+    return agf.listed(read_text(path), path) if listed else read_agf(path)
 
 
 class Alias(NamedTuple):

@@ -301,8 +301,9 @@ def name_of_field(field: Tensor) -> str:
 def check_media(lens: Lens, wavelengths: Tensor, *, where: str = "") -> None:
     """Refuse wavelengths (W,) µm at which a glass of the lens has no index; warn of glasses used outside their range.
 
-    where: the lens, to name in the message. Raises ImplausibleWavelength, where neither a glass nor the lens's own
-    wavelengths reach that far, also for a lens without glass, and `glass.InvalidIndex`; warns `glass.OutOfRange`, once for each glass.
+    where: the lens, to name in the message. Raises ImplausibleWavelength where neither a glass nor the wavelengths of
+    the lens reach that far, also for a lens without glass, and `glass.InvalidIndex`; warns `glass.OutOfRange`, once for
+    each glass.
     """
     media = [surface.glass for surface in lens.surfaces[:-1]]
     check_unit(wavelengths, media, believed=lens.wavelengths, where=where)
