@@ -7,7 +7,10 @@ import torch
 from test_zemax import file, read
 
 import raytrace as rt
-from raytrace.formats import LensFileError, read_lens, write_lens
+from raytrace.cli import main
+from raytrace.formats import LensFileError, LensFileWarning, read_lens, write_lens
+from raytrace.formats.substitutes import substitutes_of
+from raytrace.media.catalog import UnknownGlass, find_glass
 from raytrace.media.glass import ImplausibleWavelength, OutOfRange
 from raytrace.system.intent import Intent, Row
 from raytrace.system.lens import check_media
@@ -101,3 +104,73 @@ def test_nanometres_that_a_person_types_are_refused():
         rt.lens(row, stop=1, f_number=5, wavelengths=[550.0])
     with pytest.warns(OutOfRange, match="N-BK7"):
         check_media(read(file(W1="WAVM 1 5 1"))[0], torch.tensor([5.0]))
+
+
+#: The singlet with a glass that no catalog holds, in every format; that with nd and Vd beside it, where it has a place.
+UNKNOWN = {
+    ".zmx": file().replace("GLAS N-BK7 0 0 1.5 40", "GLAS XK99 0 0 1.5168 64.17"),
+    ".csv": "# stop: 1\n# F/5\nradius,thickness,glass,nd,νd\n50,4,XK99,1.5168,64.17\n-50,47.5,,,\n",
+    ".seq": "RDM; LEN\nEPD 10\nDIM M\nWL 587.6\nREF 1\nYAN 0\nSO 0 1e20\nS 50 4 XK99_SCHOTT\nSTO\nS -50 47.5\n"
+    "SI 0 0\nGO\n",
+    ".len": 'LEN NEW "x" 100\nEBR 5.0\nANG 1.0\nTH 1e20\nAIR\nNXT\nRD 50\nTH 4\nGLA XK99\nAST\nNXT\nRD -50\n'
+    "TH 47\nAIR\nNXT\nEND 3\n",
+}
+
+
+@pytest.mark.parametrize("suffix", UNKNOWN)
+def test_a_substitute_is_taken_where_it_is_asked_for_and_reported(suffix, tmp_path):
+    path = tmp_path / f"lens{suffix}"
+    path.write_text(UNKNOWN[suffix], encoding="utf-8")
+    with pytest.raises(UnknownGlass, match=r"--substitute XK99"):
+        read_lens(path)
+    wanted = find_glass("N-BK7").coefficients
+    for asked in ({"XK99": "N-BK7"}, "xk99=N-BK7", ["XK99=N-BK7"]):
+        with pytest.warns(LensFileWarning, match=r"N-BK7 \(SCHOTT\) is taken for the glass XK99, as asked for"):
+            lens = read_lens(path, substitute=asked)
+        assert any(surface.glass.coefficients.equal(wanted) for surface in lens.surfaces)
+    assert "N-BK7 (SCHOTT) is taken" in str(rt.check(path, substitute="XK99=N-BK7"))
+    if suffix in (".zmx", ".csv"):
+        for asked in ("nearest", "XK99=nearest", {"XK99": "nearest"}):
+            with pytest.warns(LensFileWarning, match=r"\(\w+\) is taken for the unknown glass XK99: the nearest to nd"):
+                lens = read_lens(path, substitute=asked)
+            glass = next(one.glass for one in lens.surfaces if one.glass.name)
+            assert abs(glass.nd_listed - 1.5168) < 1e-5
+            assert abs(glass.abbe_listed - 64.17) < 0.01
+    else:
+        with pytest.raises(UnknownGlass, match="the file has no nd and Vd to find the nearest glass by"):
+            read_lens(path, substitute="nearest")
+
+
+def test_substitutes_that_mean_nothing_are_refused_or_reported(tmp_path):
+    path = tmp_path / "lens.zmx"
+    path.write_text(file())
+    with pytest.warns(
+        LensFileWarning, match="a substitute for the glass SF5 was asked for, which the file does not name"
+    ):
+        read_lens(path, substitute="SF5=F2")
+    for wrong in ("SF5", "=F2", {"SF5": ""}, {"SF5": 3}):
+        with pytest.raises(rt.formats.BadSubstitute, match="expected GLASS=OTHER, or nearest"):
+            read_lens(path, substitute=wrong)
+    path.write_text(UNKNOWN[".zmx"].replace("1.5168 64.17", "1.5 40"))
+    with pytest.raises(UnknownGlass, match="the file has no nd and Vd"):
+        read_lens(path, substitute="nearest")
+    path.write_text(UNKNOWN[".zmx"])
+    with pytest.raises(UnknownGlass, match="unknown glass 'NONE9'"):
+        read_lens(path, substitute="XK99=NONE9")
+
+
+def test_a_substitute_is_taken_in_every_configuration():
+    tail = 'MNUM 2 1\nGLSS   1   1 "N-BK7" 0 0 0 1 1 0 0\nGLSS   1   2 "XK99" 0 0 0 1 1 0 0'
+    lens, report = read(file(tail=tail), substitutes=substitutes_of("XK99=F2"))
+    assert [one.surfaces[1].glass.name for one in lens.configurations] == ["N-BK7", "F2"]
+    assert not any("was asked for" in warning for warning in report.warnings)
+
+
+@pytest.mark.parametrize("command", ["info {}", "check {}", "spot {}", "convert {} {}.csv", "focus {} -o {}.zmx"])
+def test_commands_take_substitutes(command, tmp_path, capsys):
+    path = tmp_path / "lens.zmx"
+    path.write_text(UNKNOWN[".zmx"])
+    words = command.replace("{}", str(path)).split()
+    assert main(words) == 1
+    assert main([*words, "--substitute", "XK99=N-BK7"]) == 0
+    assert "N-BK7 (SCHOTT) is taken for the glass XK99" in "".join(capsys.readouterr())

@@ -89,6 +89,9 @@ def _figures(name: str, place: Place) -> Glass | None:
 def _listed(name: str, shelf: Shelf, *, place: Place, report: Draft) -> Glass:
     """The glass of a catalog, by NAME_CATALOG or NAME."""
     plain, _, catalog = name.rpartition("_")
+    for spelled in (name, plain):
+        if report.substitutes.of(spelled) is not None:
+            return listed_glass(spelled, catalogs=shelf.came, user=shelf.user, place=place, report=report)
     hits = plain_names(plain, came=shelf.came, user=shelf.user) if plain else ()
     found = [hit for hit in hits if same_catalog(hit[1], catalog)]
     is_told = bool(found)

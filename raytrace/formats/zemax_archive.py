@@ -20,6 +20,7 @@ from raytrace.formats import zemax_read
 from raytrace.formats.media import AtHand
 from raytrace.formats.report import IGNORED, READ, UNKNOWN, Draft, ImportReport
 from raytrace.formats.source import MAX_BYTES, LensFileError, Place, decode, read_content, shown
+from raytrace.formats.substitutes import NONE, Substitutes
 from raytrace.media import agf
 from raytrace.media.catalog import Catalog, CatalogError
 from raytrace.system.lens import Lens
@@ -91,6 +92,7 @@ def read(
     catalogs: Sequence[Path] = (),
     strict: bool = False,
     configuration: int | None = None,
+    substitutes: Substitutes = NONE,
 ) -> tuple[Lens, ImportReport]:
     """The lens of an archive's bytes and the report of its import, members first; otherwise as `zemax_read.read`."""
     found = members(content, Place(file))
@@ -99,7 +101,13 @@ def read(
     text = decode(unpacked(lens_member, MAX_BYTES, place), place)
     used: set[str] = set()
     packed = _catalogs(found, used)
-    own = {"catalogs": catalogs, "strict": strict, "configuration": configuration, "packed": packed}
+    own = {
+        "catalogs": catalogs,
+        "strict": strict,
+        "configuration": configuration,
+        "packed": packed,
+        "substitutes": substitutes,
+    }
     lens, report = zemax_read.read(text, place.file, **own)
     listed = _listed(found, lens_member, used, file).finished(strict=strict)
     return lens, dataclasses.replace(

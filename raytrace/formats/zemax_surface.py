@@ -201,7 +201,14 @@ def _medium(
     if is_code(name):
         report.glass(surface, name, "six-digit code: nd and Vd by its digits")
         return mil_glass(name)
-    return listed_glass(name, catalogs=catalogs, user=user, place=record.place, report=report)
+    how = {"catalogs": catalogs, "user": user, "place": record.place, "report": report}
+    return listed_glass(name, **how, figures=_figures(record))
+
+
+def _figures(record: Record) -> tuple[float, float] | None:
+    """n_d and V_d that a GLAS line has for its glass; None for those that mean nothing, 1.5 and 40."""
+    nd, vd = (record.number(k, "figure of the glass", 0.0) for k in (3, 4))
+    return (nd, vd) if nd > 1 and vd > 0 and (nd, vd) != (1.5, 40.0) else None
 
 
 def _model(record: Record, name: str, report: Draft) -> Glass:

@@ -64,15 +64,26 @@ def _at(where: str) -> str:
 
 
 class UnknownGlass(LookupError):
-    """No catalog holds the name. Carries `name`, `where` and `suggestions`, a tuple of (glass, catalog)."""
+    """No catalog holds the name. Carries `name`, `where` and `suggestions`, a tuple of (glass, catalog).
 
-    def __init__(self, name: str, where: str, suggestions: tuple[tuple[str, str], ...], searched: Sequence[str]):
-        self.name, self.where, self.suggestions = name, where, suggestions
+    searched: the names of the catalogs; hint: what else helps.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        where: str,
+        suggestions: tuple[tuple[str, str], ...],
+        searched: Sequence[str],
+        hint: str = "",
+    ):
+        self.name, self.where, self.suggestions, self.searched = name, where, suggestions, searched
         near = ", ".join(f"{glass} ({catalog})" for glass, catalog in suggestions)
         super().__init__(
             f"{_at(where)}unknown glass {name!r}; no catalog of {', '.join(searched)} holds it. "
             + (f"Nearest names: {near}. " if near else "No name comes near. ")
-            + f"Correct the name, or give the AGF file that defines it (--catalog FILE or {ENVIRONMENT})."
+            + f"Correct the name, or give the AGF file that defines it (--catalog FILE or {ENVIRONMENT})"
+            + (f"; {hint}." if hint else ".")
         )
 
 
