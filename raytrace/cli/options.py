@@ -183,7 +183,8 @@ def substitute(parser: argparse.ArgumentParser) -> None:
         metavar="GLASS=OTHER",
         nargs="+",
         help="take another glass for one of the file, as SSK4=SSK4A; SSK4=nearest, or nearest for every unknown glass: "
-        "the nearest one by the nd and Vd that the file has for it; each is reported in a warning",
+        "the nearest one by the nd and Vd that the file has for it; NAME=formula, or formula: accept indices that are "
+        "estimated to no better than 1e-4, of CODE V's glasses by few figures; each is reported in a warning",
     )
 
 

@@ -9,7 +9,7 @@ import torch
 
 from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, Place, shown
-from raytrace.formats.substitutes import NEAREST, nearest_glass
+from raytrace.formats.substitutes import FORMULA, NEAREST, nearest_glass
 from raytrace.media.catalog import (
     SAME_INDEX,
     AmbiguousGlass,
@@ -46,7 +46,7 @@ def listed_glass(
     how = {"catalogs": catalogs, "user": user, "place": place, "report": report}
     if other is not None:
         report.substituted.add(name.upper())
-    if other is not None and other != NEAREST:
+    if other is not None and other not in (NEAREST, FORMULA):
         glass = mil_glass(other) if is_code(other) else _catalog_glass(other, **how)
         report.warn(f"{glass_words(glass)} is taken for the glass {name}, as asked for", place)
         return glass

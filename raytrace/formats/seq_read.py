@@ -73,7 +73,7 @@ def read(
     wavelengths, weights, primary = _wavelengths(system)
     private = seq_glass.private_glasses(found.private, wavelengths.tolist(), _own_words(found, "UNNAMED"), report)
     words = [record.words[0] for block in found.surfaces for record in block.all("GLA") if record.words]
-    shelf = seq_glass.Shelf(private, seq_glass.came_with(file, words, catalogs, report), catalogs)
+    shelf = seq_glass.Shelf(private, seq_glass.came_with(file, words, catalogs, report), catalogs, wavelengths.tolist())
     surfaces = _surfaces(found, unit, shelf, report)
     solve = system.last("PIM")
     if solve and not (solve.words and solve.words[0][:1] in "Nn"):

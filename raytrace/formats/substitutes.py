@@ -6,6 +6,8 @@ A name is never replaced unasked. `substitute` is a mapping {"SSK4": "SSK4A"}, o
     d² = Δn_d² + (0.01 ΔV_d)²
 
 from the figures that the file has for the one that is not known: of an unknown glass by name, or alone of every one.
+"formula" accepts, of a glass of CODE V that is known by its n_d and V_d or by a few indices, those that a formula
+estimates at other wavelengths to no better than 1e-4.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,6 +19,9 @@ from raytrace.media.glass import Glass
 
 NEAREST = "nearest"
 
+#: Stands for the indices that a formula estimates, of a glass that a file has by few figures.
+FORMULA = "formula"
+
 #: By how much of n_d a unit of V_d counts.
 _PER_ABBE = 0.01
 
@@ -27,14 +32,22 @@ class BadSubstitute(ValueError):
 
 @dataclass(frozen=True)
 class Substitutes:
-    """Names of glasses by those, in capitals, that they are taken for; nearest: whether every unknown one has one."""
+    """Names of glasses by those, in capitals, that they are taken for; nearest: whether every unknown one has one.
+
+    formula: whether the indices that a formula estimates are accepted for every glass.
+    """
 
     named: Mapping[str, str] = field(default_factory=dict)
     nearest: bool = False
+    formula: bool = False
 
     def of(self, name: str) -> str | None:
         """The name that is taken for a name, NEAREST among them; None where none was asked for."""
         return self.named.get(name.upper())
+
+    def takes_formula(self, name: str) -> bool:
+        """Whether the indices that a formula estimates for a glass were asked for."""
+        return self.formula or self.of(name) == FORMULA
 
 
 NONE = Substitutes()
@@ -48,15 +61,15 @@ def substitutes_of(given: Mapping[str, str] | str | Sequence[str] | None) -> Sub
         pairs = list(given.items())
     else:
         words = given.split() if isinstance(given, str) else list(given)
-        pairs = [(word, "") if word == NEAREST else tuple(word.partition("=")[::2]) for word in words]
-    named = {}
+        pairs = [tuple(word.partition("=")[::2]) for word in words]
+    named, alone = {}, {name for name, other in pairs if name in (NEAREST, FORMULA) and other == ""}
     for name, other in pairs:
-        if (name, other) == (NEAREST, ""):
+        if other == "" and name in alone:
             continue
         if not (isinstance(name, str) and isinstance(other, str) and name.strip() and other.strip()):
-            raise BadSubstitute(f"`substitute`: {name!r} for {other!r}; expected GLASS=OTHER, or {NEAREST}")
+            raise BadSubstitute(f"`substitute`: {name!r} for {other!r}; expected GLASS=OTHER, {NEAREST} or {FORMULA}")
         named[name.strip().upper()] = other.strip()
-    return Substitutes(named, any(pair == (NEAREST, "") for pair in pairs))
+    return Substitutes(named, NEAREST in alone, FORMULA in alone)
 
 
 def nearest_glass(nd: float, vd: float, *, user: Sequence[Path] = ()) -> Glass:
