@@ -391,7 +391,7 @@ def test_a_file_too_large_is_refused_before_it_is_read(tmp_path):
     path = tmp_path / "huge.agf"
     with path.open("wb") as file:
         file.truncate(200 * 2**20)  # a sparse file: no disk is used
-    with pytest.raises(CatalogError, match="larger than 64 MB"):
+    with pytest.raises(CatalogError, match="larger than 16 MB"):
         read_agf(path)
 
 

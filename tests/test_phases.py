@@ -38,7 +38,34 @@ def test_the_gradient_is_that_of_the_path(name):
     scale = found.y.abs().max()
     assert (found.x - (0 if by_x is None else by_x)).abs().max() < 1e-12 * scale
     assert (found.y - by_y).abs().max() < 1e-12 * scale
-    assert float(added_path(PHASES[name], real(0.0), real(0.0), WAVELENGTH).path) == 0
+
+
+def test_the_path_at_the_vertex_is_the_constant_of_the_terms():
+    """Of the fringe terms 1, 2ρ² - 1, …: one wave of piston is a path of one wavelength; of all other kinds 0."""
+    for name, phase in PHASES.items():
+        found = float(added_path(phase, real(0.0), real(0.0), WAVELENGTH).path)
+        signs = {1: 1, 4: -1, 9: 1, 16: -1, 25: 1, 36: -1, 37: 1}
+        terms = sum(sign * float(phase.coefficients[k - 1]) for k, sign in signs.items()) if name == "fringe" else 0.0
+        assert abs(found - terms * 0.55e-3) < 1e-15, name
+
+
+@pytest.mark.parametrize("engine", ["eager", "fused"])
+def test_a_wave_of_piston_is_a_wave_of_path_with_its_derivative(engine):
+    """Zernike's first fringe term: λ times the order, along every ray, in both engines."""
+
+    def path(piston):
+        phase = rt.FringePhase(torch.stack([piston, *real([0.0, 0.3, 0.2]).unbind()]), real(6.0), real(2.0))
+        surfaces = [Surface(real(5.0), phase=phase), Surface(real(0.0))]
+        x = torch.linspace(-3, 3, 4096, dtype=torch.float64)
+        rays = start(torch.stack([x, 0.1 * x, 0 * x]), torch.stack([0 * x, 0 * x, 1 + 0 * x]), 0 * x)
+        with rt.tracing(engine):
+            return trace_surfaces(surfaces, rays, indices=[real(1.0)] * 3, wavelength=WAVELENGTH).opl
+
+    piston = real(1.0).requires_grad_()
+    found = path(piston)
+    assert ((found - path(real(0.0))).detach() - 2 * 0.55e-3).abs().max() < 1e-15  # mm
+    (slope,) = torch.autograd.grad(found.mean(), piston)
+    assert abs(float(slope) - 2 * 0.55e-3) < 1e-15
 
 
 @pytest.mark.parametrize("name", PHASES)
@@ -70,8 +97,8 @@ def test_fringe_terms_in_their_usual_order():
         ) * (torch.cos(m * phi) if m >= 0 else torch.sin(-m * phi))
         terms = torch.zeros(37, dtype=torch.float64)
         terms[number - 1] = 1.0
-        found = polynomial_xy(real(fringe_to_powers(37)) @ terms, x, y).z
-        found = found + (expected - found).mean()  # the constant is left out
+        matrix, constants = map(real, fringe_to_powers(37))
+        found = polynomial_xy(matrix @ terms, x, y).z + constants @ terms
         assert (found - expected).abs().max() < 1e-10, number
 
 

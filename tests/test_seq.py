@@ -469,7 +469,7 @@ def test_private_glasses():
     assert "its 10 indices" in report.notes[0]
     with pytest.raises(LensFileError, match="formula GMS, which is not modelled"):
         of(private("PWL 500\n'X' GMS 1 2 3", "X"))
-    assert "interpolated" in of(private("PWL 500 600\n'X' 1.51 1.50", "X"))[1].warnings[0]
+    assert "index of X at 587.6 nm is estimated" in of(private("PWL 500 600\n'X' 1.51 1.50", "X"))[1].notes[0]
 
 
 def test_what_is_in_no_catalog_comes_back():

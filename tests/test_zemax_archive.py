@@ -9,10 +9,10 @@ from test_catalog import SMALL
 from test_zemax import file as singlet
 
 from raytrace.cli import main
-from raytrace.formats import LensFileError, check, convert, read_lens, read_lens_with_report
+from raytrace.formats import LensFileError, check, convert, read_lens, read_lens_with_report, zemax_archive
 from raytrace.formats.source import MAX_BYTES, Place
 from raytrace.formats.zemax_archive import Member, members, unpacked
-from raytrace.media.agf import format_agf
+from raytrace.media.agf import MOST_GLASSES, CatalogError, format_agf, listed, parse_agf
 from raytrace.media.catalog import ENVIRONMENT, UnknownGlass, find_glass, shipped_catalog
 from raytrace.media.glass import index
 
@@ -338,3 +338,35 @@ def test_a_lens_is_written_beside_its_catalog_and_read_again(tmp_path):
     ):
         convert(path, elsewhere / "again.zmx")
     assert not any(elsewhere.iterdir())
+
+
+def test_many_large_catalogs_are_bounded_together_and_parsed_where_glasses_are_asked_for(tmp_path, monkeypatch):
+    """22 catalogs of an archive, each with a damaged glass that the lens does not name, and more than their bound."""
+    monkeypatch.setattr(zemax_archive, "MAX_CATALOGS", 20_000)
+    filler = "NM BROKEN 2\n" + "GC a comment\n" * 100
+    files = {f"C{k}.AGF": f"{ACME.replace('ACME-1', f'ACME-{k}')}{filler}".encode() for k in range(22)}
+    files["LENS.ZMX"] = singlet(GCAT=f"GCAT {' '.join(f'C{k}' for k in range(22))}").replace("N-BK7", "ACME-3").encode()
+    lens, report = read_lens_with_report(written(tmp_path, files))
+    assert first(lens).catalog == "C3"
+    size = len(files["C0.AGF"])
+    beyond = [warning for warning in report.warnings if "the catalogs of the archive hold more than 0 MB" in warning]
+    assert len(beyond) == len(report.warnings) == 22 - 20_000 // size
+
+
+def test_a_catalog_of_too_many_glasses_is_refused():
+    text = "".join(f"NM G{k} 2 0 1.5 60\n" for k in range(MOST_GLASSES + 1))
+    for read in (parse_agf, listed):
+        with pytest.raises(CatalogError, match=f"{MOST_GLASSES + 1} glasses, more than any catalog"):
+            read(text, "many.agf")
+
+
+def test_a_glass_is_parsed_when_it_is_asked_for_as_with_all_others():
+    text = format_agf(shipped_catalog("SCHOTT"))
+    eager, found = parse_agf(text, "SCHOTT.AGF"), listed(text.replace("\n", "\r\n"), "SCHOTT.AGF")
+    assert list(found.glasses) == list(eager.glasses)
+    for name in ("N-BK7", "n-sf5", "SF6"):
+        one, other = found.find(name), eager.find(name)
+        assert one.coefficients.equal(other.coefficients)
+        assert (one.name, one.records, one.wavelength_range) == (other.name, other.records, other.wavelength_range)
+    with pytest.raises(CatalogError, match=r"CAT.AGF:3: found NM TWO 2"):
+        listed("NM ONE 2\nCD 1\nNM TWO 2\n", "CAT.AGF").find("TWO")

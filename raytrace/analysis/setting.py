@@ -8,6 +8,7 @@ from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.utils import _pytree as pytree
 
+from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.result import flat
 from raytrace.optics.launch import is_at_infinity, object_field
@@ -79,7 +80,8 @@ def like(lens: Lens) -> dict:
 
 
 def field_range(lens: Lens, size: int) -> Tensor:
-    """Fields (2, size) along y from the axis to the lens's largest."""
+    """Fields (2, size) along y from the axis to the lens's largest. Raises OverBudget for too many to be traced."""
+    afford(RAY_BYTES * size * len(lens.wavelengths), f"{size:,} fields", helps="ask for fewer `samples`")
     return largest_field(lens) * torch.linspace(0.0, 1.0, size, **like(lens))
 
 

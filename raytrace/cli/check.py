@@ -28,4 +28,5 @@ def run(arguments: argparse.Namespace):
         catalogs=catalogs(arguments),
         strict=arguments.strict,
         configuration=arguments.configuration,
+        substitute=arguments.substitute,
     )

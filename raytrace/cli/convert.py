@@ -3,7 +3,7 @@
 import argparse
 
 import raytrace
-from raytrace.cli.options import catalog, configuration, file_name, json
+from raytrace.cli.options import catalog, configuration, file_name, json, substitute
 
 SUMMARY = "write a lens in another format"
 DESCRIPTION = "Read a lens file and write it as the suffix of OUT says. Every number comes back bit for bit."
@@ -20,6 +20,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     )
     configuration(parser)
     catalog(parser)
+    substitute(parser)
     json(parser)
     parser.add_argument("--strict", action="store_true", help="fail on anything unknown or assumed in IN")
 
@@ -28,6 +29,5 @@ def run(arguments: argparse.Namespace):
     from raytrace.cli.door import catalogs, find_lens
 
     path, own = find_lens(arguments.source), catalogs(arguments)
-    return raytrace.convert(
-        path, arguments.target, catalogs=own, strict=arguments.strict, configuration=arguments.configuration
-    )
+    how = {name: getattr(arguments, name) for name in ("strict", "configuration", "substitute")}
+    return raytrace.convert(path, arguments.target, catalogs=own, **how)

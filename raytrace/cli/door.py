@@ -38,7 +38,8 @@ def open_lens(arguments: argparse.Namespace) -> Lens:
     """Read the lens and set the conditions that the arguments name; one object distance at a time."""
     path = find_lens(arguments.lens)
     number = getattr(arguments, "configuration", None)
-    lens = read_lens(path, catalogs=catalogs(arguments), configuration=number if isinstance(number, int) else None)
+    how = {"catalogs": catalogs(arguments), "substitute": getattr(arguments, "substitute", None)}
+    lens = read_lens(path, **how, configuration=number if isinstance(number, int) else None)
     given = {name: getattr(arguments, name, None) for name in CONDITIONS}
     distance = getattr(arguments, "object_distances", None)
     try:

@@ -51,7 +51,8 @@ def run(arguments):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # said when the file was read first
             path, one = find_lens(arguments.lens), arguments.configuration
-            original = read_lens(path, catalogs=catalogs(arguments), configuration=one)
+            how = {"catalogs": catalogs(arguments), "substitute": arguments.substitute}
+            original = read_lens(path, **how, configuration=one)
         write_lens(with_sensor_distance(original, found.sensor_distance), arguments.output)
         say(f"written: {arguments.output}")
         arguments.output = None

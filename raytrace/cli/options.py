@@ -146,10 +146,11 @@ def _number(text: str) -> float:
 
 
 def lens(parser: argparse.ArgumentParser, *, all_configurations: str = "") -> None:
-    """LENS, --configuration, --catalog, --json."""
+    """LENS, --configuration, --catalog, --substitute, --json."""
     parser.add_argument("lens", metavar="LENS", type=file_name, help="lens file, or the name of a shipped lens")
     configuration(parser, several=all_configurations)
     catalog(parser)
+    substitute(parser)
     json(parser)
 
 
@@ -173,6 +174,17 @@ def catalog(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="glass catalog to search first, an .agf file or the name of a shipped one; may be repeated; also the "
         "environment variable RAYTRACE_CATALOGS",
+    )
+
+
+def substitute(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--substitute",
+        metavar="GLASS=OTHER",
+        nargs="+",
+        help="take another glass for one of the file, as SSK4=SSK4A; SSK4=nearest, or nearest for every unknown glass: "
+        "the nearest one by the nd and Vd that the file has for it; NAME=formula, or formula: accept indices that are "
+        "estimated to no better than 1e-4, of CODE V's glasses by few figures; each is reported in a warning",
     )
 
 

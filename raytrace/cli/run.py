@@ -18,7 +18,7 @@ from raytrace.shards import processes, share
 #: Options that are for the runner: they set the lens, or say where the result goes. A verb that has one gets it too.
 _RUNNERS = (
     *("command", "subcommand", "run", "lens", "catalog", "json", "plot", "output", "suffix", "max_bytes", "spelled"),
-    *("object_distances", "configuration", *CONDITIONS),
+    *("substitute", "object_distances", "configuration", *CONDITIONS),
 )
 _DRAWING = "plot_"  # options of the figure begin with it: --log, dest="plot_log"
 

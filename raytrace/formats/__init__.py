@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import warnings
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -25,6 +25,8 @@ from raytrace.formats.source import LensFileError as LensFileError
 from raytrace.formats.source import LensFileWarning as LensFileWarning
 from raytrace.formats.source import Place, decode, read_text, shown
 from raytrace.formats.source import UnsupportedSurface as UnsupportedSurface
+from raytrace.formats.substitutes import BadSubstitute as BadSubstitute
+from raytrace.formats.substitutes import substitutes_of
 from raytrace.maths.result import Result
 from raytrace.maths.value import value
 from raytrace.media.catalog import UnknownGlass
@@ -34,9 +36,12 @@ from raytrace.system.intent import Intent
 from raytrace.system.lens import Lens, check_media
 from raytrace.system.lens import check as check_lens
 
+#: Other glasses for those of a file: {"SSK4": "SSK4A"}, words like "SSK4=SSK4A", "nearest" for every unknown one.
+Substitute = Mapping[str, str] | str | Sequence[str] | None
+
 
 class Format(NamedTuple):
-    """read(text, file, catalogs, strict) -> (Lens, ImportReport); write(lens, file, catalogs) -> content.
+    """read(text, file, catalogs, strict, substitutes) -> (Lens, ImportReport); write(lens, file, catalogs) -> content.
 
     write: None for a format that is only read. load: what of a file's content is read, its text. configurations:
     whether a file may hold several, of which `read` takes the number of one.
@@ -69,6 +74,7 @@ def read_lens(
     catalogs: Sequence[str | Path] = (),
     strict: bool = False,
     configuration: int | None = None,
+    substitute: Substitute = None,
 ) -> Lens:
     """The lens of a file, in mm and µm: .zmx, .zar (OpticStudio), .seq (CODE V), .len (OSLO), or a table.
 
@@ -77,9 +83,13 @@ def read_lens(
     found by itself. strict: raise where the file holds something unknown or something has
     to be assumed; otherwise that is one LensFileWarning. configuration: which one of a multi-configuration file, from
     1; by default the one that was active when it was saved. `lens.configurations` are all of them.
-    Raises LensFileError, its subclass UnsupportedSurface, and UnknownGlass, each naming file, line and surface.
+    substitute: other glasses for those of the file, each reported in a warning: {"SSK4": "SSK4A"}, or "nearest" for
+    every one that no catalog holds, by the nd and Vd that the file has for it (`formats.substitutes`).
+    Raises LensFileError, its subclass UnsupportedSurface, and UnknownGlass, each naming file, line and surface; and
+    BadSubstitute.
     """
-    lens, report = read_lens_with_report(path, catalogs=catalogs, strict=strict, configuration=configuration)
+    how = {"catalogs": catalogs, "strict": strict, "configuration": configuration, "substitute": substitute}
+    lens, report = read_lens_with_report(path, **how)
     if report.warnings:
         warnings.warn("; ".join(report.warnings), LensFileWarning, stacklevel=2)
     return lens
@@ -91,6 +101,7 @@ def read_lens_with_report(
     catalogs: Sequence[str | Path] = (),
     strict: bool = False,
     configuration: int | None = None,
+    substitute: Substitute = None,
     evaluated: Collection[str] | None = None,
 ) -> tuple[Lens, ImportReport]:
     """As `read_lens`, with the report of what became of every keyword; its warnings are in it, and not issued.
@@ -102,11 +113,12 @@ def read_lens_with_report(
         path = shipped_lens(path) or path
     form = _format(path)
     asked = {"configuration": configuration} if form.configurations else {}
+    asked["substitutes"] = substitutes_of(substitute)
     lens, report = form.read(form.load(path), str(path), catalogs=tuple(catalogs), strict=strict, **asked)
     if configuration is not None and configuration != lens.current_configuration:
         there = "a file of this format holds one"
         raise LensFileError(f"has no configuration {configuration}; {there}", Place(str(path)))
-    _refuse_other_units(lens, path)
+    _refuse_no_wavelengths(lens, path)
     varied = [Varied(str(operand), tuple(operand.values())) for operand in lens.operands if operand.name != "MOFF"]
     intent = Intent() if lens.intent is None else lens.intent
     report = dataclasses.replace(
@@ -127,6 +139,7 @@ def check(
     catalogs: Sequence[str | Path] = (),
     strict: bool = False,
     configuration: int | None = None,
+    substitute: Substitute = None,
     evaluated: Collection[str] | None = None,
 ) -> ImportReport:
     """What was read from a lens file, what was not, and where each glass came from.
@@ -134,8 +147,8 @@ def check(
     strict: raise where something was assumed. configuration: which one has to be such that it can be traced. evaluated:
     as for `read_lens_with_report`. Raises as `read_lens`, and LensFileError for what cannot be traced.
     """
-    options = {"catalogs": catalogs, "strict": strict, "configuration": configuration, "evaluated": evaluated}
-    lens, report = read_lens_with_report(path, **options)
+    options = {"catalogs": catalogs, "strict": strict, "configuration": configuration, "substitute": substitute}
+    lens, report = read_lens_with_report(path, **options, evaluated=evaluated)
     try:
         check_lens(lens)
     except ValueError as error:
@@ -166,9 +179,11 @@ def convert(
     catalogs: Sequence[str | Path] = (),
     strict: bool = False,
     configuration: int | None = None,
+    substitute: Substitute = None,
 ) -> Conversion:
     """Read a lens file and write it in the format of the suffix of `target`; as `read_lens` and `write_lens`."""
-    lens, report = read_lens_with_report(source, catalogs=catalogs, strict=strict, configuration=configuration)
+    how = {"catalogs": catalogs, "strict": strict, "configuration": configuration, "substitute": substitute}
+    lens, report = read_lens_with_report(source, **how)
     for warning in report.warnings:
         warnings.warn(warning, LensFileWarning, stacklevel=2)
     write_lens(lens, target, catalogs=catalogs)
@@ -192,7 +207,7 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
     a .zmx file does not bring back, such as blanks around it.
     """
     path = Path(path)
-    _refuse_other_units(lens, path)
+    _refuse_no_wavelengths(lens, path)
     form = _format(path, WRITTEN)
     content = form.write(lens, str(path), catalogs=tuple(catalogs))
     changed = _changed_texts(lens, content, form, path, tuple(catalogs))
@@ -205,9 +220,10 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
         raise LensFileError(error.strerror or str(error), Place(str(path))) from error
 
 
-def _refuse_other_units(lens: Lens, path: Path) -> None:
+def _refuse_no_wavelengths(lens: Lens, path: Path) -> None:
+    """Raises LensFileError for what is not above 0; the unit of a file is believed."""
     try:
-        check_unit(lens.wavelengths, (surface.glass for surface in lens.surfaces))
+        check_unit(lens.wavelengths, believed=lens.wavelengths)
     except ValueError as error:
         raise LensFileError(str(error), Place(str(path))) from error
 

@@ -9,6 +9,7 @@ import torch
 
 from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, Place, shown
+from raytrace.formats.substitutes import FORMULA, NEAREST, nearest_glass
 from raytrace.media.catalog import (
     SAME_INDEX,
     AmbiguousGlass,
@@ -21,7 +22,7 @@ from raytrace.media.catalog import (
     shipped_difference,
     user_catalogs,
 )
-from raytrace.media.glass import Glass, constant, model_glass
+from raytrace.media.glass import Glass, constant, mil_glass, model_glass
 from raytrace.system.lens import Lens
 
 #: More characters than the name of any glass has.
@@ -29,6 +30,55 @@ _LONGEST = 80
 
 
 def listed_glass(
+    name: str,
+    *,
+    catalogs: Sequence[str | Catalog],
+    user: Sequence[Path],
+    place: Place,
+    report: Draft,
+    figures: tuple[float, float] | None = None,
+) -> Glass:
+    """The glass of a name, or its substitute, with a warning in the report. Raises UnknownGlass.
+
+    figures: n_d and V_d that the file has for it, of which the nearest glass is taken where that was asked for.
+    """
+    other = report.substitutes.of(name)
+    how = {"catalogs": catalogs, "user": user, "place": place, "report": report}
+    if other is not None:
+        report.substituted.add(name.upper())
+    if other is not None and other not in (NEAREST, FORMULA):
+        glass = mil_glass(other) if is_code(other) else _catalog_glass(other, **how)
+        report.warn(f"{glass_words(glass)} is taken for the glass {name}, as asked for", place)
+        return glass
+    try:
+        return _catalog_glass(name, **how)
+    except UnknownGlass as error:
+        if (other == NEAREST or report.substitutes.nearest) and figures is not None:
+            return _nearest(name, figures, user, place, report)
+        lacks = (
+            "the file has no nd and Vd to find the nearest glass by; " if report.substitutes.nearest or other else ""
+        )
+        hint = f"{lacks}another one is taken for it by --substitute {name}=OTHER (`substitute`)"
+        raise UnknownGlass(error.name, error.where, error.suggestions, error.searched, hint) from None
+
+
+def _nearest(name: str, figures: tuple[float, float], user: Sequence[Path], place: Place, report: Draft) -> Glass:
+    """The nearest glass to n_d and V_d, with a warning of how far it is."""
+    nd, vd = figures
+    glass = nearest_glass(nd, vd, user=user)
+    off = f"its nd differs by {glass.nd_listed - nd:+.1e}, its Vd by {glass.abbe_listed - vd:+.2g}"
+    told = f"the nearest to nd {nd:.7g}, Vd {vd:.5g} of the file"
+    report.warn(f"{glass_words(glass)} is taken for the unknown glass {name}: {told}; {off}", place)
+    report.glass(place.surface, name, f"{glass_words(glass)}, the nearest glass by nd and Vd")
+    return glass
+
+
+def glass_words(glass: Glass) -> str:
+    """The name of a glass with its catalog."""
+    return f"{glass.name} ({glass.catalog})" if glass.catalog else glass.name
+
+
+def _catalog_glass(
     name: str, *, catalogs: Sequence[str | Catalog], user: Sequence[Path], place: Place, report: Draft
 ) -> Glass:
     """The glass of a name, as `find_glass` finds it, its warnings in the report. Raises UnknownGlass.
@@ -38,6 +88,7 @@ def listed_glass(
     """
     if len(name) > _LONGEST:
         raise LensFileError(f"the glass {shown(name)} has {len(name)} characters; no glass has such a name", place)
+    catalogs = [catalog for catalog in catalogs if _is_readable(catalog, name, place, report)]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         glass = find_glass(name, catalogs=catalogs, user=user, where=str(place))
@@ -58,6 +109,21 @@ def listed_glass(
     return glass
 
 
+def _is_readable(catalog: str | Catalog, name: str, place: Place, report: Draft) -> bool:
+    """Whether a catalog's entry of a name can be read, if it has one; of a damaged one the report warns."""
+    if isinstance(catalog, Catalog):
+        try:
+            catalog.find(name)
+        except CatalogError as error:
+            report.warn(_left_out(catalog.name, error), Place(report.file))
+            return False
+    return True
+
+
+def _left_out(name: str, error: CatalogError) -> str:
+    return f"the catalog {name} that came with the lens is left out: {error}"
+
+
 #: Catalogs at hand by their names in capitals: where each stands, and what reads it.
 AtHand = Mapping[str, tuple[str, Callable[[], Catalog]]]
 
@@ -68,7 +134,7 @@ def beside(file: str) -> AtHand:
         found = sorted(path for path in Path(file).parent.iterdir() if path.suffix.lower() == ".agf" and path.is_file())
     except (OSError, ValueError):
         return {}
-    return {path.stem.upper(): (f"{path.name} beside the lens", partial(load, path)) for path in found}
+    return {path.stem.upper(): (f"{path.name} beside the lens", partial(load, path, listed=True)) for path in found}
 
 
 def catalogs_at_hand(
@@ -99,7 +165,7 @@ def _came(name: str, where: str, read: Callable[[], Catalog], report: Draft) -> 
         try:
             catalog = read()
         except CatalogError as error:
-            report.warn(f"the catalog {name} that came with the lens is left out: {error}", Place(report.file))
+            report.warn(_left_out(name, error), Place(report.file))
             return None
     for warning in caught:
         report.note(str(warning.message))

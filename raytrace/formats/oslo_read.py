@@ -30,6 +30,7 @@ from raytrace.formats.oslo_surface import Built
 from raytrace.formats.report import Draft, ImportReport
 from raytrace.formats.source import LensFileError, UnsupportedSurface, shown
 from raytrace.formats.spelling import double, is_number, number, refuse_overflow
+from raytrace.formats.substitutes import NONE, Substitutes
 from raytrace.formats.zemax_keywords import Record
 from raytrace.system.lens import Fields, Lens, SystemAperture
 from raytrace.system.surface import Surface, is_posed
@@ -41,13 +42,20 @@ FRACTIONS = (0.0, 0.7, 1.0)
 _SMALLEST_UNIT, _LARGEST_UNIT = 1e-6, 1e6
 
 
-def read(text: str, file: str, *, catalogs: Sequence[Path] = (), strict: bool = False) -> tuple[Lens, ImportReport]:
+def read(
+    text: str,
+    file: str,
+    *,
+    catalogs: Sequence[Path] = (),
+    strict: bool = False,
+    substitutes: Substitutes = NONE,
+) -> tuple[Lens, ImportReport]:
     """The lens of a .len text and the report of its import.
 
     file: its name, for messages. catalogs: glass catalogs (.agf) that go before the shipped ones; the file names none.
     strict: every warning is an error. Raises LensFileError, UnsupportedSurface and UnknownGlass.
     """
-    report = Draft(file, "len")
+    report = Draft(file, "len", substitutes)
     found = sections(text, file, report)
     _refuse_incomplete(found)
     unit = _unit(found)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import io
 import math
 import os
 import warnings
@@ -10,8 +11,12 @@ import numpy as np
 import pandas
 import torch
 
+from raytrace.files import read_bytes
 from raytrace.system.lens import Lens, check_media
 from raytrace.system.rays import COLUMNS, TRACED, Rays, start
+
+#: Bytes of a table of rays, some two million of them; more are traced from Python, or in several tables.
+LARGEST = 256 * 2**20
 
 
 class RayTableError(ValueError):
@@ -39,9 +44,10 @@ def read_rays(path: str | os.PathLike, lens: Lens) -> Rays:
 def _parsed(path: str | os.PathLike) -> pandas.DataFrame:
     """The table as words, without blank lines, which the index still counts, and without columns that are empty."""
     try:
-        with warnings.catch_warnings(), open(path, "rb") as file:
+        content = io.BytesIO(read_bytes(path, LARGEST))
+        with warnings.catch_warnings():
             warnings.simplefilter("error", pandas.errors.ParserWarning)  # a row longer than the header
-            table = pandas.read_csv(file, skipinitialspace=True, dtype=str, index_col=False, skip_blank_lines=False)
+            table = pandas.read_csv(content, skipinitialspace=True, dtype=str, index_col=False, skip_blank_lines=False)
     except FileNotFoundError:
         expected = f"expected a table of rays with columns {','.join(COLUMNS)}"
         raise RayTableError(f"{path}: no such file; {expected}") from None

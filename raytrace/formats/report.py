@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from raytrace.formats.source import LensFileError, Place
+from raytrace.formats.substitutes import NONE, Substitutes
 from raytrace.maths.result import Result
 from raytrace.maths.value import value
 from raytrace.system.dimensions import DIMENSION
@@ -188,14 +189,23 @@ def _wrapped(words: Iterable[str], width: int = 100) -> list[str]:
 
 @dataclass
 class Draft:
-    """A report being written by a reader; `finished` makes the value."""
+    """A report being written by a reader; `finished` makes the value.
+
+    substitutes: of glasses, as asked for; substituted: the names of those that were, in capitals.
+    """
 
     file: str
     format: str
+    substitutes: Substitutes = NONE
+    substituted: set[str] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
     warnings: list[tuple[str, Place]] = field(default_factory=list)
     glasses: list[GlassSource] = field(default_factory=list)
     _met: dict[tuple[str, str], list[tuple[Place, str]]] = field(default_factory=dict)
+
+    def again(self) -> "Draft":
+        """A new report of the same file, for what is read once more."""
+        return Draft(self.file, self.format, self.substitutes, self.substituted)
 
     def met(self, name: str, status: str, place: Place, reason: str = "") -> None:
         """Count one keyword."""
@@ -223,6 +233,11 @@ class Draft:
                 place = Place(self.file, one.lines[0] if one.lines else None)
                 what = one.name if one.name.startswith("member ") else f"keyword {one.name}"
                 self.warn(f"unknown {what}{times}: left out", place)
+        for name in self.substitutes.named:
+            if name not in self.substituted:
+                self.warn(
+                    f"a substitute for the glass {name} was asked for, which the file does not name", Place(self.file)
+                )
         if strict and self.warnings:
             text, place = self.warnings[0]
             more = len(self.warnings) - 1

@@ -31,6 +31,7 @@ from raytrace.formats.seq_keywords import FIELD_KINDS, OWN, Sections, sections, 
 from raytrace.formats.source import LensFileError, Place, shown
 from raytrace.formats.spelling import double, number, plain_text, refuse_overflow
 from raytrace.formats.spelling import words as split
+from raytrace.formats.substitutes import NONE, Substitutes
 from raytrace.formats.zemax_keywords import Block, Record
 from raytrace.media.glass import AIR, refractive_index
 from raytrace.system.lens import RAY_AIMING, Fields, Lens, SystemAperture
@@ -47,13 +48,21 @@ _MOST = 1000
 _SOLVED = 1e-6
 
 
-def read(text: str, file: str, *, catalogs: Sequence[Path] = (), strict: bool = False) -> tuple[Lens, ImportReport]:
+def read(
+    text: str,
+    file: str,
+    *,
+    catalogs: Sequence[Path] = (),
+    strict: bool = False,
+    substitutes: Substitutes = NONE,
+) -> tuple[Lens, ImportReport]:
     """The lens of a .seq text and the report of its import.
 
     file: its name, for messages. catalogs: further glass catalogs (.agf). strict: every warning is an error.
+    substitutes: of glasses.
     Raises LensFileError, UnsupportedSurface (what is not modelled) and UnknownGlass.
     """
-    report = Draft(file, "seq")
+    report = Draft(file, "seq", substitutes)
     found = sections(text, file, report)
     system, count = found.system, len(found.surfaces)
     if count < 3:
@@ -64,7 +73,7 @@ def read(text: str, file: str, *, catalogs: Sequence[Path] = (), strict: bool = 
     wavelengths, weights, primary = _wavelengths(system)
     private = seq_glass.private_glasses(found.private, wavelengths.tolist(), _own_words(found, "UNNAMED"), report)
     words = [record.words[0] for block in found.surfaces for record in block.all("GLA") if record.words]
-    shelf = seq_glass.Shelf(private, seq_glass.came_with(file, words, catalogs, report), catalogs)
+    shelf = seq_glass.Shelf(private, seq_glass.came_with(file, words, catalogs, report), catalogs, wavelengths.tolist())
     surfaces = _surfaces(found, unit, shelf, report)
     solve = system.last("PIM")
     if solve and not (solve.words and solve.words[0][:1] in "Nn"):

@@ -43,6 +43,7 @@ from raytrace.formats.spelling import (
     refuse_overflow,
     words,
 )
+from raytrace.formats.substitutes import NONE, Substitutes
 from raytrace.formats.table_text import Row, Table, cleaned, parse
 from raytrace.media.glass import AIR
 from raytrace.system.lens import Lens, unknown_changes
@@ -62,13 +63,21 @@ _STOP_MARKS = (
 )
 
 
-def read(text: str, file: str, *, catalogs: Sequence[Path] = (), strict: bool = False) -> tuple[Lens, ImportReport]:
+def read(
+    text: str,
+    file: str,
+    *,
+    catalogs: Sequence[Path] = (),
+    strict: bool = False,
+    substitutes: Substitutes = NONE,
+) -> tuple[Lens, ImportReport]:
     """The lens of a table's text and the report of its import.
 
     file: its name, for messages. catalogs: further glass catalogs (.agf). strict: every warning is an error.
+    substitutes: of glasses.
     Raises LensFileError, UnsupportedSurface and UnknownGlass.
     """
-    report = Draft(file, "table")
+    report = Draft(file, "table", substitutes)
     return build(parse(text, file, report), catalogs=catalogs), report.finished(strict=strict)
 
 

@@ -146,13 +146,20 @@ def _glass(row: Row, catalogs: Sequence[str | Catalog], user: Sequence[Path], re
         return mil_glass(text)
     if equals or all(is_number(part.strip()) for part in figures.split("/")):
         return _by_figures(name, figures, place, report)
-    glass = listed_glass(text, catalogs=catalogs, user=user, place=place, report=report)
+    how = {"catalogs": catalogs, "user": user, "place": place, "report": report}
+    glass = listed_glass(text, **how, figures=_d_line(given, place))
     for name, cell in given.items():
         kind, _, line = name.partition(" ")
         listed = float(refractive_index(glass, double(LINES[line]))) if kind == "index" else 0.0
         if kind == "index" and abs(listed - number(cell, name, place)) > 2e-3:
             report.warn(f"index {cell} stated for {text}, whose n{line} is {listed:.5f}; the catalog is used", place)
     return glass
+
+
+def _d_line(given: dict[str, str], place: Place) -> tuple[float, float] | None:
+    """n_d and V_d among the cells of a row, None where they do not both stand there."""
+    cells = [given.get(name) for name in ("index d", "abbe d")]
+    return None if None in cells else tuple(number(cell, "figure of the glass", place) for cell in cells)
 
 
 def _by_figures(name: str, figures: str, place: Place, report: Draft) -> Glass:

@@ -20,6 +20,7 @@
 # pressure: 1                    atm, of the air; 0 is vacuum
 """
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
@@ -47,6 +48,9 @@ _APERTURES = (
 
 #: Assumed where neither the header nor the stop's semi-diameter tells the aperture: slow enough for any lens.
 DEFAULT_F_NUMBER = 10.0
+
+#: µm: a wavelength this long needs its unit in the table, for one in nm that has none is likely.
+_LONGEST = 100.0
 
 _NUMBERS = re.compile(r"[\s,;]+")
 _NO, _YES = ("no", "off", "false", "0", ""), ("yes", "on", "true", "1")
@@ -201,16 +205,15 @@ def wavelengths(table: Table) -> tuple[Tensor, Tensor, int]:
 
 def _wavelengths(value: str, place: Place) -> list[float]:
     words = [word for word in _NUMBERS.split(value) if word]
-    unit = "µm" if words and is_number(words[-1]) else (words or [""]).pop()
-    powers = {"µm": 0, "μm": 0, "um": 0, "micron": 0, "microns": 0, "nm": -3}
+    unit = "" if words and is_number(words[-1]) else (words or ["?"]).pop()
+    powers = {"": 0, "µm": 0, "μm": 0, "um": 0, "micron": 0, "microns": 0, "nm": -3}
     if unit not in powers or not words or len(words) > 1000:
         raise LensFileError(f"wavelengths is {shown(value)}, expected numbers in µm (or with the unit, nm)", place)
     found = [_decimal(word, powers[unit], place) for word in words]
     for wavelength in found:
-        if not 0 < wavelength < 100:
-            raise LensFileError(
-                f"a wavelength of {wavelength:g} µm, expected 0 to 100 µm; in nm write '587.6 nm'", place
-            )
+        if not 0 < wavelength < (math.inf if unit else _LONGEST):
+            expected = f"expected 0 to {_LONGEST:g} µm; in nm write '587.6 nm', and '3000 µm' where that is meant"
+            raise LensFileError(f"a wavelength of {wavelength:g} µm, {expected}", place)
     return found
 
 
@@ -236,6 +239,7 @@ def written(lens: Lens, place: Place, catalogs: Sequence[Path] = ()) -> list[tup
     x, y = exact_list(fields.x, "field", place), exact_list(fields.y, "field", place)
     points = [f"({a}, {b})" for a, b in zip(x, y, strict=True)] if any(fields.x) else y
     vignetting = [] if fields.vignetting is None else zip(_VIGNETTING, fields.vignetting, strict=True)
+    unit = " µm" if bool((lens.wavelengths >= _LONGEST).any()) else ""
     lines = [
         ("title", quoted(lens.name) if lens.name else ""),
         *(("note", quoted(note)) for note in lens.notes),
@@ -244,7 +248,7 @@ def written(lens: Lens, place: Place, catalogs: Sequence[Path] = ()) -> list[tup
         ("field weights", listed(fields.weight, "weight of a field")),
         *((key, listed(row, "vignetting factor")) for key, row in vignetting),
         ("telecentric", "yes" if fields.telecentric else ""),
-        ("wavelengths", listed(lens.wavelengths, "wavelength")),
+        ("wavelengths", listed(lens.wavelengths, "wavelength") + unit),
         ("wavelength weights", listed(lens.wavelength_weights, "weight")),
         ("primary wavelength", str(lens.primary_wavelength + 1)),
         ("catalogs", " ".join(map(word, catalogs_needed(lens, catalogs, place.file)))),

@@ -10,6 +10,7 @@ unpacked, neither further than what such files may hold.
 """
 
 import dataclasses
+from array import array
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -19,12 +20,16 @@ from raytrace.formats import zemax_read
 from raytrace.formats.media import AtHand
 from raytrace.formats.report import IGNORED, READ, UNKNOWN, Draft, ImportReport
 from raytrace.formats.source import MAX_BYTES, LensFileError, Place, decode, read_content, shown
+from raytrace.formats.substitutes import NONE, Substitutes
 from raytrace.media import agf
 from raytrace.media.catalog import Catalog, CatalogError
 from raytrace.system.lens import Lens
 
 #: Larger archives are refused before they are read; those of whole systems, with drawings, are some tens of MB.
 MAX_ARCHIVE = 256 * 2**20
+
+#: Bytes of all catalogs of an archive that its lens names, unpacked; all that makers publish have some MB.
+MAX_CATALOGS = 32 * 2**20
 
 #: More members than any archive has.
 _MOST_MEMBERS = 1000
@@ -87,6 +92,7 @@ def read(
     catalogs: Sequence[Path] = (),
     strict: bool = False,
     configuration: int | None = None,
+    substitutes: Substitutes = NONE,
 ) -> tuple[Lens, ImportReport]:
     """The lens of an archive's bytes and the report of its import, members first; otherwise as `zemax_read.read`."""
     found = members(content, Place(file))
@@ -95,7 +101,13 @@ def read(
     text = decode(unpacked(lens_member, MAX_BYTES, place), place)
     used: set[str] = set()
     packed = _catalogs(found, used)
-    own = {"catalogs": catalogs, "strict": strict, "configuration": configuration, "packed": packed}
+    own = {
+        "catalogs": catalogs,
+        "strict": strict,
+        "configuration": configuration,
+        "packed": packed,
+        "substitutes": substitutes,
+    }
     lens, report = zemax_read.read(text, place.file, **own)
     listed = _listed(found, lens_member, used, file).finished(strict=strict)
     return lens, dataclasses.replace(
@@ -145,26 +157,34 @@ def unpacked(member: Member, most: int, place: Place) -> bytes:
         if len(member.content) > most:
             raise _too_large(member, most, place)
         return bytes(member.content)
-    words = [bytes([k]) for k in range(256)]
-    parts, length, before, bits, held, width = [], 0, b"", 0, 0, 9
+    out, singles = bytearray(), [bytes([k]) for k in range(256)]
+    starts, lengths = array("Q"), array("Q")  # where in the output each word of the dictionary stands
+    before, bits, held, width = 0, 0, 0, 9  # before: the length of the word before
     for byte in member.content:
         bits, held = bits << 8 | byte, held + 8
         if held < width:
             continue
         held -= width
         code, bits = bits >> held, bits & (1 << held) - 1
-        if code > len(words) - (not before):
-            message = f"{shown(member.name)}: code {code} of a dictionary of {len(words)} words; damaged"
-            raise LensFileError(message, place)
-        word = words[code] if code < len(words) else before + before[:1]
         if before:
-            words.append(before + word[:1])
-        parts.append(word)
-        length, before = length + len(word), word
-        if length > most:
+            starts.append(len(out) - before)
+            lengths.append(before + 1)
+        if code < 256:
+            word = singles[code]
+        elif code - 256 < len(starts):
+            start, length = starts[code - 256], lengths[code - 256]
+            word = out[start : start + length]
+            if len(word) < length:  # the word that ends with the first byte of this one, which is its own
+                word += word[:1]
+        else:
+            count = 256 + len(starts) - bool(before)
+            raise LensFileError(f"{shown(member.name)}: code {code} of a dictionary of {count} words; damaged", place)
+        out += word
+        before = len(word)
+        if len(out) > most:
             raise _too_large(member, most, place)
-        width = len(words).bit_length()
-    return b"".join(parts)
+        width = (256 + len(starts)).bit_length()
+    return bytes(out)
 
 
 def _too_large(member: Member, most: int, place: Place) -> LensFileError:
@@ -188,17 +208,23 @@ def _lens(found: Sequence[Member], file: str) -> Member:
 
 def _catalogs(found: Sequence[Member], used: set[str]) -> AtHand:
     """The catalogs of an archive, unpacked when they are asked for, and then noted in `used`."""
-    packed = [member for member in found if member.suffix == ".agf"]
-    return {member.stem: (f"{member.name} of the archive", partial(_catalog, member, used)) for member in packed}
+    packed, left = [member for member in found if member.suffix == ".agf"], [MAX_CATALOGS]
+    return {member.stem: (f"{member.name} of the archive", partial(_catalog, member, used, left)) for member in packed}
 
 
-def _catalog(member: Member, used: set[str]) -> Catalog:
+def _catalog(member: Member, used: set[str], left: list[int]) -> Catalog:
+    """A catalog of an archive, its glasses parsed when they are asked for; left: how many bytes it may have, and then
+    those that are left to the others."""
     used.add(member.name)
+    most = min(MAX_BYTES, left[0])
+    left[0] -= most
     try:
-        content = unpacked(member, MAX_BYTES, Place(member.name))
+        content = unpacked(member, most, Place(member.name))
     except LensFileError as error:
-        raise CatalogError(str(error)) from error
-    return agf.parse_agf(agf.decode(content, member.name), member.name)
+        together = f"{member.name}: the catalogs of the archive hold more than {MAX_CATALOGS / 1e6:.0f} MB; not read"
+        raise CatalogError(str(error) if most == MAX_BYTES else together) from error
+    left[0] += most - len(content)
+    return agf.listed(agf.decode(content, member.name), member.name)
 
 
 def _listed(found: Sequence[Member], lens: Member, used: set[str], file: str) -> Draft:

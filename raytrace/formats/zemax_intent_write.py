@@ -6,6 +6,7 @@ The lines of a surface are those that a lens without an intent has; words in the
 from collections.abc import Callable, Sequence
 
 from raytrace.formats.source import LensFileError, Place
+from raytrace.formats.zemax_keywords import BLANK
 from raytrace.formats.zemax_names import listed, names
 from raytrace.formats.zemax_rules import (
     BOUNDLESS,
@@ -135,7 +136,14 @@ def _with_glass(lines: Lines, one: Vary | Solve, parameters: dict, place: Place)
     if isinstance(one, Vary):
         return _changed(lines, "GLAS", {1 + k: "1" for k, name in GLASS_NUMBERS.items() if name == one.quantity})
     words = {2: str(_code_of(one.kind, GLASS_RULES))} | ({3: str(one.source)} if one.kind == "pickup" else {})
-    return _changed(lines, "GLAS", words)
+    return _changed(with_glass_line(lines) if one.kind == "pickup" else lines, "GLAS", words)
+
+
+def with_glass_line(lines: Lines) -> Lines:
+    """The lines of a surface with one for its medium, which a surface in air leaves out."""
+    if any(line.split()[0] == "GLAS" for line in lines):
+        return lines
+    return _behind(lines, "DISZ", f"GLAS {BLANK} 0 0 1.5 40 0 0 0 0 0 0")
 
 
 def _with_parameter(lines: Lines, one: Vary | Solve, parameters: dict, place: Place) -> Lines:

@@ -1,5 +1,6 @@
 """The keywords of a .zmx file, a row each, and a text sorted by them: the system, the surfaces, what follows them."""
 
+import re
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -16,7 +17,7 @@ def _words(text: str) -> frozenset[str]:
 #: Keywords of the system and of a surface that are read; an aperture's are in the rows of `aperture.SHAPES`.
 SYSTEM_READ = _words(
     "VERS MODE NAME NOTE UNIT GCAT ENVD GFAC RAIM FTYP PWAV MNUM ENPD FNUM OBNA FLOA XFLN YFLN FWGN XFLD YFLD FWGT"
-    " SDMA VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN VDX VDY VCX VCY VAN WAVM WAVL WAVN WWGT WWGN"
+    " FEFD SDMA VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN VDX VDY VCX VCY VAN WAVM WAVL WAVN WWGT WWGN"
 )
 _SURFACE_READ = _words(
     "SURF TYPE CURV CONI DISZ GLAS DIAM STOP PARM COMM FLAP OBDC USAP USOB UDAD SCBD IGNR XDAT VCON VDSZ VPAR PPAR PZUP"
@@ -24,7 +25,7 @@ _SURFACE_READ = _words(
 )
 
 #: Keywords that may stand more than once in the system or in one surface.
-REPEATED = ("NOTE", "WAVM", "PARM", "UDAD", "XDAT", "PPAR", "VPAR", "SCBD")
+REPEATED = ("NOTE", "WAVM", "FEFD", "PARM", "UDAD", "XDAT", "PPAR", "VPAR", "SCBD")
 
 
 def _left_out(rows: dict[str, str]) -> dict[str, str]:
@@ -46,6 +47,7 @@ SYSTEM_IGNORED = _left_out(
         "comment on a field point; not carried": "FCOM",
         "entry of the vendor's catalog": "DBDT",
         "checksum of the program": "CSUM",
+        "number of fields, which FTYP states": "FENF",
     }
 )
 SURFACE_IGNORED = _left_out(
@@ -111,6 +113,9 @@ FIELD_LISTS = {
     },
 }
 
+#: The lists of fields hold this many; a FEFD line holds a number of every list for each further field.
+FIELDS_IN_LISTS = 12
+
 #: OpticStudio cuts a long note into pieces of this many characters.
 NOTE_PIECE = 200
 
@@ -174,6 +179,24 @@ class Block:
         return None
 
 
+#: The name of a glass that a GLAS line leaves out: the medium is a model glass, or that of another surface.
+BLANK = "___BLANK"
+
+
+def is_blank(record: Record) -> bool:
+    """True for a GLAS line without the name of a glass."""
+    return record.words[:1] != () and record.words[0].upper() == BLANK
+
+
+def glass_source(block: Block) -> int | None:
+    """The number of the earlier surface whose medium is picked up: GLAS name 2 surface; None without a pickup."""
+    record = block.last("GLAS")
+    if not record or len(record.words) < 3 or record.words[1] != "2" or not re.fullmatch("[0-9]{1,6}", record.words[2]):
+        return None
+    source = int(record.words[2])
+    return source if source < block.place.surface else None
+
+
 class Sections(NamedTuple):
     """A file sorted: the system, one block per surface, and what follows them, multi-configuration operands last."""
 
@@ -223,7 +246,21 @@ def sections(text: str, file: str, report: Draft) -> Sections:
             block = system
             _classify(record, system, SYSTEM_READ, SYSTEM_IGNORED, report)
     _warn_of_repeats([system, *surfaces], report)
+    _join_fields(system)
     return Sections(system, surfaces, tail)
+
+
+def _join_fields(system: Block) -> None:
+    """Put the fields beyond the twelfth (FEFD) behind those of the lists, each of which has a number in its line."""
+    further = system.all("FEFD")
+    for position, (keywords, default, what) in enumerate(FIELD_LISTS.values()) if further else ():
+        record = system.last(*keywords) or Record(keywords[0], (), "", further[0].place, False)
+        words = [*record.words[:FIELDS_IN_LISTS]]
+        words += [repr(default)] * (FIELDS_IN_LISTS - len(words))
+        for one in further:
+            one.number(position, what)
+            words.append(one.words[position])
+        system.records[record.keyword] = [record._replace(words=tuple(words))]
 
 
 def _next_surface(record: Record, surfaces: list[Block]) -> Block:

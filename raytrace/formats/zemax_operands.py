@@ -14,7 +14,15 @@ from typing import NamedTuple
 
 from raytrace.formats.source import LensFileError, shown
 from raytrace.formats.spelling import is_infinite, is_number, plain
-from raytrace.formats.zemax_keywords import FIELD_LISTS, Block, Record, Sections, aperture_keywords
+from raytrace.formats.zemax_keywords import (
+    FIELD_LISTS,
+    Block,
+    Record,
+    Sections,
+    aperture_keywords,
+    glass_source,
+    is_blank,
+)
 
 #: Stands for the temperature or the pressure of a surface where it is the lens's.
 UNTOLD = "-"
@@ -330,14 +338,12 @@ def _followed(surfaces: list[Block], before: Sequence[Block]) -> list[Block]:
 
 def _with_picked_glass(block: Block, surfaces: Sequence[Block], before: Sequence[Block]) -> Block:
     """A surface with the glass that it picks up from another, which has changed."""
-    record = block.last("GLAS")
-    if not record or len(record.words) < 3 or record.words[1] != "2" or not re.fullmatch("[0-9]{1,6}", record.words[2]):
-        return block
-    source = int(record.words[2])
-    if source >= block.place.surface or surfaces[source] is before[source]:
+    record, source = block.last("GLAS"), glass_source(block)
+    if source is None or surfaces[source] is before[source]:
         return block
     old, new = (blocks[source].last("GLAS") for blocks in (before, surfaces))
-    if not old or old.words[:1] != record.words[:1] or (new and new.words[:1] == old.words[:1]):
+    named_alike = bool(old) and old.words[:1] == record.words[:1]
+    if not (named_alike or is_blank(record)) or (new and old and new.words[:1] == old.words[:1]):
         return block
     return _with_record(block, record, new._replace(place=record.place) if new else None)
 

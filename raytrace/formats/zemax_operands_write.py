@@ -9,7 +9,7 @@ from raytrace.formats import zemax_environment
 from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, Place
 from raytrace.formats.spelling import exact, is_infinite, one_line
-from raytrace.formats.zemax_intent_write import statuses
+from raytrace.formats.zemax_intent_write import statuses, with_glass_line
 from raytrace.formats.zemax_keywords import Record, Sections, sections
 from raytrace.formats.zemax_operands import FAR, ROWS, Cell, word
 from raytrace.system.configurations import Operand, count, same, with_operands
@@ -55,6 +55,7 @@ def with_pickups(lines: list[str], lens: Lens, number: int, place: Place) -> lis
             if name in ("PRAM", "THIC"):
                 lines = [*lines, f"  PPAR {operand.parameter} {rule}" if name == "PRAM" else f"  PZUP {rule}"]
             else:
+                lines = with_glass_line(lines) if name == "GLSS" else lines
                 lines = [_picking(line, name, operand.number, factor) for line in lines]
     return lines
 

@@ -24,6 +24,7 @@ from raytrace.formats.media import AtHand, catalogs_at_hand
 from raytrace.formats.report import Draft, ImportReport
 from raytrace.formats.source import LensFileError, UnsupportedSurface, shown
 from raytrace.formats.spelling import MILLIMETRES, double, refuse_overflow
+from raytrace.formats.substitutes import NONE, Substitutes
 from raytrace.formats.zemax_keywords import (
     FIELD_KINDS,
     FIELD_LISTS,
@@ -50,15 +51,16 @@ def read(
     strict: bool = False,
     configuration: int | None = None,
     packed: AtHand | None = None,
+    substitutes: Substitutes = NONE,
 ) -> tuple[Lens, ImportReport]:
     """The lens of a .zmx text and the report of its import.
 
     file: its name, for messages and for the catalogs beside it. catalogs: further glass catalogs (.agf). strict: every
     warning is an error. configuration: which one of a multi-configuration file, from 1; None: the one that its surfaces
-    hold. packed: the catalogs of an archive, instead of those beside the file.
+    hold. packed: the catalogs of an archive, instead of those beside the file. substitutes: of glasses.
     Raises LensFileError, UnsupportedSurface (a type that is not modelled) and UnknownGlass.
     """
-    report = Draft(file, "zmx")
+    report = Draft(file, "zmx", substitutes)
     found = sections(text, file, report)
     _refuse_incomplete(found)
     zemax_surface.refuse_unsupported(found.surfaces)
@@ -66,15 +68,15 @@ def read(
     names = tuple(name for record in found.system.all("GCAT") for name in record.words)
     at_hand = catalogs_at_hand(names, catalogs, report, packed)
     build = partial(zemax_surface.build, millimetres=unit, catalogs=at_hand, user=catalogs)
-    lens = _lens(found, [build(block, report=report) for block in found.surfaces], unit, report)
+    lens = _lens(found, [build(block, blocks=found.surfaces, report=report) for block in found.surfaces], unit, report)
     refuse_overflow(lens, file)
     _remarks(found, report)
     known = dict(zip(found.surfaces, lens.surfaces, strict=True))
 
     def rebuild(other: Sections) -> Lens:
         """The lens of changed records; what they were before is known."""
-        draft = Draft(file, "zmx")
-        surfaces = [known.get(block) or build(block, report=draft) for block in other.surfaces]
+        draft = report.again()
+        surfaces = [known.get(block) or build(block, blocks=other.surfaces, report=draft) for block in other.surfaces]
         changed = _lens(other, surfaces, unit, draft)
         refuse_overflow(changed, file)
         return changed

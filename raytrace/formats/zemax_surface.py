@@ -9,7 +9,7 @@ from raytrace.formats.media import by_figures, is_code, listed_glass
 from raytrace.formats.report import Draft
 from raytrace.formats.source import LensFileError, UnsupportedSurface, shown
 from raytrace.formats.spelling import double, is_infinite
-from raytrace.formats.zemax_keywords import TYPE_NAMES, Block, Record, aperture_keywords
+from raytrace.formats.zemax_keywords import TYPE_NAMES, Block, Record, aperture_keywords, glass_source, is_blank
 from raytrace.formats.zemax_numbers import SurfaceType
 from raytrace.formats.zemax_parameters import numbers, poses, report_unused
 from raytrace.formats.zemax_types import types
@@ -74,10 +74,17 @@ def _modelled() -> str:
 
 
 def build(
-    block: Block, millimetres: float, *, catalogs: Sequence[str | Catalog], user: Sequence[Path], report: Draft
+    block: Block,
+    millimetres: float,
+    blocks: Sequence[Block],
+    *,
+    catalogs: Sequence[str | Catalog],
+    user: Sequence[Path],
+    report: Draft,
 ) -> Surface:
     """The surface of a block, its lengths in units of `millimetres`.
 
+    blocks: all surfaces of the file, of which a glass may be picked up.
     GLAS names are looked up in `catalogs`, then `user` files; raises UnknownGlass as `find_glass` does.
     """
     thickness = block.last("DISZ")
@@ -94,7 +101,7 @@ def build(
     if kind == "COORDBRK":
         _report_bare(block, report)
     else:
-        shape["glass"] = _medium(block, catalogs, user, report)
+        shape["glass"] = _medium(block, blocks, catalogs, user, report)
         shape["apertures"] = _apertures(block, millimetres, report)
     shape |= poses(block, millimetres) | _fields(block, row, millimetres)
     report_unused(block, kind, row, report)
@@ -149,12 +156,36 @@ def semi_diameter(block: Block, millimetres: float) -> float | None:
     return found or None
 
 
-def _medium(block: Block, catalogs: Sequence[str | Catalog], user: Sequence[Path], report: Draft) -> Glass:
+def _picked_up(block: Block, blocks: Sequence[Block], report: Draft) -> Record | None:
+    """The GLAS record that holds the medium of a surface: its own, or that of the surface it is picked up from.
+
+    A file stores the name of a glass that is picked up, but of air or of a model glass no figures: those in the line
+    are left from before. None is air.
+    """
+    record, source = block.last("GLAS"), glass_source(block)
+    if source is None:
+        return record
+    held = _picked_up(blocks[source], blocks, report)
+    name = record.words[0].upper()
+    if held is not None and held.words[:1] and held.words[0].upper() == name:
+        return held._replace(place=record.place)
+    if is_blank(record):
+        medium = held.words[0] if held is not None and held.words else "air"
+        report.note(f"surface {block.place.surface}: the medium, {medium}, is picked up from surface {source}")
+        return held and held._replace(place=record.place)
+    message = f"GLAS {name[:40]} is a pickup from surface {source}, which has {held.words[0] if held else 'air'}"
+    report.warn(f"{message}; {name[:40]} is taken", record.place)
+    return record
+
+
+def _medium(
+    block: Block, blocks: Sequence[Block], catalogs: Sequence[str | Catalog], user: Sequence[Path], report: Draft
+) -> Glass:
     """The medium of a GLAS record: name, flag (0 catalog, 1 model, 2 pickup, 3 substitute), -, nd, Vd, ΔPgF.
 
     The columns after the name are placeholders unless the flag says model glass or the name is ___BLANK.
     """
-    record = block.last("GLAS")
+    record = _picked_up(block, blocks, report)
     if record is None:
         return AIR
     if not record.words:
@@ -164,13 +195,20 @@ def _medium(block: Block, catalogs: Sequence[str | Catalog], user: Sequence[Path
         return AIR
     if name.upper() == "MIRROR":
         return MIRROR
-    blank = name.upper() == "___BLANK"
+    blank = is_blank(record)
     if blank or record.integer(1, "flag", 0) == 1:
         return _model(record, "" if blank else name, report)
     if is_code(name):
         report.glass(surface, name, "six-digit code: nd and Vd by its digits")
         return mil_glass(name)
-    return listed_glass(name, catalogs=catalogs, user=user, place=record.place, report=report)
+    how = {"catalogs": catalogs, "user": user, "place": record.place, "report": report}
+    return listed_glass(name, **how, figures=_figures(record))
+
+
+def _figures(record: Record) -> tuple[float, float] | None:
+    """n_d and V_d that a GLAS line has for its glass; None for those that mean nothing, 1.5 and 40."""
+    nd, vd = (record.number(k, "figure of the glass", 0.0) for k in (3, 4))
+    return (nd, vd) if nd > 1 and vd > 0 and (nd, vd) != (1.5, 40.0) else None
 
 
 def _model(record: Record, name: str, report: Draft) -> Glass:

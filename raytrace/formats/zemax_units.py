@@ -85,6 +85,8 @@ def _powers(words: list[str], row: SurfaceType, angles: bool) -> dict[int, int |
         return _WORDS["CURV"] | {k: power for k, power in enumerate(solved, 3) if power}
     if keyword in (FIELD_LISTS["x"].keywords[0], FIELD_LISTS["y"].keywords[0]):
         return {} if angles else dict.fromkeys(range(1, len(words)), 1)
+    if keyword == "FEFD":
+        return {} if angles else {1: 1, 2: 1}
     return _WORDS.get(keyword) or _APERTURES.get(keyword) or {}
 
 

@@ -4,11 +4,20 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+from torch import Tensor
+
 from raytrace.formats import zemax_environment, zemax_intent_write, zemax_merit
 from raytrace.formats.media import catalogs_needed, is_code, is_left_out, listed_name
 from raytrace.formats.source import LensFileError, Place
 from raytrace.formats.spelling import exact, exact_list, one_line, thickness
-from raytrace.formats.zemax_keywords import FIELD_KINDS, FIELD_LISTS, NOTE_PIECE, SYSTEM_APERTURES
+from raytrace.formats.zemax_keywords import (
+    BLANK,
+    FIELD_KINDS,
+    FIELD_LISTS,
+    FIELDS_IN_LISTS,
+    NOTE_PIECE,
+    SYSTEM_APERTURES,
+)
 from raytrace.formats.zemax_numbers import INVERSE, SurfaceType, numbers_of, spelled_inverse
 from raytrace.formats.zemax_operands_write import operand_lines, with_pickups
 from raytrace.formats.zemax_sags import stands_in_parameters
@@ -85,13 +94,20 @@ def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
         f"FTYP {kind} {int(fields.telecentric)} {len(fields.x)} {len(lens.wavelengths)} 0 0 0",
         "ROPD 2",
         "PICB 1",
-        *(
-            f"{row.keywords[0]} {' '.join(exact_list(numbers, row.what, place))}"
-            for row, numbers in zip(FIELD_LISTS.values(), (fields.x, fields.y, fields.weight, *vignetting), strict=True)
-        ),
+        *_fields((fields.x, fields.y, fields.weight, *vignetting), place),
         *(f"WAVM {slot} {wavelength} {weight}" for slot, (wavelength, weight) in enumerate(waves, 1)),
         f"PWAV {lens.primary_wavelength + 1}",
     ]
+
+
+def _fields(lists: Sequence[Tensor], place: Place) -> list[str]:
+    """The lists of fields, and a line for every field beyond those that they hold."""
+    texts = [exact_list(numbers, row.what, place) for row, numbers in zip(FIELD_LISTS.values(), lists, strict=True)]
+    rows = zip(FIELD_LISTS.values(), texts, strict=True)
+    told = [f"{row.keywords[0]} {' '.join(text[:FIELDS_IN_LISTS])}" for row, text in rows]
+    further = list(zip(*(text[FIELDS_IN_LISTS:] for text in texts), strict=True))
+    count = FIELDS_IN_LISTS + len(further)
+    return [*told, *([f"FENF {count} {count}"] if further else []), *(" ".join(["FEFD", *one]) for one in further)]
 
 
 def _check_floating_stop(lens: Lens, place: Place) -> None:
@@ -227,7 +243,7 @@ def _glass(glass: Glass, place: Place) -> list[str]:
         figures = exact_list(glass.coefficients, "model glass", place)
     else:
         return [f"  GLAS {listed_name(glass, place)} 0 0 1.5 40 0 0 0 0 0 0"]
-    flag, name = 1, listed_name(glass, place) if glass.name else "___BLANK"
+    flag, name = 1, listed_name(glass, place) if glass.name else BLANK
     if name.upper() in ("AIR", "MIRROR"):
         raise LensFileError(f"a glass of index {figures[0]} is named {name!r}; give it another name", place)
     if is_code(name) and exact_list(mil_glass(name).coefficients, "model glass", place) == figures:

@@ -1,6 +1,6 @@
 // Paths p(x, y) that a phase adds, with their derivatives, over a block or at one point: raytrace/system/phases.py.
 //
-//     polynomial  Σ c_k x^i y^j in the order x, y, x², xy, y², x³, …        radial  Σ a_j u^j, u = r², j = 1, 2, …
+//     polynomial  c + Σ c_k x^i y^j in the order x, y, x², xy, y², x³, …    radial  Σ a_j u^j, u = r², j = 1, 2, …
 //     hologram    s Σ (|P - Q| - |Q|) over two points Q = (a, b, c); the numbers are theirs, and s
 //
 // A new form is one more `Form`, in the order of FORMS in structure.py, and a case of `path_at`, `path_change` and `sum_path`.
@@ -61,6 +61,15 @@ void polynomial(const C* c, int count, const T* x, const T* y, int n, Added<T, s
       to.p[i] = to.p[i] * y[i] + to.q[i];
     }
   }
+}
+
+// The same behind its constant.
+template <bool second, typename C, typename T, int size>
+void with_constant(const C* c, int count, const T* x, const T* y, int n, Added<T, size>& to) {
+  polynomial<second>(c + 1, count - 1, x, y, n, to);
+  const T constant = T(c[0]);
+#pragma omp simd
+  for (int i = 0; i < n; i++) to.p[i] += constant;
 }
 
 // p = u q(u).
@@ -143,7 +152,7 @@ void path_at(const Layout& at, const C* numbers, const T* x, const T* y, int n, 
   if (at.phase == kRadial) radial<second>(numbers, at.phase_terms, x, y, n, to);
   else if (at.phase == kFacets) clear(to, n);
   else if (at.phase == kHologram) hologram<second>(numbers, x, y, n, to);
-  else polynomial<second>(numbers, at.phase_terms, x, y, n, to);
+  else with_constant<second>(numbers, at.phase_terms, x, y, n, to);
 }
 
 // How it and its slopes change with the numbers; other forms are linear in them.
@@ -178,6 +187,17 @@ void sum_polynomial(int count, const T* x, const T* y, const T* gp, const T* gx,
       if (k + j > 0 && place < count) sums[place] += sum;
     }
   }
+}
+
+// The same behind its constant.
+template <typename T>
+void sum_with_constant(int count, const T* x, const T* y, const T* gp, const T* gx, const T* gy, int n,
+                       Added<T, kBlock>& to, double* sums) {
+  T sum = 0;
+#pragma omp simd reduction(+ : sum)
+  for (int i = 0; i < n; i++) sum += gp[i];
+  sums[0] += sum;
+  sum_polynomial(count - 1, x, y, gp, gx, gy, n, to, sums + 1);
 }
 
 // The same of Σ a_j u^j.
@@ -224,7 +244,7 @@ void sum_path(const Layout& at, const T* numbers, const Rays<T>& hit, const T* g
   if (at.phase == kFacets) return;
   if (at.phase == kHologram) sum_hologram(numbers, hit, gp, gx, gy, n, sums);
   else if (at.phase == kRadial) sum_radial(at.phase_terms, hit, gp, gx, gy, n, to, sums);
-  else sum_polynomial(at.phase_terms, hit.x, hit.y, gp, gx, gy, n, to, sums);
+  else sum_with_constant(at.phase_terms, hit.x, hit.y, gp, gx, gy, n, to, sums);
 }
 
 }  // namespace raytrace

@@ -224,6 +224,9 @@ def _form_of(phase: Phase | None, wavelength: Tensor | None) -> tuple[int, Seque
     path = path_of(phase, wavelength)
     if isinstance(path, HologramPath):
         return FORMS.index(HologramPath), (*path.first.unbind(0), *path.second.unbind(0), path.scale)
+    if isinstance(path, PolynomialPath):
+        constant = path.coefficients.new_zeros(()) if path.constant is None else path.constant
+        return FORMS.index(PolynomialPath), (constant, *path.coefficients.unbind(0))
     return FORMS.index(type(path)), path.coefficients.unbind(0)
 
 
@@ -274,8 +277,9 @@ def _phase_of(row: _Row, numbers: Sequence[Tensor]) -> Phase | None:
     if FORMS[row.phase] is HologramPath:
         first, second = (torch.stack(torch.broadcast_tensors(*own[i : i + 3])) for i in (0, 3))
         return HologramPath(first, second, own[6])
+    constant, own = ((own[0],), own[1:]) if FORMS[row.phase] is PolynomialPath else ((), own)
     none = numbers[row.before].new_zeros(0)
-    return FORMS[row.phase](torch.stack(torch.broadcast_tensors(*own)) if own else none)
+    return FORMS[row.phase](torch.stack(torch.broadcast_tensors(*own)) if own else none, *constant)
 
 
 def _departure_of(row: _Row, numbers: Sequence[Tensor]) -> PowerSag | None:

@@ -85,9 +85,9 @@ def fringe(number: int) -> tuple[int, int]:
     return 2 * half - m, m if place % 2 == 0 else -m
 
 
-def fringe_to_powers(count: int) -> np.ndarray:
-    """Matrix (K, count) from coefficients of the first fringe terms, 1 at the rim, to those of x^i y^j; no constant."""
-    return zernike_to_powers(tuple(fringe(number) for number in range(1, count + 1)))[0]
+def fringe_to_powers(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """`zernike_to_powers` of the first `count` fringe terms: the matrix (K, count), and the constants (count,)."""
+    return zernike_to_powers(tuple(fringe(number) for number in range(1, count + 1)))
 
 
 @functools.lru_cache(maxsize=8)

@@ -19,7 +19,12 @@ _STATUSES = {0: "standard", 1: "preferred", 2: "obsolete", 3: "special", 4: "mel
 _NUMERIC = {"ED": 0, "CD": 1, "TD": 2, "MD": 2, "OD": 2, "LD": 3, "IT": 4}
 _KEYWORDS = ("CC", "NM", "GC", *_NUMERIC)
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?", re.ASCII)
-_LARGEST_FILE = 64 * 2**20
+_LARGEST_FILE = 16 * 2**20
+
+#: More glasses than any catalog has; all makers together list some thousands.
+MOST_GLASSES = 20_000
+
+_NAMES = re.compile(r"^[ \t]*NM[ \t]+(\S+)", re.MULTILINE)
 
 
 class CatalogError(ValueError):
@@ -40,9 +45,9 @@ class Catalog:
 
     def find(self, name: str) -> Glass | None:
         """The glass of this name, or of this name but for upper and lower case; None if there is none."""
-        if name in self.glasses:
-            return self.glasses[name]
-        return next((glass for listed, glass in self.glasses.items() if listed.upper() == name.upper()), None)
+        if name not in self.glasses:
+            name = next((listed for listed in self.glasses if listed.upper() == name.upper()), None)
+        return None if name is None else self.glasses[name]
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -80,9 +85,59 @@ def decode(content: bytes, path: str | Path) -> str:
     return text
 
 
+class _Listing(Mapping):
+    """The glasses of a catalog's text by their names, each parsed when it is asked for; raises CatalogError then."""
+
+    def __init__(self, text: str, catalog: str, path: Path):
+        self._text, self._catalog, self._path = text, catalog, path
+        starts = [(found[1], found.start()) for found in _NAMES.finditer(text)]
+        ends = [start for _, start in starts[1:]] + [len(text)]
+        self._places: dict[str, tuple[int, int]] = {}
+        for (name, start), end in zip(starts, ends, strict=True):
+            self._places.setdefault(name, (start, end))
+        self._parsed: dict[str, Glass] = {}
+
+    def __getitem__(self, name: str) -> Glass:
+        if name not in self._parsed:
+            start, end = self._places[name]
+            line = self._text.count("\n", 0, start) + 1
+            block = next(_blocks(_records(self._text[start:end], {}, line)))
+            self._parsed[name] = _glass(block, self._catalog, self._path)
+        return self._parsed[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._places
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._places)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+
+def listed(text: str, path: str | Path) -> Catalog:
+    """The catalog of a text as `parse_agf` reads it, but that a glass is parsed when it is asked for.
+
+    Raises CatalogError where there is none, or more than MOST_GLASSES; of a damaged glass when it is asked for.
+    """
+    path, text = Path(path), re.sub(r"\r\n|\r", "\n", text)
+    _refuse_many(text, path)
+    glasses = _Listing(text, path.stem.upper(), path)
+    if not glasses:
+        raise _fault(path, 1, "no glass", "an AGF catalog, with one NM record for each glass")
+    return Catalog(path.stem.upper(), glasses)
+
+
+def _refuse_many(text: str, path: Path) -> None:
+    count = sum(1 for _ in _NAMES.finditer(text))
+    if count > MOST_GLASSES:
+        raise CatalogError(f"{path}: {count} glasses, more than any catalog ({MOST_GLASSES}); not read")
+
+
 def parse_agf(text: str, path: str | Path) -> Catalog:
     """The catalog written in the text of an AGF file; `path` gives its name and its place in messages."""
     path = Path(path)
+    _refuse_many(text, path)
     name, comments, glasses = path.stem.upper(), [], {}
     unknown: dict[str, int] = {}
     for block in _blocks(_records(text, unknown)):
@@ -109,14 +164,14 @@ def _fault(path: Path, line: int, found: str, expected: str, fix: str = "") -> C
     return CatalogError(f"{path}:{line}: found {found}, expected {expected}" + (f"; {fix}" if fix else ""))
 
 
-def _records(text: str, unknown: dict[str, int]) -> Iterator[tuple[int, str, str]]:
-    """(line, keyword, rest) of every record.
+def _records(text: str, unknown: dict[str, int], first: int = 1) -> Iterator[tuple[int, str, str]]:
+    """(line, keyword, rest) of every record, its lines counted from `first`.
 
     A line that begins with a number continues the numeric record before it; one that begins with "!" explains a
     status; what is neither is noted in `unknown` as word -> line.
     """
     line_of_record, keyword, parts = 0, "", []
-    for line, content in enumerate(re.split(r"\r\n|\r|\n", text), 1):
+    for line, content in enumerate(re.split(r"\r\n|\r|\n", text), first):
         word, *rest = content.split(maxsplit=1) or [""]
         if not word or word.startswith("!"):
             continue

@@ -26,6 +26,7 @@ from typing import NamedTuple
 import torch
 
 from raytrace.files import shipped
+from raytrace.media import agf
 from raytrace.media.agf import Catalog as Catalog
 from raytrace.media.agf import CatalogError as CatalogError
 from raytrace.media.agf import CatalogWarning as CatalogWarning
@@ -63,15 +64,26 @@ def _at(where: str) -> str:
 
 
 class UnknownGlass(LookupError):
-    """No catalog holds the name. Carries `name`, `where` and `suggestions`, a tuple of (glass, catalog)."""
+    """No catalog holds the name. Carries `name`, `where` and `suggestions`, a tuple of (glass, catalog).
 
-    def __init__(self, name: str, where: str, suggestions: tuple[tuple[str, str], ...], searched: Sequence[str]):
-        self.name, self.where, self.suggestions = name, where, suggestions
+    searched: the names of the catalogs; hint: what else helps.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        where: str,
+        suggestions: tuple[tuple[str, str], ...],
+        searched: Sequence[str],
+        hint: str = "",
+    ):
+        self.name, self.where, self.suggestions, self.searched = name, where, suggestions, searched
         near = ", ".join(f"{glass} ({catalog})" for glass, catalog in suggestions)
         super().__init__(
             f"{_at(where)}unknown glass {name!r}; no catalog of {', '.join(searched)} holds it. "
             + (f"Nearest names: {near}. " if near else "No name comes near. ")
-            + f"Correct the name, or give the AGF file that defines it (--catalog FILE or {ENVIRONMENT})."
+            + f"Correct the name, or give the AGF file that defines it (--catalog FILE or {ENVIRONMENT})"
+            + (f"; {hint}." if hint else ".")
         )
 
 
@@ -195,19 +207,22 @@ def shipped_catalog(name: str) -> Catalog:
     return load(shipped_folder() / f"{shipped}.AGF")
 
 
-def load(path: str | Path) -> Catalog:
-    """The catalog of an AGF file, parsed again only when the file has changed. Raises CatalogError."""
+def load(path: str | Path, *, listed: bool = False) -> Catalog:
+    """The catalog of an AGF file, parsed again only when the file has changed. Raises CatalogError.
+
+    listed: a glass is parsed when it is asked for, and raises then.
+    """
     path = Path(path)
     try:
         state = path.stat()
     except OSError as error:
         raise CatalogError(f"{path}: cannot be read ({error.strerror}); expected a glass catalog (AGF)") from error
-    return _load(path.resolve(), state.st_mtime_ns, state.st_size)
+    return _load(path.resolve(), state.st_mtime_ns, state.st_size, listed)
 
 
 @lru_cache(maxsize=64)
-def _load(path: Path, modified: int, size: int) -> Catalog:
-    return read_agf(path)
+def _load(path: Path, modified: int, size: int, listed: bool) -> Catalog:
+    return agf.listed(read_text(path), path) if listed else read_agf(path)
 
 
 class Alias(NamedTuple):

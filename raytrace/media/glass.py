@@ -135,15 +135,21 @@ def check_wavelengths(glass: Glass, wavelengths: Tensor | Sequence[float] | floa
             warnings.warn(message, OutOfRange, stacklevel=2)
 
 
-def check_unit(wavelengths: Tensor, media: Iterable[Glass] = (), *, where: str = "") -> None:
+def check_unit(
+    wavelengths: Tensor, media: Iterable[Glass] = (), *, believed: Tensor | None = None, where: str = ""
+) -> None:
     """Refuse wavelengths in another unit than µm: shorter than hard x-rays, or longer than any glass lets through.
 
-    media: glasses whose range, where it reaches further, is believed. Raises ImplausibleWavelength, with a guess.
+    media: glasses whose range, where it reaches further, is believed. believed: wavelengths (...) known to be in µm, as
+    those of a lens file: up to ten times longer or shorter ones are, too. Raises ImplausibleWavelength, with a guess;
+    it refuses what is not above 0 and finite in any case.
     """
     spans = [medium.wavelength_range for medium in media if medium.wavelength_range]
-    shortest, longest = min([_SHORTEST, *(s[0] for s in spans)]), max([_LONGEST, *(s[1] for s in spans)])
+    known = [] if believed is None else [one for one in believed.detach().flatten().tolist() if 0 < one < math.inf]
+    shortest = min([_SHORTEST, *(s[0] for s in spans), *(0.1 * one for one in known)])
+    longest = max([_LONGEST, *(s[1] for s in spans), *(10 * one for one in known)])
     for wavelength in wavelengths.detach().flatten().tolist():
-        if not shortest <= wavelength <= longest:
+        if not (0 < wavelength < math.inf and shortest <= wavelength <= longest):
             guesses = (wavelength * factor for factor in _UNITS)
             guess = next((f"did you mean {g:.7g}?" for g in guesses if _LIKELY[0] <= g <= _LIKELY[1]), None)
             raise ImplausibleWavelength(
@@ -243,11 +249,17 @@ _SCHOTT_POWERS, _SCHOTT_PLACES = (0, -2, 2, -4, -6, -8), (0, 2, 1, 3, 4, 5)
 
 
 def from_table(
-    wavelengths: Sequence[float] | Tensor, indices: Sequence[float] | Tensor, *, name: str = "table"
+    wavelengths: Sequence[float] | Tensor,
+    indices: Sequence[float] | Tensor,
+    *,
+    exact: int = 0,
+    terms: int = len(_SCHOTT_POWERS),
+    name: str = "table",
 ) -> Glass:
     """The glass n² = a₀ + a₂ λ⁻² + a₁ λ² + a₃ λ⁻⁴ + … through indices (m,) at wavelengths (m,) µm.
 
-    Up to six indices are met exactly, more by least squares. Differentiable in the indices.
+    As many indices as there are terms are met exactly, more by least squares; of these the first `exact` ones, fewer
+    than there are terms, still are. Differentiable in the indices.
     Raises ValueError for lists of unequal length, for equal wavelengths and for numbers that are none.
     """
     w, n = (torch.as_tensor(part, dtype=torch.float64) for part in (wavelengths, indices))
@@ -257,9 +269,18 @@ def from_table(
         raise ValueError(f"wavelengths {w.tolist()} µm and indices {n.tolist()}: expected finite, positive numbers")
     if len(torch.unique(w)) < len(w):
         raise ValueError(f"a wavelength stands twice in {w.tolist()}: expected one index for each")
-    terms = min(len(w), len(_SCHOTT_POWERS))
+    terms, exact = min(len(w), terms, len(_SCHOTT_POWERS)), min(exact, len(w))
     basis = torch.stack([w**power for power in _SCHOTT_POWERS[:terms]], -1)
-    found = torch.linalg.lstsq(basis, (n * n)[:, None]).solution[:, 0]
+    if len(w) > terms > exact > 0:  # a = Q (y, z): the first rows decide y, least squares z
+        q, r = torch.linalg.qr(basis[:exact].T, mode="complete")
+        y = torch.linalg.solve_triangular(r[:exact].T, (n * n)[:exact, None], upper=False)
+        rest = basis[exact:] @ q
+        left = (n * n)[exact:, None] - rest[:, :exact] @ y
+        found = (q @ torch.cat([y, torch.linalg.lstsq(rest[:, exact:], left).solution]))[:, 0]
+        missed = (n * n)[:exact, None] - basis[:exact] @ found[:, None]  # by rounding
+        found = found + (q[:, :exact] @ torch.linalg.solve_triangular(r[:exact].T, missed, upper=False))[:, 0]
+    else:
+        found = torch.linalg.lstsq(basis, (n * n)[:, None]).solution[:, 0]
     coefficients = found.new_zeros(6).index_put((torch.tensor(_SCHOTT_PLACES[:terms]),), found)
     return Glass(name, "schott", coefficients, wavelength_range=(float(w.min()), float(w.max())))
 

@@ -5,7 +5,7 @@ from os import PathLike
 from pathlib import Path
 
 from raytrace import formats
-from raytrace.formats import ImportReport
+from raytrace.formats import ImportReport, Substitute
 from raytrace.merit.operands import OPERANDS
 from raytrace.merit.plan import SETTINGS
 
@@ -16,11 +16,13 @@ def check(
     catalogs: Sequence[str | Path] = (),
     strict: bool = False,
     configuration: int | None = None,
+    substitute: Substitute = None,
 ) -> ImportReport:
     """What was read from a lens file, what was not, and where each glass came from; what of its merit is evaluated.
 
-    strict: raise where something was assumed. configuration: which one has to be such that it can be traced. Raises as
-    `read_lens`, and LensFileError for what cannot be traced.
+    strict: raise where something was assumed. configuration: which one has to be such that it can be traced.
+    substitute: as for `read_lens`. Raises as that, and LensFileError for what cannot be traced.
     """
     evaluated = (*OPERANDS, *SETTINGS)
-    return formats.check(path, catalogs=catalogs, strict=strict, configuration=configuration, evaluated=evaluated)
+    how = {"catalogs": catalogs, "strict": strict, "configuration": configuration, "substitute": substitute}
+    return formats.check(path, **how, evaluated=evaluated)

@@ -20,6 +20,9 @@ from raytrace.system.intent import Row
 from raytrace.system.lens import Lens
 from raytrace.words import did_you_mean
 
+#: More rows than any merit function is worth: each is a ray, with its derivatives by all variables.
+MOST_ROWS = 100_000
+
 
 class BadMerit(ValueError):
     """A merit function that cannot be made; the message says what was found and what was expected."""
@@ -130,6 +133,8 @@ def _operand(kind: str, reference: str, choice: Choice) -> str:
 def _by_rays(lens: Lens, operand: str, choice: Choice) -> Iterator[Row]:
     """A row for every ray, by field, wavelength, arm and ring."""
     fields, colours = _fields(lens, choice), _weights(lens.wavelength_weights, choice.wavelength_weights, "wavelength")
+    count = sum(_arm_count(lens, field, choice.arms) for field, _ in fields) * len(colours) * choice.rings
+    _refuse_many(count, f"`rings={choice.rings}` and `arms={choice.arms}`")
     nodes, weights = gauss_legendre(choice.rings)
     for field, field_weight in fields:
         angles = _arms(lens, field, choice.arms)
@@ -144,6 +149,7 @@ def _by_rays(lens: Lens, operand: str, choice: Choice) -> Iterator[Row]:
 def _by_frequencies(lens: Lens, operand: str, choice: Choice) -> Iterator[Row]:
     """A row for every field and frequency, all wavelengths together; the best that there is is 1."""
     fields = _fields(lens, choice)
+    _refuse_many(len(fields) * len(choice.frequencies), f"{len(choice.frequencies)} `frequencies`")
     for number, (_, weight) in enumerate(fields, 1):
         for frequency in choice.frequencies if weight else ():
             share = weight / (len(fields) * len(choice.frequencies))
@@ -170,12 +176,23 @@ def _weights(own, given: Sequence[float] | None, what: str) -> list[float]:
     return [float(weight) for weight in given]
 
 
+def _refuse_many(rows: int, what: str) -> None:
+    """Raise BadMerit for more rows than MOST_ROWS, before one is made."""
+    if rows > MOST_ROWS:
+        raise BadMerit(f"{what}: {rows:,} rows of a merit function, expected at most {MOST_ROWS:,}; ask for fewer")
+
+
+def _arm_count(lens: Lens, field: tuple[float, float], arms: int) -> int:
+    """How many arms are traced at a field: of a round lens half of them, and one on the axis."""
+    if not is_round_about_axis(lens) or bool(lens.fields.x.any()):
+        return arms
+    return arms // 2 if field != (0.0, 0.0) else 1
+
+
 def _arms(lens: Lens, field: tuple[float, float], arms: int) -> np.ndarray:
     """The angles of the arms in radians, clockwise from the first right of the y axis."""
-    angles = np.deg2rad(90 - (np.arange(arms) + 0.5) * (360 / arms))
-    if not is_round_about_axis(lens) or bool(lens.fields.x.any()):
-        return angles
-    return angles[: arms // 2] if field != (0.0, 0.0) else np.zeros(1)
+    count = _arm_count(lens, field, arms)
+    return np.deg2rad(90 - (np.arange(count) + 0.5) * (360 / arms)) if count > 1 else np.zeros(1)
 
 
 def _clean(number: float) -> float:

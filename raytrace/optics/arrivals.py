@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 import torch
 from torch import Tensor
 
+from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.result import Result, axis, masked
 from raytrace.maths.value import value
 from raytrace.optics.axis import is_bent
@@ -14,6 +15,8 @@ from raytrace.optics.losses import STATUS, fates
 from raytrace.optics.trace import lens_steps
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.rays import Rays
+
+_KEPT_BYTES = 100  # of a ray on the sensor, with its status
 
 
 @value
@@ -62,9 +65,13 @@ def arrivals(
 ) -> Arrivals:
     """Trace points (2, P) of the pupil and their weights (P,) to the sensor, field by field.
 
-    fields, ray_aiming: as for `launch`; progress: goes over the fields one by one, as a bar does.
+    fields, ray_aiming: as for `launch`; progress: goes over the fields one by one, as a bar does. Raises
+    budget.OverBudget for more rays than memory holds.
     """
     fields = field_points(fields, like=lens)
+    F, W, P = fields.shape[1], len(lens.wavelengths), pupil.shape[1]
+    count = f"{F * W * P:,} rays ({F} fields × {W} wavelengths × {P:,} pupil points)"
+    afford(RAY_BYTES * W * P + _KEPT_BYTES * F * W * P, count, helps="ask for fewer, or by `rays`, which keeps none")
     each = [_field(lens, pupil, field[:, None], ray_aiming) for field in progress(fields.unbind(1))]
     joined = Rays(
         torch.cat([rays.position for rays, *_ in each], 1),

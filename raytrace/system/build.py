@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from raytrace.media.catalog import find_glass
-from raytrace.media.glass import AIR, MIRROR, Glass, constant, model_glass
+from raytrace.media.glass import AIR, MIRROR, Glass, check_unit, constant, model_glass
 from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, Fields, Lens, SystemAperture, changed, check, field_points
 from raytrace.system.surface import Surface
 
@@ -71,6 +71,7 @@ def lens(
         ray_aiming=ray_aiming,
     )
     try:
+        check_unit(wavelengths, (surface.glass for surface in found.surfaces))
         check(found)
     except ValueError as error:
         raise BadPrescription(str(error)) from error

@@ -301,11 +301,12 @@ def name_of_field(field: Tensor) -> str:
 def check_media(lens: Lens, wavelengths: Tensor, *, where: str = "") -> None:
     """Refuse wavelengths (W,) µm at which a glass of the lens has no index; warn of glasses used outside their range.
 
-    where: the lens, to name in the message. Raises ImplausibleWavelength, also for a lens without glass, and
-    `glass.InvalidIndex`; warns `glass.OutOfRange`, once for each glass.
+    where: the lens, to name in the message. Raises ImplausibleWavelength where neither a glass nor the wavelengths of
+    the lens reach that far, also for a lens without glass, and `glass.InvalidIndex`; warns `glass.OutOfRange`, once for
+    each glass.
     """
     media = [surface.glass for surface in lens.surfaces[:-1]]
-    check_unit(wavelengths, media, where=where)
+    check_unit(wavelengths, media, believed=lens.wavelengths, where=where)
     seen = set()
     for number, medium in enumerate(media):
         key = (medium.name, medium.catalog)
@@ -329,7 +330,7 @@ def check(lens: Lens) -> None:
         raise ValueError(f"{last + 1} surfaces found; expected at least the object, one surface and the image")
     if not 1 <= lens.stop < last:
         raise ValueError(f"the stop is surface {lens.stop}; expected one from 1 to {last - 1}")
-    check_unit(lens.wavelengths, (surface.glass for surface in lens.surfaces))
+    check_unit(lens.wavelengths, believed=lens.wavelengths)
     if not 0 <= lens.primary_wavelength < len(lens.wavelengths):
         raise ValueError(f"primary wavelength {lens.primary_wavelength + 1} of {len(lens.wavelengths)}")
     if not float(lens.aperture.value) > 0:

@@ -13,6 +13,9 @@ from raytrace.system.lens import Lens
 from raytrace.system.places import Place, places
 from raytrace.words import did_you_mean
 
+#: Surfaces and configurations are counted up to this number, and so many are named at a time.
+MOST = 10_000
+
 
 class BadVariables(ValueError):
     """A list of variables that the lens does not have, or that cannot be read."""
@@ -34,7 +37,9 @@ def counted(word: str, numbers: str, what: str = "surface") -> list[int]:
         match = re.fullmatch(r"(\d+)(?:-(\d+))?", part)
         if not match:
             raise BadVariables(f"{word!r}: {part!r} is no {what} number; expected numbers and ranges like 1,3-5")
-        first, last = int(match[1]), int(match[2] or match[1])
+        first, last = (int(digits) if len(digits) < 10 else MOST + 1 for digits in (match[1], match[2] or match[1]))
+        if last > MOST or len(found) + last - first > MOST:
+            raise BadVariables(f"{word[:60]!r}: {part[:60]!r} reaches beyond {what} {MOST}, which no lens has")
         found += range(first, last + 1)
     return found
 

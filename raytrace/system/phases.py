@@ -31,9 +31,13 @@ class Added(NamedTuple):
 
 @value
 class PolynomialPath:
-    """The path itself, p = Σ c_k x^i y^j in the order x, y, x², xy, y², …; coefficients: (K, ...) mm^(1-i-j)."""
+    """The path itself, p = constant + Σ c_k x^i y^j in the order x, y, x², xy, y², …
+
+    coefficients: (K, ...) mm^(1-i-j); constant: (...) mm, None for a path that is 0 at the vertex.
+    """
 
     coefficients: Tensor
+    constant: Tensor | None = None
 
 
 @value
@@ -167,10 +171,11 @@ def _polynomial(phase: PolynomialPhase, wavelength: Tensor) -> PolynomialPath:
 
 
 def _fringe(phase: FringePhase, wavelength: Tensor) -> PolynomialPath:
-    matrix = phase.coefficients.new_tensor(fringe_to_powers(phase.coefficients.shape[0]))
+    matrix, constants = map(phase.coefficients.new_tensor, fringe_to_powers(phase.coefficients.shape[0]))
     terms = torch.tensordot(matrix, phase.coefficients, dims=1)
     scale = phase.order * wavelength * _MICROMETRE
-    return PolynomialPath(_scaled(terms, phase.radius, _degrees(len(terms)), scale))
+    piston = scale * torch.tensordot(constants, phase.coefficients, dims=1)
+    return PolynomialPath(_scaled(terms, phase.radius, _degrees(len(terms)), scale), piston)
 
 
 def _degrees(count: int) -> list[int]:
@@ -246,7 +251,7 @@ def added_path(phase: Phase, x: Tensor, y: Tensor, wavelength: Tensor | None) ->
     if isinstance(path, RadialPath):
         return _radial_added(path.coefficients, x, y)
     z, slope_x, slope_y, *_ = polynomial_xy(path.coefficients, x, y, highest=1)
-    return Added(z, slope_x, slope_y)
+    return Added(z if path.constant is None else z + path.constant, slope_x, slope_y)
 
 
 def _radial_added(a: Tensor, x: Tensor, y: Tensor) -> Added:

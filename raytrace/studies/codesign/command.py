@@ -3,7 +3,7 @@
 import argparse
 import importlib
 
-from raytrace.cli.options import catalog, file_name, json, output_folder, seed_number
+from raytrace.cli.options import catalog, file_name, json, output_folder, seed_number, substitute
 from raytrace.studies.codesign.settings import AFTER_PARAXIAL, MODELS, Settings
 from raytrace.studies.options import add_options, documents, pictures
 from raytrace.words import did_you_mean
@@ -78,6 +78,7 @@ def options(parser: argparse.ArgumentParser) -> None:
         "`sweep`, `spaces` and `fields` find optima of the closed form, `retrain` compares known lenses",
     )
     catalog(parser)
+    substitute(parser)
     json(parser)
     output_folder(
         parser,

@@ -154,7 +154,8 @@ def _light(arguments: argparse.Namespace) -> dict[str, Sequence[float]]:
 
 def lens_of_file(arguments: argparse.Namespace) -> Lens:
     """The lens as its file has it: what options change of it is part of the settings."""
-    return open_lens(argparse.Namespace(lens=arguments.lens, catalog=arguments.catalog))
+    own = {name: getattr(arguments, name, None) for name in ("lens", "catalog", "substitute")}
+    return open_lens(argparse.Namespace(**own))
 
 
 def _agreed(choose: Callable[[], str]) -> str:
