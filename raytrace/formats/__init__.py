@@ -134,6 +134,11 @@ def check(
     strict: raise where something was assumed. configuration: which one has to be such that it can be traced. evaluated:
     as for `read_lens_with_report`. Raises as `read_lens`, and LensFileError for what cannot be traced.
     """
+    return checked(path, catalogs, strict, configuration, evaluated)[1]
+
+
+def checked(path, catalogs, strict: bool, configuration: int | None, evaluated) -> tuple[Lens, ImportReport]:
+    """The lens of `check` and the report."""
     options = {"catalogs": catalogs, "strict": strict, "configuration": configuration, "evaluated": evaluated}
     lens, report = read_lens_with_report(path, **options)
     try:
@@ -141,7 +146,7 @@ def check(
     except ValueError as error:
         raise LensFileError(str(error), Place(str(path))) from error
     check_media(lens, lens.wavelengths, where=str(path))
-    return report
+    return lens, report
 
 
 @value

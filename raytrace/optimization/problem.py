@@ -44,7 +44,7 @@ class Problem:
         self._again = lambda model: Problem(
             model, rows, conditions, unit=unit, skip_unknown=skip_unknown, readings=readings
         )
-        self.model, self.rows, self.unit = model, tuple(rows), unit
+        self.model, self.rows, self.unit, self.conditions = model, tuple(rows), unit, tuple(conditions)
         self.evaluation = Evaluation(
             model, (*rows, *(row for row, _ in held)), unit=unit, skip_unknown=skip_unknown, readings=readings
         )
@@ -66,7 +66,7 @@ class Problem:
 
     def state(self, x: np.ndarray, derivatives: bool) -> State:
         """Residuals of rows of positive weight, and what the others miss, in units of their rows."""
-        found = self._charged(self.evaluated(x, derivatives), x)
+        found = self._charged(self.evaluation(x, derivatives=derivatives, shown=False), x)
         of_row, weights = found.of_row, self.evaluation.weights
         signs, factors = self.signs[of_row], self.evaluation.factors[of_row]
         rows, excess, slopes = _joined(found.sides, len(x))

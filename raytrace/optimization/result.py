@@ -7,10 +7,11 @@ import torch
 from torch import Tensor
 
 from raytrace.formats import write_lens
-from raytrace.maths.result import Result, number, plain
+from raytrace.maths.result import Result, cell, number, plain
 from raytrace.maths.value import value
 from raytrace.merit.operands import OPERANDS
 from raytrace.optimization.glass import GlassStep
+from raytrace.optimization.reached import Reached
 from raytrace.system.intent import Row
 from raytrace.system.lens import Lens
 
@@ -19,7 +20,7 @@ STOPPED = {
     "gradient": "no variable makes the merit any less",
     "step": "no step makes the merit any less",
     "merit": "the merit hardly changes any more",
-    "cycles": "as many cycles as were asked for",
+    "cycles": "the limit on cycles was reached",
     "seconds": "as much time as was asked for",
     "interrupted": "interrupted; this is the best so far",
 }
@@ -33,7 +34,7 @@ class Optimized(Result):
     merit: the rows; names (n,) of the variables, before and after in variables: (n,) in mm; values: (R,) of the rows
     before and after; contributions: (R,) of each to the square of the merit, which add up to 1; history: (cycles, 5)
     merit, how far conditions are missed, step, damping and seconds of every cycle; stopped: a key of STOPPED;
-    glasses: the steps in which glasses that vary were chosen.
+    glasses: the steps in which glasses that vary were chosen; conditions: what was asked for and what was reached.
     """
 
     lens: Lens
@@ -54,6 +55,7 @@ class Optimized(Result):
     seconds: float
     stopped: str
     glasses: tuple[GlassStep, ...] = ()
+    conditions: tuple[Reached, ...] = ()
 
     FIGURE = "plot.optimize.optimize_report"
 
@@ -61,6 +63,10 @@ class Optimized(Result):
     def rows(self) -> tuple[int, ...]:
         """Rows that have a value, counted from 1."""
         return tuple(i for i, row in enumerate(self.merit, 1) if row.operand in OPERANDS)
+
+    @property
+    def falls_short(self) -> bool:
+        return not all(one.met for one in self.conditions)
 
     def columns(self) -> dict[str, Tensor]:
         kept = [i - 1 for i in self.rows]
@@ -103,6 +109,7 @@ class Optimized(Result):
                     for i in self.rows
                 ],
                 **({"glasses": [step.document() for step in self.glasses]} if self.glasses else {}),
+                "conditions": [one.document() for one in self.conditions],
             }
         )
 
@@ -130,7 +137,28 @@ class Optimized(Result):
         if len(left) > _SHOWN:
             rest = sum(float(self.contributions[i - 1]) for i in left[_SHOWN:])
             lines.append(f"  and {len(left) - _SHOWN} more rows, {rest:.1%}")
-        return "\n".join(lines)
+        return "\n".join([*lines, *self._conditions()])
+
+    def _conditions(self) -> list[str]:
+        """The table of what was asked for and reached; of boundaries that are met as many as fit."""
+        shown = self.shown_conditions()
+        if not shown:
+            return []
+        width = max(24, *(len(one.name) for one in shown))
+        lines = [f"\n  {'condition':<{width}} {'asked':>15} {'reached':>14}"]
+        for one in shown:
+            asked, number = f"{one.relation} {one.asked:.6g}", cell(one.reached, "14.6g")
+            told = ", ".join(filter(None, ["" if one.met else "not met", one.place]))
+            lines.append(f"  {one.name:<{width}} {asked:>15} {number:>14}  {told}".rstrip())
+        if len(shown) < len(self.conditions):
+            lines.append(f"  and {len(self.conditions) - len(shown)} more boundaries, met")
+        return lines
+
+    def shown_conditions(self) -> list[Reached]:
+        """Those of tables: all but boundaries that are met, of which there are the first few."""
+        chosen = [k for k, one in enumerate(self.conditions) if not one.met or not one.row]
+        met = [k for k, one in enumerate(self.conditions) if one.met and one.row]
+        return [self.conditions[k] for k in sorted(chosen + met[: max(_SHOWN - len(chosen), 0)])]
 
     def _counts(self, i: int) -> bool:
         return self.merit[i - 1].weight != 0
