@@ -25,10 +25,10 @@ from raytrace.optimization.glass_pool import catalogs_of, pool_of
 from raytrace.optimization.least_squares import Cycle
 from raytrace.optimization.opening import opened
 from raytrace.optimization.paths import Found, best_of_paths
-from raytrace.optimization.problem import Condition, NoProblem, Problem, typical_of
+from raytrace.optimization.problem import Condition, NoProblem, Problem, intent_of, typical_of
 from raytrace.optimization.reached import NotReached, reached, refuse_contradictions
 from raytrace.optimization.result import Optimized
-from raytrace.system.intent import Intent, Row, Vary
+from raytrace.system.intent import Row, Vary
 from raytrace.system.lens import Lens
 
 
@@ -283,7 +283,7 @@ def _with_intent(lens: Lens, model: Model, rows: tuple[Row, ...], unit: float) -
     """The lens with what it was optimised for, where its file says nothing of it."""
     if lens.intent is not None:
         return lens
-    return dataclasses.replace(lens, intent=Intent(model.variables, model.solves, rows, unit))
+    return dataclasses.replace(lens, intent=intent_of(model, rows, unit))
 
 
 def _with_bounds(lens: Lens, variables: Sequence[Vary], lower: np.ndarray, upper: np.ndarray) -> Lens:

@@ -93,7 +93,8 @@ def reached(problem: Problem, x: np.ndarray, *, lower: np.ndarray, upper: np.nda
 
 def refuse_contradictions(problem: Problem, x: np.ndarray, *, lower: np.ndarray, upper: np.ndarray) -> None:
     """Raise NoProblem for conditions that no lens meets between the bounds, as far as that is certain."""
-    needs = [need for need in _needs(problem, x) if need.exact]
+    held = _held_rows(problem)
+    needs = [need for need in _needs(problem, x) if need.number in held] if held else []
     conflict = _conflict(problem, needs, x, lower, upper)
     if conflict is None or not _holds_elsewhere(problem, conflict, x, lower, upper):
         return
@@ -195,7 +196,6 @@ class _Need:
     miss: float
     slope: np.ndarray
     equal: bool
-    exact: bool
     part: int = 0
 
 
@@ -243,11 +243,11 @@ def _needs(problem: Problem, x: np.ndarray) -> list[_Need]:
     for k, residual, slope in zip(found.of_row.tolist(), found.residuals, found.jacobian, strict=True):
         if evaluation.weights[k] < 0 and k not in sided and not found.lost[k]:
             factor, sign = evaluation.factors[k], int(problem.signs[k])
-            needs.append(_Need(k, (sign or 1) * residual / factor, (sign or 1) * slope / factor, sign == 0, True))
+            needs.append(_Need(k, (sign or 1) * residual / factor, (sign or 1) * slope / factor, sign == 0))
     for rows, excess, slopes, _ in found.sides:
         for k, e, slope in zip(rows.tolist(), excess, slopes, strict=True):
             factor = evaluation.factors[k]
-            needs.append(_Need(k, e / factor, slope / factor, False, bool(evaluation.weights[k] < 0)))
+            needs.append(_Need(k, e / factor, slope / factor, False))
     seen: dict[int, int] = {}
     for place, need in enumerate(needs):
         seen[need.number] = seen.get(need.number, -1) + 1
