@@ -116,6 +116,42 @@ def semi_diameters(found) -> list[float]:
     return sizes
 
 
+def closing(surface, size) -> float:
+    """(1+k) c² s², 1 where a conic closes at its semi-diameter."""
+    c, k = (0.0 if number is None else float(number) for number in (surface.curvature, surface.conic))
+    return (1 + k) * (c * size) ** 2
+
+
+def past_edge(surface, size) -> float:
+    """What the root of a conic that closes within its semi-diameter adds to a sag whose root is held at 0."""
+    left = 1 - closing(surface, size)
+    if surface.kind != "even asphere" or surface.departure is not None or not left < 1e-4:
+        return 0.0
+    t = 1 - left / 1e-4
+    root = np.sqrt(1e-4 / (1 + t + t * t))
+    return float(surface.curvature) * size**2 * (1 / (1 + root) - 1 / (1 + np.sqrt(max(left, 0.0))))
+
+
+def short(found, row: Row) -> float:
+    """mm by which the surfaces of a row of edges fall short of their semi-diameters, s (q - 1)/2, all together."""
+    name, surfaces, last = row.operand, found.surfaces, len(found.surfaces) - 1
+    if not ((name[:2] in ("MN", "MX") and name[2] == "E") or name in ("ETGT", "ETLT", "TTGT", "TTLT")):
+        return 0.0
+    first, behind = row.integers[0], row.integers[1] + 1 if name in OF_RANGES else row.integers[0] + 1
+    glass = [None] * (last + 1)
+    for k, one in enumerate(surfaces):
+        glass[k] = glass[k - 1] if one.is_mirror or one.is_break else one.glass
+    listed = [k for k in range(first, min(behind, last)) if not surfaces[k].is_break]
+    in_air = {k: abs(float(nd(glass[k])) - 1) < 1e-3 for k in listed}
+    kind = name[3] if name in OF_RANGES else "T"
+    listed = [k for k in listed if kind == "T" or in_air[k] == (kind == "A")]
+    ends = {next((j for j in range(k + 1, last) if not surfaces[j].is_break), last) for k in listed}
+    sizes = semi_diameters(found)
+    return sum(
+        max(0.5 * sizes[k] * (closing(surfaces[k], sizes[k]) - 1), 0.0) for k in {*listed, *ends} if 0 < k < last
+    )
+
+
 def amounts(found, name: str, row: Row) -> list[float]:
     """What the surfaces of a row have."""
     surfaces, last = found.surfaces, len(found.surfaces) - 1
@@ -133,7 +169,7 @@ def amounts(found, name: str, row: Row) -> list[float]:
     x, y = [(0.0, 1.0), (1.0, 0.0), (0.0, -1.0), (-1.0, 0.0)][row.integers[1] if one else 0]
 
     def sag(k):
-        return float(sag_at(surfaces[k], scalar(x * sizes[k]), scalar(y * sizes[k])))
+        return float(sag_at(surfaces[k], scalar(x * sizes[k]), scalar(y * sizes[k]))) + past_edge(surfaces[k], sizes[k])
 
     def centre(k):
         return sum(float(s.thickness) for s in surfaces[k : ends[k]]) * turned[k]
@@ -167,8 +203,8 @@ def expected(found, row: Row) -> float:
     if row.operand[2:] == "VA":
         return have[0]
     if row.operand[:2] == "MN" or row.operand[2:] == "GT":
-        return row.target - sum(max(row.target - amount, 0.0) for amount in have)
-    return row.target + sum(max(amount - row.target, 0.0) for amount in have)
+        return row.target - sum(max(row.target - amount, 0.0) for amount in have) - short(found, row)
+    return row.target + sum(max(amount - row.target, 0.0) for amount in have) + short(found, row)
 
 
 def rows_of(found) -> list[Row]:

@@ -84,7 +84,8 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command line; returns 0, or what went wrong: 1 bad input, 2 bad usage, 130 interrupted.
+    """Run one command line; returns 0, or what went wrong: 1 bad input, or a result that falls short of what was asked
+    for, 2 bad usage, 130 interrupted.
 
     Results go to stdout; progress, warnings and errors to stderr, one line each.
     """
@@ -101,7 +102,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 importlib.import_module("raytrace.cli.progress").heartbeat(arguments.command),
                 importlib.import_module("raytrace.budget").within(getattr(arguments, "max_bytes", None)),
             ):
-                importlib.import_module("raytrace.cli.run").carry_out(arguments.run, arguments)
+                return importlib.import_module("raytrace.cli.run").carry_out(arguments.run, arguments)
         except KeyboardInterrupt:
             return _fail("interrupted", 130)
         except BrokenPipeError:
@@ -119,7 +120,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _fail(
                 f"{kind}: {_one_line(error)} (a defect of raytrace; RAYTRACE_TRACEBACK=1 shows where, please report)", 1
             )
-    return 0
 
 
 def script() -> None:

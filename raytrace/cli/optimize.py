@@ -23,7 +23,7 @@ def options(parser):
     merit(parser)
     freedom(parser)
     ends = parser.add_argument_group("how long")
-    ends.add_argument("--cycles", metavar="N", type=words.count, help="end after so many cycles")
+    ends.add_argument("--cycles", metavar="N", type=words.count, help="end after so many cycles (default 500)")
     ends.add_argument("--seconds", metavar="S", type=words.positive_finite, help="end after so much time")
     ends.add_argument("--paths", metavar="N", type=words.count, help="ways of damping that are tried (default 1)")
     files = parser.add_argument_group("files")

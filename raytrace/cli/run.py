@@ -23,29 +23,32 @@ _RUNNERS = (
 _DRAWING = "plot_"  # options of the figure begin with it: --log, dest="plot_log"
 
 
-def carry_out(command: ModuleType, arguments: argparse.Namespace) -> None:
-    """Run a command; its verb gets every option as the keyword of the same name.
+def carry_out(command: ModuleType, arguments: argparse.Namespace) -> int:
+    """Run a command; its verb gets every option as the keyword of the same name. Returns the exit code: 1 for a result
+    that falls short of what was asked for.
 
     Several object distances go to the verb where it takes `object_distances`, else one result follows the other. Under
     torchrun processes share the work of a verb that takes a `share`, and the first one tells what was found.
     """
     with processes() if takes(command, "share") else nullcontext():
-        _carry_out(command, arguments)
+        return _carry_out(command, arguments)
 
 
-def _carry_out(command: ModuleType, arguments: argparse.Namespace) -> None:
+def _carry_out(command: ModuleType, arguments: argparse.Namespace) -> int:
     run = getattr(command, "run", None) or partial(verb_of_lens, command)
     run = called(run) if isinstance(run, str) else run
     distances = getattr(arguments, "object_distances", None)
     if not distances or takes(command, "object_distances"):
-        present(run(arguments), arguments)
-        return
-    documents = []
+        found = run(arguments)
+        present(found, arguments)
+        return int(found is not None and found.falls_short)
+    documents, short = [], 0
     for distance, one in _each(arguments, distances):
         if len(distances) > 1 and not arguments.json:
             print(f"object at {_words(distance)}", flush=True)
         found = run(one)
         save(found, one)
+        short |= found.falls_short
         if arguments.json:
             place = {} if len(distances) == 1 else {"object_distance": distance if math.isfinite(distance) else None}
             documents.append({**place, **found.document()})
@@ -53,6 +56,7 @@ def _carry_out(command: ModuleType, arguments: argparse.Namespace) -> None:
             print(found)
     if arguments.json:
         print_json(documents[0] if len(distances) == 1 else {"results_by_object_distance": documents})
+    return int(short)
 
 
 def takes(command: ModuleType, keyword: str) -> bool:

@@ -147,6 +147,13 @@ def check(
     strict: raise where something was assumed. configuration: which one has to be such that it can be traced. evaluated:
     as for `read_lens_with_report`. Raises as `read_lens`, and LensFileError for what cannot be traced.
     """
+    return checked(path, catalogs, strict, configuration, substitute, evaluated)[1]
+
+
+def checked(
+    path, catalogs, strict: bool, configuration: int | None, substitute: Substitute, evaluated
+) -> tuple[Lens, ImportReport]:
+    """The lens of `check` and the report."""
     options = {"catalogs": catalogs, "strict": strict, "configuration": configuration, "substitute": substitute}
     lens, report = read_lens_with_report(path, **options, evaluated=evaluated)
     try:
@@ -154,7 +161,7 @@ def check(
     except ValueError as error:
         raise LensFileError(str(error), Place(str(path))) from error
     check_media(lens, lens.wavelengths, where=str(path))
-    return report
+    return lens, report
 
 
 @value

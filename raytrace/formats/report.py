@@ -111,7 +111,7 @@ def _short(one: object) -> str:
 
 
 #: Keys that a document has only where there is something to say.
-_WHERE_THERE_ARE_SOME = ("configurations", "variables", "solves", "kept", "operands", "tolerances")
+_WHERE_THERE_ARE_SOME = ("configurations", "variables", "solves", "kept", "operands", "tolerances", "geometry")
 
 
 @value
@@ -122,6 +122,7 @@ class ImportReport(Result):
     error when the file is read with `strict=True`. surfaces, stop_surface: of the lens that was read.
     configurations: what differs between those of a multi-configuration file.
     variables, solves, kept: of `Lens.intent`, in words; operands: those of its merit function; tolerances: its lines.
+    geometry: surfaces and gaps that cannot be made.
     """
 
     file: str
@@ -138,6 +139,7 @@ class ImportReport(Result):
     kept: tuple[str, ...] = ()
     operands: tuple[OperandUse, ...] = ()
     tolerances: int = 0
+    geometry: tuple[str, ...] = ()
 
     def document(self) -> dict:
         return {name: one for name, one in asdict(self).items() if one or name not in _WHERE_THERE_ARE_SOME}
@@ -153,7 +155,8 @@ class ImportReport(Result):
 
     def __str__(self) -> str:
         lines = [f"{self.file} ({self.format})"]
-        lines += [f"  warning: {warning}" for warning in self.warnings] + [f"  note: {note}" for note in self.notes]
+        lines += [f"  warning: {warning}" for warning in (*self.warnings, *self.geometry)]
+        lines += [f"  note: {note}" for note in self.notes]
         for status, title in _TITLES.items():
             chosen = [str(keyword) for keyword in self.keywords if keyword.status == status]
             listed = _wrapped(chosen) if status == READ else [f"    {keyword}" for keyword in chosen]

@@ -43,6 +43,11 @@ class Result:
     #: The function that draws it, "plot.file.function"(result, **options) -> Figure.
     FIGURE: ClassVar[str] = ""
 
+    @property
+    def falls_short(self) -> bool:
+        """Whether what was asked for is not reached: the command prints and saves the result, and exits with 1."""
+        return False
+
     def columns(self) -> dict[str, Tensor]:
         """Columns by name, broadcast against one another; nan where no ray arrives. Raises TypeError: no table."""
         raise TypeError(f"{type(self).__name__} is no table; see its document() for what it holds")

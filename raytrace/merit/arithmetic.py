@@ -63,7 +63,7 @@ def in_order(referred: dict[int, Sequence[int]]) -> list[int]:
         ) from None
 
 
-def _operand(tell: Callable, refers: Callable, text: str, reading: str = "") -> Operand:
+def _operand(tell: Callable, refers: Callable, text: str, reading: str = "", bounds: str = "") -> Operand:
     """tell: of the row and of the values that it takes."""
 
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
@@ -79,7 +79,7 @@ def _operand(tell: Callable, refers: Callable, text: str, reading: str = "") -> 
 
         return evaluate
 
-    return Operand(plan, text, reading=reading, refers=refers)
+    return Operand(plan, text, reading=reading, refers=refers, bounds=bounds)
 
 
 def _finite(number):
@@ -166,12 +166,18 @@ ARITHMETIC = {
     "ATAN": _operand(_to_angle(np.arctan), _one, "inverse tangent of row a" + _FLAG),
     "LOGT": _operand(_logarithm(np.log10), _one, "decimal logarithm of row a, 0 where that is not positive"),
     "LOGE": _operand(_logarithm(np.log), _one, "natural logarithm of row a, 0 where that is not positive"),
-    "OPGT": _operand(_below, _one, f"row a is meant to be above the target: its value, or {_SIDED}"),
-    "OPLT": _operand(_above, _one, f"row a is meant to be below the target: its value, or {_SIDED}"),
+    "OPGT": _operand(_below, _one, f"row a is meant to be above the target: its value, or {_SIDED}", bounds=">="),
+    "OPLT": _operand(_above, _one, f"row a is meant to be below the target: its value, or {_SIDED}", bounds="<="),
     "ABGT": _operand(
-        lambda row, a: _below(row, np.abs(a)), _one, f"|row a| is meant to be above the target: its value, or {_SIDED}"
+        lambda row, a: _below(row, np.abs(a)),
+        _one,
+        f"|row a| is meant to be above the target: its value, or {_SIDED}",
+        bounds=">=",
     ),
     "ABLT": _operand(
-        lambda row, a: _above(row, np.abs(a)), _one, f"|row a| is meant to be below the target: its value, or {_SIDED}"
+        lambda row, a: _above(row, np.abs(a)),
+        _one,
+        f"|row a| is meant to be below the target: its value, or {_SIDED}",
+        bounds="<=",
     ),
 }

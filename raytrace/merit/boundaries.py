@@ -2,7 +2,8 @@
 
 A row over several surfaces is its target where all of them comply, else less, or more, by the sum of what they lack. So
 its error is 0 and does not move where the boundary is kept, and grows from 0 steadily where it is passed. Breaks of
-coordinates are no surfaces here, and a gap ends at the next one that is none.
+coordinates are no surfaces here, and a gap ends at the next one that is none. A surface that closes before its
+semi-diameter has no edge: it lacks what it falls short of it in every row of edges, whichever side that bounds.
 """
 
 from collections.abc import Callable, Sequence
@@ -162,29 +163,57 @@ class _Places:
         return found
 
 
-def within(prepared: Prepared, chosen: Chosen, side: float, length: int):
-    """Rows that are their target where no surface passes it, else off by what the surfaces lack."""
+def within(prepared: Prepared, chosen: Chosen, side: float, length: int, also: Prepared | None = None):
+    """Rows that are their target where no surface passes it, else off by what the surfaces lack.
+
+    also: what the surfaces at both ends of the gaps lack whatever the target is, mm.
+    """
 
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
         places = _Places(prepared, chosen, lines, planner)
         targets = np.array([line.row.target for line in lines]) * planner.unit**length
         counted = LACKS[planner.readings.boundary]
+        closed = None if also is None else _Places(also, _both(chosen), lines, planner)
+        rows = places.rows if closed is None else np.concatenate([places.rows, closed.rows])
+        surfaces = places.surfaces if closed is None else np.concatenate([places.surfaces, closed.surfaces])
+
+        def lacking(now: Now, chosen: np.ndarray):
+            """What some places lack, with derivatives."""
+            first = chosen[chosen < len(places.rows)]
+            lacks = side * (targets[places.rows[first]] - places.at(now, first))
+            further = chosen[chosen >= len(places.rows)] - len(places.rows)
+            return np.concatenate([lacks, closed.at(now, further)]) if len(further) else lacks
 
         def evaluate(now: Now) -> Found:
             lacks = side * (targets[places.rows] - places.values(now))
-            sides = ()
-            if counted is _all:
-                sides = places.rows, side * (targets[places.rows] - places.at(now, np.arange(len(places.rows))))
-            passed = counted(np.flatnonzero(~(lacks <= 0)), places.rows, lacks)  # nan is none that complies
+            lacks = lacks if closed is None else np.concatenate([lacks, closed.values(now)])
+            sides = (rows, lacking(now, np.arange(len(rows))), surfaces) if counted is _all else ()
+            passed = counted(np.flatnonzero(~(lacks <= 0)), rows, lacks)  # nan is none that complies
             if not passed.size:
                 return Found(targets, sides=sides)
-            rows = places.rows[passed]
-            of_row = (rows == np.arange(len(lines))[:, None]).astype(float)
-            return Found(targets - of_row @ (targets[rows] - places.at(now, passed)), sides=sides)
+            of_row = (rows[passed] == np.arange(len(lines))[:, None]).astype(float)
+            return Found(targets - side * (of_row @ lacking(now, passed)), sides=sides)
 
         return evaluate
 
     return plan
+
+
+def _shortfall(planner: Planner, surfaces: Sequence[int], code: int) -> Amounts:
+    """How far surfaces fall short of their semi-diameters."""
+    gaps = planner.shared(Gaps)
+    gaps.semi_diameters.ask(surfaces)
+    return gaps.shortfall
+
+
+def _both(chosen: Chosen) -> Chosen:
+    """The surfaces that begin and end the gaps, each once a row; the image ends none that has an edge."""
+
+    def either(line: Line, planner: Planner) -> list[tuple[int, int]]:
+        ends = [end for k, _ in chosen(line, planner) for end in (k, int(planner.shared(Gaps).end[k]))]
+        return [(k, 0) for k in dict.fromkeys(ends) if 0 < k < planner.image]
+
+    return either
 
 
 def _all(passed: np.ndarray, rows: np.ndarray, lacks: np.ndarray) -> np.ndarray:
@@ -217,23 +246,27 @@ _SUM = (
     "number of mirrors are compared along the light, or signed: as the lens has them"
 )
 _SIGNED = "thicknesses behind mirrors as the lens has them, negative"
+_SIDE = "thickness at the edge behind surface int1; int2: 0 +y, 1 +x, 2 -y, 3 -x"
+_WHOLE = "thickness behind surface int1 from where it begins to where it ends"
 _PLACES = {
     "G": (_in_glass, "in glass"),
     "A": (_in_air, "in air, behind mirrors too"),
     "T": (_range, "in glass and air"),
 }
+_RELATIONS = {_AT_LEAST: ">=", _AT_MOST: "<="}
 _SIDES = (("MN", _AT_LEAST, "least"), ("MX", _AT_MOST, "largest"))
 _BOUNDS = (("GT", _AT_LEAST, "at least"), ("LT", _AT_MOST, "at most"))
 
 
-def _ranges(letter: str, prepared: Prepared, text: str) -> dict[str, Operand]:
+def _ranges(letter: str, prepared: Prepared, text: str, also: Prepared | None = None) -> dict[str, Operand]:
     """MN… and MX… over the gaps of surfaces int1 to int2."""
     return {
         f"{head}{letter}{kind}": Operand(
-            within(_along_light(prepared), surfaces, side, 1),
+            within(_along_light(prepared), surfaces, side, 1, also),
             f"{word} {text} {place}, surfaces int1 to int2",
             1,
             _SUM,
+            bounds=_RELATIONS[side],
         )
         for head, side, word in _SIDES
         for kind, (surfaces, place) in _PLACES.items()
@@ -248,15 +281,24 @@ def _of_range(tail: str, prepared: Prepared, surfaces, text: str, length: int = 
             f"{word} {text}, surfaces int1 to int2",
             length=length,
             reading=_SUM,
+            bounds=_RELATIONS[side],
         )
         for head, side, word in _SIDES
     }
 
 
-def _of_one(head: str, prepared: Prepared, text: str, length: int = 0, reading: str = "") -> dict[str, Operand]:
+def _of_one(
+    head: str, prepared: Prepared, text: str, length: int = 0, reading: str = "", also: Prepared | None = None
+) -> dict[str, Operand]:
     """GT, LT and VA of a number of surface int1."""
     bounds = {
-        f"{head}{tail}": Operand(within(prepared, _single, side, length), f"{text}, {word} the target", length, reading)
+        f"{head}{tail}": Operand(
+            within(prepared, _single, side, length, also),
+            f"{text}, {word} the target",
+            length,
+            reading,
+            bounds=_RELATIONS[side],
+        )
         for tail, side, word in _BOUNDS
     }
     return bounds | {f"{head}VA": Operand(value(prepared), text, length, reading)}
@@ -264,15 +306,15 @@ def _of_one(head: str, prepared: Prepared, text: str, length: int = 0, reading: 
 
 BOUNDARIES: dict[str, Operand] = {
     **_ranges("C", _centre, "thickness on the axis"),
-    **_ranges("E", _edge, "thickness at the edge"),
+    **_ranges("E", _edge, "thickness at the edge", _shortfall),
     **_of_range("CV", _number("curvature"), _range, "curvature", -1),
     **_of_range("SD", _semi_diameter, _range, "semi-diameter", 1),
     **_of_range("DT", _slenderness, _in_glass, "diameter over thickness of glasses"),
     **_of_range("IN", _of_glass(lambda d, F, C: d), _in_glass, "index of glasses at the d line"),
     **_of_range("AB", _of_glass(lambda d, F, C: (d - 1) / (F - C)), _in_glass, "Abbe number of glasses at the d line"),
     **_of_one("CT", _centre, "thickness on the axis behind surface int1", 1, _SIGNED),
-    **_of_one("ET", _edge, "thickness at the edge behind surface int1; int2: 0 +y, 1 +x, 2 -y, 3 -x", 1, _SIGNED),
-    **_of_one("TT", _whole, "thickness behind surface int1 from where it begins to where it ends", 1, _SIGNED),
+    **_of_one("ET", _edge, _SIDE, 1, _SIGNED, _shortfall),
+    **_of_one("TT", _whole, _WHOLE, 1, _SIGNED, _shortfall),
     **_of_one("CV", _number("curvature"), "curvature of surface int1", -1),
     **_of_one("CO", _number("conic"), "conic constant of surface int1"),
     **_of_one("DM", _diameter, "diameter of surface int1", 1),

@@ -1,5 +1,6 @@
 """What was read from a lens file, the operands of its merit function that are evaluated among it."""
 
+import dataclasses
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
@@ -8,6 +9,7 @@ from raytrace import formats
 from raytrace.formats import ImportReport, Substitute
 from raytrace.merit.operands import OPERANDS
 from raytrace.merit.plan import SETTINGS
+from raytrace.optics.geometry import defects
 
 
 def check(
@@ -18,11 +20,12 @@ def check(
     configuration: int | None = None,
     substitute: Substitute = None,
 ) -> ImportReport:
-    """What was read from a lens file, what was not, and where each glass came from; what of its merit is evaluated.
+    """What was read from a lens file, what was not, and where each glass came from; what of its merit is evaluated, and
+    what of the lens cannot be made (`optics.geometry`).
 
     strict: raise where something was assumed. configuration: which one has to be such that it can be traced.
     substitute: as for `read_lens`. Raises as that, and LensFileError for what cannot be traced.
     """
     evaluated = (*OPERANDS, *SETTINGS)
-    how = {"catalogs": catalogs, "strict": strict, "configuration": configuration, "substitute": substitute}
-    return formats.check(path, **how, evaluated=evaluated)
+    lens, report = formats.checked(path, catalogs, strict, configuration, substitute, evaluated)
+    return dataclasses.replace(report, geometry=tuple(map(str, defects(lens))))

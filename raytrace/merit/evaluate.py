@@ -13,7 +13,7 @@ from raytrace.merit.merit import Evaluation
 from raytrace.merit.model import Model
 from raytrace.merit.operands import OPERANDS
 from raytrace.merit.readings import Readings, readings_of
-from raytrace.merit.value import Merit, arguments, merit_for
+from raytrace.merit.value import Merit, arguments, configurations_of, merit_for
 from raytrace.system.intent import Row
 from raytrace.system.lens import Lens
 
@@ -163,7 +163,7 @@ def evaluate(
         wavelength_weights=wavelength_weights, glass_thickness=glass_thickness, air_thickness=air_thickness, edge=edge,
         configurations=configuration and [configuration],
     )  # fmt: skip
-    where = _configurations(lens, function)
+    where = configurations_of(function, lens.current_configuration)
     if configuration is not None:
         apart = {number: 0.0 for number, at in enumerate(where, 1) if at != configuration}
         function = function.with_weights(apart)
@@ -197,12 +197,3 @@ def _result(
         skipped=planned.skipped,
         each=each,
     )
-
-
-def _configurations(lens: Lens, function: Merit) -> list[int]:
-    """The configuration (from 1) that every row is of."""
-    found, at = [], lens.current_configuration
-    for row in function:
-        at = row.integers[0] if row.operand == "CONF" else at
-        found.append(at)
-    return found

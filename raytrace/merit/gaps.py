@@ -21,6 +21,8 @@ from raytrace.system.surface import Surface, sag_at
 #: Where on the edge of a surface a row looks, by its code: +y, +x, -y, -x.
 SIDES = ((0.0, 1.0), (1.0, 0.0), (0.0, -1.0), (-1.0, 0.0))
 
+_EDGE = 1e-4  # of 1 - (1+k) c² s²: how near its edge the root of a conic is held
+
 
 class Gaps:
     """The gaps of a lens in one configuration."""
@@ -101,10 +103,35 @@ class Gaps:
                 slopes[:, k] = one.slope
         return Dual(values, slopes) if count else values
 
+    def shortfall(self, now: Now):
+        """mm by which surfaces fall short of their semi-diameters s, below 0 where they reach them: s (q - 1)/2.
+
+        q = (1+k) c² s² is 1 where a conic closes at s; near there it is s - 1/(|c| √(1+k)).
+        """
+        return now.once(self._shortfall)
+
+    def _shortfall(self, now: Now):
+        heights = self.semi_diameters.at(now)
+        return 0.5 * heights * (self._closing(now.moment, heights * heights) - 1.0)
+
+    def _closing(self, moment: Moment, u):
+        """(1+k) c² u, which is 1 at the edge of a closed conic."""
+        c = self.numbers(moment, "curvature")
+        return (1 + self.numbers(moment, "conic")) * (c * c) * u
+
     def _even_sag(self, moment: Moment, heights):
-        """c u/(1 + √(1 - (1+k) c² u)) + Σ a_j u^j, u = s²; beyond the edge of a closed conic that of its edge."""
-        u, c, conic = heights * heights, self.numbers(moment, "curvature"), self.numbers(moment, "conic")
-        found = c * u / (1 + np.sqrt(np.maximum(1 - (1 + conic) * (c * c) * u, 0.0)))
+        """c u/(1 + √(1 - q)) + Σ a_j u^j, u = s², q = (1+k) c² u.
+
+        Of a conic that closes within s, from 1 - q = ε on, 1 - q is ε/(1 + τ + τ²), τ = 1 - (1 - q)/ε: above 0, with
+        two continuous derivatives.
+        """
+        u, c = heights * heights, self.numbers(moment, "curvature")
+        left = 1 - self._closing(moment, u)
+        closed = value_of(left) < _EDGE
+        if closed.any():
+            over = np.where(closed, 1 - left / _EDGE, 0.0)
+            left = np.where(closed, _EDGE / (1 + over + over * over), left)
+        found = c * u / (1 + np.sqrt(left))
         power = u
         for name in self.terms:
             found = found + power * self.numbers(moment, name)

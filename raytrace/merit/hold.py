@@ -29,12 +29,13 @@ class BadHold(ValueError):
 class Condition:
     """What is held: the value of a row related to its target, lengths in mm; in a configuration, 0 the current one.
 
-    relation: "=", "<=" or ">=".
+    relation: "=", "<=" or ">="; name: as it is called in tables, by default the operand of the row.
     """
 
     row: Row
     relation: str = "="
     configuration: int = 0
+    name: str = ""
 
 
 #: The arguments of a row: two whole numbers, four numbers.
@@ -75,7 +76,7 @@ def _condition(lens: Lens, word: str) -> Condition:
     if known.one_sided and relation != "<=":
         raise BadHold(f"`hold`: {word!r}: {name} is the largest that there is; expected {name}<={number}")
     row = Row(known.operand, *arguments, target=_number(number, known.unit, word))
-    return Condition(row, relation, configuration)
+    return Condition(row, relation, configuration, name)
 
 
 def _named(lens: Lens, name: str, word: str) -> tuple[Word, Arguments]:

@@ -33,7 +33,8 @@ class Evaluated:
 
     values: (R,) of all rows, nan for text and rows of unknown operands; lost: (R,) bool. residuals: (m,) whose squares
     sum up to M²; jacobian: (m, n) their derivatives by the variables; of_row: (m,) the row, from 0, of each.
-    sides: of one-sided rows, whose residual is Σ max(0, e), by operand: the rows (K,), e (K,), by the variables (K, n).
+    sides: of one-sided rows, whose residual is Σ max(0, e), by operand: the rows (K,), e (K,), by the variables (K, n),
+    and the surfaces (K,).
     """
 
     values: np.ndarray
@@ -66,6 +67,7 @@ class Evaluation:
         self.groups: list[tuple[Planner, tuple[Line, ...], Evaluate]] = []
         self.planners: list[tuple[int, Planner]] = []
         self.needed: frozenset[int] = frozenset()
+        self.counted: frozenset[int] = frozenset()
         self.skipped = tuple(self._plan(skip_unknown))
         self.units = np.array([unit ** OPERANDS[r.operand].length if r.operand in OPERANDS else 1.0 for r in self.rows])
         weights = np.array([row.weight for row in self.rows])
@@ -98,7 +100,18 @@ class Evaluation:
             self.groups.append((planner, tuple(lines), OPERANDS[name].plan(lines, planner)))
         self.planners = [(configuration, planner) for (configuration, _), planner in planners.items()]
         self.needed = frozenset(row for rows in referred.values() for row in rows)
+        self.counted = self._counted(referred)
         return sorted(skipped)
+
+    def _counted(self, referred: dict[int, Sequence[int]]) -> frozenset[int]:
+        """Rows with a weight, and all that rows of arithmetic among them take values of."""
+        found, left = set(), [number for number, row in enumerate(self.rows, 1) if row.weight != 0]
+        while left:
+            number = left.pop()
+            if number not in found:
+                found.add(number)
+                left += referred.get(number, ())
+        return frozenset(found)
 
     def _lines(self):
         """Rows that have a value, each with the configuration and the primary wavelength that stand above it."""
@@ -139,8 +152,8 @@ class Evaluation:
         if line.row.weight != 0 and not skip_unknown:
             raise UnknownOperand(f"row {line.number} of the merit function: {why}; `skip_unknown` leaves such rows out")
 
-    def __call__(self, variables: np.ndarray, *, derivatives: bool = False) -> Evaluated:
-        """All rows there; derivatives: with the Jacobian."""
+    def __call__(self, variables: np.ndarray, *, derivatives: bool = False, shown: bool = True) -> Evaluated:
+        """All rows there; derivatives: with the Jacobian; shown: also operands of which no row moves the merit."""
         count = len(variables)
         x = Dual(np.asarray(variables, dtype=float), np.eye(count)) if derivatives else np.asarray(variables, float)
         values, residuals, slopes, of_row = np.full(len(self.rows), np.nan), [], [], []
@@ -148,6 +161,8 @@ class Evaluation:
         moments = {configuration: self.model.views[configuration - 1].moment(x) for configuration, _ in self.planners}
         now = {id(planner): Now(planner, moments[configuration], found) for configuration, planner in self.planners}
         for planner, lines, evaluate in self.groups:
+            if not (shown or any(line.number in self.counted for line in lines)):
+                continue
             places = np.array([line.number - 1 for line in lines])
             told = evaluate(now[id(planner)])
             units = self.units[places]
@@ -174,13 +189,13 @@ class Evaluation:
         """One-sided rows of an operand, as `Evaluated.sides` has them; none of rows that are no number."""
         if not told.sides:
             return
-        rows, excess = told.sides
+        rows, excess, surfaces = told.sides
         undefined = np.bincount(rows, np.isnan(value_of(excess)), minlength=len(places)) > 0
         chosen = (self.factors[places] > 0)[rows] & ~undefined[rows]
         if chosen.any():
             scale = (self.factors[places] / units)[rows[chosen]]
             slope = None if count is None else (scale * slope_of(excess, count)[:, chosen]).T
-            yield places[rows[chosen]], scale * value_of(excess)[chosen], slope
+            yield places[rows[chosen]], scale * value_of(excess)[chosen], slope, surfaces[chosen]
 
     def _evaluated(self, values, residuals, slopes, of_row, count: int) -> Evaluated:
         of_row = np.concatenate(of_row) if of_row else np.zeros(0, dtype=int)

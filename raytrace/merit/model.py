@@ -52,11 +52,11 @@ def place_of(surface: Surface, quantity: str, where: str = "") -> Place:
     return known[quantity]
 
 
-def with_numbers_of(lens: Lens, numbers: dict[Address, Tensor]) -> Lens:
-    """The lens with other numbers of its surfaces."""
+def with_numbers_of(lens: Lens, numbers: dict[Address, Tensor], known: dict[Address, Place] | None = None) -> Lens:
+    """The lens with other numbers of its surfaces; known: their places, where they have been looked up before."""
     surfaces = list(lens.surfaces)
     for (surface, quantity), number in numbers.items():
-        place = place_of(surfaces[surface], quantity, f"surface {surface}: ")
+        place = known[surface, quantity] if known else place_of(surfaces[surface], quantity, f"surface {surface}: ")
         surfaces[surface] = with_number(surfaces[surface], place, number)
     return dataclasses.replace(lens, surfaces=tuple(surfaces))
 
@@ -145,6 +145,8 @@ class View:
         self.moved: tuple[Address, ...] = tuple(dict.fromkeys(moved))
         self.lens = _modelled(lens, self.moved)
         self.stored = {at: self.number(at) for at in self.moved}
+        surfaces = self.lens.surfaces
+        self._held = {(k, quantity): place_of(surfaces[k], quantity) for k, quantity in self.moved}
 
     def _is_idle(self, one: Solve, lens: Lens) -> bool:
         """Whether a pickup is of a number that does not vary, and that the lens does not model, for it is 0."""
@@ -259,7 +261,7 @@ class View:
 
     def held(self, numbers: dict[Address, Tensor]) -> Lens:
         """The lens with other numbers."""
-        return with_numbers_of(self.lens, numbers)
+        return with_numbers_of(self.lens, numbers, self._held)
 
     def table_of(self, last: int, lens: Lens, indices: dict[int, Tensor] | None = None):
         """The structure of the surfaces 1 to `last`, and the table (W, K) of their numbers.

@@ -53,7 +53,8 @@ class Found(NamedTuple):
     """What rows come to: values (R,), an array or dual numbers, nan where a ray is lost.
 
     parts: several (R,) or (K, R), whose squares sum up to the square of the value, and which are smooth where it is 0.
-    sides: of rows that are off their target by Σ max(0, e): of which row each e is (K,), and e (K,), also below 0.
+    sides: of rows that are off their target by Σ max(0, e): of which row each e is (K,), e (K,), also below 0, and of
+    which surface each is (K,).
     """
 
     values: object
@@ -74,6 +75,7 @@ class Operand:
     reading: where the field's own program is not settled, which reading is taken.
     takes: what the two integers of its rows are, keys of `arguments.ARGUMENTS`; "" for what is not looked at.
     refers: of an operand of arithmetic, the numbers of the rows that a row takes values of, among all rows.
+    bounds: of an operand that is its target where a boundary is kept, the relation to it: ">=" or "<=".
     """
 
     plan: Callable[[Sequence[Line], "Planner"], Evaluate]
@@ -82,6 +84,7 @@ class Operand:
     reading: str = ""
     takes: tuple[str, str] = ("", "")
     refers: Callable[[Line, Sequence[Row]], Sequence[int]] | None = None
+    bounds: str = ""
 
 
 class Planner:

@@ -7,7 +7,7 @@ one.with_weights(EFFL=1)               of all rows of an operand; with_targets l
 """
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from raytrace.merit.default import BadMerit, Boundaries, boundary_rows, rows_of
@@ -141,6 +141,15 @@ def arguments(row: Row) -> str:
     plain = [] if named or not any(row.integers) else [f"{row.integers[0]} {row.integers[1]}"]
     numbers = [f"{number:.6g}" for number in row.numbers]
     return "  ".join([*named, *plain, *([" ".join(numbers)] if any(row.numbers) else [])])
+
+
+def configurations_of(rows: Iterable[Row], current: int) -> list[int]:
+    """The configuration (from 1) that every row is of; current: that of the rows before the first that says so."""
+    found = []
+    for row in rows:
+        current = row.integers[0] if row.operand == "CONF" else current
+        found.append(current)
+    return found
 
 
 def in_unit(row: Row, before: float, after: float) -> Row:

@@ -11,6 +11,7 @@ from raytrace.maths.value import detached, value
 from raytrace.media.environment import told
 from raytrace.optics.base_ray import base_ray
 from raytrace.optics.f_number import real_working_f_number
+from raytrace.optics.geometry import defects, warn_of_defects
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.remarks import entries, remarks
 from raytrace.optics.trace import media
@@ -83,7 +84,7 @@ class Info(Result):
 
     def document(self) -> dict:
         lens = detached(self.lens)
-        indices = media(lens, lens.wavelengths)
+        indices, found = media(lens, lens.wavelengths), defects(lens)
         return {
             "name": lens.name,
             **{name: number(figure) for (_, name, _), figure in zip(FIRST_ORDER_LINES, _figures(lens), strict=True)},
@@ -117,6 +118,7 @@ class Info(Result):
                 }
                 for k, surface in enumerate(lens.surfaces)
             ],
+            **({"geometry": [one.document() for one in found]} if found else {}),
         }
 
     def __str__(self) -> str:
@@ -184,7 +186,8 @@ class Layout(Result):
 
 
 def info(lens: Lens) -> Info:
-    """First-order data and prescription; what `print(lens)` shows."""
+    """First-order data and prescription; what `print(lens)` shows. Warns Unbuildable of what cannot be made."""
+    warn_of_defects(lens)
     return Info(lens)
 
 
@@ -202,7 +205,8 @@ def layout(
     fields: y, (x, y) or (2, F), in the lens's own kind of field, by default its own; rays: how many of the fan of each,
     in the plane that is shown; view: a key of VIEWS; wavelengths: µm, by default the primary one; rays of several are
     coloured by wavelength; configuration: of `lens.configurations`, from 1, or "all": superimposed, rays coloured by
-    configuration. Raises ValueError for a view or a configuration that there is not.
+    configuration. Warns Unbuildable of what cannot be made. Raises ValueError for a view or a configuration that there
+    is not.
     """
     if view not in VIEWS:
         raise ValueError(f"`view={view}`: expected one of {', '.join(VIEWS)}")
@@ -211,6 +215,8 @@ def layout(
     if configuration not in (None, ALL):
         lens = lens.configuration(configuration)
     chosen = None if wavelengths is None else wavelengths_of(lens, wavelengths)
+    for one in lens.configurations if configuration == ALL else (lens,):
+        warn_of_defects(one)
     every = ALL if configuration == ALL else None
     return Layout(lens, field_points(fields, like=lens), rays, view, chosen, every, fields is not None)
 

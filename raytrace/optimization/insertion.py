@@ -102,6 +102,11 @@ class Insertion:
 
     DONE: ClassVar[str] = "surfaces"
 
+    @property
+    def followed(self) -> int:
+        """Descents that were followed to their end."""
+        return self.begun
+
     def through(self, progress: Callable | None) -> None:
         """The lens itself, then both sides at every place. Raises Stopped and NoProblem."""
         model, space = self.asked.model, self.asked.space

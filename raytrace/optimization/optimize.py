@@ -2,6 +2,7 @@
 
 import dataclasses
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from os import PathLike
 
@@ -15,6 +16,7 @@ from raytrace.merit.model import Model
 from raytrace.merit.readings import Readings, readings_of
 from raytrace.merit.value import Merit, in_unit, merit_for
 from raytrace.merit.vary import Freedom, bounds_of, freedom, name_of
+from raytrace.optics.geometry import warn_of_defects
 from raytrace.optimization.bfgs import Function, lowest
 from raytrace.optimization.checkpoint import BadCheckpoint, Checkpoint, Kept, Log, resumed
 from raytrace.optimization.glass import Choice
@@ -23,9 +25,10 @@ from raytrace.optimization.glass_pool import catalogs_of, pool_of
 from raytrace.optimization.least_squares import Cycle
 from raytrace.optimization.opening import opened
 from raytrace.optimization.paths import Found, best_of_paths
-from raytrace.optimization.problem import Condition, NoProblem, Problem, typical_of
+from raytrace.optimization.problem import Condition, NoProblem, Problem, intent_of, typical_of
+from raytrace.optimization.reached import NotReached, reached, refuse_contradictions
 from raytrace.optimization.result import Optimized
-from raytrace.system.intent import Intent, Row, Vary
+from raytrace.system.intent import Row, Vary
 from raytrace.system.lens import Lens
 
 
@@ -64,11 +67,14 @@ def optimize(
     edge (least); or any function of a lens that gives one number (), to be least, which L-BFGS descends on.
     vary: variables, or words for them, as "curvature thickness:5,6", by default the file's; bounds: of variables, as
     "thickness:2,15"; hold: what is met exactly, as "efl=50 total_track<=80" (`merit.hold`). cycles, seconds: after
-    which it ends; paths: how many ways of damping are tried. skip_unknown: leave rows of unknown operands out;
-    readings: where an operand is open (`Readings`). catalog: names of shipped catalogs, or AGF files, for glasses that
-    vary, by default those of the lens, else SCHOTT (`optimization.glass`). log: a file with a line for every cycle;
-    checkpoint: a file that keeps the best variables, and the glasses; resume: one that they are taken from. Ctrl-C ends
-    with the best lens.
+    which it ends, by default 500 cycles a path; paths: how many ways of damping are tried. skip_unknown: leave rows of
+    unknown operands out; readings: where an operand is open (`Readings`). catalog: names of shipped catalogs, or AGF
+    files, for glasses that vary, by default those of the lens, else SCHOTT (`optimization.glass`). log: a file with a
+    line for every cycle; checkpoint: a file that keeps the best variables, and the glasses; resume: one that they are
+    taken from. Ctrl-C ends with the best lens.
+    Conditions that exclude one another for certain are refused. Conditions and boundaries that are not met at the end
+    are in `Optimized.conditions` with the reason; they are warned of (NotReached), as are surfaces and gaps that cannot
+    be made (Unbuildable).
     Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadCheckpoint.
     """
     prepare()
@@ -87,7 +93,7 @@ def optimize(
         if hold:
             raise NoProblem("`hold` goes with a merit of rows: of a function give `bounds`, or make it a row")
         with _Told(names, log, checkpoint, progress and progress(cycles, "cycle")) as told:
-            return _by_gradient(lens, model, merit, names, start, how, told)
+            return _warned(_by_gradient(lens, model, merit, names, start, how, told))
     function = merit_for(
         lens, merit, rings=rings, arms=arms, reference=reference, frequencies=frequencies, field_weights=field_weights,
         wavelength_weights=wavelength_weights, glass_thickness=glass_thickness, air_thickness=air_thickness, edge=edge,
@@ -95,6 +101,7 @@ def optimize(
     conditions = _conditions(lens, hold, function.unit)
     of_rows = {"unit": function.unit, "skip_unknown": skip_unknown, "readings": readings_of(readings)}
     problem = Problem(model, function.rows, conditions, **of_rows)
+    refuse_contradictions(problem, start, lower=lower, upper=upper)
     begun, before = time.monotonic(), problem.evaluated(model.start)
     until, choice = np.inf if seconds is None else begun + seconds, None
     if not kept.glasses:
@@ -113,8 +120,9 @@ def optimize(
         )
         told.kept.keep(found.state.x, float(np.sqrt(found.state.cost)), found.cycles, now=True)
     done = _result(lens, problem, names, before, found, time.monotonic() - begun)
-    done = dataclasses.replace(done, lens=_with_bounds(done.lens, free.variables, lower, upper))
-    return _with_choice(done, choice)
+    ends = reached(problem, found.state.x, lower=lower, upper=upper)
+    done = dataclasses.replace(done, lens=_with_bounds(done.lens, free.variables, lower, upper), conditions=ends)
+    return _warned(_with_choice(done, choice))
 
 
 class _Told:
@@ -247,6 +255,16 @@ def _optimized(
     )
 
 
+def _warned(found: Optimized) -> Optimized:
+    """The result, with a warning for every condition that is not met, and for what of the lens cannot be made."""
+    for one in found.conditions:
+        if not one.met:
+            warnings.warn(str(one), NotReached, stacklevel=3)
+    for lens in found.lens.configurations:
+        warn_of_defects(lens)
+    return found
+
+
 def _with_choice(found: Optimized, choice: Choice | None) -> Optimized:
     """The result with how its glasses were chosen."""
     if choice is None:
@@ -265,7 +283,7 @@ def _with_intent(lens: Lens, model: Model, rows: tuple[Row, ...], unit: float) -
     """The lens with what it was optimised for, where its file says nothing of it."""
     if lens.intent is not None:
         return lens
-    return dataclasses.replace(lens, intent=Intent(model.variables, model.solves, rows, unit))
+    return dataclasses.replace(lens, intent=intent_of(model, rows, unit))
 
 
 def _with_bounds(lens: Lens, variables: Sequence[Vary], lower: np.ndarray, upper: np.ndarray) -> Lens:

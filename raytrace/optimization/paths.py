@@ -20,6 +20,9 @@ MANNERS = (
     Manner(damping=1e-2, bends=False, keeps=True),
 )
 
+#: Cycles of a path where neither these nor the time are limited: along a narrow valley a merit may fall for ever.
+LIMIT = 500
+
 
 @dataclass(frozen=True)
 class Found:
@@ -44,9 +47,10 @@ def best_of_paths(
     seconds: float | None = None,
     watch: Callable[[Cycle, State], None] | None = None,
 ) -> Found:
-    """Descend from x within the bounds in so many manners; cycles and seconds: of all of them together."""
+    """Descend from x within the bounds in so many manners; cycles and seconds: of all of them together,
+    without either LIMIT each."""
     until = time.monotonic() + (np.inf if seconds is None else seconds)
-    left = 100_000 if cycles is None else cycles
+    left = cycles if cycles is not None else LIMIT * max(1, paths) if seconds is None else 1_000_000
     best, stopped, history, evaluations = None, "", [], 0
     for manner in MANNERS[: max(1, paths)]:
         one = least_squares(

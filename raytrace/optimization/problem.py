@@ -15,7 +15,7 @@ from raytrace.merit.readings import Readings
 from raytrace.optimization.least_squares import State
 from raytrace.optimization.lost import MARGIN, STEEP, Recovery
 from raytrace.optimization.step import Sides
-from raytrace.system.intent import Row
+from raytrace.system.intent import Intent, Row
 from raytrace.system.lens import Lens
 
 #: Signs by which a relation is a limit ≤ 0; equalities have none.
@@ -44,7 +44,7 @@ class Problem:
         self._again = lambda model: Problem(
             model, rows, conditions, unit=unit, skip_unknown=skip_unknown, readings=readings
         )
-        self.model, self.rows, self.unit = model, tuple(rows), unit
+        self.model, self.rows, self.unit, self.conditions = model, tuple(rows), unit, tuple(conditions)
         self.evaluation = Evaluation(
             model, (*rows, *(row for row, _ in held)), unit=unit, skip_unknown=skip_unknown, readings=readings
         )
@@ -66,7 +66,7 @@ class Problem:
 
     def state(self, x: np.ndarray, derivatives: bool) -> State:
         """Residuals of rows of positive weight, and what the others miss, in units of their rows."""
-        found = self._charged(self.evaluated(x, derivatives), x)
+        found = self._charged(self.evaluation(x, derivatives=derivatives, shown=False), x)
         of_row, weights = found.of_row, self.evaluation.weights
         signs, factors = self.signs[of_row], self.evaluation.factors[of_row]
         rows, excess, slopes = _joined(found.sides, len(x))
@@ -116,6 +116,12 @@ class Problem:
         """M over the rows of the merit function alone."""
         own = found.residuals[found.of_row < len(self.rows)]
         return float(np.sqrt(own @ own))
+
+
+def intent_of(model: Model, rows: Sequence[Row], unit: float) -> Intent:
+    """What a lens is optimised for, where its file says nothing of it; all semi-diameters that it has stay given."""
+    given = tuple(k for k, surface in enumerate(model.lens.surfaces) if surface.semi_diameter)
+    return Intent(model.variables, model.solves, tuple(rows), unit, semi_diameters=given)
 
 
 def _held(lens: Lens, rows: Sequence[Row], conditions: Sequence[Condition]) -> Iterator[tuple[Row, int]]:

@@ -7,10 +7,13 @@ import torch
 from torch import Tensor
 
 from raytrace.formats import write_lens
-from raytrace.maths.result import Result, number, plain
+from raytrace.maths.result import Result, cell, number, plain
 from raytrace.maths.value import value
 from raytrace.merit.operands import OPERANDS
+from raytrace.merit.value import configurations_of
+from raytrace.optics.paraxial import first_order
 from raytrace.optimization.glass import GlassStep
+from raytrace.optimization.reached import Reached
 from raytrace.system.intent import Row
 from raytrace.system.lens import Lens
 
@@ -19,7 +22,7 @@ STOPPED = {
     "gradient": "no variable makes the merit any less",
     "step": "no step makes the merit any less",
     "merit": "the merit hardly changes any more",
-    "cycles": "as many cycles as were asked for",
+    "cycles": "the limit on cycles was reached",
     "seconds": "as much time as was asked for",
     "interrupted": "interrupted; this is the best so far",
 }
@@ -33,7 +36,7 @@ class Optimized(Result):
     merit: the rows; names (n,) of the variables, before and after in variables: (n,) in mm; values: (R,) of the rows
     before and after; contributions: (R,) of each to the square of the merit, which add up to 1; history: (cycles, 5)
     merit, how far conditions are missed, step, damping and seconds of every cycle; stopped: a key of STOPPED;
-    glasses: the steps in which glasses that vary were chosen.
+    glasses: the steps in which glasses that vary were chosen; conditions: what was asked for and what was reached.
     """
 
     lens: Lens
@@ -54,6 +57,7 @@ class Optimized(Result):
     seconds: float
     stopped: str
     glasses: tuple[GlassStep, ...] = ()
+    conditions: tuple[Reached, ...] = ()
 
     FIGURE = "plot.optimize.optimize_report"
 
@@ -62,12 +66,26 @@ class Optimized(Result):
         """Rows that have a value, counted from 1."""
         return tuple(i for i, row in enumerate(self.merit, 1) if row.operand in OPERANDS)
 
+    @property
+    def falls_short(self) -> bool:
+        return not all(one.met for one in self.conditions)
+
+    @property
+    def configurations(self) -> tuple[int, ...]:
+        """Of every row, from 1."""
+        return tuple(configurations_of(self.merit, self.before.current_configuration))
+
+    @property
+    def has_configurations(self) -> bool:
+        return bool(self.lens.operands)
+
     def columns(self) -> dict[str, Tensor]:
         kept = [i - 1 for i in self.rows]
         rows = [self.merit[k] for k in kept]
         kinds = self.words()["operand"]
         return {
             "row": torch.tensor(self.rows),
+            "configuration": torch.tensor([self.configurations[k] for k in kept]),
             "operand": torch.tensor([kinds.index(row.name) for row in rows]),
             "target": torch.tensor([row.target for row in rows], dtype=torch.float64),
             "weight": torch.tensor([row.weight for row in rows], dtype=torch.float64),
@@ -94,6 +112,7 @@ class Optimized(Result):
                 "operands": [
                     {
                         "row": i,
+                        **({"configuration": self.configurations[i - 1]} if self.has_configurations else {}),
                         "operand": self.merit[i - 1].name,
                         "target": self.merit[i - 1].target,
                         "weight": self.merit[i - 1].weight,
@@ -103,6 +122,7 @@ class Optimized(Result):
                     for i in self.rows
                 ],
                 **({"glasses": [step.document() for step in self.glasses]} if self.glasses else {}),
+                "conditions": [one.document() for one in self.conditions],
             }
         )
 
@@ -120,17 +140,54 @@ class Optimized(Result):
         if self.glasses:
             lines.append(f"\n  {'glass':<52} {'predicted':>14} {'merit':>14} {'s':>8}")
             lines += [f"  {step}" for step in self.glasses]
+        lines += self._by_configuration()
         left = [i for i in sorted(self.rows, key=lambda i: -float(self.contributions[i - 1])) if self._counts(i)]
         ends = f"{'before':>14} {'after':>14}"
-        lines.append(f"\n  {'row':>5} {'operand':<8} {'target':>12} {'weight':>10} {ends} {'left':>7}")
+        head = f"{'conf.':>5} " if self.has_configurations else ""
+        lines.append(f"\n  {head}{'row':>5} {'operand':<8} {'target':>12} {'weight':>10} {ends} {'left':>7}")
         for i in left[:_SHOWN]:
             row, share = self.merit[i - 1], float(self.contributions[i - 1])
             ends = f"{float(self.values_before[i - 1]):>14.6g} {float(self.values_after[i - 1]):>14.6g}"
-            lines.append(f"  {i:>5} {row.name:<8} {row.target:>12.6g} {row.weight:>10.4g} {ends} {share:>7.1%}")
+            of = f"{self.configurations[i - 1]:>5} " if self.has_configurations else ""
+            lines.append(f"  {of}{i:>5} {row.name:<8} {row.target:>12.6g} {row.weight:>10.4g} {ends} {share:>7.1%}")
         if len(left) > _SHOWN:
             rest = sum(float(self.contributions[i - 1]) for i in left[_SHOWN:])
             lines.append(f"  and {len(left) - _SHOWN} more rows, {rest:.1%}")
-        return "\n".join(lines)
+        table = self.conditions_in_words()
+        return "\n".join([*lines, *(["", *(f"  {line}" for line in table)] if table else [])])
+
+    def _by_configuration(self) -> list[str]:
+        """The focal length of every configuration, and its part in the square of the merit; nothing of one alone."""
+        if not self.has_configurations:
+            return []
+        lines = [f"\n  {'configuration':<18} {'EFL before, mm':>16} {'EFL after, mm':>16} {'left':>7}"]
+        pairs = zip(self.before.configurations, self.lens.configurations, strict=True)
+        for k, pair in enumerate(pairs, 1):
+            lengths = " ".join(cell(float(first_order(one).effective_focal_length), "16.8g") for one in pair)
+            of = zip(self.configurations, self.contributions.tolist(), strict=False)
+            lines.append(f"  {k:<18} {lengths} {sum(part for at, part in of if at == k):>7.1%}")
+        return lines
+
+    def conditions_in_words(self) -> list[str]:
+        """The table of what was asked for and reached; of boundaries that are met as many as fit."""
+        shown = self.shown_conditions()
+        if not shown:
+            return []
+        width = max(24, *(len(one.name) for one in shown))
+        lines = [f"{'condition':<{width}} {'asked':>15} {'reached':>14}"]
+        for one in shown:
+            asked, number = f"{one.relation} {one.asked:.6g}", cell(one.reached, "14.6g")
+            told = ", ".join(filter(None, ["" if one.met else "not met", one.place]))
+            lines.append(f"{one.name:<{width}} {asked:>15} {number:>14}  {told}".rstrip())
+        if len(shown) < len(self.conditions):
+            lines.append(f"and {len(self.conditions) - len(shown)} more boundaries, met")
+        return lines
+
+    def shown_conditions(self) -> list[Reached]:
+        """Those of tables: all but boundaries that are met, of which there are the first few."""
+        chosen = [k for k, one in enumerate(self.conditions) if not one.met or not one.row]
+        met = [k for k, one in enumerate(self.conditions) if one.met and one.row]
+        return [self.conditions[k] for k in sorted(chosen + met[: max(_SHOWN - len(chosen), 0)])]
 
     def _counts(self, i: int) -> bool:
         return self.merit[i - 1].weight != 0

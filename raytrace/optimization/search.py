@@ -27,6 +27,7 @@ from raytrace.optimization.meniscus import places_of
 from raytrace.optimization.minima import Minima, Minimum
 from raytrace.optimization.opening import opened
 from raytrace.optimization.problem import NoProblem, Problem
+from raytrace.optimization.reached import refuse_contradictions
 from raytrace.optimization.searched import Searched, searched
 from raytrace.optimization.stages import FOLLOW, LONG, Stage, descended
 from raytrace.optimization.starts import Space
@@ -100,6 +101,8 @@ def search(
     ends, conditions = bounds_of(free.lens, free.variables, bounds), _conditions(lens, hold, function.unit)
     how = {"unit": function.unit, "skip_unknown": skip_unknown, "readings": readings_of(readings)}
     asked = Asked(free, tuple(function.rows), conditions, ends, glass, air, how)
+    start = np.clip(asked.model.start, asked.space.lower, asked.space.upper)
+    refuse_contradictions(asked.whole, start, lower=asked.space.lower, upper=asked.space.upper)
     until = begun + (np.inf if seconds is None else seconds)
     if insert is None or insert is False:
         run = _Run(asked, Journal(folder, asked.about(seed), until), seed, STARTS if starts is None else starts)
@@ -108,7 +111,9 @@ def search(
         journal = Journal(folder, {**asked.about(seed), "insert": list(places)}, until)
         run = Insertion(asked, journal, places)
     stopped = _stopped(run, progress)
-    found = searched(lens, run.each(), starts=run.begun, stopped=stopped, seconds=time.monotonic() - begun)
+    found = searched(
+        lens, run.each(), starts=run.begun, descents=run.followed, stopped=stopped, seconds=time.monotonic() - begun
+    )
     if folder is not None and not (share and share.rank):
         found.save(folder)
     return found
@@ -159,6 +164,7 @@ class _Run:
     seed: int
     starts: int
     begun: int = 0  # starts
+    followed: int = 0  # descents
     work: float = 0.0  # s
 
     DONE: ClassVar[str] = "starts"
@@ -203,6 +209,7 @@ class _Run:
         ends = self._each(
             [(key, lambda x=x: descended(x, [Stage(self.whole, LONG, FOLLOW, *self._bounds)])) for key, x in tasks]
         )
+        self.followed += len(tasks)
         for (key, _), end in zip(tasks, ends, strict=True):
             if self.minima.add(end, key, self.work) and bar is not None:
                 bar.set_postfix_str(f"{len(self.minima.each)} minima, the best {self.minima.each[0].ended.merit:.6g}")

@@ -17,8 +17,7 @@ from raytrace.maths.value import value
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.spots import spot
 from raytrace.optimization.minima import Minimum
-from raytrace.optimization.problem import NoProblem, Problem
-from raytrace.system.intent import Intent
+from raytrace.optimization.problem import NoProblem, Problem, intent_of
 from raytrace.system.lens import Lens
 
 #: Why a search ends, by what is told of it.
@@ -36,7 +35,9 @@ class Searched(Result):
     """The minima (M,), the best first.
 
     lenses: one each; merit, focal_length in mm, spots (M, F): RMS radius of every field in mm, all wavelengths by their
-    weights; found: how often; after: processor seconds until it was; tasks: what found it. variables: (M, n).
+    weights; found: how many of the descents that were followed to their end; after: processor seconds until the first
+    did; tasks: which one that was. variables: (M, n). starts, descents: how many there were of either: the best starts
+    are followed, and hops from the best minima.
     """
 
     before: Lens
@@ -50,6 +51,7 @@ class Searched(Result):
     found: Tensor
     after: Tensor
     starts: int
+    descents: int
     seconds: float
     stopped: str
 
@@ -68,7 +70,8 @@ class Searched(Result):
         return {**own, "found": self.found, "seconds": self.after, **variables}
 
     def document(self) -> dict:
-        told = {"starts": self.starts, "seconds": round(self.seconds, 3), "stopped": self.stopped}
+        told = {"starts": self.starts, "descents": self.descents, "seconds": round(self.seconds, 3)}
+        told |= {"stopped": self.stopped}
         return {**told, **Result.document(self)}
 
     def __str__(self) -> str:
@@ -76,7 +79,8 @@ class Searched(Result):
         count = f"{len(self.lenses)} minima" if len(self.lenses) > 1 else "1 minimum"
         lines = [
             self.before.name,
-            f"  {count} from {self.starts} starts in {self.seconds:.1f} s; {STOPPED[self.stopped]}\n",
+            f"  {count} from {self.starts} starts in {self.seconds:.1f} s; {STOPPED[self.stopped]}",
+            f"  found: by how many of the {self.descents} descents that were followed to their end\n",
             f"  {'':>7} {'':>12} {'EFL':>10} {'RMS spots':>{width}}\n  {'minimum':>7} {'merit':>12} {'mm':>10} "
             f"{'µm, by field':>{width}} {'found':>6}",
         ]
@@ -108,7 +112,7 @@ class Searched(Result):
 
 
 def searched(
-    lens: Lens, each: Sequence[tuple[Problem, Minimum]], *, starts: int, stopped: str, seconds: float
+    lens: Lens, each: Sequence[tuple[Problem, Minimum]], *, starts: int, descents: int, stopped: str, seconds: float
 ) -> Searched:
     """The result: minima, the best first, each with the problem that it is one of. Raises NoProblem without any."""
     if not each:
@@ -132,6 +136,7 @@ def searched(
         found=torch.tensor([one.found for _, one in kept]),
         after=tensor([one.seconds for _, one in kept]),
         starts=starts,
+        descents=descents,
         seconds=seconds,
         stopped=stopped,
     )
@@ -160,5 +165,5 @@ def _named(lens: Lens, problem: Problem, x: np.ndarray, number: int) -> Lens:
     """The lens there, with its number behind its name, and with what it was searched for."""
     model = problem.model
     found = model.lens_at(x)
-    intent = found.intent or Intent(model.variables, model.solves, problem.rows)
+    intent = found.intent or intent_of(model, problem.rows, problem.unit)
     return replace(found, name=f"{lens.name}, minimum {number}".removeprefix(", "), intent=intent)

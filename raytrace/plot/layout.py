@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from torch import Tensor
 
 from raytrace.maths.pupil import fan, hexapolar
+from raytrace.optics.geometry import edge_radius
 from raytrace.optics.launch import launch, stop_radius
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.trace import media, trace_lens
@@ -269,7 +270,7 @@ def _draw_apertures(axes: Axes, lens: Lens, places: list[outline.Section], radii
                 bars += [(-inner, inner)] if inner > 0 else []
             for low, high in bars:
                 height = centre + np.linspace(low, high, 41)
-                edge = 0.9999 * outline.edge_radius(surface)
+                edge = 0.9999 * edge_radius(surface)
                 depth = outline.depth(surface, np.clip(height, -edge, edge), place.direction)
                 axes.plot(*place.at(depth, height), color="#8c8c8c", linewidth=2.4, solid_capstyle="butt", zorder=1.5)
 
@@ -306,7 +307,7 @@ def _draw_sensor(axes: Axes, lens: Lens, place: outline.Section, radii: list[flo
     surface = lens.surfaces[-1]
     hits = [float(place.height(path.z[-1], path.y[-1])) for field in paths for path in field if path.status == "ok"]
     low, high = min(hits, default=0.0), max(hits, default=0.0)
-    least, edge = 0.05 * max(radii[1:-1]), 0.9999 * outline.edge_radius(surface)
+    least, edge = 0.05 * max(radii[1:-1]), 0.9999 * edge_radius(surface)
     centre = 0.5 * (low + high) if outline.is_bent(lens) else 0.0
     half = min(max(1.06 * max(high - centre, centre - low), least), edge)
     height = centre + np.linspace(-half, half, 81)

@@ -15,25 +15,58 @@ from raytrace.system.lens import Lens
 
 _MOST_FIELDS = 5
 _MOST_BARS = 10
+_MOST_CONFIGURATIONS = 4
 _BEFORE, _AFTER = style.FAINT, style.FIELD_COLOURS[0]
 
 
 @style.styled
 def optimize_report(found: Optimized) -> Figure:
-    """One page: the lens and its spots before and after, the merit by cycle, and the operands that are left."""
-    before, after = style.detached(found.before), style.detached(found.lens)
-    figure = style.new_figure(10.0, 10.2)
-    name = style.fill(after.name, figure.get_figwidth(), 12, bold=True) or "Lens"
+    """One page: the lens and its spots before and after in its configurations, the merit by cycle, the operands that
+    are left, and what conditions and boundaries asked for and reached."""
+    each, conditions = _configurations(found), found.shown_conditions()
+    count, below = len(each), 0.16 * (len(conditions) + 3) if conditions else 0.0
+    heights = [2.8 * count, 4.2 * count, 2.9, *([below] if conditions else [])]
+    figure = style.new_figure(10.0, 0.3 + sum(heights))
+    name = style.fill(found.lens.name, figure.get_figwidth(), 12, bold=True) or "Lens"
     figure.suptitle(name, fontsize=12, fontweight="bold")
-    top, middle, bottom = figure.subfigures(3, 1, height_ratios=(1.0, 1.45, 1.0), hspace=0.02)
-    for axes, lens, when in zip(top.subplots(1, 2), (before, after), ("Before", "After"), strict=True):
-        merit = found.merit_before if when == "Before" else found.merit_after
-        _draw_lens(axes, lens, f"{when}: merit {style.number_text(merit)}")
-    _draw_spots(middle, before, after)
+    top, middle, bottom, *last = figure.subfigures(len(heights), 1, height_ratios=heights, hspace=0.02)
+    for row, (label, before, after) in zip(top.subplots(count, 2, squeeze=False), each, strict=True):
+        for axes, lens, when, merit in (
+            (row[0], before, "Before", found.merit_before),
+            (row[1], after, "After", found.merit_after),
+        ):
+            _draw_lens(axes, lens, f"{when}, {label}" if label else f"{when}: merit {style.number_text(merit)}")
+    _draw_spots(middle, each)
     left, right = bottom.subplots(1, 2, width_ratios=(1.0, 1.0))
     _draw_history(left, found)
     _draw_left(right, found)
+    if conditions:
+        _draw_conditions(last[0].add_subplot(), found)
     return figure
+
+
+def _configurations(found: Optimized) -> list[tuple[str, Lens, Lens]]:
+    """The configurations that are drawn, spread over all: label, before and after; one alone has no label."""
+    pairs = [*zip(found.before.configurations, found.lens.configurations, strict=True)]
+    chosen = np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _MOST_CONFIGURATIONS)).round().astype(int))
+    several = len(pairs) > 1
+    return [
+        (f"configuration {k + 1} of {len(pairs)}" if several else "", *(style.detached(one) for one in pairs[k]))
+        for k in chosen.tolist()
+    ]
+
+
+def _draw_conditions(axes: Axes, found: Optimized) -> None:
+    """The table of what was asked for and what was reached, what is not met in red."""
+    lines, shown = found.conditions_in_words(), found.shown_conditions()
+    axes.axis("off")
+    axes.set_title("Asked and reached", fontweight="bold", loc="left")
+    for k, line in enumerate(lines):
+        missed = 0 < k <= len(shown) and not shown[k - 1].met
+        axes.annotate(
+            line, (0.0, 1.0), (0, -11 * k - 4), xycoords="axes fraction", textcoords="offset points", va="top",
+            fontsize=7.5, family="monospace", color="#b00020" if missed else style.INK,
+        )  # fmt: skip
 
 
 def _draw_lens(axes: Axes, lens: Lens, title: str) -> None:
@@ -53,20 +86,27 @@ def drawn_fields(lens: Lens):
     return points[:, chosen.tolist()]
 
 
-def _draw_spots(page, before: Lens, after: Lens) -> None:
-    """A row of spots before and one after, each on a scale of its own, which its bars tell."""
-    fields = drawn_fields(after)
-    panels = page.subplots(2, fields.shape[1], squeeze=False)
-    wavelengths, airy = style.array(after.wavelengths), float(airy_radius(after))
-    for row, lens, when in zip(panels, (before, after), ("before", "after"), strict=True):
+def _draw_spots(page, each: list[tuple[str, Lens, Lens]]) -> None:
+    """A row of spots before and one after, of every configuration, each on a scale of its own, which its bars tell."""
+    panels = page.subplots(2 * len(each), max(drawn_fields(after).shape[1] for _, _, after in each), squeeze=False)
+    first = each[0][2]
+    wavelengths, airy = style.array(first.wavelengths), float(airy_radius(first))
+    states = [
+        (label, lens, when) for label, *both in each for lens, when in zip(both, ("before", "after"), strict=True)
+    ]
+    for row, (label, lens, when) in zip(panels, states, strict=True):
+        fields, airy_here = drawn_fields(lens), float(airy_radius(lens))
         whole, dots = field_spots(lens, fields=fields)
-        half = panel_size(style.array(whole.geometric_radius), airy)
+        half = panel_size(style.array(whole.geometric_radius), airy_here)
         for f, panel in enumerate(row):
-            draw_spot(panel, whole, dots, f, wavelengths=wavelengths, airy=airy, half=half)
+            if f >= fields.shape[1]:
+                panel.axis("off")
+                continue
+            draw_spot(panel, whole, dots, f, wavelengths=style.array(lens.wavelengths), airy=airy_here, half=half)
             if when == "before":
                 colour = style.field_colours(len(row))[f]
                 panel.set_title(style.field_label(lens, style.array(fields)[:, f]), color=colour, fontsize=8.5)
-        row[0].set_ylabel(f"Spots {when}", fontweight="bold")
+        row[0].set_ylabel(f"Spots {when}" + (f"\n{label}" if label else ""), fontweight="bold")
     page.legend(handles=wavelength_handles(wavelengths, airy), loc="outside lower center", ncols=6, handletextpad=0.3)
 
 

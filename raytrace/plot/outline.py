@@ -13,6 +13,7 @@ from torch import Tensor
 
 from raytrace.maths.pupil import fan
 from raytrace.optics.frames import Frame, frames
+from raytrace.optics.geometry import edge_radius
 from raytrace.optics.launch import launch, stop_radius
 from raytrace.optics.trace import lens_steps, media
 from raytrace.plot.style import array
@@ -97,13 +98,6 @@ def sides(lens: Lens) -> list[int]:
         result.append(side)
         side = -side if surface.is_mirror else side
     return result
-
-
-def edge_radius(surface: Surface) -> float:
-    """Largest radius in mm at which the surface exists: 1/(|c| √(1+k)) for a closed conic, else inf."""
-    curvature = 0.0 if surface.curvature is None else abs(float(surface.curvature))
-    shape = 1.0 if surface.conic is None else 1 + float(surface.conic)
-    return 1 / (curvature * math.sqrt(shape)) if curvature > 0 and shape > 0 else math.inf
 
 
 def depth(surface: Surface, radius: np.ndarray, direction: tuple[float, float] = (0.0, 1.0)) -> np.ndarray:

@@ -39,7 +39,7 @@ def _draw(axes: Axes, found: Searched, k: int) -> None:
     times = int(found.found[k])
     axes.set_title(
         f"{k + 1}: merit {style.number_text(float(found.merit[k]))}\n"
-        f"RMS spots {spots} µm; found {'once' if times == 1 else f'{times} times'}", fontsize=8,
+        f"RMS spots {spots} µm; found by {times} of {found.descents} descents", fontsize=8,
     )  # fmt: skip
 
 
