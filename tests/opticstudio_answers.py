@@ -17,6 +17,7 @@ import torch
 import raytrace as rt
 from raytrace.kernels import diffraction
 from raytrace.maths import pupil, zernike
+from raytrace.formats.zemax_keywords import AIMINGS
 from raytrace.media import glass
 from raytrace.media.catalog import find_glass
 from raytrace.media.environment import Environment
@@ -25,7 +26,7 @@ from raytrace.optics.paraxial import first_order
 from raytrace.optics.scene import Scene, scene
 from raytrace.optics.trace import media, steps, trace_lens
 from raytrace.optics.wavefront import peak_to_valley, rms, wavefront_of
-from raytrace.system.lens import FIELD_UNITS, RAY_AIMING, Fields, Lens, SystemAperture
+from raytrace.system.lens import FIELD_UNITS, Fields, Lens, SystemAperture
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Aperture, Surface
 
@@ -87,7 +88,7 @@ def system(name: str) -> Lens:
         wavelength_weights=tensor([weight for _, weight in waves]),
         primary_wavelength=told["primary"] - 1,
         catalogs=tuple(told.get("catalogs", ())),
-        ray_aiming=list(RAY_AIMING)[told["ray_aiming"]],
+        ray_aiming=AIMINGS[told["ray_aiming"]],
     )
 
 

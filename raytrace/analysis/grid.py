@@ -16,6 +16,7 @@ from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.result import axis, cell, masked
 from raytrace.maths.value import value
 from raytrace.optics.arrivals import chief_points
+from raytrace.optics.filling import warn_of_filling
 from raytrace.optics.launch import is_at_infinity
 from raytrace.system.lens import Lens, with_wavelengths
 
@@ -83,6 +84,7 @@ def distortion_grid(lens: Lens, *, wavelengths: Numbers = None, points: int = 11
     lens = with_wavelengths(unvignetted(lens), primary_wavelength(lens) if wavelengths is None else wavelengths)
     largest = field_range(lens, 2)[:, 1:]
     refuse_axis(largest)
+    warn_of_filling(lens, largest)
     described, _, corner, found = in_object_space(lens, largest)
     half = safe_sqrt((corner * corner).sum() / 2)
     line = half * (2 * torch.arange(points, dtype=half.dtype, device=half.device) + 1 - points) / max(points - 1, 1)

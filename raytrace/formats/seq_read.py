@@ -81,7 +81,7 @@ def read(text: str, file: str, *, catalogs: Sequence[Path] = (), strict: bool = 
         name=_text(title).strip() if title else "",
         notes=tuple(plain_text(record.text) for record in found.own if record.keyword == "NOTE"),
         catalogs=_catalogs(found, surfaces),
-        ray_aiming=_aiming(found),
+        ray_aiming=_aiming(found, report),
     )
     refuse_overflow(lens, file)
     _remarks(system, report)
@@ -314,10 +314,15 @@ def _catalogs(found: Sections, surfaces: Sequence[Surface]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(surface.glass.catalog for surface in surfaces if surface.glass.catalog))
 
 
-def _aiming(found: Sections) -> str:
+def _aiming(found: Sections, report: Draft) -> str:
+    """CODE V aims reference rays at the stop; EPD is the diameter of the real beam on the axis."""
     told = [record for record in found.own if record.keyword == "AIMING"]
     if not told:
-        return "paraxial"
+        report.note(
+            "ray aiming is not specified: real, as CODE V aims at the stop; the stop is as wide as the real marginal ray "
+            "of the axial beam, so that EPD holds on the axis"
+        )
+        return "real"
     word = told[-1].text.strip().lower()
     if word not in RAY_AIMING:
         message = f"{OWN.lower()} aiming is {shown(word)}, expected one of {', '.join(RAY_AIMING)}"

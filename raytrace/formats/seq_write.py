@@ -84,7 +84,7 @@ def _own(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
     return [
         *(f"{own} note {quoted(one_line(note, 'a note', place))}" for note in lens.notes),
         f"{own} catalogs {' '.join(map(word, lens.catalogs))}" if lens.catalogs else f"{own} catalogs",
-        f"{own} aiming {lens.ray_aiming}" if lens.ray_aiming != "paraxial" else "",
+        f"{own} aiming {lens.ray_aiming}" if lens.ray_aiming != "real" else "",
         f"{own} unnamed {' '.join(unnamed)}" if unnamed else "",
     ]
 

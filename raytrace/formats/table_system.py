@@ -72,7 +72,7 @@ def _choice(table: Table, key: str, choices: Sequence[str], expected: str) -> st
 
 
 def ray_aiming(table: Table) -> str:
-    """off, paraxial or real."""
+    """A key of RAY_AIMING."""
     return _choice(table, "ray aiming", [*RAY_AIMING], f"one of {', '.join(RAY_AIMING)}")
 
 
@@ -248,7 +248,7 @@ def written(lens: Lens, place: Place, catalogs: Sequence[Path] = ()) -> list[tup
         ("wavelength weights", listed(lens.wavelength_weights, "weight")),
         ("primary wavelength", str(lens.primary_wavelength + 1)),
         ("catalogs", " ".join(map(word, catalogs_needed(lens, catalogs, place.file)))),
-        ("ray aiming", "" if lens.ray_aiming == "off" else lens.ray_aiming),
+        ("ray aiming", "" if lens.ray_aiming == "auto" else lens.ray_aiming),
         *written_environment(lens.environment, place).items(),
     ]
     return [(key, value) for key, value in lines if value]

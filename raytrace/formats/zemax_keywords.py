@@ -111,6 +111,9 @@ FIELD_LISTS = {
     },
 }
 
+#: Ray aiming by the second number of RAIM; a file without RAIM specifies none.
+AIMINGS = ("off", "paraxial", "real")
+
 #: OpticStudio cuts a long note into pieces of this many characters.
 NOTE_PIECE = 200
 

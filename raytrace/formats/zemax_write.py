@@ -8,7 +8,7 @@ from raytrace.formats import zemax_environment, zemax_intent_write, zemax_merit
 from raytrace.formats.media import catalogs_needed, is_code, is_left_out, listed_name
 from raytrace.formats.source import LensFileError, Place
 from raytrace.formats.spelling import exact, exact_list, one_line, thickness
-from raytrace.formats.zemax_keywords import FIELD_KINDS, FIELD_LISTS, NOTE_PIECE, SYSTEM_APERTURES
+from raytrace.formats.zemax_keywords import AIMINGS, FIELD_KINDS, FIELD_LISTS, NOTE_PIECE, SYSTEM_APERTURES
 from raytrace.formats.zemax_numbers import INVERSE, SurfaceType, numbers_of, spelled_inverse
 from raytrace.formats.zemax_operands_write import operand_lines, with_pickups
 from raytrace.formats.zemax_sags import stands_in_parameters
@@ -16,10 +16,10 @@ from raytrace.formats.zemax_types import type_of, types
 from raytrace.formats.zemax_units import in_unit
 from raytrace.media.glass import Glass, mil_glass
 from raytrace.system.aperture import SHAPES, Aperture
-from raytrace.system.lens import RAY_AIMING, Lens
+from raytrace.system.lens import Lens
 from raytrace.system.pose import Pose
 from raytrace.system.shapes import EVEN, KINDS
-from raytrace.system.surface import Surface
+from raytrace.system.surface import Surface, is_posed
 
 #: OpticStudio has this many wavelengths.
 _WAVELENGTHS = 24
@@ -79,7 +79,7 @@ def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
         zemax_environment.line(lens, place),
         "GFAC 0 0",
         f"GCAT {' '.join(catalogs_needed(lens, catalogs, place.file))}".rstrip(),
-        f"RAIM 0 {list(RAY_AIMING).index(lens.ray_aiming)} 1 1 0 0 0 0 0",
+        *_ray_aiming(lens),
         "PUSH 0 0 0 0 0 0",
         zemax_intent_write.margin(lens.intent),
         f"FTYP {kind} {int(fields.telecentric)} {len(fields.x)} {len(lens.wavelengths)} 0 0 0",
@@ -92,6 +92,13 @@ def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
         *(f"WAVM {slot} {wavelength} {weight}" for slot, (wavelength, weight) in enumerate(waves, 1)),
         f"PWAV {lens.primary_wavelength + 1}",
     ]
+
+
+def _ray_aiming(lens: Lens) -> list[str]:
+    """RAIM; none of a lens that specifies no ray aiming, unless a surface up to the stop is posed: it is aimed then."""
+    front = lens.surfaces[: lens.stop + 1]
+    aiming = "real" if lens.ray_aiming == "auto" and any(map(is_posed, front)) else lens.ray_aiming
+    return [] if aiming == "auto" else [f"RAIM 0 {AIMINGS.index(aiming)} 1 1 0 0 0 0 0"]
 
 
 def _check_floating_stop(lens: Lens, place: Place) -> None:

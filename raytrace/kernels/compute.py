@@ -21,6 +21,7 @@ from raytrace.maths.grid import Grid
 from raytrace.maths.grid import grid as make_grid
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
+from raytrace.optics.filling import warn_of_filling
 from raytrace.optics.losses import beam_hint, losses, warn_of_losses
 from raytrace.optics.reuse import Memo
 from raytrace.optics.scene import Scene, scene, trace_scene
@@ -93,6 +94,7 @@ def psf(
     wavelengths = like if wavelengths is None else _row(wavelengths, like)
     weights = torch.ones_like(wavelengths) if weights is None else _row(weights, like)
     _check_batch(fields, distances, wavelengths, weights)
+    warn_of_filling(with_object_distance(lens, distances.min()), fields)
     options = {"rho": rho, "zernike": zernike}
     drive = _driver(lens, model, options, tol, rays, order, share, max_bytes, progress)
     if share is not None and share.processes > 1:

@@ -207,7 +207,8 @@ def _near(lens: Lens, wavelength: Tensor) -> _Near:
     X, D, to_stop = (torch.movedim(part, (0, 1), (-2, -1)) for part in (X, D, to_stop))
     A, B = to_stop[..., :2], to_stop[..., 2:]
     Q, H_inverse = _polar(A)
-    vergence = 1 / (distance * _length(torch.stack([*(aim / distance), torch.ones_like(aim[0])]), 0))
+    # Not 1/(distance · length), whose derivative by the length is 0 · inf for an object at infinity.
+    vergence = (1 / distance) / _length(torch.stack([*(aim / distance), torch.ones_like(aim[0])]), 0)
     position, direction, last, *ways = (part[:, 0] for part in (position, direction, last, *ways))
     return _Near(
         A, B, X, D, _inverse(A) @ B, Q, H_inverse, aim, begun, position, direction, valid[0],

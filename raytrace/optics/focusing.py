@@ -19,6 +19,7 @@ from raytrace.optics.focus import (
     mean_rms_radius,
     paraxial_sensor,
 )
+from raytrace.optics.filling import warn_of_filling
 from raytrace.optics.losses import LostRays, warn_of_losses
 from raytrace.optics.paraxial import first_order
 from raytrace.system.lens import (
@@ -164,6 +165,7 @@ def focus(
     fields = field_points(fields, like=lens)
     primary = lens.wavelengths[lens.primary_wavelength][None]
     wavelengths = primary if wavelengths is None else wavelengths_of(lens, wavelengths)
+    warn_of_filling(with_object_distance(lens, distances.min()), fields)
     like = lens.surfaces[-2].thickness
     at, weights = pupil.sampled(sampling, rings=rings, points=points, seed=seed, dtype=like.dtype, device=like.device)
     paraxial = paraxial_sensor(lens, distances)

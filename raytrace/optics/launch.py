@@ -15,7 +15,7 @@ from torch import Tensor
 from raytrace.maths.numerics import broadcast_shape, dot, dot_2, safe_divide, safe_sqrt, unit
 from raytrace.maths.pupil import gauss_rings
 from raytrace.optics.aiming import aim_at_image, aim_at_stop, at_stop
-from raytrace.optics.axis import is_bent
+from raytrace.optics.axis import aiming_of, is_bent
 from raytrace.optics.base_ray import Entrance, entrance_of
 from raytrace.optics.paraxial import FirstOrder, first_order
 from raytrace.optics.vignetting import vignette
@@ -170,7 +170,7 @@ def _part_of_field(lens: Lens, field: Tensor, fraction: float) -> Tensor:
 
 
 def _is_aimed(lens: Lens) -> bool:
-    return lens.ray_aiming != "off" and not lens.fields.telecentric
+    return aiming_of(lens) != "off" and not lens.fields.telecentric
 
 
 def _entrance(lens: Lens) -> Entrance | None:
@@ -185,8 +185,8 @@ def _turned(matrix: Tensor, points: Tensor) -> Tensor:
 
 
 def with_ray_aiming(lens: Lens, ray_aiming: str | None) -> Lens:
-    """The lens with another kind of ray aiming, a key of RAY_AIMING; its own where that is None or "file"."""
-    if ray_aiming in (None, "file", lens.ray_aiming):
+    """The lens with another kind of ray aiming, a key of RAY_AIMING; its own where that is None."""
+    if ray_aiming in (None, lens.ray_aiming):
         return lens
     if ray_aiming not in RAY_AIMING:
         raise ValueError(f"ray aiming {ray_aiming!r}: expected one of {', '.join(RAY_AIMING)}")
@@ -200,6 +200,16 @@ def stop_radius(lens: Lens) -> Tensor:
     the primary wavelength. Where the axis bends it counts from the base ray.
     """
     return _stop_radius(lens, first_order(lens), _entrance(lens))
+
+
+def points_of_stop(lens: Lens, pupil: Tensor) -> Tensor:
+    """The points (2, ...) mm of the stop at which aimed rays through pupil points (2, ...) arrive; the lens is aimed.
+
+    Warns MarginalRayLost.
+    """
+    paraxial, entrance = first_order(lens), _entrance(lens)
+    target = pupil if entrance is None else _turned(entrance.turn, pupil)
+    return _aimed_radius(lens, paraxial, entrance) * target
 
 
 def _stop_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> Tensor:
@@ -217,7 +227,7 @@ def _aimed_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -
 
     Where the axis bends an `Entrance` tells what an inverted image of the stop turns, and the sign is +.
     """
-    by_real_ray = lens.ray_aiming == "real" and lens.aperture.kind != "float_by_stop"
+    by_real_ray = aiming_of(lens) == "real" and lens.aperture.kind != "float_by_stop"
     if by_real_ray and not bool(_marginal_height(lens, paraxial, entrance)[1].all()):
         message = "the real marginal ray does not reach the stop; rays are aimed over the radius of the paraxial one"
         warnings.warn(message, MarginalRayLost, stacklevel=4)

@@ -11,6 +11,7 @@ from raytrace.maths.value import detached, value
 from raytrace.media.environment import told
 from raytrace.optics.base_ray import base_ray
 from raytrace.optics.f_number import real_working_f_number
+from raytrace.optics.filling import warn_of_filling
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.remarks import entries, remarks
 from raytrace.optics.trace import media
@@ -184,7 +185,8 @@ class Layout(Result):
 
 
 def info(lens: Lens) -> Info:
-    """First-order data and prescription; what `print(lens)` shows."""
+    """First-order data and prescription; what `print(lens)` shows. Warns UnfilledStop."""
+    warn_of_filling(lens, field_points(None, like=lens))
     return Info(lens)
 
 
@@ -202,7 +204,7 @@ def layout(
     fields: y, (x, y) or (2, F), in the lens's own kind of field, by default its own; rays: how many of the fan of each,
     in the plane that is shown; view: a key of VIEWS; wavelengths: µm, by default the primary one; rays of several are
     coloured by wavelength; configuration: of `lens.configurations`, from 1, or "all": superimposed, rays coloured by
-    configuration. Raises ValueError for a view or a configuration that there is not.
+    configuration. Warns UnfilledStop. Raises ValueError for a view or a configuration that there is not.
     """
     if view not in VIEWS:
         raise ValueError(f"`view={view}`: expected one of {', '.join(VIEWS)}")
@@ -212,13 +214,15 @@ def layout(
         lens = lens.configuration(configuration)
     chosen = None if wavelengths is None else wavelengths_of(lens, wavelengths)
     every = ALL if configuration == ALL else None
-    return Layout(lens, field_points(fields, like=lens), rays, view, chosen, every, fields is not None)
+    points = field_points(fields, like=lens)
+    warn_of_filling(lens, points)
+    return Layout(lens, points, rays, view, chosen, every, fields is not None)
 
 
 def text(lens: Lens) -> str:
     """What `print(lens)` shows: the lens as `info` tells it, or its bare numbers where it cannot be traced."""
     try:
-        return str(info(lens))
+        return str(Info(lens))
     except (ValueError, RuntimeError):
         return repr(lens)
 

@@ -15,6 +15,7 @@ from raytrace.merit.model import Model
 from raytrace.merit.readings import Readings, readings_of
 from raytrace.merit.value import Merit, in_unit, merit_for
 from raytrace.merit.vary import Freedom, bounds_of, freedom, name_of
+from raytrace.optics.filling import warn_of_filling
 from raytrace.optimization.bfgs import Function, lowest
 from raytrace.optimization.checkpoint import BadCheckpoint, Checkpoint, Kept, Log, resumed
 from raytrace.optimization.glass import Choice
@@ -26,7 +27,7 @@ from raytrace.optimization.paths import Found, best_of_paths
 from raytrace.optimization.problem import Condition, NoProblem, Problem, typical_of
 from raytrace.optimization.result import Optimized
 from raytrace.system.intent import Intent, Row, Vary
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, field_points
 
 
 def optimize(
@@ -72,6 +73,7 @@ def optimize(
     Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadCheckpoint.
     """
     prepare()
+    warn_of_filling(lens, field_points(None, like=lens))
     free, glasses = without_glass(_freedom(lens, vary), vary)
     names = tuple(name_of(one) for one in free.variables)
     model = Model(free.lens, free.variables, free.solves)

@@ -31,7 +31,7 @@ def lens(
     object_distance: float = math.inf,
     name: str = "",
     catalogs: Sequence[str] = (),
-    ray_aiming: str = "off",
+    ray_aiming: str = "auto",
     **aperture: float,
 ) -> Lens:
     """A lens from rows of plain numbers, surface 1 to the last before the sensor; object and image are added.

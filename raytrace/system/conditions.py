@@ -12,8 +12,9 @@ FIELD_UNITS = {
     "real_image_height": "mm",
 }
 
-#: How rays find the stop, in the order of OpticStudio's numbers 0, 1, 2.
+#: How rays find the stop. "auto" is that of a lens, or of a file, that specifies none.
 RAY_AIMING = {
+    "auto": "real where the axis bends in front of the stop, or the stop is off it; else off",
     "off": "through points of the paraxial entrance pupil",
     "paraxial": "to points of the stop, whose radius is that of the paraxial marginal ray",
     "real": "to points of the stop, whose radius is that of the real marginal ray",

@@ -58,7 +58,7 @@ class Lens:
     name: str = ""
     notes: tuple[str, ...] = ()
     catalogs: tuple[str, ...] = ()
-    ray_aiming: str = "off"
+    ray_aiming: str = "auto"
     environment: Environment | None = None
     operands: tuple[Operand, ...] = ()
     current_configuration: int = 1

@@ -37,6 +37,7 @@ from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to
 from raytrace.maths.zernike import noll
 from raytrace.media.glass import index
+from raytrace.optics.filling import warn_of_filling
 from raytrace.optics.launch import rays_of_field
 from raytrace.optics.scene import Scene, scene, symmetry, trace_scene
 from raytrace.optics.sequence import sequence_of
@@ -157,6 +158,7 @@ def hybrid_psf(
     distances, colours = (
         torch.as_tensor(t).to(like) for t in (distances, like if wavelengths is None else wavelengths)
     )
+    warn_of_filling(lens, fields)
     view = scene(lens, fields, distances, colours)
     with torch.no_grad():
         chief = trace_scene(view, fields.new_zeros(2, 1)).position[:2, ..., 0].expand(2, *view.shape)
