@@ -141,7 +141,7 @@ def reference(surfaces, p, d, n=1.0):
 def surfaces_of(document: dict) -> list[dict]:
     """What `reference` takes, out of `raytrace info --json` (for lenses without apertures or mirrors)."""
     rows = document["surfaces"][1:]
-    primary = document["primary_wavelength"]
+    primary = document["primary_wavelength"] - 1
     return [
         {
             "c": s["curvature"],
@@ -407,7 +407,7 @@ def test_info_of_the_double_gauss(run):
         assert document[name] == pytest.approx(expected, abs=1e-9)
     assert document["entrance_pupil_diameter"] == 33.33
     assert document["wavelengths"] == [0.53]
-    assert document["primary_wavelength"] == 0
+    assert document["primary_wavelength"] == 1
     assert [(f["x"], f["y"]) for f in document["fields"]] == [(0, 0), (0, 10), (0, 14)]
     assert document["stop_surface"] == 6
     surfaces = document["surfaces"]
@@ -450,7 +450,7 @@ def test_conditions_other_than_the_files(run):
     assert far["entrance_pupil_diameter"] == 20
     several = run("info", "double_gauss", "--json", "--wavelength", 0.6, 0.5).document
     assert several["wavelengths"] == [0.6, 0.5]
-    assert several["primary_wavelength"] == 0
+    assert several["primary_wavelength"] == 1
     assert all(len(s["indices"]) == 2 for s in several["surfaces"])
 
 
@@ -651,7 +651,7 @@ def test_wavelength_column(run):
     run("trace", "double_gauss", "--rays", "in.csv", "-o", "out.csv")
     rows = read_rows(Path("out.csv"))
     for ray in (0, 1):
-        surfaces = surfaces_of({**document, "primary_wavelength": ray})
+        surfaces = surfaces_of({**document, "primary_wavelength": ray + 1})
         own = [{**row, "ray": 0} for row in rows if row["ray"] == str(ray)]
         assert_rows(own, surfaces, [(0, 9, -5, 0, 0, 1)], 1e-11)
 

@@ -55,9 +55,11 @@ def test_a_shipped_lens_is_known_by_its_name(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("rows", [ROWS, pd.DataFrame(ROWS)], ids=["rows", "frame"])
 def test_a_lens_is_made_from_plain_numbers(rows):
-    lens = rt.lens(rows, stop=1, f_number=5, fields=[0, (1, 2)], wavelengths=[0.4861, 0.5876, 0.6563])
+    lens = rt.lens(
+        rows, stop=1, f_number=5, fields=[0, (1, 2)], wavelengths=[0.4861, 0.5876, 0.6563], primary_wavelength=2
+    )
     assert len(lens.surfaces) == 5
-    assert lens.primary_wavelength == 1
+    assert lens.primary_wavelength == 2
     assert lens.fields.kind == "angle"
     assert lens.fields.x.tolist() == [0, 1]
     assert lens.fields.y.tolist() == [0, 2]

@@ -74,7 +74,7 @@ def objective(field=None):
         aperture=("image_f_number", 2.7),
         field=field or fields("real_image_height", (0.0, 4.5)),
         wavelengths=WAVELENGTHS,
-        primary_wavelength=1,
+        primary_wavelength=2,
         ray_aiming="paraxial",
     )
 

@@ -513,7 +513,7 @@ def test_commands_are_joined_parted_cut_short_and_commented():
     )
     assert lens.name == "a; b ! c & d"
     assert lens.wavelengths.tolist() == [0.4861, 0.5876]
-    assert (lens.primary_wavelength, lens.fields.y.tolist(), lens.stop) == (1, [0.0, 5.0], 1)
+    assert (lens.primary_wavelength, lens.fields.y.tolist(), lens.stop) == (2, [0.0, 5.0], 1)
     assert float(lens.aperture.value) == 100.0
     assert float(lens.surfaces[1].curvature) == 0.1 / 10
     assert float(lens.surfaces[2].curvature) == 1 / -50

@@ -218,7 +218,7 @@ def test_fields_and_wavelengths_of_the_header():
     colours = SYSTEM.replace("0.5876", "486.1 587.6 656.3 nm\n# primary wavelength: 2\n# weights: 1 2 1")
     found = lens(system=colours)
     assert found.wavelengths.tolist() == [0.4861, 0.5876, 0.6563]
-    assert (found.primary_wavelength, found.wavelength_weights.tolist()) == (1, [1.0, 2.0, 1.0])
+    assert (found.primary_wavelength, found.wavelength_weights.tolist()) == (2, [1.0, 2.0, 1.0])
 
 
 def test_units_of_the_header():

@@ -67,7 +67,7 @@ def test_only_the_slots_that_ftyp_counts_are_wavelengths_and_pwav_counts_from_on
     found = lens()
     assert found.wavelengths.tolist() == [0.4861327, 0.5875618]
     assert found.wavelength_weights.tolist() == [1.0, 0.5]
-    assert found.primary_wavelength == 1
+    assert found.primary_wavelength == 2
 
 
 def test_older_lists_of_wavelengths_and_fields():

@@ -197,7 +197,7 @@ def lateral_colour(
 
 def _lateral_colour(lens: Lens, fields: Tensor) -> LateralColour:
     height, valid = _height(unvignetted(lens), fields, fields)
-    primary = slice(lens.primary_wavelength, lens.primary_wavelength + 1)
+    primary = slice(lens.primary_wavelength - 1, lens.primary_wavelength)
     valid = valid & valid[:, primary]
     return LateralColour(lens, fields, torch.where(valid, height - height[:, primary], 0.0), valid)
 
@@ -225,7 +225,7 @@ def _height(lens: Lens, fields: Tensor, along: Tensor, *, each_axis: bool = Fals
         way = chief_points(lens, close, lens.wavelengths)[0] - axis
         side = torch.where(dot_2(way, meridian[:, :, None]).detach() < 0, -1.0, 1.0)
         length = side * safe_sqrt(dot_2(way, way))
-        axis = axis if each_axis else axis[..., lens.primary_wavelength, None]
+        axis = axis if each_axis else axis[..., lens.primary_wavelength - 1, None]
         return safe_divide(dot_2(points - axis, way), length), valid
     return dot_2(points, _meridian(along)[:, :, None]), valid
 

@@ -229,7 +229,7 @@ def side_by_side(lens: Lens, object_distances: Tensor, *, pixels: Grid | None = 
         psfs=tuple(_psf(lens, m, object_distances=object_distances, grid=pixels, **m.compared) for m in _ROWS),
         object_distances=object_distances,
         sensor_distance=lens.surfaces[-2].thickness,
-        wavelength=lens.wavelengths[lens.primary_wavelength],
+        wavelength=lens.primary,
         models=tuple(model.title for model in _ROWS),
     )
 
@@ -282,7 +282,7 @@ def _about_light(lens: Lens, fields: Tensor, pixels: Grid, model: Model) -> Grid
 
 def _most_curved(lens: Lens) -> int:
     """Number of the most curved surface that bends light: the image may be curved, and so may dummies."""
-    indices = media(lens, lens.wavelengths[lens.primary_wavelength])
+    indices = media(lens, lens.primary)
     strength = {
         k: abs(float(surface.curvature))
         for k, surface in enumerate(lens.surfaces[:-1])

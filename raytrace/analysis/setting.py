@@ -64,7 +64,7 @@ def setting(
 
 def primary_wavelength(lens: Lens) -> Tensor:
     """() µm."""
-    return lens.wavelengths[lens.primary_wavelength]
+    return lens.primary
 
 
 def scene_of(lens: Lens, fields: Tensor) -> Scene:

@@ -113,7 +113,7 @@ class Camera(nn.Module):
         """The pixels around the chief ray: they follow it with its derivatives, for where a picture lies is no loss."""
         if bool((fields == 0).all()):
             return self.pixels
-        primary = lens.wavelengths[lens.primary_wavelength][None]
+        primary = lens.primary[None]
         rays = trace_scene(scene(lens, fields, distances, primary, self._memo), fields.new_zeros(2, 1))
         chief = rays.position[:2, ..., 0, 0].expand(2, len(distances), fields.shape[1])
         return dataclasses.replace(self.pixels, centre=self.pixels.centre[:, None, None] + chief)

@@ -1,7 +1,16 @@
 """`raytrace compare`."""
 
 from raytrace.cli.options import (
-    aperture, lens, log, object_distance, plot, positive, positive_finite, ray_aiming, size, wavelength,
+    aperture,
+    lens,
+    log,
+    object_distance,
+    plot,
+    positive,
+    positive_finite,
+    ray_aiming,
+    size,
+    wavelength,
 )
 
 SUMMARY = "the PSF models side by side"

@@ -65,7 +65,7 @@ def read(text: str, file: str, *, catalogs: Sequence[Path] = (), strict: bool = 
         fields=_fields(found, surfaces[0], unit, report),
         wavelengths=wavelengths,
         wavelength_weights=weights,
-        primary_wavelength=0,
+        primary_wavelength=1,
         name=title,
         notes=notes,
     )

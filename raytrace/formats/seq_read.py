@@ -68,7 +68,7 @@ def read(text: str, file: str, *, catalogs: Sequence[Path] = (), strict: bool = 
     surfaces = _surfaces(found, unit, shelf, report)
     solve = system.last("PIM")
     if solve and not (solve.words and solve.words[0][:1] in "Nn"):
-        surfaces = _at_paraxial_image(surfaces, wavelengths[primary], solve.place, report)
+        surfaces = _at_paraxial_image(surfaces, wavelengths[primary - 1], solve.place, report)
     title = system.last("TIT")
     lens = Lens(
         surfaces=_focused(surfaces),
@@ -238,7 +238,7 @@ def _wavelengths(system: Block) -> tuple[Tensor, Tensor, int]:
     primary = reference.integer(0, "number of the reference wavelength") if reference else 1
     if not 1 <= primary <= len(waves):
         raise LensFileError(f"REF is {primary}, expected 1 to {len(waves)}, the number of wavelengths", reference.place)
-    return double(waves), double(weights), primary - 1
+    return double(waves), double(weights), primary
 
 
 def _fields(system: Block, unit: float, report: Draft) -> Fields:
@@ -319,8 +319,8 @@ def _aiming(found: Sections, report: Draft) -> str:
     told = [record for record in found.own if record.keyword == "AIMING"]
     if not told:
         report.note(
-            "ray aiming is not specified: real, as CODE V aims at the stop; the stop is as wide as the real marginal ray "
-            "of the axial beam, so that EPD holds on the axis"
+            "ray aiming is not specified: real, as CODE V aims at the stop, which is as wide as the real marginal ray "
+            "of the axial beam: EPD holds on the axis"
         )
         return "real"
     word = told[-1].text.strip().lower()

@@ -62,7 +62,7 @@ def _system(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
         _aperture(lens.aperture, lens.surfaces[0], place),
         "DIM M",
         _listed("WL", waves),
-        f"REF {lens.primary_wavelength + 1}",
+        f"REF {lens.primary_wavelength}",
         _listed("WTW", _weights(lens.wavelength_weights, "weight of a wavelength", place)),
         _listed(x, exact_list(fields.x, "field", place)),
         _listed(y, exact_list(fields.y, "field", place)),
@@ -181,7 +181,7 @@ def _surface(
 
 
 def _reference(lens: Lens) -> float:
-    return float(lens.wavelengths[lens.primary_wavelength])
+    return float(lens.primary)
 
 
 def _medium(lens: Lens, number: int) -> Glass:

@@ -180,7 +180,7 @@ def _per_field(table: Table, key: str, count: int, default: float) -> list[float
 
 
 def wavelengths(table: Table) -> tuple[Tensor, Tensor, int]:
-    """Wavelengths in µm, weights, 0-based primary; the d line, with a warning, if there are none."""
+    """Wavelengths in µm, weights, number of the primary one; the d line, with a warning, if there are none."""
     found, report = [LINES["d"]], table.report
     if "wavelengths" in table.metadata:
         found = _wavelengths(*table.metadata["wavelengths"])
@@ -196,7 +196,7 @@ def wavelengths(table: Table) -> tuple[Tensor, Tensor, int]:
         raise LensFileError(f"primary wavelength is {value}, expected a number from 1 to {len(found)}", place)
     if "primary wavelength" not in table.metadata and len(found) > 1:
         report.note("no primary wavelength in the header: the first is taken")
-    return double(found), double(weights), primary - 1
+    return double(found), double(weights), primary
 
 
 def _wavelengths(value: str, place: Place) -> list[float]:
@@ -246,7 +246,7 @@ def written(lens: Lens, place: Place, catalogs: Sequence[Path] = ()) -> list[tup
         ("telecentric", "yes" if fields.telecentric else ""),
         ("wavelengths", listed(lens.wavelengths, "wavelength")),
         ("wavelength weights", listed(lens.wavelength_weights, "weight")),
-        ("primary wavelength", str(lens.primary_wavelength + 1)),
+        ("primary wavelength", str(lens.primary_wavelength)),
         ("catalogs", " ".join(map(word, catalogs_needed(lens, catalogs, place.file)))),
         ("ray aiming", "" if lens.ray_aiming == "auto" else lens.ray_aiming),
         *written_environment(lens.environment, place).items(),

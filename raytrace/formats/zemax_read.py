@@ -270,16 +270,16 @@ def _guessed_count(system: Block, slots: dict[int, Record], report: Draft) -> in
 
 
 def _primary(system: Block, count: int, report: Draft) -> int:
-    """The 0-based position of the primary wavelength."""
+    """The number of the primary wavelength, from 1."""
     record = system.last("PWAV")
     if record is None:
         if count > 1:
             report.warn("no PWAV: the first wavelength is taken as the primary one", system.place)
-        return 0
+        return 1
     primary = record.integer(0, "primary wavelength")
     if not 1 <= primary <= count:
         raise LensFileError(f"PWAV is {primary}, expected 1 to {count}, the number of wavelengths", record.place)
-    return primary - 1
+    return primary
 
 
 def _notes(system: Block) -> tuple[str, ...]:

@@ -90,7 +90,7 @@ def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
             for row, numbers in zip(FIELD_LISTS.values(), (fields.x, fields.y, fields.weight, *vignetting), strict=True)
         ),
         *(f"WAVM {slot} {wavelength} {weight}" for slot, (wavelength, weight) in enumerate(waves, 1)),
-        f"PWAV {lens.primary_wavelength + 1}",
+        f"PWAV {lens.primary_wavelength}",
     ]
 
 

@@ -80,7 +80,7 @@ def psf(
     progress: (how many, unit) -> a bar of them, see `cli.progress`.
     empty: what a PSF of a batch is that no ray reaches: "nan", its kernel 0 and its moments nan, all with gradient 0,
     or "error". Raises ValueError for arguments that make no sense, EmptyPsf if no ray at all reaches the sensor. Warns
-    NotConverged.
+    NotConverged and, outside of loops (without `order` and `memo`), UnfilledStop.
     """
     center = center or ("chief" if fields is None else "axis")
     _check(model, center, normalise, tol=tol, rays=rays, order=order, grid=grid, pixel=pixel, size=size)
@@ -94,7 +94,8 @@ def psf(
     wavelengths = like if wavelengths is None else _row(wavelengths, like)
     weights = torch.ones_like(wavelengths) if weights is None else _row(weights, like)
     _check_batch(fields, distances, wavelengths, weights)
-    warn_of_filling(with_object_distance(lens, distances.min()), fields)
+    if order is None and memo is None:
+        warn_of_filling(with_object_distance(lens, distances.min()), fields)
     options = {"rho": rho, "zernike": zernike}
     drive = _driver(lens, model, options, tol, rays, order, share, max_bytes, progress)
     if share is not None and share.processes > 1:
@@ -246,7 +247,7 @@ def _centre(batch: Scene, lens: Lens, center: str, weights: Tensor) -> Tensor | 
         if center == "centroid":
             pixel = make_grid(batch.wavelengths.new_tensor(1.0), 1)
             return polychromatic(gaussian.kernels_alone(batch, pixel, order=6), weights, "").centroid
-        primary = lens.wavelengths[lens.primary_wavelength][None]
+        primary = lens.primary[None]
         rays = trace_scene(dataclasses.replace(batch, wavelengths=primary), batch.fields.new_zeros(2, 1))
         return rays.position[:2, :, :, 0, 0]
 

@@ -183,7 +183,7 @@ class Bundle:
     def _marginal(self) -> "Bundle":
         """The axial ray through the edge of the paraxial entrance pupil, on the stop."""
         found = Bundle(self.view, self.view.lens.stop)
-        found.ask(self.view.lens.primary_wavelength, (0.0, 0.0), (0.0, 1.0 / self._opening))
+        found.ask(self.view.lens.primary_wavelength - 1, (0.0, 0.0), (0.0, 1.0 / self._opening))
         return found
 
     # -- at a moment ---------------------------------------------------------------------------------------------------

@@ -156,7 +156,7 @@ class Moment:
 
     @property
     def primary(self) -> int:
-        return self.lens.primary_wavelength
+        return self.lens.primary_wavelength - 1
 
     def _found(self, wavelength: int) -> Gaussian:
         n, stop, last = self.index(wavelength), self.lens.stop, len(self.lens.surfaces) - 2

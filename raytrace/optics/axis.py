@@ -1,4 +1,4 @@
-"""Axis: whether light along it stays on it, from the object to the image, in a straight line; and ray aiming by that."""
+"""Axis: whether light along it stays on it, from the object to the image, in a straight line; ray aiming by that."""
 
 from collections.abc import Sequence
 from itertools import islice
@@ -57,7 +57,7 @@ def _bends(lens: Lens, surfaces: Sequence[Surface]) -> bool:
 
 @torch.no_grad()
 def _leaves_the_axis(lens: Lens, count: int) -> bool:
-    wavelength = lens.wavelengths[lens.primary_wavelength]
+    wavelength = lens.primary
     axis = lens.surfaces[-2].thickness.new_tensor([0.0, 0.0, 1.0])
     rays = Rays(0 * axis, axis, axis[2] > 0)
     off = [0 * axis[:2]]

@@ -88,7 +88,7 @@ def base_ray(lens: Lens, wavelength: Tensor | None = None) -> BaseRay:
     `first_order` has the straightened figures, as OpticStudio prints them; the two agree in a lens with an axis.
     First derivatives by every number of the lens are exact; second ones lack the third derivatives of the trace.
     """
-    wavelength = lens.wavelengths[lens.primary_wavelength] if wavelength is None else wavelength
+    wavelength = lens.primary if wavelength is None else wavelength
     near = _near(lens, wavelength)
     one, kappa = torch.eye(2, dtype=near.X.dtype, device=near.X.device), near.vergence[..., None, None]
     parallel = near.behind(one, 0 * one)
@@ -129,7 +129,7 @@ def _magnification(near: "_Near", image: Tensor) -> Tensor:
 
 def entrance_of(lens: Lens) -> Entrance:
     """Where rays of the primary wavelength go in that fill the stop of a bent lens."""
-    near = _near(lens, lens.wavelengths[lens.primary_wavelength])
+    near = _near(lens, lens.primary)
     kappa = near.vergence
     first, second = torch.diagonal(near.E, dim1=-2, dim2=-1).unbind(-1)
     # The plane halfway between the images of the stop in both sections, if those are one; else that of the vertex.
@@ -314,7 +314,7 @@ def _stop_radius(lens: Lens, H_inverse: Tensor, of_turn: Tensor) -> Tensor:
         return lens.aperture.value + 0 * batch
     straight = first_order(lens)
     if lens.aperture.kind in ("object_na", "object_cone_angle"):
-        found = torch.tan(cone_angle(lens, media(lens, lens.wavelengths[lens.primary_wavelength])[0]))
+        found = torch.tan(cone_angle(lens, media(lens, lens.primary)[0]))
         found = found * _length(of_turn, -1)
     else:
         found = _over(0.5 * straight.entrance_pupil_diameter, _length(H_inverse)[..., 0])

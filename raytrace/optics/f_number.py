@@ -21,7 +21,7 @@ def real_working_f_number(lens: Lens) -> Tensor:
     if is_bent(lens):
         return _between_rims(lens)
     rim = lens.wavelengths.new_tensor([[0.0], [1.0]])
-    wavelength = lens.wavelengths[lens.primary_wavelength][None]
+    wavelength = lens.primary[None]
     rays = image_rays(lens, rim, fields=torch.zeros_like(rim), wavelengths=wavelength)
     n_image = media(lens, wavelength)[-2]
     L, M, _ = rays.direction[:, 0, 0, 0]
@@ -45,7 +45,7 @@ def axial_f_number(lens: Lens) -> Tensor:
 
 def _between_rims(lens: Lens) -> Tensor:
     rims = lens.wavelengths.new_tensor([[0.0, 0.0], [1.0, -1.0]])
-    wavelength = lens.wavelengths[lens.primary_wavelength][None]
+    wavelength = lens.primary[None]
     rays = image_rays(lens, rims, fields=torch.zeros_like(rims[:, :1]), wavelengths=wavelength)
     step = rays.direction[:, 0, 0, 0] - rays.direction[:, 0, 0, 1]
     found = 1 / (media(lens, wavelength)[-2][0] * torch.linalg.vector_norm(step))

@@ -23,7 +23,7 @@ TOLERANCE = 0.02
 
 
 class UnfilledStop(UserWarning):
-    """The beam of a field misses the stop by more than TOLERANCE; the message has the field, by how much, and a remedy."""
+    """The beam of a field misses the stop by more than TOLERANCE; the message has figures and a remedy."""
 
 
 @value
@@ -46,7 +46,7 @@ def filling(lens: Lens, fields: Tensor) -> Filling:
     Five rays a field are traced to the stop. The stop is as wide as the real marginal ray of the axial beam makes it.
     """
     lens, fields = detached(lens), fields.detach()
-    wavelength = lens.wavelengths[lens.primary_wavelength]
+    wavelength = lens.primary
     five = fields.new_tensor([[0.0, 0.0, 0.0, -1.0, 1.0], [0.0, -1.0, 1.0, 0.0, 0.0]])
     pupil = vignette(lens, fields[:, :, None], five)
     aimed = with_ray_aiming(lens, "real")
@@ -74,18 +74,19 @@ def warn_of_filling(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None
         return
     at = int(worst.argmax())
     named = f"{name_of_field(fields[:, at])} {FIELD_UNITS[lens.fields.kind]}"
-    many = f" ({int((worst > TOLERANCE).sum())} of {len(worst)} fields miss it)" if len(worst) > 1 else ""
+    many = f" ({int((worst > TOLERANCE).sum())} of {len(worst)} fields by more than {TOLERANCE:.0%})"
     warnings.warn(
-        f"field {named}: the stop is not filled evenly: {_words('chief ray', found.chief[at], 'centre')}, "
-        f"{_words('marginal rays', found.marginal[at], 'rim')}, of its semi-diameter of {float(found.radius):.4g} mm"
-        f"{many}; `ray_aiming=real` fills it, in Python lens.at(ray_aiming='real')",
+        f"field {named}: rays miss the stop, whose semi-diameter is {float(found.radius):.4g} mm: the chief ray "
+        f"{_words(found.chief[at], 'centre')}, marginal rays {_words(found.marginal[at], 'rim')}"
+        f"{many if len(worst) > 1 else ''}; `ray_aiming=real` aims them, in Python lens.at(ray_aiming='real')",
         UnfilledStop,
         stacklevel=3,
     )
 
 
-def _words(rays: str, missed: Tensor, place: str) -> str:
-    return f"{rays} {100 * float(missed):.3g} % off its {place}" if bool(missed.isfinite()) else f"{rays} miss it"
+def _words(missed: Tensor, place: str) -> str:
+    """How far from its place of the stop a ray passes, of the semi-diameter."""
+    return f"by {100 * float(missed):.3g} % of it from the {place}" if bool(missed.isfinite()) else "altogether"
 
 
 def _is_being_optimised(lens: Lens) -> bool:

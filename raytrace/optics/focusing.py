@@ -11,6 +11,7 @@ from raytrace.formats import write_lens
 from raytrace.maths import pupil
 from raytrace.maths.result import Result, number, numbers
 from raytrace.maths.value import value
+from raytrace.optics.filling import warn_of_filling
 from raytrace.optics.focus import (
     focus_of_mean_radius,
     focus_of_rms,
@@ -19,7 +20,6 @@ from raytrace.optics.focus import (
     mean_rms_radius,
     paraxial_sensor,
 )
-from raytrace.optics.filling import warn_of_filling
 from raytrace.optics.losses import LostRays, warn_of_losses
 from raytrace.optics.paraxial import first_order
 from raytrace.system.lens import (
@@ -163,7 +163,7 @@ def focus(
         raise ValueError(f"criterion {criterion!r}: expected one of rms, paraxial, mean")
     distances = vector(lens.surfaces[0].thickness if object_distances is None else object_distances, like=lens)
     fields = field_points(fields, like=lens)
-    primary = lens.wavelengths[lens.primary_wavelength][None]
+    primary = lens.primary[None]
     wavelengths = primary if wavelengths is None else wavelengths_of(lens, wavelengths)
     warn_of_filling(with_object_distance(lens, distances.min()), fields)
     like = lens.surfaces[-2].thickness

@@ -156,7 +156,7 @@ def paraxial_field(lens: Lens, field: Tensor, paraxial: FirstOrder) -> Tensor:
         if at_infinity:
             raise ValueError("fields are object heights but the object is at infinity: give angles, or a distance")
         return field
-    index = index_behind(lens, 0, lens.wavelengths[lens.primary_wavelength])
+    index = index_behind(lens, 0, lens.primary)
     scale = paraxial.power / index if at_infinity else 1 / paraxial.magnification
     return _scaled(field, scale)
 
@@ -237,7 +237,7 @@ def _aimed_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -
 
 def _marginal_height(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> tuple[Tensor, Tensor]:
     """Height in mm at the stop of the real axial ray through the edge of the entrance pupil, and whether it arrives."""
-    wavelength = lens.wavelengths[lens.primary_wavelength]
+    wavelength = lens.primary
     edge = lens.wavelengths.new_tensor([0.0, 1.0]).to(paraxial.entrance_pupil_diameter.dtype)
     index = index_behind(lens, 0, wavelength).to(edge.dtype)
     rays = _through_entrance_pupil(lens, torch.zeros_like(edge), edge, paraxial, index, entrance)
@@ -305,7 +305,7 @@ def _telecentric_radius(lens: Lens, paraxial: FirstOrder, index: Tensor) -> Tens
 
 def _field_of_real_height(lens, height: Tensor, estimate: Tensor, paraxial: FirstOrder) -> tuple[Tensor, Tensor]:
     """The field (2, ...) whose real chief ray meets the image at `height` (2, ...) mm, and whether there is one."""
-    wavelength = lens.wavelengths[lens.primary_wavelength]
+    wavelength = lens.primary
     index = index_behind(lens, 0, wavelength).to(height.dtype)
 
     entrance = _entrance(lens)

@@ -108,7 +108,7 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
 
     A quantity that does not exist (the focal length of an afocal lens, say) comes out infinite.
     """
-    wavelength = lens.wavelengths[lens.primary_wavelength] if wavelength is None else wavelength
+    wavelength = lens.primary if wavelength is None else wavelength
     surfaces = lens.surfaces[1:-1]
     n = signed(surfaces, media(lens, wavelength)[:-1])
     n_object, n_image = n[0], n[-1]
@@ -177,7 +177,7 @@ def largest_field(lens: Lens) -> Tensor:
 
 def marginal_ray(lens: Lens) -> tuple[Tensor, Tensor]:
     """(y, ω) in mm and 1 of the marginal ray in front of surface 1, at the primary wavelength."""
-    wavelength = lens.wavelengths[lens.primary_wavelength]
+    wavelength = lens.primary
     n_object = media(lens, wavelength)[0]
     data = first_order(lens)
     vergence = n_object / object_distance_of(lens)
@@ -187,7 +187,7 @@ def marginal_ray(lens: Lens) -> tuple[Tensor, Tensor]:
 
 def paraxial_image_distance(lens: Lens, object_distance: Tensor, wavelength: Tensor | None = None) -> Tensor:
     """Paraxial image distance (...) mm from the last surface before the image; object_distance: (...) mm or inf."""
-    wavelength = lens.wavelengths[lens.primary_wavelength] if wavelength is None else wavelength
+    wavelength = lens.primary if wavelength is None else wavelength
     surfaces = lens.surfaces[1:-1]
     n = signed(surfaces, media(lens, wavelength)[:-1])
     A, B, C, D = system_matrix(surfaces, n, wavelength)

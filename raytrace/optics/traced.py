@@ -165,7 +165,7 @@ def trace(
 
 
 def _chosen(lens: Lens, wavelengths: Tensor | Sequence[float] | None) -> Tensor:
-    primary = lens.wavelengths[lens.primary_wavelength][None]
+    primary = lens.primary[None]
     return primary if wavelengths is None else wavelengths_of(lens, wavelengths)
 
 

@@ -9,6 +9,8 @@ from torch import Tensor
 from raytrace.maths.result import Result, number, numbers
 from raytrace.maths.value import detached, value
 from raytrace.media.environment import told
+from raytrace.media.glass import label
+from raytrace.optics.axis import aiming_of
 from raytrace.optics.base_ray import base_ray
 from raytrace.optics.f_number import real_working_f_number
 from raytrace.optics.filling import warn_of_filling
@@ -78,7 +80,7 @@ class Info(Result):
         lens = detached(self.lens)
         surfaces = lens.surfaces
         return {
-            "glass": [s.glass.name for s in surfaces],
+            "glass": [label(s.glass) for s in surfaces],
             "note": [_remarks(lens, k) for k in range(len(surfaces))],
         }
 
@@ -92,6 +94,8 @@ class Info(Result):
             "wavelengths": numbers(lens.wavelengths),
             "wavelength_weights": numbers(lens.wavelength_weights),
             "primary_wavelength": lens.primary_wavelength,
+            "ray_aiming": lens.ray_aiming,
+            "rays_aimed": aiming_of(lens),
             "field_type": lens.fields.kind,
             "field_unit": FIELD_UNITS[lens.fields.kind],
             "fields": [
@@ -110,7 +114,7 @@ class Info(Result):
                     "coefficients": [] if surface.coefficients is None else numbers(surface.coefficients),
                     **entries(surface),
                     "thickness": number(surface.thickness),
-                    "glass": surface.glass.name or None,
+                    "glass": label(surface.glass) or None,
                     "indices": numbers(indices[k].expand_as(lens.wavelengths)),
                     "semi_diameter": number(surface.semi_diameter),
                     "comment": surface.comment,
@@ -129,11 +133,13 @@ class Info(Result):
         points = ", ".join(f"({x:g}, {y:g})" for x, y in field_points(None, like=lens).T.tolist())
         several, which = len(lens.wavelengths) > 1, _configuration(lens)
         shown = [
-            f"{w:g}" + ("*" if i == lens.primary_wavelength and several else "")
+            f"{w:g}" + ("*" if i == lens.primary_wavelength - 1 and several else "")
             for i, w in enumerate(lens.wavelengths.tolist())
         ]
         lines += [
-            f"  {'wavelengths':<24} {', '.join(shown)} µm" + ("  (* primary)" if several else ""),
+            f"  {'wavelengths':<24} {', '.join(shown)} µm"
+            + (f"  (* primary: number {lens.primary_wavelength})" if several else ""),
+            f"  {'ray aiming':<24} {_aiming(lens)}",
             *([f"  {'configuration':<24} {' of '.join(map(str, which.values()))}"] if which else []),
             f"  {'fields':<24} {points} {FIELD_UNITS[lens.fields.kind]}, {lens.fields.kind.replace('_', ' ')}",
             *([f"  {'environment':<24} {told(lens.environment)}"] if lens.environment else []),
@@ -144,7 +150,7 @@ class Info(Result):
             size = surface.semi_diameter
             lines.append(
                 f"  {k:>7} {_radius_in_words(surface):>13} {float(surface.thickness):>12.7g} "
-                f"{surface.glass.name:<12} {index:>9.6f} {'' if size is None else f'{size:.5g}':>10}  "
+                f"{label(surface.glass):<12} {index:>9.6f} {'' if size is None else f'{size:.5g}':>10}  "
                 f"{_remarks(lens, k)}".rstrip()
             )
         return "\n".join(lines)
@@ -233,6 +239,11 @@ def _configuration(lens: Lens) -> dict[str, int]:
     return {"configuration": lens.current_configuration, "configurations": several} if several > 1 else {}
 
 
+def _aiming(lens: Lens) -> str:
+    """The ray aiming of a lens, and what "auto" comes to."""
+    return lens.ray_aiming if lens.ray_aiming != "auto" else f"auto: {aiming_of(lens)}"
+
+
 def _radius(surface) -> float:
     """mm, of the vertex where the surface has no curvature of its own; inf of a plane."""
     curvature = float(vertex_curvature(surface)) if surface.curvature is None else float(surface.curvature)
@@ -254,7 +265,7 @@ def _environment(holder: Lens | Surface) -> dict:
 
 
 def _indices(lens: Lens) -> list[float]:
-    return [float(index) for index in media(lens, lens.wavelengths[lens.primary_wavelength])]
+    return [float(index) for index in media(lens, lens.primary)]
 
 
 def _quantity(value: float) -> str:

@@ -151,7 +151,7 @@ def _ends(model: Model, one: Vary, length: float | None, glass: Range, air: Rang
 
 def _glasses(model: Model) -> Sequence[int]:
     view = model.views[0]
-    return [k for k, n in enumerate(view.indices[model.lens.primary_wavelength]) if abs(n) > 1.01]
+    return [k for k, n in enumerate(view.indices[model.lens.primary_wavelength - 1]) if abs(n) > 1.01]
 
 
 def _pupil_radius(model: Model, length: float) -> float:

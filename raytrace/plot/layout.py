@@ -35,7 +35,7 @@ def layout(found: Layout) -> Figure:
     system is drawn as it stands. Raises ValueError for a lens with an infinite thickness inside.
     """
     lens, fields = style.detached(found.lens), found.fields.detach()
-    wavelengths = lens.wavelengths[lens.primary_wavelength][None] if found.wavelengths is None else found.wavelengths
+    wavelengths = lens.primary[None] if found.wavelengths is None else found.wavelengths
     if found.configuration == ALL:
         return _superimposed(found, lens.configurations, fields, wavelengths.detach())
     if found.view == "3d":
@@ -123,7 +123,7 @@ def draw_layout(
     view: str = "yz",
 ) -> None:
     """Draw the cross section into axes, equal in both directions, without ticks; wavelengths: (W,) µm, or primary."""
-    wavelengths = lens.wavelengths[lens.primary_wavelength][None] if wavelengths is None else wavelengths
+    wavelengths = lens.primary[None] if wavelengths is None else wavelengths
     _framed(axes, [_drawn(axes, lens, fields=fields, wavelengths=wavelengths, rays=rays, view=view)])
 
 

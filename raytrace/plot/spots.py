@@ -28,7 +28,7 @@ _DOT_RINGS = 12  # 469 dots of a wavelength
 
 def airy_radius(lens: Lens) -> Tensor:
     """Radius in mm of the first dark ring, 1.22 λ N: λ the primary wavelength, N the paraxial working F/#."""
-    return 1.22e-3 * lens.wavelengths[lens.primary_wavelength] * axial_f_number(lens)
+    return 1.22e-3 * lens.primary * axial_f_number(lens)
 
 
 def field_spots(
