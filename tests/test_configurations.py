@@ -111,7 +111,11 @@ CASES = {
     "aperture": (two("APMX", 1, "5", "3"), {"surface": "CLAP 1 5 0"}, ("CLAP 1 5", "CLAP 1 3")),
     "hole": (two("APMN", 1, "1", "2"), {"surface": "CLAP 1 5 0"}, ("CLAP 1 5", "CLAP 2 5")),
     "decentre": (two("APDY", 1, "0.5", "1"), {"surface": "CLAP 0 5 0\nOBDC 0 0.5"}, ("OBDC 0 0.5", "OBDC 0 1")),
-    "before": (two("CBTX", 1, "0", "3"), {"surface": "SCBD 1 0 0 0 0 0 0 0", "PWAV": RAIM}, ("1 0 0 0 0 0 0 0", "1 0 0 0 0 3 0 0")),
+    "before": (
+        two("CBTX", 1, "0", "3"),
+        {"surface": "SCBD 1 0 0 0 0 0 0 0", "PWAV": RAIM},
+        ("1 0 0 0 0 0 0 0", "1 0 0 0 0 3 0 0"),
+    ),
     "comment": (two("MCOM", 1, '"a"', '"b"'), {"surface": "COMM a"}, ("COMM a", "COMM b")),
     "field": (two("YFIE", 2, "7", "3.5"), {}, ("YFLN 0 7", "YFLN 0 3.5")),
     "field x": (two("XFIE", 2, "0", "2"), {}, ("XFLN 0 0", "XFLN 0 2")),

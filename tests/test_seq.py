@@ -645,7 +645,10 @@ def test_what_a_sequence_cannot_hold_is_refused(changes, message, tmp_path):
 
 def test_apertures_of_a_lens_that_a_sequence_cannot_hold_are_refused():
     lens = read_lens("double_gauss")
-    for aperture in (SystemAperture("float_by_stop", number(9.0)), SystemAperture("working_f_number", number(3.0))):
+    for aperture in (
+        SystemAperture("float_by_stop", number(9.0)),
+        SystemAperture("paraxial_working_f_number", number(3.0)),
+    ):
         with pytest.raises(LensFileError, match="set `entrance_pupil_diameter`"):
             again(dataclasses.replace(lens, aperture=aperture))
     with pytest.raises(LensFileError, match="a temperature or pressure"):

@@ -196,7 +196,7 @@ def test_object_by_row_or_header():
         ("F/3", "image_f_number", 3.0),
         ("f/# 2.8", "image_f_number", 2.8),
         ("F-number 2.8", "image_f_number", 2.8),
-        ("working F/4", "working_f_number", 4.0),
+        ("working F/4", "paraxial_working_f_number", 4.0),
         ("NA 0.1", "object_na", 0.1),
         ("cone angle 5", "object_cone_angle", 5.0),
         ("stop 10.2", "float_by_stop", 10.2),

@@ -144,7 +144,7 @@ def _pitch(lens: Lens, field: float, distance: float) -> float:
     with torch.no_grad():
         light = gaussian_kernels(place.scene, grid(1.0, 1), order=8)
         width = 7 * float(light.covariance[::2].max().sqrt())
-        number = float(first_order(with_object_distance(lens, distance)).working_f_number)
+        number = float(first_order(with_object_distance(lens, distance)).paraxial_working_f_number)
         airy = 8e-3 * float(lens.primary) * number
     pitch = max(width, airy if math.isfinite(airy) else 0.0, 1e-6) / PIXELS
     decade = 10.0 ** math.floor(math.log10(pitch))

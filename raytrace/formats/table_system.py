@@ -37,7 +37,7 @@ from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, RAY_AIMING, Fields
 
 #: Short names of the system aperture, longest first, as patterns.
 _APERTURES = (
-    (r"working\s+f[\s/#-]*(?:number|num|no\.?)?", "working_f_number"),
+    (r"(?:paraxial\s+)?working\s+f[\s/#-]*(?:number|num|no\.?)?", "paraxial_working_f_number"),
     (r"(?:image\s+)?f[\s/#-]*(?:number|num|no\.?)?", "image_f_number"),
     (r"epd|enpd|entrance pupil", "entrance_pupil_diameter"),
     (r"na|object na", "object_na"),

@@ -82,7 +82,7 @@ TYPE_NAMES = dict(name.split(" ", 1) for name in _TYPES.split(", "))
 SYSTEM_APERTURES = {
     "entrance_pupil_diameter": ("ENPD", None),
     "image_f_number": ("FNUM", 0),
-    "working_f_number": ("FNUM", 1),
+    "paraxial_working_f_number": ("FNUM", 1),
     "object_na": ("OBNA", 0),
     "object_cone_angle": ("OBNA", 1),
     "float_by_stop": ("FLOA", None),

@@ -45,7 +45,7 @@ class BaseRay:
         closest to it.
     entrance_pupil_position: from the plane of the vertex of surface 1 to the image of the stop in object space.
     exit_pupil_position: from the image surface to that in image space; diameters > 0.
-    working_f_number: 1/(2 n′ |u′|) of rays from the axial object point through the rim of the stop.
+    paraxial_working_f_number: 1/(2 n′ |u′|) of rays from the axial object point through the rim of the stop.
     magnification: of the image of each section, 0 for an object at infinity; its sign as that of the focal length.
     A quantity that does not exist (the focal length of an afocal lens, say) comes out infinite.
     """
@@ -61,7 +61,7 @@ class BaseRay:
     exit_pupil_position: Tensor
     exit_pupil_diameter: Tensor
     image_distance: Tensor
-    working_f_number: Tensor
+    paraxial_working_f_number: Tensor
     magnification: Tensor
 
 
@@ -111,7 +111,7 @@ def base_ray(lens: Lens, wavelength: Tensor | None = None) -> BaseRay:
         exit_pupil_position=_first(exit_pupil),
         exit_pupil_diameter=_first(2 * _length(across)),
         image_distance=_first(image + near.last[..., None]),
-        working_f_number=_first(_over(0.5, near.index[..., None] * _length(rim[1]))),
+        paraxial_working_f_number=_first(_over(0.5, near.index[..., None] * _length(rim[1]))),
         magnification=_first(_magnification(near, image)),
     )
 

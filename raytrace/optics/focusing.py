@@ -90,6 +90,9 @@ class Focus(Result):
     def words(self) -> dict:
         return {"place": [words for words, _ in self._places()]}
 
+    def units(self) -> dict[str, str]:
+        return {"sensor_distance": "mm", "rms_radius": "mm"}
+
     def document(self) -> dict:
         alone = len(self.object_distances) == 1
         before = self.before.surfaces[-2].thickness

@@ -65,6 +65,11 @@ class Spots(Result):
             **{name: getattr(self.each, name) for name in names},
         }  # fmt: skip
 
+    def units(self) -> dict[str, str]:
+        field = FIELD_UNITS[self.lens.fields.kind]
+        lengths = ("centroid_x", "centroid_y", "rms_radius", "geometric_radius")
+        return {"field_x": field, "field_y": field, "wavelength": "µm", **dict.fromkeys(lengths, "mm")}
+
     def document(self) -> dict:
         places = [(f, w) for f in range(self.fields.shape[1]) for w in range(len(self.lens.wavelengths))]
         unit = {"field_type": self.lens.fields.kind, "field_unit": FIELD_UNITS[self.lens.fields.kind]}

@@ -12,7 +12,7 @@ from raytrace.media.environment import told
 from raytrace.media.glass import label
 from raytrace.optics.axis import aiming_of
 from raytrace.optics.base_ray import base_ray
-from raytrace.optics.f_number import real_working_f_number
+from raytrace.optics.f_number import working_f_number
 from raytrace.optics.filling import warn_of_filling
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.remarks import entries, remarks
@@ -21,14 +21,14 @@ from raytrace.system.configurations import count
 from raytrace.system.lens import FIELD_UNITS, Lens, field_points, name_of_field, wavelengths_of
 from raytrace.system.surface import Surface, is_posed, is_round, vertex_curvature
 
-#: Lines of `raytrace info`: words, entry of FirstOrder (and the real working F/#), unit.
+#: Lines of `raytrace info`: words, entry of FirstOrder (and the working F/# of real light), unit.
 FIRST_ORDER_LINES = (
     ("effective focal length", "effective_focal_length", "mm"),
     ("back focal distance", "back_focal_distance", "mm, from the last surface before the image"),
     ("front focal distance", "front_focal_distance", "mm, from surface 1"),
     ("F/#", "f_number", "focal length / entrance pupil diameter"),
-    ("working F/#", "working_f_number", "1/(2 n' u')"),
-    ("real working F/#", "real_working_f_number", "1/(2 n' sin θ') of the real marginal ray"),
+    ("paraxial working F/#", "paraxial_working_f_number", "1/(2 n' u')"),
+    ("working F/#", "working_f_number", "1/(2 n' sin θ') of the real marginal ray"),
     ("entrance pupil position", "entrance_pupil_position", "mm, from surface 1"),
     ("entrance pupil diameter", "entrance_pupil_diameter", "mm"),
     ("exit pupil position", "exit_pupil_position", "mm, from the image"),
@@ -51,7 +51,7 @@ BASE_RAY_LINES = (
     ("exit pupil position", "exit_pupil_position", "mm along the base ray, from the image"),
     ("exit pupil diameter", "exit_pupil_diameter", "mm"),
     ("image distance", "image_distance", "mm along the base ray, from the last surface that is no break"),
-    ("working F/#", "working_f_number", "1/(2 n' u')"),
+    ("paraxial working F/#", "paraxial_working_f_number", "1/(2 n' u')"),
     ("magnification", "magnification", ""),
 )
 
@@ -277,7 +277,7 @@ def _quantity(value: float) -> str:
 
 def _figures(lens: Lens) -> list[float]:
     """The numbers of FIRST_ORDER_LINES; nan or infinite where a quantity does not exist."""
-    data, real = first_order(lens), real_working_f_number(lens)
+    data, real = first_order(lens), working_f_number(lens)
     return [float(getattr(data, name, real)) for _, name, _ in FIRST_ORDER_LINES]
 
 

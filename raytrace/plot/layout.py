@@ -127,6 +127,15 @@ def draw_layout(
     _framed(axes, [_drawn(axes, lens, fields=fields, wavelengths=wavelengths, rays=rays, view=view)])
 
 
+def on_one_scale(panels: Sequence[Axes]) -> None:
+    """Give cross sections in axes of one size the same scale: each stays in the middle of what it shows."""
+    limits = [(panel.get_xlim(), panel.get_ylim()) for panel in panels]
+    width, height = (max(abs(one[k][1] - one[k][0]) for one in limits) for k in (0, 1))
+    for panel, ((left, right), (low, high)) in zip(panels, limits, strict=True):
+        panel.set_xlim(0.5 * (left + right - width), 0.5 * (left + right + width))
+        panel.set_ylim(0.5 * (low + high - height), 0.5 * (low + high + height))
+
+
 class _Drawn(NamedTuple):
     """What a cross section takes: the places of its surfaces, whether it is bent, its extent in z and in height, mm."""
 

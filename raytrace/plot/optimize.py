@@ -9,8 +9,8 @@ from matplotlib.ticker import MaxNLocator
 from raytrace.optics.paraxial import first_order
 from raytrace.optimization.result import STOPPED, Optimized
 from raytrace.plot import style
-from raytrace.plot.layout import draw_layout
-from raytrace.plot.spots import airy_radius, draw_spot, field_spots, panel_size, wavelength_handles
+from raytrace.plot.layout import draw_layout, on_one_scale
+from raytrace.plot.spots import airy_radius, draw_spot_to_scale, field_spots, panel_size, wavelength_handles
 from raytrace.system.lens import Lens
 
 _MOST_FIELDS = 5
@@ -20,15 +20,18 @@ _BEFORE, _AFTER = style.FAINT, style.FIELD_COLOURS[0]
 
 @style.styled
 def optimize_report(found: Optimized) -> Figure:
-    """One page: the lens and its spots before and after, the merit by cycle, and the operands that are left."""
+    """One page: the lens and its spots before and after, each on one scale, the merit by cycle, and the operands that
+    are left."""
     before, after = style.detached(found.before), style.detached(found.lens)
     figure = style.new_figure(10.0, 10.2)
     name = style.fill(after.name, figure.get_figwidth(), 12, bold=True) or "Lens"
     figure.suptitle(name, fontsize=12, fontweight="bold")
     top, middle, bottom = figure.subfigures(3, 1, height_ratios=(1.0, 1.45, 1.0), hspace=0.02)
-    for axes, lens, when in zip(top.subplots(1, 2), (before, after), ("Before", "After"), strict=True):
+    layouts = top.subplots(1, 2)
+    for axes, lens, when in zip(layouts, (before, after), ("Before", "After"), strict=True):
         merit = found.merit_before if when == "Before" else found.merit_after
         _draw_lens(axes, lens, f"{when}: merit {style.number_text(merit)}")
+    on_one_scale(layouts)
     _draw_spots(middle, before, after)
     left, right = bottom.subplots(1, 2, width_ratios=(1.0, 1.0))
     _draw_history(left, found)
@@ -54,15 +57,15 @@ def drawn_fields(lens: Lens):
 
 
 def _draw_spots(page, before: Lens, after: Lens) -> None:
-    """A row of spots before and one after, each on a scale of its own, which its bars tell."""
+    """A row of spots before and one after, all on one scale; small ones are enlarged in a corner of their panel."""
     fields = drawn_fields(after)
     panels = page.subplots(2, fields.shape[1], squeeze=False)
     wavelengths, airy = style.array(after.wavelengths), float(airy_radius(after))
-    for row, lens, when in zip(panels, (before, after), ("before", "after"), strict=True):
-        whole, dots = field_spots(lens, fields=fields)
-        half = panel_size(style.array(whole.geometric_radius), airy)
+    spots = [field_spots(lens, fields=fields) for lens in (before, after)]
+    half = panel_size(np.concatenate([style.array(whole.geometric_radius) for whole, _ in spots]), airy)
+    for row, (whole, dots), lens, when in zip(panels, spots, (before, after), ("before", "after"), strict=True):
         for f, panel in enumerate(row):
-            draw_spot(panel, whole, dots, f, wavelengths=wavelengths, airy=airy, half=half)
+            draw_spot_to_scale(panel, whole, dots, f, wavelengths=wavelengths, airy=airy, half=half)
             if when == "before":
                 colour = style.field_colours(len(row))[f]
                 panel.set_title(style.field_label(lens, style.array(fields)[:, f]), color=colour, fontsize=8.5)

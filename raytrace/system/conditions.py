@@ -24,7 +24,7 @@ RAY_AIMING = {
 APERTURE_KINDS = {
     "entrance_pupil_diameter": "mm",
     "image_f_number": "EFL / entrance pupil diameter",
-    "working_f_number": "paraxial working F/#",
+    "paraxial_working_f_number": "paraxial working F/#",
     "object_na": "n sin θ of the marginal ray at the object",
     "object_cone_angle": "degrees, half angle of the marginal ray at the object",
     "float_by_stop": "mm, semi-diameter of the stop",
