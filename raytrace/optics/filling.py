@@ -31,11 +31,13 @@ class Filling:
     """How far rays miss the stop, fractions of its semi-diameter; inf for a ray that does not reach it.
 
     chief: (F,) chief ray from the centre. marginal: (F,) the worst of four marginal rays, from its point of the rim; of
-    a field with vignetting factors from the point that these leave. radius: () mm, semi-diameter of the stop.
+    a field with vignetting factors from the point that these leave. lost: (F,) whether no ray reaches the stop; radius:
+    () mm, semi-diameter of the stop.
     """
 
     chief: Tensor
     marginal: Tensor
+    lost: Tensor
     radius: Tensor
 
 
@@ -56,20 +58,21 @@ def filling(lens: Lens, fields: Tensor) -> Filling:
     position, arrives = at_stop(lens, rays_of_field(lens, fields[:, :, None], pupil, wavelength=wavelength), wavelength)
     missed = torch.linalg.vector_norm(position - target, dim=0) / radius
     missed = torch.where(arrives & torch.isfinite(missed), missed, torch.inf)
-    return Filling(missed[:, 0], missed[:, 1:].amax(1), radius)
+    return Filling(missed[:, 0], missed[:, 1:].amax(1), ~arrives.any(1), radius)
 
 
 def warn_of_filling(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None) -> None:
     """Warn UnfilledStop of the field of (2, F) that misses the stop most, if it does by more than TOLERANCE.
 
-    Nothing is traced where rays are aimed, where chief rays are parallel in object space, and in optimisation: where
-    numbers of the lens require a gradient or are inside a transform of torch.func.
+    A field that loses all its rays in front of the stop is left to LostRays. Nothing is traced where rays are aimed,
+    where chief rays are parallel in object space, and in optimisation: where numbers of the lens require a gradient or
+    are inside a transform of torch.func.
     """
     lens = with_ray_aiming(lens, ray_aiming)
     if lens.fields.telecentric or aiming_of(lens) != "off" or _is_being_optimised(lens):
         return
     found = filling(lens, fields)
-    worst = torch.maximum(found.chief, found.marginal)
+    worst = torch.where(found.lost, 0.0, torch.maximum(found.chief, found.marginal))
     if not bool((worst > TOLERANCE).any()):
         return
     at = int(worst.argmax())
