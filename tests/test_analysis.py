@@ -419,3 +419,22 @@ def test_a_wavelength_without_light_is_named_too(analyse, geometric):
     )
     with pytest.raises(EmptySpot, match=lost):
         analyse(lens, [1.0], geometric=geometric)
+
+
+def test_a_column_in_per_cent_is_named_so_and_is_what_the_text_prints():
+    """Text, frame and document have the same number; units of the columns come with the frame and the document."""
+    lens = problems.double_gauss()
+    found, grid = rt.distortion(lens, fields=[14.0]), rt.distortion_grid(lens, points=3)
+    frame, document = found.to_frame(), found.document()
+    percent = 100 * float(found.f_tan[0, 0])
+    assert frame["f_tan_percent"][0] == document["results"][0]["f_tan_percent"] == percent
+    assert f"{percent:.6g}" in str(found)
+    assert "f_tan" not in frame
+    assert frame.attrs["units"] == document["units"] == found.units()
+    assert {frame.attrs["units"][name] for name in ("f_tan_percent", "f_theta_percent")} == {"%"}
+    largest = 100 * float(grid.largest()[0])
+    assert grid.document()["summary"][0]["largest_percent"] == largest
+    assert f"largest {largest:.6f} %" in str(grid)
+    assert grid.to_frame()["distortion_percent"].abs().max() == pytest.approx(abs(largest), rel=1e-12)
+    assert rt.spot(lens, rings=2).to_frame().attrs["units"]["rms_radius"] == "mm"
+    assert rt.lateral_colour(lens, wavelengths=[0.5, 0.6]).document()["units"]["shift"] == "mm"

@@ -10,6 +10,7 @@ import pytest
 import torch
 from problems import aspheric_singlet, double_gauss, fields, lens, scalar, surface, vector
 
+import raytrace as rt
 from raytrace.cli import main
 from raytrace.formats import read_lens, write_lens
 from raytrace.media.glass import MIRROR
@@ -295,3 +296,20 @@ def test_info_prints_what_does_not_exist_as_a_dash(capsys, tmp_path):
     document = json.loads(capsys.readouterr().out)
     assert document["optical_invariant"] == pytest.approx(5.0 * math.tan(math.radians(3.0)))
     assert document["working_f_number"] is None
+
+
+def test_info_prints_the_working_f_number_of_real_light_and_the_paraxial_one_under_its_name():
+    """A parabola of f = 100 mm, F/1: the real ray meets it h²/4f in front of its vertex, the paraxial one in it."""
+    h, f = 50.0, 100.0
+    mirror = rt.lens(
+        [dict(radius=-2 * f, conic=-1, thickness=-f, glass="MIRROR")], stop=1, entrance_pupil_diameter=2 * h
+    )
+    document, text = rt.info(mirror).document(), str(rt.info(mirror))
+    slope = h / (f - h * h / (4 * f))
+    real = 1 / (2 * math.sin(math.atan(slope)))
+    assert document["working_f_number"] == pytest.approx(real, rel=1e-12)
+    assert document["paraxial_working_f_number"] == pytest.approx(1.0, rel=1e-12)
+    assert "real_working_f_number" not in document
+    lines = {line.split("  ")[1].strip(): line for line in text.splitlines() if "working F/#" in line}
+    assert f"{real:.9g}" in lines["working F/#"]
+    assert " 1 " in lines["paraxial working F/#"]

@@ -31,10 +31,15 @@ SURF 2
   DISZ 0
 """
 SEQ = "RDM;LEN\nDIM M\nEPD 10\nWL 587.6 486.1 656.3\n{}YAN 0\nSO 0 1e14\nS 50 4 517.642\nSTO\nS -50 48\nSI 0 0\nGO\n"
-TABLE = (
-    "# aperture: entrance pupil diameter 10\n# wavelengths: 0.5876 0.4861 0.6563\n{}surface,radius,thickness,glass\n"
-)
-TABLE += "0,inf,inf,\n1,50,4,N-BK7\n2,-50,48,\n3,inf,0,\n"
+TABLE = """# aperture: entrance pupil diameter 10
+# wavelengths: 0.5876 0.4861 0.6563
+# stop: 1
+{}surface,radius,thickness,glass
+0,inf,inf,
+1,50,4,N-BK7
+2,-50,48,
+3,inf,0,
+"""
 
 
 def read(text: str, suffix: str) -> rt.Lens:
