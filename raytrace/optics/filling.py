@@ -14,7 +14,7 @@ from torch.utils import _pytree as pytree
 from raytrace.maths.value import detached, value
 from raytrace.optics.aiming import at_stop
 from raytrace.optics.axis import aiming_of
-from raytrace.optics.launch import MarginalRayLost, points_of_stop, rays_of_field, stop_radius, with_ray_aiming
+from raytrace.optics.launch import points_of_stop, rays_of_field, with_ray_aiming
 from raytrace.optics.vignetting import vignette
 from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
 
@@ -51,10 +51,7 @@ def filling(lens: Lens, fields: Tensor) -> Filling:
     wavelength = lens.primary
     five = fields.new_tensor([[0.0, 0.0, 0.0, -1.0, 1.0], [0.0, -1.0, 1.0, 0.0, 0.0]])
     pupil = vignette(lens, fields[:, :, None], five)
-    aimed = with_ray_aiming(lens, "real")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MarginalRayLost)  # aimed rays are not traced here
-        target, radius = points_of_stop(aimed, pupil), stop_radius(aimed)
+    target, radius = points_of_stop(with_ray_aiming(lens, "real"), pupil)
     position, arrives = at_stop(lens, rays_of_field(lens, fields[:, :, None], pupil, wavelength=wavelength), wavelength)
     missed = torch.linalg.vector_norm(position - target, dim=0) / radius
     missed = torch.where(arrives & torch.isfinite(missed), missed, torch.inf)
@@ -73,7 +70,7 @@ def warn_of_filling(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None
         return
     found = filling(lens, fields)
     worst = torch.where(found.lost, 0.0, torch.maximum(found.chief, found.marginal))
-    if not bool((worst > TOLERANCE).any()):
+    if not bool((worst > TOLERANCE).any() & (found.radius > 1e-9)):  # a point has no rim
         return
     at = int(worst.argmax())
     named = f"{name_of_field(fields[:, at])} {FIELD_UNITS[lens.fields.kind]}"

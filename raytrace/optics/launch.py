@@ -199,40 +199,44 @@ def stop_radius(lens: Lens) -> Tensor:
     The paraxial ray where rays are aimed by it, or where the real one does not reach the stop; else the real one. At
     the primary wavelength. Where the axis bends it counts from the base ray.
     """
-    return _stop_radius(lens, first_order(lens), _entrance(lens))
+    return _stop_radius(lens, first_order(lens), _entrance(lens))[0]
 
 
-def points_of_stop(lens: Lens, pupil: Tensor) -> Tensor:
-    """The points (2, ...) mm of the stop at which aimed rays through pupil points (2, ...) arrive; the lens is aimed.
-
-    Warns MarginalRayLost.
-    """
+def points_of_stop(lens: Lens, pupil: Tensor) -> tuple[Tensor, Tensor]:
+    """The points (2, ...) mm of the stop that pupil points (2, ...) stand for where rays are aimed, as in this lens,
+    and the radius of the stop, mm."""
     paraxial, entrance = first_order(lens), _entrance(lens)
+    radius = _stop_radius(lens, paraxial, entrance)[0]
     target = pupil if entrance is None else _turned(entrance.turn, pupil)
-    return _aimed_radius(lens, paraxial, entrance) * target
+    return _signed(radius, paraxial, entrance) * target, radius
 
 
-def _stop_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> Tensor:
+def _stop_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> tuple[Tensor, Tensor | None]:
+    """And whether the real marginal ray tells it, None where that is not asked."""
     if lens.aperture.kind == "float_by_stop":
-        return lens.aperture.value
+        return lens.aperture.value, None
     estimate = paraxial.stop_height.abs() if entrance is None else entrance.radius
     if lens.ray_aiming == "paraxial":
-        return estimate
+        return estimate, None
     height, arrives = _marginal_height(lens, paraxial, entrance)
-    return torch.where(arrives, height.abs(), estimate)
+    return torch.where(arrives, height.abs(), estimate), arrives
 
 
-def _aimed_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> Tensor:
-    """The radius of the stop with the sign of `FirstOrder.stop_height`; warns MarginalRayLost.
+def _signed(radius: Tensor, paraxial: FirstOrder, entrance: Entrance | None) -> Tensor:
+    """The radius of the stop with the sign of `FirstOrder.stop_height`.
 
     Where the axis bends an `Entrance` tells what an inverted image of the stop turns, and the sign is +.
     """
-    by_real_ray = aiming_of(lens) == "real" and lens.aperture.kind != "float_by_stop"
-    if by_real_ray and not bool(_marginal_height(lens, paraxial, entrance)[1].all()):
+    return radius * torch.where(paraxial.stop_height.detach() < 0, -1.0, 1.0) if entrance is None else radius
+
+
+def _aimed_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> Tensor:
+    """The radius of the stop with its sign, as `_signed`; warns MarginalRayLost."""
+    radius, arrives = _stop_radius(lens, paraxial, entrance)
+    if arrives is not None and not bool(arrives.all()):
         message = "the real marginal ray does not reach the stop; rays are aimed over the radius of the paraxial one"
         warnings.warn(message, MarginalRayLost, stacklevel=4)
-    radius = _stop_radius(lens, paraxial, entrance)
-    return radius * torch.where(paraxial.stop_height.detach() < 0, -1.0, 1.0) if entrance is None else radius
+    return _signed(radius, paraxial, entrance)
 
 
 def _marginal_height(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> tuple[Tensor, Tensor]:
