@@ -15,7 +15,7 @@ from raytrace.formats import FORMATS
 from raytrace.formats.source import Place, decode
 from raytrace.optics.aiming import at_stop
 from raytrace.optics.axis import aiming_of
-from raytrace.optics.filling import TOLERANCE, UnfilledStop, filling
+from raytrace.optics.filling import TOLERANCE, UnfilledStop, filling, warn_of_filling
 from raytrace.optics.launch import launch
 
 RIM = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]], dtype=torch.float64)
@@ -96,6 +96,7 @@ def test_a_beam_that_misses_the_stop_is_told_once_with_figures_and_a_remedy(caps
         rt.spot(lens, fields=[0, 1])
         rt.spot(lens.replace(1, curvature=curvature), fields=[0, 40])  # as in a loop of optimisation
         rt.psf(lens, "gaussian", fields=[40], order=3)
+        torch.func.vmap(lambda y: (warn_of_filling(lens, torch.stack([0 * y, y])[:, None]), y)[1])(vector(30.0, 40.0))
     from raytrace.cli import main
 
     assert main(["spot", "retrofocus", "--ray-aiming", "off"]) == 0

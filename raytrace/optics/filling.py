@@ -62,11 +62,11 @@ def warn_of_filling(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None
     """Warn UnfilledStop of the field of (2, F) that misses the stop most, if it does by more than TOLERANCE.
 
     A field that loses all its rays in front of the stop is left to LostRays. Nothing is traced where rays are aimed,
-    where chief rays are parallel in object space, and in optimisation: where numbers of the lens require a gradient or
-    are inside a transform of torch.func.
+    where chief rays are parallel in object space, and in optimisation: where numbers of the lens or fields require a
+    gradient or are inside a transform of torch.func.
     """
     lens = with_ray_aiming(lens, ray_aiming)
-    if lens.fields.telecentric or aiming_of(lens) != "off" or _is_being_optimised(lens):
+    if _is_being_optimised((lens, fields)) or lens.fields.telecentric or aiming_of(lens) != "off":
         return
     found = filling(lens, fields)
     worst = torch.where(found.lost, 0.0, torch.maximum(found.chief, found.marginal))
@@ -89,6 +89,6 @@ def _words(missed: Tensor, place: str) -> str:
     return f"by {100 * float(missed):.3g} % of it from the {place}" if bool(missed.isfinite()) else "altogether"
 
 
-def _is_being_optimised(lens: Lens) -> bool:
-    leaves = [leaf for leaf in pytree.tree_leaves(lens) if isinstance(leaf, Tensor)]
+def _is_being_optimised(numbers: tuple[Lens, Tensor]) -> bool:
+    leaves = [leaf for leaf in pytree.tree_leaves(numbers) if isinstance(leaf, Tensor)]
     return any(is_functorch_wrapped_tensor(leaf) or leaf.requires_grad for leaf in leaves)
