@@ -54,6 +54,7 @@ PUBLIC = {
     "NoFocus": "optics.focusing",
     "OutOfReach": "optics.losses",
     "Spot": "optics.spot",
+    "UnfilledStop": "optics.filling",
     "base_ray": "optics.base_ray",
     "first_order": "optics.paraxial",
     "focus": "optics.focusing",

@@ -79,6 +79,7 @@ def spectrometer(ray_aiming: str = "real") -> rt.Lens:
         stop=2,
         fields=[0.0, 1.0],
         wavelengths=[0.5, 0.55, 0.6],
+        primary_wavelength=2,
         object_distance=100.0,
         object_na=0.05,
         ray_aiming=ray_aiming,

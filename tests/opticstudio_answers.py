@@ -15,6 +15,7 @@ from pathlib import Path
 import torch
 
 import raytrace as rt
+from raytrace.formats.zemax_keywords import AIMINGS
 from raytrace.kernels import diffraction
 from raytrace.maths import pupil, zernike
 from raytrace.media import glass
@@ -25,7 +26,7 @@ from raytrace.optics.paraxial import first_order
 from raytrace.optics.scene import Scene, scene
 from raytrace.optics.trace import media, steps, trace_lens
 from raytrace.optics.wavefront import peak_to_valley, rms, wavefront_of
-from raytrace.system.lens import FIELD_UNITS, RAY_AIMING, Fields, Lens, SystemAperture
+from raytrace.system.lens import FIELD_UNITS, Fields, Lens, SystemAperture
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Aperture, Surface
 
@@ -85,9 +86,9 @@ def system(name: str) -> Lens:
         fields=Fields(list(FIELD_UNITS)[fields["type"]], x, y, torch.ones_like(x), factors),
         wavelengths=tensor([wavelength for wavelength, _ in waves]),
         wavelength_weights=tensor([weight for _, weight in waves]),
-        primary_wavelength=told["primary"] - 1,
+        primary_wavelength=told["primary"],
         catalogs=tuple(told.get("catalogs", ())),
-        ray_aiming=list(RAY_AIMING)[told["ray_aiming"]],
+        ray_aiming=AIMINGS[told["ray_aiming"]],
     )
 
 
@@ -150,7 +151,7 @@ def waves_of(case: dict) -> torch.Tensor:
     """(W,) µm of `wavelength`, one or several; the primary one where there is none."""
     lens = lens_of(case)
     if "wavelength" not in case:
-        return lens.wavelengths[lens.primary_wavelength].reshape(1)
+        return lens.primary.reshape(1)
     return tensor(case["wavelength"]).reshape(-1)
 
 
@@ -280,7 +281,7 @@ def spot(case):
     Rays count alike, and a wavelength of weight w has √(w / the largest) times the rings.
     """
     lens, fields = lens_of(case), fields_of(case)
-    primary = lens.wavelengths[lens.primary_wavelength][None]
+    primary = lens.primary[None]
     rays = launch(lens, fields.new_zeros(2, 1), fields=fields, wavelengths=primary)
     chief = trace_lens(lens, rays, primary).position[:2]
     off = []

@@ -69,13 +69,15 @@ def test_ray_fan_counts_lateral_colour_and_lands_where_rays_land():
 def test_opd_fans_on_the_sphere_of_the_primary_wavelength_hold_lateral_colour():
     """Its centre lies δ from the wavelength's own chief ray's point: the OPD gains the tilt δ·(d - d_chief)."""
     lens = read_lens(shipped("lenses") / "tessar.zmx")
-    other = next(k for k in range(len(lens.wavelengths)) if k != lens.primary_wavelength)
+    other = next(k for k in range(len(lens.wavelengths)) if k != lens.primary_wavelength - 1)
     own, primary = (rt.opd_fan(lens, reference=reference) for reference in ("own", "primary"))
-    assert torch.equal(own.tangential[:, lens.primary_wavelength], primary.tangential[:, lens.primary_wavelength])
+    assert torch.equal(
+        own.tangential[:, lens.primary_wavelength - 1], primary.tangential[:, lens.primary_wavelength - 1]
+    )
     apart = (primary.tangential - own.tangential)[-1, other] * 1e-3 * lens.wavelengths[other]  # mm
     rays = image_rays(lens, torch.stack([torch.zeros(41).double(), own.pupil]))
     chief = rays.position[1, -1, :, 20]
-    shift = chief[other] - chief[lens.primary_wavelength]
+    shift = chief[other] - chief[lens.primary_wavelength - 1]
     M = rays.direction[1, -1, other]
     assert shift.abs() > 1e-4  # mm
     # Aberrated rays pass the centres at e = 0.1 mm and more: the sagitta e²/2R of 40 mm is left out.
@@ -291,7 +293,7 @@ def test_near_the_axis_foci_bend_as_petzval_says():
 
 
 def test_lateral_colour_is_the_difference_of_chief_rays():
-    lens = problems.double_gauss(wavelengths=(0.48, 0.53, 0.65), primary_wavelength=1)
+    lens = problems.double_gauss(wavelengths=(0.48, 0.53, 0.65), primary_wavelength=2)
     found = rt.lateral_colour(lens, samples=3)
     rays = image_rays(lens, vector(0.0, 0.0)[:, None], fields=found.fields)
     assert torch.allclose(found.shift, rays.position[1, ..., 0] - rays.position[1, :, 1:2, 0], atol=1e-12)
@@ -417,3 +419,22 @@ def test_a_wavelength_without_light_is_named_too(analyse, geometric):
     )
     with pytest.raises(EmptySpot, match=lost):
         analyse(lens, [1.0], geometric=geometric)
+
+
+def test_a_column_in_per_cent_is_named_so_and_is_what_the_text_prints():
+    """Text, frame and document have the same number; units of the columns come with the frame and the document."""
+    lens = problems.double_gauss()
+    found, grid = rt.distortion(lens, fields=[14.0]), rt.distortion_grid(lens, points=3)
+    frame, document = found.to_frame(), found.document()
+    percent = 100 * float(found.f_tan[0, 0])
+    assert frame["f_tan_percent"][0] == document["results"][0]["f_tan_percent"] == percent
+    assert f"{percent:.6g}" in str(found)
+    assert "f_tan" not in frame
+    assert frame.attrs["units"] == document["units"] == found.units()
+    assert {frame.attrs["units"][name] for name in ("f_tan_percent", "f_theta_percent")} == {"%"}
+    largest = 100 * float(grid.largest()[0])
+    assert grid.document()["summary"][0]["largest_percent"] == largest
+    assert f"largest {largest:.6f} %" in str(grid)
+    assert grid.to_frame()["distortion_percent"].abs().max() == pytest.approx(abs(largest), rel=1e-12)
+    assert rt.spot(lens, rings=2).to_frame().attrs["units"]["rms_radius"] == "mm"
+    assert rt.lateral_colour(lens, wavelengths=[0.5, 0.6]).document()["units"]["shift"] == "mm"

@@ -24,7 +24,7 @@ def test_it_is_first_order_where_the_axis_is_straight(distance):
     pairs = {"focal_length": "effective_focal_length", "image_distance": "paraxial_image_distance"}
     same = (
         "back_focal_distance", "entrance_pupil_position", "entrance_pupil_diameter", "exit_pupil_position",
-        "exit_pupil_diameter", "working_f_number", "magnification",
+        "exit_pupil_diameter", "paraxial_working_f_number", "magnification",
     )  # fmt: skip
     for name, theirs in (pairs | {name: name for name in same}).items():
         expected = float(getattr(straight, theirs))
@@ -177,7 +177,7 @@ def test_it_is_differentiated_exactly():
         )
         found = rt.base_ray(lens)
         mm = "focal_length image_distance entrance_pupil_position exit_pupil_position exit_pupil_diameter position"
-        return tuple(getattr(found, name) for name in (*mm.split(), "working_f_number", "magnification"))
+        return tuple(getattr(found, name) for name in (*mm.split(), "paraxial_working_f_number", "magnification"))
 
     at = [real(number).requires_grad_() for number in (50.0, 12.0, 6.0, 0.5)]
     assert torch.autograd.gradcheck(figures, at, eps=1e-5, atol=1e-5)

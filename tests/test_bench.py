@@ -185,7 +185,7 @@ def test_gradient_about_a_fixed_centroid_is_that_of_the_spot():
     lens = read_lens(shipped("lenses") / "cooke_triplet.zmx")
     rays = field_rays(lens, 40)
     moving, leaves = with_leaves(lens)
-    x, y, _ = trace_lens(moving, rays, lens.wavelengths[lens.primary_wavelength]).position
+    x, y, _ = trace_lens(moving, rays, lens.primary).position
     centroid = torch.stack([x.mean(), y.mean()])
     fixed = torch.autograd.grad(squared_radius(x, y, centroid.detach()), leaves, retain_graph=True)
     free = torch.autograd.grad(squared_radius(x, y, centroid), leaves)

@@ -87,7 +87,7 @@ def test_solid_angle_of_a_perfect_lens():
 def test_moments_are_those_of_many_rings():
     lens = read_lens("double_gauss")
     s = scene_of(lens, 14.0, 1e4)
-    s = dataclasses.replace(s, wavelengths=lens.wavelengths[lens.primary_wavelength][None])
+    s = dataclasses.replace(s, wavelengths=lens.primary[None])
     found, fine = moments(s, 12, 48), gaussian_kernels(s, grid(1.0, 1), order=12)
     assert torch.allclose(found.variance, fine.covariance[::2, 0, 0, 0], rtol=1e-10)
     assert torch.allclose(found.centroid, fine.centroid[:, 0, 0, 0], atol=1e-12)

@@ -73,7 +73,7 @@ def compared(limit, lens, rays):
     """Largest distance of position and direction, where both come through; and that the same rays do."""
     lens, rays = to(lens, dtype=limit.dtype), to(rays, dtype=limit.dtype)
     with torch.no_grad(), tracing("eager"):
-        expected = trace_lens(lens, rays, lens.wavelengths[lens.primary_wavelength])
+        expected = trace_lens(lens, rays, lens.primary)
     found = limit.trace(rays)
     assert torch.equal(found.valid, expected.valid)
     alive = expected.valid

@@ -359,7 +359,7 @@ def test_a_sensor_that_is_in_focus_for_nothing_is_no_optimum():
     images = [float(paraxial_image_distance(read_lens(LENS), number(d))) for d in (10e3, 50e3)]
     assert low < min(images) < max(images) < high
     # By similar triangles: at F/N a blur as wide as the window is N windows away.
-    number_of_the_lens = float(first_order(own.variables()).working_f_number)
+    number_of_the_lens = float(first_order(own.variables()).paraxial_working_f_number)
     assert high - max(images) == pytest.approx(7 * 0.005 * number_of_the_lens, rel=0.1)
 
 

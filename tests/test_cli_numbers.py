@@ -156,7 +156,7 @@ def test_info_says_infinite_or_nothing_where_there_is_no_number(run):
     (line,) = (line for line in touching.splitlines() if line.strip().startswith("magnification"))
     lens = rt.read_lens("touching.zmx")
     stop, front, back = lens.surfaces[1:4]
-    n = float(rt.refractive_index(front.glass, lens.wavelengths[lens.primary_wavelength]))
+    n = float(rt.refractive_index(front.glass, lens.primary))
     reach = float(stop.thickness) + float(front.thickness) / n
     enlarged = 1 / (1 - (1 - n) * float(back.curvature) * reach)  # of an object on the stop, in front of a flat face
     assert float(line.split()[1]) == pytest.approx(enlarged, rel=1e-8)

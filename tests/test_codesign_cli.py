@@ -152,7 +152,7 @@ def test_the_files_own_wavelengths_are_taken_when_asked(run, pictures):
     assert code == 0, err
     settings = json.loads(out)["settings"]
     assert sorted(settings["wavelengths"]) == sorted(lens.wavelengths.tolist())
-    assert settings["wavelengths"][0] == float(lens.wavelengths[lens.primary_wavelength])
+    assert settings["wavelengths"][0] == float(lens.primary)
     code, _, err = run("cooke_triplet", *options, "--file-wavelengths", "--wavelength", "0.5")
     assert code == 1
     assert "leave out --wavelength" in err

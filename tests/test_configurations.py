@@ -88,6 +88,7 @@ def saved_alike(one, other) -> bool:
 
 #: An operand, its values, and the file saved in each of the configurations: (what stands there, what it becomes).
 ASPHERE = "TYPE EVENASPH\nPARM 1 0\nPARM 2 1e-5"
+RAIM = "PWAV 2\nRAIM 0 0"
 CASES = {
     "thickness": (two("THIC", 1, "4", "5.5"), {}, ("DISZ 4\n", "DISZ 5.5\n")),
     "object": (two("THIC", 0, "1e10", "250"), {}, ("DISZ INFINITY", "DISZ 250")),
@@ -110,7 +111,11 @@ CASES = {
     "aperture": (two("APMX", 1, "5", "3"), {"surface": "CLAP 1 5 0"}, ("CLAP 1 5", "CLAP 1 3")),
     "hole": (two("APMN", 1, "1", "2"), {"surface": "CLAP 1 5 0"}, ("CLAP 1 5", "CLAP 2 5")),
     "decentre": (two("APDY", 1, "0.5", "1"), {"surface": "CLAP 0 5 0\nOBDC 0 0.5"}, ("OBDC 0 0.5", "OBDC 0 1")),
-    "before": (two("CBTX", 1, "0", "3"), {"surface": "SCBD 1 0 0 0 0 0 0 0"}, ("1 0 0 0 0 0 0 0", "1 0 0 0 0 3 0 0")),
+    "before": (
+        two("CBTX", 1, "0", "3"),
+        {"surface": "SCBD 1 0 0 0 0 0 0 0", "PWAV": RAIM},
+        ("1 0 0 0 0 0 0 0", "1 0 0 0 0 3 0 0"),
+    ),
     "comment": (two("MCOM", 1, '"a"', '"b"'), {"surface": "COMM a"}, ("COMM a", "COMM b")),
     "field": (two("YFIE", 2, "7", "3.5"), {}, ("YFLN 0 7", "YFLN 0 3.5")),
     "field x": (two("XFIE", 2, "0", "2"), {}, ("XFLN 0 0", "XFLN 0 2")),
@@ -122,7 +127,7 @@ CASES = {
     "pupil": (two("APER", 0, "10", "6"), {}, ("ENPD 10", "ENPD 6")),
     "F-number": (two("APER", 0, "5", "8"), {"APERTURE": "FNUM 5 0"}, ("FNUM 5 0", "FNUM 8 0")),
     "telecentric": (two("TELE", 0, "0", "1"), {}, ("FTYP 0 0", "FTYP 0 1")),
-    "aiming": (two("RAAM", 0, "0", "1"), {"PWAV": "PWAV 2\nRAIM 0 0"}, ("RAIM 0 0", "RAIM 0 1")),
+    "aiming": (two("RAAM", 0, "0", "1"), {"PWAV": RAIM}, ("RAIM 0 0", "RAIM 0 1")),
     "title": (two("LTTL", 0, '"A singlet"', '"Far"'), {}, ("NAME A singlet", "NAME Far")),
     "stop": (two("STPS", 0, "2", "1"), {"surface": "COMM here"}, ("COMM here", "COMM here\n  STOP")),
 }

@@ -21,7 +21,9 @@ pytestmark = pytest.mark.filterwarnings("ignore::raytrace.media.catalog.Ambiguou
 
 @pytest.fixture
 def lens():
-    return rt.lens(ROWS, stop=5, f_number=3.5, fields=[0, 8.4, 11.9], wavelengths=[0.4861, 0.5876, 0.6563])
+    return rt.lens(
+        ROWS, stop=5, f_number=3.5, fields=[0, 8.4, 11.9], wavelengths=[0.4861, 0.5876, 0.6563], primary_wavelength=2
+    )
 
 
 def test_a_lens_comes_from_a_shipped_name_or_plain_numbers_and_goes_to_a_file(lens, tmp_path):

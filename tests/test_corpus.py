@@ -94,7 +94,7 @@ def compare_system(lens: Lens, entry: dict) -> list[str]:
     found = {
         "surfaces": (len(lens.surfaces), system["nsurf"]),
         "stop": (lens.stop, system["stop"]),
-        "primary": (lens.primary_wavelength, system["primary"]),
+        "primary": (lens.primary_wavelength - 1, system["primary"]),
         "wavelengths": (lens.wavelengths.tolist(), system["waves"]),
         "telecentric": (lens.fields.telecentric, system["telecentric"]),
     }
@@ -151,7 +151,7 @@ def compare_rays(lens: Lens, entry: dict, result: Comparison) -> list[str]:
     unit = MILLIMETRES[entry["system"]["unit"]]
     indices = [torch.tensor(n, dtype=torch.float64) for n in media_of(lens, entry["n_primary"])]
     surfaces = [dataclasses.replace(surface, apertures=()) for surface in lens.surfaces[1:]]
-    wavelength, faults = lens.wavelengths[lens.primary_wavelength], []
+    wavelength, faults = lens.primary, []
     for ray in entry["rays"]:
         if not ray["oracle"]:
             continue

@@ -55,9 +55,11 @@ def test_a_shipped_lens_is_known_by_its_name(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("rows", [ROWS, pd.DataFrame(ROWS)], ids=["rows", "frame"])
 def test_a_lens_is_made_from_plain_numbers(rows):
-    lens = rt.lens(rows, stop=1, f_number=5, fields=[0, (1, 2)], wavelengths=[0.4861, 0.5876, 0.6563])
+    lens = rt.lens(
+        rows, stop=1, f_number=5, fields=[0, (1, 2)], wavelengths=[0.4861, 0.5876, 0.6563], primary_wavelength=2
+    )
     assert len(lens.surfaces) == 5
-    assert lens.primary_wavelength == 1
+    assert lens.primary_wavelength == 2
     assert lens.fields.kind == "angle"
     assert lens.fields.x.tolist() == [0, 1]
     assert lens.fields.y.tolist() == [0, 2]
@@ -402,7 +404,7 @@ ANALYSES = (
         "coefficient",
         "spherical",
     ),
-    ("distortion", {"samples": 3}, "--samples 3", "f_theta", "%"),
+    ("distortion", {"samples": 3}, "--samples 3", "f_theta_percent", "%"),
     ("field_curvature", {"fields": [5, 9]}, "--fields 5 9", "sagittal", "mm"),
     ("lateral_colour", {"wavelengths": [0.5, 0.6], "samples": 3}, "--wavelengths 0.5 0.6 --samples 3", "shift", "µm"),
     ("relative_illumination", {"fields": [3, 9]}, "--field 3 9", "illumination", "sr"),
@@ -415,7 +417,7 @@ ANALYSES = (
         "shift",
         "mm",
     ),
-    ("distortion_grid", {"points": 3}, "--points 3", "distortion", "largest"),
+    ("distortion_grid", {"points": 3}, "--points 3", "distortion_percent", "largest"),
     ("incidence", {"samples": 3, "surfaces": True}, "--samples 3 --surfaces", "chief", "upper"),
     ("rms_over_field", {"samples": 3, "spot": True}, "--samples 3 --spot", "rms", "all, weighted"),
     ("mtf", {"frequencies": [10, 20], "fields": [9]}, "--frequency 10 20 --field 9", "diffraction_limit", "1/mm"),

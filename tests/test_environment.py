@@ -159,6 +159,7 @@ def doublet_at_100_degrees():
         stop=1,
         entrance_pupil_diameter=20.0,
         wavelengths=[0.486, 0.589, 0.656],
+        primary_wavelength=2,
         catalogs=["SCHOTT"],
     )
 

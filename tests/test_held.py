@@ -85,7 +85,7 @@ def test_a_lens_that_is_afocal_without_the_number_has_finite_derivatives():
     thicker, bent = torch.autograd.grad(found, [variables.thickness_2, variables.curvature_2])
     assert float(thicker) == 0  # the power of the first surface is none
     number = next(one for one in variables.variables if one.name == "curvature_2")
-    gap = 5.0 / float(media(lens, lens.wavelengths[lens.primary_wavelength])[2])
+    gap = 5.0 / float(media(lens, lens.primary)[2])
     power = 1 / focal_length(lens)
     assert float(bent) / number.unit == pytest.approx(1 - gap * power, rel=1e-9)  # φ₂ + φ₃ - (t/n) φ₂ φ₃ = φ
 

@@ -14,8 +14,9 @@ def test_most_functions_are_a_few_lines():
     assert house.median_body() <= MEDIAN_BODY
 
 
-@pytest.mark.parametrize(("what", "most"), [("refraction", 5), ('psf(lens, "drt")', 30), ("training step", 35)])
+@pytest.mark.parametrize(("what", "most"), [("refraction", 5), ('psf(lens, "drt")', 35), ("training step", 35)])
 def test_work_walks_downhill_through_few_files(what, most):
+    """Five files of a PSF measure, once a call, how far the beam misses the stop; a training step does not."""
     files, upward = house.walked(house.walks()[what])
     assert len(files) <= most, sorted(files)
     assert not upward

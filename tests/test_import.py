@@ -205,9 +205,7 @@ def test_indices_beyond_the_lines_of_a_glass_by_its_code_are_refused_unless_aske
     """At 404.7 nm the formula errs by more than 1e-4, which is named with the ways out; between F and C it stands."""
     _, report = sequence("656.27 587.56 546.1 486.13", name)
     assert not report.warnings
-    with pytest.raises(
-        LensFileError, match=rf"index of {name} at 404\.7 nm is est.*to about \d\.\de-03.*=formula"
-    ):
+    with pytest.raises(LensFileError, match=rf"index of {name} at 404\.7 nm is est.*to about \d\.\de-03.*=formula"):
         sequence("587.56 404.7", name)
     lens, report = sequence("587.56 404.7", name, substitutes=substitutes_of(f"{name}=formula"))
     assert "to about" in report.warnings[0]

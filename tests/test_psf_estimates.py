@@ -111,7 +111,7 @@ def prepared(model: str, case: Case) -> tuple[Lens, dict]:
         radius, (inner, outer, shift) = float(stop_radius(lens)), case.clip
         hole = Aperture("circular", (inner * radius, outer * radius), centre=(0.0, shift * radius))
         lens = lens.replace(lens.stop, apertures=(hole,))
-    shown = slice(None) if case.colours == "all" else slice(lens.primary_wavelength, lens.primary_wavelength + 1)
+    shown = slice(None) if case.colours == "all" else slice(lens.primary_wavelength - 1, lens.primary_wavelength)
     options = {
         "fields": number(case.field)[:, None],
         "object_distances": number([case.distance]),

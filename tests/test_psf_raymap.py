@@ -19,7 +19,7 @@ NANOMETRE = 1e-6
 
 
 def scene_of(lens: Lens, *fields: float, distance: float = 1e4):
-    wavelength = lens.wavelengths[lens.primary_wavelength][None]
+    wavelength = lens.primary[None]
     return scene(lens, number([[0.0] * len(fields), fields]), number([distance]), wavelength)
 
 

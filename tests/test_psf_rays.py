@@ -20,7 +20,7 @@ LENSES = Path(__file__).parents[1] / "lenses"
 
 
 def scene_of(lens: Lens, field: float, distance: float = 1e4):
-    wavelength = lens.wavelengths[lens.primary_wavelength][None]
+    wavelength = lens.primary[None]
     return scene(lens, number([[0.0], [field]]), number([distance]), wavelength)
 
 

@@ -59,3 +59,16 @@ def test_a_document_holds_the_numbers_of_a_phase_and_a_pose():
     assert found["phase"] == {"kind": "Grating", "frequency": 0.3, "order": -1.0}
     pose = {"x": 0.3, "y": -0.2, "tilt_x": 4.0, "tilt_y": -3.0, "tilt_z": 25.0, "tilts_first": False}
     assert found["before"] == pose
+
+
+def test_the_glass_column_of_info_has_the_figures_of_a_medium_without_a_name():
+    rows = [
+        dict(radius=50, thickness=5, glass=(1.62, 36.4)),
+        dict(radius=-60, thickness=1, glass=1.5),
+        dict(radius=-70, thickness=9, glass="N-BK7"),
+        dict(radius=-80, thickness=70),
+    ]
+    found = rt.info(rt.lens(rows, stop=1, f_number=9))
+    assert found.words()["glass"] == ["", "1.62/36.4", "n 1.5", "N-BK7", "", ""]
+    assert [row["glass"] for row in found.document()["surfaces"]] == [None, "1.62/36.4", "n 1.5", "N-BK7", None, None]
+    assert all(label in str(found) for label in ("1.62/36.4 ", "n 1.5 ", "N-BK7 "))

@@ -43,7 +43,7 @@ def moment_of(solves, x=None, *, duals=False, lens=None):
 
 def marginal_slope(lens, last: int) -> tuple[float, float]:
     """u′ and height behind a surface of the paraxial marginal ray, and at the next vertex, surface by surface."""
-    primary = lens.wavelengths[lens.primary_wavelength]
+    primary = lens.primary
     y, u, n = float(rt.first_order(lens).entrance_pupil_diameter) / 2, 0.0, 1.0
     for surface in lens.surfaces[1 : last + 1]:
         behind = float(refractive_index(surface.glass, primary))
@@ -143,7 +143,7 @@ def test_a_real_ray_meets_the_image_at_the_height_of_its_solve(part):
     solve = Solve(11, "thickness", "marginal_height", (0.25, part))
     model, x, _ = moment_of((solve,))
     lens = model.lens_at(x)
-    wavelength = lens.wavelengths[lens.primary_wavelength]
+    wavelength = lens.primary
     origin, point = torch.zeros(2, dtype=torch.float64), torch.tensor([0.0, part], dtype=torch.float64)
     rays = rays_of_field(lens, origin, point, wavelength=wavelength)
     assert float(trace_lens(lens, rays, wavelength).position[1]) == pytest.approx(0.25, rel=1e-10)

@@ -196,7 +196,7 @@ def test_object_by_row_or_header():
         ("F/3", "image_f_number", 3.0),
         ("f/# 2.8", "image_f_number", 2.8),
         ("F-number 2.8", "image_f_number", 2.8),
-        ("working F/4", "working_f_number", 4.0),
+        ("working F/4", "paraxial_working_f_number", 4.0),
         ("NA 0.1", "object_na", 0.1),
         ("cone angle 5", "object_cone_angle", 5.0),
         ("stop 10.2", "float_by_stop", 10.2),
@@ -218,7 +218,7 @@ def test_fields_and_wavelengths_of_the_header():
     colours = SYSTEM.replace("0.5876", "486.1 587.6 656.3 nm\n# primary wavelength: 2\n# weights: 1 2 1")
     found = lens(system=colours)
     assert found.wavelengths.tolist() == [0.4861, 0.5876, 0.6563]
-    assert (found.primary_wavelength, found.wavelength_weights.tolist()) == (1, [1.0, 2.0, 1.0])
+    assert (found.primary_wavelength, found.wavelength_weights.tolist()) == (2, [1.0, 2.0, 1.0])
 
 
 def test_units_of_the_header():

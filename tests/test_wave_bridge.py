@@ -282,7 +282,7 @@ def test_without_height_the_kernel_is_that_of_the_wave_model(elements, y):
 def test_defocus_moves_the_best_focus_as_a_thin_lens_at_the_stop_does():
     """δz = -φ (y_stop/u')², φ = -2 (n - 1) c₁; odd part of ± a quarter wave, where the next order cancels."""
     system = slow_gauss()
-    slope = 0.5 / float(first_order(system).working_f_number)
+    slope = 0.5 / float(first_order(system).paraxial_working_f_number)
     edge = float(cross_scene(view_of(system), vector(0, 1)[:, None])[5].rays.position[1])
     step = 0.25 * 0.53e-3
     power = 2 * step / edge**2

@@ -67,7 +67,7 @@ def test_only_the_slots_that_ftyp_counts_are_wavelengths_and_pwav_counts_from_on
     found = lens()
     assert found.wavelengths.tolist() == [0.4861327, 0.5875618]
     assert found.wavelength_weights.tolist() == [1.0, 0.5]
-    assert found.primary_wavelength == 1
+    assert found.primary_wavelength == 2
 
 
 def test_older_lists_of_wavelengths_and_fields():
@@ -117,7 +117,7 @@ def test_field_angles_are_not_lengths(kind):
         ("ENPD 10", "entrance_pupil_diameter", 10.0),
         ("FNUM 5.5 0", "image_f_number", 5.5),
         ("FNUM 5.5", "image_f_number", 5.5),
-        ("FNUM 5.5 1", "working_f_number", 5.5),
+        ("FNUM 5.5 1", "paraxial_working_f_number", 5.5),
         ("OBNA 0.1478 0", "object_na", 0.1478),
         ("OBNA 160 1", "object_cone_angle", 160.0),
         ("FLOA", "float_by_stop", 5.5),

@@ -33,7 +33,8 @@ class Distortion(OverField):
     """Heights (F, W) in mm of chief rays on the sensor, and by how much they miss the ideal image.
 
     height: along the meridian of the field, positive towards +y (+x where it is the x axis), as the ray's own y.
-    f_tan: relative, height/(f tan θ) - 1, of an object at a finite distance height/(m h) - 1; 0 on the axis.
+    f_tan: relative, height/(f tan θ) - 1, of an object at a finite distance height/(m h) - 1; 0 on the axis. The table
+        has it in per cent, as f_theta.
     f_theta: relative, height/(f θ) - 1; None for an object at a finite distance.
     fields: (2, F); valid: (F, W) bool.
     """
@@ -49,8 +50,9 @@ class Distortion(OverField):
     FIGURE = "plot.analysis.distortion_curves"
 
     def columns(self) -> dict[str, Tensor]:
-        curves = {"height": self.height, "f_tan": self.f_tan, "f_theta": self.f_theta}
-        found = {name: masked(curve, self.valid) for name, curve in curves.items() if curve is not None}
+        relative = {"f_tan_percent": self.f_tan, "f_theta_percent": self.f_theta}
+        percent = {name: 100 * curve for name, curve in relative.items() if curve is not None}
+        found = {name: masked(curve, self.valid) for name, curve in {"height": self.height, **percent}.items()}
         return {**self.heads(wavelength=self.wavelengths), **found}
 
     def at(self, fields: Tensor) -> "Distortion":
@@ -106,10 +108,11 @@ class LateralColour(OverField):
 
 
 def distortion(lens: Lens, *, fields: Points = None, wavelengths: Numbers = None, samples: int = 11) -> Distortion:
-    """Distortion of the chief ray, 1 = 100 %; fields: y or (x, y), by default `samples` from the axis to the largest.
+    """Distortion of the chief ray; fields: y or (x, y), by default `samples` from the axis to the largest.
 
-    The scale of the ideal image is that of each wavelength's own chief ray close to the axis, on the sensor as it
-    stands: an image out of focus is not distorted for that. wavelengths: µm. Raises NothingToShow for the axis alone.
+    Relative, in per cent in the table. The scale of the ideal image is that of each wavelength's own chief ray close to
+    the axis, on the sensor as it stands: an image out of focus is not distorted for that. wavelengths: µm. Raises
+    NothingToShow for the axis alone.
     """
     lens, fields = setting(lens, fields, wavelengths, samples=samples)
     refuse_axis(fields)
@@ -197,7 +200,7 @@ def lateral_colour(
 
 def _lateral_colour(lens: Lens, fields: Tensor) -> LateralColour:
     height, valid = _height(unvignetted(lens), fields, fields)
-    primary = slice(lens.primary_wavelength, lens.primary_wavelength + 1)
+    primary = slice(lens.primary_wavelength - 1, lens.primary_wavelength)
     valid = valid & valid[:, primary]
     return LateralColour(lens, fields, torch.where(valid, height - height[:, primary], 0.0), valid)
 
@@ -225,7 +228,7 @@ def _height(lens: Lens, fields: Tensor, along: Tensor, *, each_axis: bool = Fals
         way = chief_points(lens, close, lens.wavelengths)[0] - axis
         side = torch.where(dot_2(way, meridian[:, :, None]).detach() < 0, -1.0, 1.0)
         length = side * safe_sqrt(dot_2(way, way))
-        axis = axis if each_axis else axis[..., lens.primary_wavelength, None]
+        axis = axis if each_axis else axis[..., lens.primary_wavelength - 1, None]
         return safe_divide(dot_2(points - axis, way), length), valid
     return dot_2(points, _meridian(along)[:, :, None]), valid
 

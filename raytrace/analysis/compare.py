@@ -229,7 +229,7 @@ def side_by_side(lens: Lens, object_distances: Tensor, *, pixels: Grid | None = 
         psfs=tuple(_psf(lens, m, object_distances=object_distances, grid=pixels, **m.compared) for m in _ROWS),
         object_distances=object_distances,
         sensor_distance=lens.surfaces[-2].thickness,
-        wavelength=lens.wavelengths[lens.primary_wavelength],
+        wavelength=lens.primary,
         models=tuple(model.title for model in _ROWS),
     )
 
@@ -282,7 +282,7 @@ def _about_light(lens: Lens, fields: Tensor, pixels: Grid, model: Model) -> Grid
 
 def _most_curved(lens: Lens) -> int:
     """Number of the most curved surface that bends light: the image may be curved, and so may dummies."""
-    indices = media(lens, lens.wavelengths[lens.primary_wavelength])
+    indices = media(lens, lens.primary)
     strength = {
         k: abs(float(surface.curvature))
         for k, surface in enumerate(lens.surfaces[:-1])
@@ -306,7 +306,7 @@ def _dark_ring(lens: Lens, model: Model, work: dict) -> float:
     """First minimum along x of the kernel of the slowed lens, below a twentieth of the peak; nan without one."""
     slow = torch.clamp(first_order(lens).f_number, min=_SLOW)
     slowed = dataclasses.replace(lens, aperture=SystemAperture("image_f_number", slow))
-    airy = 1.2197e-3 * lens.wavelengths[0] * first_order(slowed).working_f_number
+    airy = 1.2197e-3 * lens.wavelengths[0] * first_order(slowed).paraxial_working_f_number
     line = _psf(slowed, model, grid=grid(airy / _AIRY_PIXELS, (1, 4 * _AIRY_PIXELS + 1)), **work)
     line = line.kernel[0, 0, 0, 2 * _AIRY_PIXELS :].tolist()
     for i in range(1, len(line) - 1):
@@ -329,7 +329,7 @@ def _parameters(lens: Lens, model: Model, work: dict) -> int:
         numbers += changes.values()
         surfaces[k] = dataclasses.replace(surface, **changes)
     lens = dataclasses.replace(lens, surfaces=tuple(surfaces))
-    number = first_order(lens).working_f_number.detach()
+    number = first_order(lens).paraxial_working_f_number.detach()
     blur = 1e-3 * lens.wavelengths[0] * number
     lens = with_sensor_distance(lens, surfaces[-2].thickness + 8 * blur * number)
     work = {**work, "tol": 0.05} if "tol" in work else work

@@ -16,6 +16,7 @@ from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.result import axis, cell, masked
 from raytrace.maths.value import value
 from raytrace.optics.arrivals import chief_points
+from raytrace.optics.filling import warn_of_filling
 from raytrace.optics.launch import is_at_infinity
 from raytrace.system.lens import Lens, with_wavelengths
 
@@ -27,7 +28,8 @@ class GridDistortion(Analysis):
     """Chief rays (2, W, N, N) mm on the sensor, of a grid of object points along y (rows) and x (columns).
 
     actual: where they land; ideal: where they would without distortion, by the linear map of rays close to the axis.
-    distortion: (W, N, N) relative, |actual|/|ideal| - 1 from the image of the axis; 0 there. valid: (W, N, N) bool.
+    distortion: (W, N, N) relative, |actual|/|ideal| - 1 from the image of the axis; 0 there; in the
+        table in per cent. valid: (W, N, N) bool.
     fields: (2, N, N) tan θ of an object at infinity, else mm of it.
     """
 
@@ -51,11 +53,18 @@ class GridDistortion(Analysis):
             "ideal_y": ideal_y,
             "actual_x": x,
             "actual_y": y,
-            "distortion": masked(self.distortion, self.valid),
+            "distortion_percent": masked(100 * self.distortion, self.valid),
         }
 
+    def units(self) -> dict[str, str]:
+        """The field is tan θ or mm of the object, whatever the kind of field of the lens."""
+        points = ("ideal_x", "ideal_y", "actual_x", "actual_y")
+        field = {} if is_at_infinity(self.lens) else {"field_x": "mm", "field_y": "mm"}
+        wavelength, percent = {"wavelength": "µm"}, {"distortion_percent": "%", "largest_percent": "%"}
+        return {**wavelength, **field, **dict.fromkeys(points, "mm"), **percent}
+
     def summary(self) -> dict[str, Tensor]:
-        return {"wavelength": self.wavelengths, "largest": self.largest()}
+        return {"wavelength": self.wavelengths, "largest_percent": 100 * self.largest()}
 
     def largest(self) -> Tensor:
         """The distortion (W,) of largest size, with its sign; 0 where no ray arrives."""
@@ -83,6 +92,7 @@ def distortion_grid(lens: Lens, *, wavelengths: Numbers = None, points: int = 11
     lens = with_wavelengths(unvignetted(lens), primary_wavelength(lens) if wavelengths is None else wavelengths)
     largest = field_range(lens, 2)[:, 1:]
     refuse_axis(largest)
+    warn_of_filling(lens, largest)
     described, _, corner, found = in_object_space(lens, largest)
     half = safe_sqrt((corner * corner).sum() / 2)
     line = half * (2 * torch.arange(points, dtype=half.dtype, device=half.device) + 1 - points) / max(points - 1, 1)

@@ -9,6 +9,7 @@ from raytrace.maths.numerics import safe_divide
 from raytrace.maths.result import axis, masked
 from raytrace.maths.value import value
 from raytrace.optics.axis import need_axis
+from raytrace.optics.filling import warn_of_filling
 from raytrace.optics.focus import image_rays
 from raytrace.system.lens import Lens, with_wavelengths
 
@@ -50,7 +51,9 @@ def longitudinal_aberration(lens: Lens, *, wavelengths: Numbers = None, points: 
     pupil = torch.linspace(0.0, 1.0, points, **like(lens))
     heights = torch.cat([torch.full_like(pupil[:1], _NEAR_AXIS), pupil[1:]])
     on_axis = torch.stack([torch.zeros_like(heights), heights])
-    rays = image_rays(lens, on_axis, fields=torch.zeros_like(on_axis[:, :1]))
+    axis = torch.zeros_like(on_axis[:, :1])
+    warn_of_filling(lens, axis)
+    rays = image_rays(lens, on_axis, fields=axis)
     _, M, N = rays.direction[:, 0]
     crossing = -safe_divide(rays.position[1, 0] * N, M)
     return LongitudinalAberration(lens, pupil, crossing, rays.valid[0] & (M != 0))

@@ -229,7 +229,7 @@ def _of_spots(lens: Lens, fields: Tensor, frequencies: Tensor, points: Tensor, r
 
 def _from_primary(lens: Lens, place: Tensor) -> Tensor:
     """Places (..., W) of the wavelengths, from that of the primary one."""
-    return place - place[..., lens.primary_wavelength, None]
+    return place - place[..., lens.primary_wavelength - 1, None]
 
 
 def modulation(otf: Tensor, frequencies: Tensor, shift: Tensor, weights: Tensor) -> Tensor:

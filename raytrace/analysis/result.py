@@ -11,10 +11,10 @@ from raytrace.maths.numerics import broadcast_shape
 from raytrace.maths.result import Result, axis, cell, flat, rows
 from raytrace.system.lens import FIELD_UNITS
 
-#: Units of columns by their names; per cent are told of what is relative.
+#: Units of columns by their names; the name of a column in per cent ends in _percent.
 _UNITS = {
     "wavelength": "µm", "frequency": "1/mm", "sensor_distance": "mm", "radius": "mm", "height": "mm", "shift": "mm",
-    "f_tan": "%", "f_theta": "%", "projected_solid_angle": "sr", "crossing": "mm", "lower": "°", "chief": "°",
+    "projected_solid_angle": "sr", "crossing": "mm", "lower": "°", "chief": "°",
     "upper": "°",
 }  # fmt: skip
 _FINE = 321  # points of a curve over frequency or radius, when it is drawn
@@ -51,8 +51,11 @@ class Analysis(Result):
         """The columns of a shorter table, if there is one: it is the text, and stands beside the results in JSON."""
         return {}
 
+    def units(self) -> dict[str, str]:
+        return {name: unit for name in (*self.columns(), *self.summary()) if (unit := self._unit(name))}
+
     def document(self) -> dict:
-        found = {"analysis": self.COMMAND, **self.about(), "results": rows(self.columns())}
+        found = {"analysis": self.COMMAND, **self.about(), "units": self.units(), "results": rows(self.columns())}
         summary = self.summary()
         return {**found, "summary": rows(summary)} if summary else found
 
@@ -77,11 +80,7 @@ class Analysis(Result):
         if "field_x" in listed and not listed["field_x"].any():
             del listed["field_x"]
         units = {name: self._unit(name) for name in listed}
-        scaled = (100 * column if units[name] == "%" else column for name, column in listed.items())
-        texts = (
-            [name, units[name], *(cell(value, ".6g") for value in column)]
-            for name, column in zip(listed, scaled, strict=True)
-        )
+        texts = ([name, units[name], *(cell(value, ".6g") for value in column)] for name, column in listed.items())
         padded = [[f"{text:>{max(len(column[0]), 9)}}" for text in column] for column in texts]
         lines = ["  ".join(row) for row in zip(*padded, strict=True)]
         if thin > 1:
@@ -91,6 +90,8 @@ class Analysis(Result):
     def _unit(self, name: str) -> str:
         if name.startswith("field"):
             return FIELD_UNITS[self.lens.fields.kind]
+        if name.endswith("_percent"):
+            return "%"
         return self.UNIT if name in _OWN_UNIT else _UNITS.get(name, "")
 
 

@@ -11,6 +11,7 @@ from torch.utils import _pytree as pytree
 from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.result import flat
+from raytrace.optics.filling import warn_of_filling
 from raytrace.optics.launch import is_at_infinity, object_field
 from raytrace.optics.losses import check_reach, losses
 from raytrace.optics.paraxial import first_order, largest_field
@@ -49,11 +50,14 @@ def setting(
 
     fields: None for the lens's own, or for `samples` from the axis to its largest. Rays must reach the sensor from one
     of those listed, or from `every` one, see `check_reach`; inside transforms of torch.func that cannot be told.
+    Warns UnfilledStop.
     """
     lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
-    if fields is None and samples is not None:
-        return lens, field_range(lens, samples)
-    found = field_points(fields, like=lens)
+    curve = fields is None and samples is not None
+    found = field_range(lens, samples) if curve else field_points(fields, like=lens)
+    warn_of_filling(lens, found)
+    if curve:
+        return lens, found
     if not any(isinstance(leaf, Tensor) and is_functorch_wrapped_tensor(leaf) for leaf in pytree.tree_leaves(lens)):
         check_reach(lens, None if fields is None else found, every=every)
     return lens, found
@@ -61,7 +65,7 @@ def setting(
 
 def primary_wavelength(lens: Lens) -> Tensor:
     """() µm."""
-    return lens.wavelengths[lens.primary_wavelength]
+    return lens.primary
 
 
 def scene_of(lens: Lens, fields: Tensor) -> Scene:

@@ -190,7 +190,7 @@ def _met(lens: Lens) -> int:
 def error_of(tracer: Tracer) -> float:
     """nm between the tracer and the eager trace in float64 of the same numbers, the largest of a few rays."""
     rays = to(field_rays(tracer.lens, SAMPLE), dtype=tracer.dtype)
-    wavelength = tracer.lens.wavelengths[tracer.lens.primary_wavelength].double()
+    wavelength = tracer.lens.primary.double()
     tracer.prepare()
     with torch.no_grad(), tracing("eager"):
         exact = trace_lens(*(to(x, dtype=torch.float64) for x in (tracer.lens, rays)), wavelength)

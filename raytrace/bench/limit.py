@@ -126,7 +126,7 @@ class Limit:
 
 
 def _surfaces(lens: Lens, safe: bool) -> ctypes.Array:
-    indices = media(lens, lens.wavelengths[lens.primary_wavelength])
+    indices = media(lens, lens.primary)
     gaps = [0.0, *(float(surface.thickness) for surface in lens.surfaces[1:-1])]  # rays stand at the first surface
     rows = zip(lens.surfaces[1:], gaps, indices[:-1], indices[1:], strict=True)
     found = [_surface(number, *row) for number, row in enumerate(rows, 1)]

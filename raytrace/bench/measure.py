@@ -78,7 +78,7 @@ class Own:
     def __init__(self, lens: Lens, dtype: torch.dtype, *, engine: str | None = None, with_path=False, by_indices=False):
         self.dtype, self.with_path, self.engine = dtype, with_path, engine or engine_asked_for()
         self.name = "raytrace" if engine in (None, "auto") else f"raytrace, {engine}"
-        self.lens, self.wavelength = to(lens, dtype=dtype), lens.wavelengths[lens.primary_wavelength]
+        self.lens, self.wavelength = to(lens, dtype=dtype), lens.primary
         self.surfaces, self.indices, self.leaves = leaves_of(self.lens, by_indices=by_indices)
 
     def prepare(self) -> None:
@@ -150,7 +150,7 @@ def leaves_of(lens: Lens, *, by_indices: bool = True) -> tuple[tuple[Surface, ..
     nothing.
     """
     moving, leaves = with_leaves(lens)
-    fixed = media(lens, lens.wavelengths[lens.primary_wavelength])
+    fixed = media(lens, lens.primary)
     indices = list(fixed)
     for number, index in enumerate(fixed if by_indices else ()):
         if number > 0 and index is fixed[number - 1]:
@@ -167,7 +167,7 @@ def leaves_of(lens: Lens, *, by_indices: bool = True) -> tuple[tuple[Surface, ..
 def field_rays(lens: Lens, count: int) -> Rays:
     """`count` rays (Sobol points of the pupil) of the lens's middle field at its primary wavelength, float64."""
     field = torch.stack([lens.fields.x, lens.fields.y])[:, len(lens.fields.x) // 2, None]
-    wavelength = lens.wavelengths[lens.primary_wavelength]
+    wavelength = lens.primary
     with torch.no_grad():
         rays = rays_of_field(lens, field, sobol(count)[0], wavelength=wavelength, ray_aiming="off")
     return dataclasses.replace(rays, opl=None)
@@ -206,7 +206,7 @@ def shape_of(surface: Surface, number: int) -> tuple[float, float, list[float]]:
 
 def reference_of(lens: Lens) -> tuple[list[ReferenceSurface], float]:
     """The surfaces behind the object and the first index, for `trace_reference`."""
-    indices = [float(index) for index in media(lens, lens.wavelengths[lens.primary_wavelength])]
+    indices = [float(index) for index in media(lens, lens.primary)]
     surfaces = [
         ReferenceSurface(*shape_of(surface, number), float(surface.thickness), index, surface.is_mirror)
         for number, (surface, index) in enumerate(zip(lens.surfaces[1:], indices[1:], strict=True), 1)
@@ -232,7 +232,7 @@ def errors_of(tracer: Tracer, lens: Lens, rays: Rays, *, copies: int = 1, gradie
         1e6 * max(_worst(points[axis].tolist(), [ray.position[axis] for ray in exact]) for axis in (0, 1)), None, None
     )
     if path is not None:
-        waves = 1e3 / float(lens.wavelengths[lens.primary_wavelength])
+        waves = 1e3 / float(lens.primary)
         own = path[:count].double() - path[0].double()
         found = dataclasses.replace(
             found, path=waves * _worst(own.tolist(), [ray.path - exact[0].path for ray in exact])

@@ -85,7 +85,7 @@ def psf_methods(truth: Truth) -> list[Method]:
         return []
     energy = {name: float(kernel.sum()) for name, kernel in truth.kernels.items()}
     field = (0.0, 1.0 if truth.case.field else 0.0)
-    wavelength = float(truth.case.lens.wavelengths[truth.case.lens.primary_wavelength])
+    wavelength = float(truth.case.lens.primary)
 
     def method(model: str, sampling: str, against: str, compute: Callable, *sizes: int) -> Method:
         run = functools.partial(_run, compute, optic, field, wavelength, sizes, energy.get(against, 1.0))

@@ -110,7 +110,7 @@ def problem(name: str, *, moved: float = 0.0) -> Problem:
     be.set_backend("numpy")
     optic = _moved(sample(), radii, thicknesses, moved)
     lens = lens_of(optic)
-    rows = (Row("EFFL", (0, lens.primary_wavelength + 1), target=focal_length, weight=1.0), *spot_rows(lens))
+    rows = (Row("EFFL", (0, lens.primary_wavelength), target=focal_length, weight=1.0), *spot_rows(lens))
     variables = tuple(
         Vary(number, quantity)
         for quantity, numbers in (("curvature", radii), ("thickness", thicknesses))
@@ -163,7 +163,7 @@ def lens_of(optic: Optic) -> Lens:
         fields=Fields("angle", torch.zeros_like(heights), heights, torch.ones_like(heights)),
         wavelengths=_real(wavelengths),
         wavelength_weights=torch.ones(len(wavelengths), dtype=torch.float64),
-        primary_wavelength=int(optic.wavelengths.primary_index),
+        primary_wavelength=int(optic.wavelengths.primary_index) + 1,
         name=type(optic).__name__,
     )
 

@@ -48,8 +48,8 @@ class Optiland:
         self.dtype, self.backend, self.by_indices = dtype, backend, by_indices
         self.has_gradient = backend == "torch"
         self.lens = to(lens, dtype=dtype)
-        self.wavelength = float(lens.wavelengths[lens.primary_wavelength])
-        self.indices = media(self.lens, self.lens.wavelengths[lens.primary_wavelength])
+        self.wavelength = float(lens.primary)
+        self.indices = media(self.lens, self.lens.primary)
         self._leaves: tuple[list[Tensor], dict[int, Tensor]] | None = None
         self.prepare()
         with warnings.catch_warnings():
@@ -271,8 +271,8 @@ class RayOptics:
         self.trace = importlib.import_module("rayoptics.raytr.raytrace").trace_raw
         surface = importlib.import_module("rayoptics.elem.surface").Surface
         sphere = importlib.import_module("rayoptics.elem.profiles").Spherical
-        self.wavelength = 1e3 * float(lens.wavelengths[lens.primary_wavelength])
-        indices = [float(index) for index in media(lens, lens.wavelengths[lens.primary_wavelength])]
+        self.wavelength = 1e3 * float(lens.primary)
+        indices = [float(index) for index in media(lens, lens.primary)]
         unturned = np.eye(3)
         self.path = [[surface(), None, (unturned, np.zeros(3)), indices[0], 1]]
         for number, (one, index) in enumerate(zip(lens.surfaces[1:], indices[1:], strict=True), 1):

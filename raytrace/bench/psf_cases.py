@@ -52,7 +52,7 @@ class Case:
     @property
     def scene(self) -> Scene:
         """The primary wavelength alone, float64."""
-        wavelength = self.lens.wavelengths[self.lens.primary_wavelength][None]
+        wavelength = self.lens.primary[None]
         field = wavelength.new_tensor([[0.0], [self.field]])
         return scene(self.lens, field, wavelength.new_tensor([self.distance]), wavelength)
 
@@ -144,8 +144,8 @@ def _pitch(lens: Lens, field: float, distance: float) -> float:
     with torch.no_grad():
         light = gaussian_kernels(place.scene, grid(1.0, 1), order=8)
         width = 7 * float(light.covariance[::2].max().sqrt())
-        number = float(first_order(with_object_distance(lens, distance)).working_f_number)
-        airy = 8e-3 * float(lens.wavelengths[lens.primary_wavelength]) * number
+        number = float(first_order(with_object_distance(lens, distance)).paraxial_working_f_number)
+        airy = 8e-3 * float(lens.primary) * number
     pitch = max(width, airy if math.isfinite(airy) else 0.0, 1e-6) / PIXELS
     decade = 10.0 ** math.floor(math.log10(pitch))
     return next(step for step in (decade, 2 * decade, 5 * decade, 10 * decade) if step >= pitch * (1 - 1e-9))

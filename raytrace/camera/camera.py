@@ -25,6 +25,7 @@ from raytrace.camera.noise import add_noise
 from raytrace.camera.variables import Variables
 from raytrace.kernels import MODELS, NotConverged, psf
 from raytrace.maths.grid import Grid, grid
+from raytrace.optics.filling import warn_of_filling
 from raytrace.optics.reuse import Memo
 from raytrace.optics.scene import chief_landing, scene
 from raytrace.system.lens import Lens, field_points
@@ -41,6 +42,7 @@ class Camera(nn.Module):
     chosen once, for the lens as it is at the first call (`plan`). rho: of the paraxial model.
     network_dtype: torch.bfloat16 runs the network alone in it (autocast); the optics keep the lens's dtype.
     The object is taken to be flat at one distance, and upright: magnification and its sign change no loss.
+    Warns UnfilledStop, once, of the lens as it is when the camera is made.
     """
 
     def __init__(
@@ -63,6 +65,7 @@ class Camera(nn.Module):
         self.range = object_distances
         like = variables.lens.wavelengths
         self.fields = like.new_zeros(2, 1) if fields is None else field_points(fields, like=variables.lens)
+        warn_of_filling(variables.lens, self.fields)
         self.pixels = grid(like.new_tensor(0.005), 21) if pixels is None else pixels
         self.normalise, self.noise, self.tol, self.rho, self.network_dtype = normalise, noise, tol, rho, network_dtype
         self._order: int | None = None
@@ -113,8 +116,7 @@ class Camera(nn.Module):
         """The pixels around the chief ray: they follow it with its derivatives, for where a picture lies is no loss."""
         if bool((fields == 0).all()):
             return self.pixels
-        primary = lens.wavelengths[lens.primary_wavelength][None]
-        chief = chief_landing(scene(lens, fields, distances, primary, self._memo))[..., 0]
+        chief = chief_landing(scene(lens, fields, distances, lens.primary[None], self._memo))[..., 0]
         return dataclasses.replace(self.pixels, centre=self.pixels.centre[:, None, None] + chief)
 
     def image(self, picture: Tensor, object_distances: Tensor, field: int = 0) -> Tensor:

@@ -67,7 +67,7 @@ def _length(text: str) -> float:
 def solved(like: Lens, focal_length: float, with_value: Callable[[Tensor], Lens]) -> Tensor:
     """The number () that gives a lens its focal length in mm. with_value: the lens with that number at a value."""
     at_zero, change = _line(like, with_value)
-    wavelength = like.wavelengths[like.primary_wavelength]
+    wavelength = like.primary
     *_, index, _ = media(like, wavelength)
     return (index.abs() / focal_length - at_zero) / change
 

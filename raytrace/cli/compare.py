@@ -1,6 +1,17 @@
 """`raytrace compare`."""
 
-from raytrace.cli.options import aperture, lens, log, object_distance, plot, positive, positive_finite, size, wavelength
+from raytrace.cli.options import (
+    aperture,
+    lens,
+    log,
+    object_distance,
+    plot,
+    positive,
+    positive_finite,
+    ray_aiming,
+    size,
+    wavelength,
+)
 
 SUMMARY = "the PSF models side by side"
 
@@ -24,6 +35,7 @@ def options(parser) -> None:
     object_distance(group, "the columns (default 10000 20000 30000 40000 50000)")
     aperture(group)
     wavelength(group)
+    ray_aiming(group)
     parser.add_argument(
         "--start",
         choices=("paraxial", "rms"),

@@ -12,7 +12,9 @@ from raytrace.system.lens import Lens, check_media
 from raytrace.words import did_you_mean
 
 #: Options that set the lens, by the keywords of `Lens.at`.
-CONDITIONS = ("sensor_distance", "f_number", "entrance_pupil_diameter", "wavelengths", "temperature", "pressure")
+CONDITIONS = (
+    *("sensor_distance", "f_number", "entrance_pupil_diameter", "wavelengths", "ray_aiming", "temperature", "pressure"),
+)
 
 
 class CommandError(ValueError):

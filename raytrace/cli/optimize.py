@@ -20,6 +20,7 @@ EXAMPLES = """examples:
 
 def options(parser):
     words.lens(parser)
+    words.ray_aiming(parser)
     merit(parser)
     freedom(parser)
     ends = parser.add_argument_group("how long")

@@ -205,6 +205,7 @@ def conditions(parser: argparse.ArgumentParser, *, several: str = "") -> None:
     )
     aperture(group)
     wavelength(group)
+    ray_aiming(group)
     environment(group)
 
 
@@ -322,13 +323,12 @@ def reference(parser: argparse.ArgumentParser, what: str) -> None:
     parser.add_argument("--reference", choices=("primary", "own"), help=what)
 
 
-def ray_aiming(parser: argparse.ArgumentParser) -> None:
+def ray_aiming(parser) -> None:
     parser.add_argument(
         "--ray-aiming",
-        choices=("file", "off", "paraxial", "real"),
-        default="file",
-        help="aim rays at the stop: as the file says (default), not at all, or over a stop as large as the paraxial or "
-        "the real marginal ray makes it",
+        choices=("auto", "off", "paraxial", "real"),
+        help="aim rays at the stop: not at all, over a stop as wide as the paraxial or the real marginal ray makes it, "
+        "or auto: real where the axis bends in front of the stop, else off (default: as the file specifies, else auto)",
     )
 
 

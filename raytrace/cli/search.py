@@ -21,6 +21,7 @@ EXAMPLES = """examples:
 
 def options(parser):
     words.lens(parser)
+    words.ray_aiming(parser)
     merit(parser)
     freedom(parser)
     how = parser.add_argument_group("how far")

@@ -46,7 +46,6 @@ def options(parser):
         help="rays count by their share of the pupil's area (default) or all alike; OpticStudio's spots are "
         "--sampling hexapolar --rings 6 --weights equal --reference chief",
     )
-    words.ray_aiming(parser)
     words.output(parser, "table of the rays to write (.csv): field, wavelength, pupil point, x, y, weight, status")
     words.plot(parser, "the spot diagram")
 

@@ -28,7 +28,6 @@ def options(parser):
     words.output(parser, "table to write (.csv); default: standard output")
     words.conditions(parser, several="rays from each")
     words.fields(parser)
-    words.ray_aiming(parser)
 
 
 def run(arguments):

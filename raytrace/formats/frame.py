@@ -21,8 +21,9 @@ _PLACE = Place("DataFrame")
 
 
 def frame_of(result: Result) -> pd.DataFrame:
-    """A result as a table: a row for every point of every curve."""
+    """A result as a table: a row for every point of every curve; units of the columns are in `frame.attrs["units"]`."""
     frame = pd.DataFrame(flat(result.columns()))
+    frame.attrs["units"] = result.units()
     return frame.assign(**{name: [words[number] for number in frame[name]] for name, words in result.words().items()})
 
 

@@ -73,7 +73,7 @@ def read(
         fields=_fields(found, surfaces[0], unit, report),
         wavelengths=wavelengths,
         wavelength_weights=weights,
-        primary_wavelength=0,
+        primary_wavelength=1,
         name=title,
         notes=notes,
     )

@@ -10,6 +10,7 @@ from raytrace.formats.source import LensFileError, Place
 from raytrace.formats.substitutes import NONE, Substitutes
 from raytrace.maths.result import Result
 from raytrace.maths.value import value
+from raytrace.system.conditions import RAY_AIMING
 from raytrace.system.dimensions import DIMENSION
 from raytrace.system.intent import Row
 
@@ -119,7 +120,8 @@ class ImportReport(Result):
     """What became of a lens file: every keyword met, where each glass came from, notes and warnings.
 
     A note says what was done where the file leaves a choice; a warning says what was assumed or lost, and is an
-    error when the file is read with `strict=True`. surfaces, stop_surface: of the lens that was read.
+    error when the file is read with `strict=True`. surfaces, stop_surface, primary_wavelength (its
+    number, from 1), wavelengths (µm), ray_aiming: of the lens that was read.
     configurations: what differs between those of a multi-configuration file.
     variables, solves, kept: of `Lens.intent`, in words; operands: those of its merit function; tolerances: its lines.
     geometry: surfaces and gaps that cannot be made.
@@ -133,6 +135,9 @@ class ImportReport(Result):
     warnings: tuple[str, ...] = ()
     surfaces: int = 0
     stop_surface: int = 0
+    primary_wavelength: int = 1
+    wavelengths: tuple[float, ...] = ()
+    ray_aiming: str = ""
     configurations: tuple[Varied, ...] = ()
     variables: tuple[str, ...] = ()
     solves: tuple[str, ...] = ()
@@ -157,6 +162,7 @@ class ImportReport(Result):
         lines = [f"{self.file} ({self.format})"]
         lines += [f"  warning: {warning}" for warning in (*self.warnings, *self.geometry)]
         lines += [f"  note: {note}" for note in self.notes]
+        lines += self._conventions()
         for status, title in _TITLES.items():
             chosen = [str(keyword) for keyword in self.keywords if keyword.status == status]
             listed = _wrapped(chosen) if status == READ else [f"    {keyword}" for keyword in chosen]
@@ -167,6 +173,16 @@ class ImportReport(Result):
         lines += self._intent()
         lines += ["  glasses:", *(f"    {use}" for use in self.glasses)] if self.glasses else []
         return "\n".join(lines)
+
+    def _conventions(self) -> list[str]:
+        """The primary wavelength and the ray aiming of the lens."""
+        if not self.wavelengths:
+            return []
+        chosen, count = self.primary_wavelength, len(self.wavelengths)
+        return [
+            f"  primary wavelength: number {chosen} of {count}, {self.wavelengths[chosen - 1]:g} µm",
+            f"  ray aiming: {self.ray_aiming} ({RAY_AIMING[self.ray_aiming]})",
+        ]
 
     def _intent(self) -> list[str]:
         """What the lens is to become, and the operands of its merit function by what becomes of them."""

@@ -77,7 +77,7 @@ def read(
     surfaces = _surfaces(found, unit, shelf, report)
     solve = system.last("PIM")
     if solve and not (solve.words and solve.words[0][:1] in "Nn"):
-        surfaces = _at_paraxial_image(surfaces, wavelengths[primary], solve.place, report)
+        surfaces = _at_paraxial_image(surfaces, wavelengths[primary - 1], solve.place, report)
     title = system.last("TIT")
     lens = Lens(
         surfaces=_focused(surfaces),
@@ -90,7 +90,7 @@ def read(
         name=_text(title).strip() if title else "",
         notes=tuple(plain_text(record.text) for record in found.own if record.keyword == "NOTE"),
         catalogs=_catalogs(found, surfaces),
-        ray_aiming=_aiming(found),
+        ray_aiming=_aiming(found, report),
     )
     refuse_overflow(lens, file)
     _remarks(system, report)
@@ -247,7 +247,7 @@ def _wavelengths(system: Block) -> tuple[Tensor, Tensor, int]:
     primary = reference.integer(0, "number of the reference wavelength") if reference else 1
     if not 1 <= primary <= len(waves):
         raise LensFileError(f"REF is {primary}, expected 1 to {len(waves)}, the number of wavelengths", reference.place)
-    return double(waves), double(weights), primary - 1
+    return double(waves), double(weights), primary
 
 
 def _fields(system: Block, unit: float, report: Draft) -> Fields:
@@ -323,10 +323,15 @@ def _catalogs(found: Sections, surfaces: Sequence[Surface]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(surface.glass.catalog for surface in surfaces if surface.glass.catalog))
 
 
-def _aiming(found: Sections) -> str:
+def _aiming(found: Sections, report: Draft) -> str:
+    """CODE V aims reference rays at the stop; EPD is the diameter of the real beam on the axis."""
     told = [record for record in found.own if record.keyword == "AIMING"]
     if not told:
-        return "paraxial"
+        report.note(
+            "ray aiming is not specified: real, as CODE V aims at the stop, which is as wide as the real marginal ray "
+            "of the axial beam: EPD holds on the axis"
+        )
+        return "real"
     word = told[-1].text.strip().lower()
     if word not in RAY_AIMING:
         message = f"{OWN.lower()} aiming is {shown(word)}, expected one of {', '.join(RAY_AIMING)}"

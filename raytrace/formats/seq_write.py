@@ -62,7 +62,7 @@ def _system(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
         _aperture(lens.aperture, lens.surfaces[0], place),
         "DIM M",
         _listed("WL", waves),
-        f"REF {lens.primary_wavelength + 1}",
+        f"REF {lens.primary_wavelength}",
         _listed("WTW", _weights(lens.wavelength_weights, "weight of a wavelength", place)),
         _listed(x, exact_list(fields.x, "field", place)),
         _listed(y, exact_list(fields.y, "field", place)),
@@ -84,7 +84,7 @@ def _own(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
     return [
         *(f"{own} note {quoted(one_line(note, 'a note', place))}" for note in lens.notes),
         f"{own} catalogs {' '.join(map(word, lens.catalogs))}" if lens.catalogs else f"{own} catalogs",
-        f"{own} aiming {lens.ray_aiming}" if lens.ray_aiming != "paraxial" else "",
+        f"{own} aiming {lens.ray_aiming}" if lens.ray_aiming != "real" else "",
         f"{own} unnamed {' '.join(unnamed)}" if unnamed else "",
     ]
 
@@ -181,7 +181,7 @@ def _surface(
 
 
 def _reference(lens: Lens) -> float:
-    return float(lens.wavelengths[lens.primary_wavelength])
+    return float(lens.primary)
 
 
 def _medium(lens: Lens, number: int) -> Glass:

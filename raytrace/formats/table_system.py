@@ -38,7 +38,7 @@ from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, RAY_AIMING, Fields
 
 #: Short names of the system aperture, longest first, as patterns.
 _APERTURES = (
-    (r"working\s+f[\s/#-]*(?:number|num|no\.?)?", "working_f_number"),
+    (r"(?:paraxial\s+)?working\s+f[\s/#-]*(?:number|num|no\.?)?", "paraxial_working_f_number"),
     (r"(?:image\s+)?f[\s/#-]*(?:number|num|no\.?)?", "image_f_number"),
     (r"epd|enpd|entrance pupil", "entrance_pupil_diameter"),
     (r"na|object na", "object_na"),
@@ -76,7 +76,7 @@ def _choice(table: Table, key: str, choices: Sequence[str], expected: str) -> st
 
 
 def ray_aiming(table: Table) -> str:
-    """off, paraxial or real."""
+    """A key of RAY_AIMING."""
     return _choice(table, "ray aiming", [*RAY_AIMING], f"one of {', '.join(RAY_AIMING)}")
 
 
@@ -184,7 +184,7 @@ def _per_field(table: Table, key: str, count: int, default: float) -> list[float
 
 
 def wavelengths(table: Table) -> tuple[Tensor, Tensor, int]:
-    """Wavelengths in µm, weights, 0-based primary; the d line, with a warning, if there are none."""
+    """Wavelengths in µm, weights, number of the primary one; the d line, with a warning, if there are none."""
     found, report = [LINES["d"]], table.report
     if "wavelengths" in table.metadata:
         found = _wavelengths(*table.metadata["wavelengths"])
@@ -200,7 +200,7 @@ def wavelengths(table: Table) -> tuple[Tensor, Tensor, int]:
         raise LensFileError(f"primary wavelength is {value}, expected a number from 1 to {len(found)}", place)
     if "primary wavelength" not in table.metadata and len(found) > 1:
         report.note("no primary wavelength in the header: the first is taken")
-    return double(found), double(weights), primary - 1
+    return double(found), double(weights), primary
 
 
 def _wavelengths(value: str, place: Place) -> list[float]:
@@ -250,9 +250,9 @@ def written(lens: Lens, place: Place, catalogs: Sequence[Path] = ()) -> list[tup
         ("telecentric", "yes" if fields.telecentric else ""),
         ("wavelengths", listed(lens.wavelengths, "wavelength") + unit),
         ("wavelength weights", listed(lens.wavelength_weights, "weight")),
-        ("primary wavelength", str(lens.primary_wavelength + 1)),
+        ("primary wavelength", str(lens.primary_wavelength)),
         ("catalogs", " ".join(map(word, catalogs_needed(lens, catalogs, place.file)))),
-        ("ray aiming", "" if lens.ray_aiming == "off" else lens.ray_aiming),
+        ("ray aiming", "" if lens.ray_aiming == "auto" else lens.ray_aiming),
         *written_environment(lens.environment, place).items(),
     ]
     return [(key, value) for key, value in lines if value]

@@ -84,7 +84,7 @@ TYPE_NAMES = dict(name.split(" ", 1) for name in _TYPES.split(", "))
 SYSTEM_APERTURES = {
     "entrance_pupil_diameter": ("ENPD", None),
     "image_f_number": ("FNUM", 0),
-    "working_f_number": ("FNUM", 1),
+    "paraxial_working_f_number": ("FNUM", 1),
     "object_na": ("OBNA", 0),
     "object_cone_angle": ("OBNA", 1),
     "float_by_stop": ("FLOA", None),
@@ -115,6 +115,8 @@ FIELD_LISTS = {
 
 #: The lists of fields hold this many; a FEFD line holds a number of every list for each further field.
 FIELDS_IN_LISTS = 12
+#: Ray aiming by the second number of RAIM; a file without RAIM specifies none.
+AIMINGS = ("off", "paraxial", "real")
 
 #: OpticStudio cuts a long note into pieces of this many characters.
 NOTE_PIECE = 200

@@ -26,6 +26,7 @@ from raytrace.formats.source import LensFileError, UnsupportedSurface, shown
 from raytrace.formats.spelling import MILLIMETRES, double, refuse_overflow
 from raytrace.formats.substitutes import NONE, Substitutes
 from raytrace.formats.zemax_keywords import (
+    AIMINGS,
     FIELD_KINDS,
     FIELD_LISTS,
     FIELD_NAMES,
@@ -36,7 +37,7 @@ from raytrace.formats.zemax_keywords import (
     Sections,
     sections,
 )
-from raytrace.system.lens import RAY_AIMING, Fields, Lens, SystemAperture
+from raytrace.system.lens import Fields, Lens, SystemAperture
 from raytrace.system.surface import Surface
 
 #: More field points or wavelengths than any file has.
@@ -271,16 +272,16 @@ def _guessed_count(system: Block, slots: dict[int, Record], report: Draft) -> in
 
 
 def _primary(system: Block, count: int, report: Draft) -> int:
-    """The 0-based position of the primary wavelength."""
+    """The number of the primary wavelength, from 1."""
     record = system.last("PWAV")
     if record is None:
         if count > 1:
             report.warn("no PWAV: the first wavelength is taken as the primary one", system.place)
-        return 0
+        return 1
     primary = record.integer(0, "primary wavelength")
     if not 1 <= primary <= count:
         raise LensFileError(f"PWAV is {primary}, expected 1 to {count}, the number of wavelengths", record.place)
-    return primary - 1
+    return primary
 
 
 def _notes(system: Block) -> tuple[str, ...]:
@@ -301,12 +302,14 @@ def _notes(system: Block) -> tuple[str, ...]:
 
 
 def _ray_aiming(system: Block) -> str:
-    """Whether RAIM, in its second number, asks for rays aimed at the stop: 0 off, 1 paraxial, 2 real reference."""
+    """Whether RAIM, in its second number, asks for rays aimed at the stop; "auto" of a file without RAIM."""
     record = system.last("RAIM")
-    kind = record.integer(1, "ray aiming", 0) if record else 0
-    if not 0 <= kind < len(RAY_AIMING):
+    if record is None:
+        return "auto"
+    kind = record.integer(1, "ray aiming", 0)
+    if not 0 <= kind < len(AIMINGS):
         raise LensFileError(f"RAIM of kind {kind}, expected 0 (off), 1 (paraxial) or 2 (real)", record.place)
-    return list(RAY_AIMING)[kind]
+    return AIMINGS[kind]
 
 
 def _remarks(found: Sections, report: Draft) -> None:

@@ -11,6 +11,7 @@ from raytrace.formats.media import catalogs_needed, is_code, is_left_out, listed
 from raytrace.formats.source import LensFileError, Place
 from raytrace.formats.spelling import exact, exact_list, one_line, thickness
 from raytrace.formats.zemax_keywords import (
+    AIMINGS,
     BLANK,
     FIELD_KINDS,
     FIELD_LISTS,
@@ -25,10 +26,10 @@ from raytrace.formats.zemax_types import type_of, types
 from raytrace.formats.zemax_units import in_unit
 from raytrace.media.glass import Glass, mil_glass
 from raytrace.system.aperture import SHAPES, Aperture
-from raytrace.system.lens import RAY_AIMING, Lens
+from raytrace.system.lens import Lens
 from raytrace.system.pose import Pose
 from raytrace.system.shapes import EVEN, KINDS
-from raytrace.system.surface import Surface
+from raytrace.system.surface import Surface, is_posed
 
 #: OpticStudio has this many wavelengths.
 _WAVELENGTHS = 24
@@ -88,7 +89,7 @@ def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
         zemax_environment.line(lens, place),
         "GFAC 0 0",
         f"GCAT {' '.join(catalogs_needed(lens, catalogs, place.file))}".rstrip(),
-        f"RAIM 0 {list(RAY_AIMING).index(lens.ray_aiming)} 1 1 0 0 0 0 0",
+        *_ray_aiming(lens),
         "PUSH 0 0 0 0 0 0",
         zemax_intent_write.margin(lens.intent),
         f"FTYP {kind} {int(fields.telecentric)} {len(fields.x)} {len(lens.wavelengths)} 0 0 0",
@@ -96,7 +97,7 @@ def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
         "PICB 1",
         *_fields((fields.x, fields.y, fields.weight, *vignetting), place),
         *(f"WAVM {slot} {wavelength} {weight}" for slot, (wavelength, weight) in enumerate(waves, 1)),
-        f"PWAV {lens.primary_wavelength + 1}",
+        f"PWAV {lens.primary_wavelength}",
     ]
 
 
@@ -108,6 +109,13 @@ def _fields(lists: Sequence[Tensor], place: Place) -> list[str]:
     further = list(zip(*(text[FIELDS_IN_LISTS:] for text in texts), strict=True))
     count = FIELDS_IN_LISTS + len(further)
     return [*told, *([f"FENF {count} {count}"] if further else []), *(" ".join(["FEFD", *one]) for one in further)]
+
+
+def _ray_aiming(lens: Lens) -> list[str]:
+    """RAIM; none of a lens that specifies no ray aiming, unless a surface up to the stop is posed: it is aimed then."""
+    front = lens.surfaces[: lens.stop + 1]
+    aiming = "real" if lens.ray_aiming == "auto" and any(map(is_posed, front)) else lens.ray_aiming
+    return [] if aiming == "auto" else [f"RAIM 0 {AIMINGS.index(aiming)} 1 1 0 0 0 0 0"]
 
 
 def _check_floating_stop(lens: Lens, place: Place) -> None:

@@ -21,6 +21,7 @@ from raytrace.maths.grid import Grid
 from raytrace.maths.grid import grid as make_grid
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
+from raytrace.optics.filling import warn_of_filling
 from raytrace.optics.losses import beam_hint, losses, warn_of_losses
 from raytrace.optics.reuse import Memo
 from raytrace.optics.scene import Scene, chief_landing, scene, symmetry
@@ -89,7 +90,7 @@ def psf(
     progress: (how many, unit) -> a bar of them, see `cli.progress`.
     empty: what a PSF of a batch is that no ray reaches: "nan", its kernel 0 and its moments nan, all with gradient 0,
     or "error". Raises ValueError for arguments that make no sense, EmptyPsf if no ray at all reaches the sensor. Warns
-    NotConverged.
+    NotConverged and, outside of loops (without `order` and `memo`), UnfilledStop.
     """
     center = center or ("chief" if fields is None else "axis")
     _check(model, center, window, normalise, tol=tol, rays=rays, order=order, grid=grid, pixel=pixel, size=size)
@@ -103,6 +104,8 @@ def psf(
     wavelengths = like if wavelengths is None else _row(wavelengths, like)
     weights = torch.ones_like(wavelengths) if weights is None else _row(weights, like)
     _check_batch(fields, distances, wavelengths, weights)
+    if order is None and memo is None:
+        warn_of_filling(with_object_distance(lens, distances.min()), fields)
     options = {"rho": rho, "zernike": zernike}
     drive = _driver(lens, model, options, tol, rays, order, share, max_bytes, progress)
     if share is not None and share.processes > 1:
@@ -257,8 +260,7 @@ def _centre(batch: Scene, lens: Lens, center: str, weights: Tensor) -> Tensor | 
     if center == "centroid" and symmetry(batch) != "round":
         pixel = make_grid(batch.wavelengths.new_tensor(1.0), 1)
         return polychromatic(gaussian.kernels_alone(batch, pixel, order=6), weights, "").centroid
-    primary = lens.wavelengths[lens.primary_wavelength][None]
-    return chief_landing(dataclasses.replace(batch, wavelengths=primary))[..., 0]
+    return chief_landing(dataclasses.replace(batch, wavelengths=lens.primary[None]))[..., 0]
 
 
 def _with_centre(base: Tensor, place: Tensor | None, wavelengths: int) -> Tensor:

@@ -155,7 +155,9 @@ def _rounding(batch: Scene, pixels: Grid, found: Psf, model: Model) -> Tensor:
     is the rounding of the lens, whose image is out of focus by ε f and so blurred by ε f/2N.
     """
     paraxial = first_order(batch.lens)
-    focal, f_number = (t.abs().reshape(-1)[:1] for t in (paraxial.effective_focal_length, paraxial.working_f_number))
+    focal, f_number = (
+        t.abs().reshape(-1)[:1] for t in (paraxial.effective_focal_length, paraxial.paraxial_working_f_number)
+    )
     spread = torch.finfo(found.kernel.dtype).eps * torch.where(torch.isfinite(focal), focal, 1.0)
     if model.waves:
         spread = spread / (2 * torch.where(torch.isfinite(f_number), f_number, 1.0))

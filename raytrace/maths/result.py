@@ -56,6 +56,10 @@ class Result:
         """What the numbers of a column, 0 and up, stand for, by the name of the column."""
         return {}
 
+    def units(self) -> dict[str, str]:
+        """Units of columns, by the name of the column, of those that have one; `to_frame` has them in `attrs`."""
+        return {}
+
     to_frame = lent("formats.frame.frame_of")
     save = lent("formats.frame.save")
 

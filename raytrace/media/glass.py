@@ -233,6 +233,16 @@ def model_glass(nd: float | Tensor, vd: float | Tensor, dpgf: float | Tensor = 0
     return Glass(name, "model", coefficients)
 
 
+def label(glass: Glass) -> str:
+    """The name of a medium; of one without a name n_d/V_d of a model glass, "n 1.5" of a constant index, "" of air."""
+    if glass.name or glass.coefficients.dim() > 1:
+        return glass.name
+    numbers = glass.coefficients.tolist()
+    if glass.formula == "model":
+        return f"{numbers[0]:.6g}/{numbers[1]:.4g}"
+    return f"n {numbers[0]:.6g}" if glass.formula == "constant" and numbers[0] != 1 else ""
+
+
 def mil_glass(code: str) -> Glass:
     """The model glass of a six-digit code: "517642" is n_d = 1.517, V_d = 64.2.
 

@@ -21,7 +21,7 @@ from raytrace.merit.by_torch import rays_by_torch
 from raytrace.merit.launch import launched
 from raytrace.merit.model import GLASS, unbent
 from raytrace.merit.moment import Moment
-from raytrace.optics.axis import is_bent
+from raytrace.optics.axis import aiming_of, is_bent
 from raytrace.optics.jacobian import ends, pushed, pushed_everywhere
 from raytrace.optics.launch import rays_of_field
 from raytrace.optics.sequence import media, sequence_of
@@ -166,11 +166,11 @@ class Bundle:
         source = lens.surfaces[0]
         plane = source.is_plane and source.after is None
         usual = lens.fields.kind in ("angle", "object_height", "paraxial_image_height") and not lens.fields.telecentric
-        return plane and usual and (lens.ray_aiming == "off" or not is_bent(lens))
+        return plane and usual and (not self._aims or not is_bent(lens))
 
     @cached_property
     def _aims(self) -> bool:
-        return self.view.lens.ray_aiming != "off"
+        return aiming_of(self.view.lens) != "off"
 
     @cached_property
     def _at_stop(self) -> "Bundle":
@@ -183,7 +183,7 @@ class Bundle:
     def _marginal(self) -> "Bundle":
         """The axial ray through the edge of the paraxial entrance pupil, on the stop."""
         found = Bundle(self.view, self.view.lens.stop)
-        found.ask(self.view.lens.primary_wavelength, (0.0, 0.0), (0.0, 1.0 / self._opening))
+        found.ask(self.view.lens.primary_wavelength - 1, (0.0, 0.0), (0.0, 1.0 / self._opening))
         return found
 
     # -- at a moment ---------------------------------------------------------------------------------------------------

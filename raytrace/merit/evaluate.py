@@ -14,8 +14,9 @@ from raytrace.merit.model import Model
 from raytrace.merit.operands import OPERANDS
 from raytrace.merit.readings import Readings, readings_of
 from raytrace.merit.value import Merit, arguments, configurations_of, merit_for
+from raytrace.optics.filling import warn_of_filling
 from raytrace.system.intent import Row
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, field_points
 
 _WHOLE = 40  # rows that are listed one by one
 _TOGETHER = 3  # rows of one field that share a line in longer tables
@@ -163,6 +164,7 @@ def evaluate(
         wavelength_weights=wavelength_weights, glass_thickness=glass_thickness, air_thickness=air_thickness, edge=edge,
         configurations=configuration and [configuration],
     )  # fmt: skip
+    warn_of_filling(lens, field_points(None, like=lens))
     where = configurations_of(function, lens.current_configuration)
     if configuration is not None:
         apart = {number: 0.0 for number, at in enumerate(where, 1) if at != configuration}

@@ -116,7 +116,7 @@ class Evaluation:
     def _lines(self):
         """Rows that have a value, each with the configuration and the primary wavelength that stand above it."""
         lens = self.model.lens
-        configuration, primary = lens.current_configuration, lens.primary_wavelength
+        configuration, primary = lens.current_configuration, lens.primary_wavelength - 1
         for number, row in enumerate(self.rows, 1):
             line = Line(number, row, row.integers[1] - 1 if row.integers[1] > 0 else primary)
             if row.operand == "CONF":

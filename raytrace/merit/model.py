@@ -174,7 +174,10 @@ class View:
                     at for surface, quantity in solved if (at := quantity) != "thickness" and surface > one.surface
                 ]
                 return bool(shape) or not any(one.numbers[1:])
-            return one.surface < self.lens.stop or self.lens.aperture.kind in ("image_f_number", "working_f_number")
+            return one.surface < self.lens.stop or self.lens.aperture.kind in (
+                "image_f_number",
+                "paraxial_working_f_number",
+            )
 
         return any(is_late(*found) for found in enumerate(self.solves))
 

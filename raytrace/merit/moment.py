@@ -156,7 +156,7 @@ class Moment:
 
     @property
     def primary(self) -> int:
-        return self.lens.primary_wavelength
+        return self.lens.primary_wavelength - 1
 
     def _found(self, wavelength: int) -> Gaussian:
         n, stop, last = self.index(wavelength), self.lens.stop, len(self.lens.surfaces) - 2
@@ -191,7 +191,7 @@ class Moment:
             return np.abs(data.effective_focal_length) / number
         if kind == "float_by_stop":
             return 2 * number / np.abs(data.front[0])
-        if kind == "working_f_number":
+        if kind == "paraxial_working_f_number":
             slope, omega = 0.5 / (number * abs(data.n_image)), data.C + data.D * self.vergence
             pupil = data.entrance_pupil_position
             return 2 * np.abs(slope * data.n_image / omega * (1 + pupil * self.vergence / data.n_object))

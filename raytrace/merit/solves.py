@@ -60,7 +60,7 @@ def _real_height(lens: Lens, solve: Solve) -> Tensor:
     """t = z + (N/M)(h - y) - z′(h) behind which a real axial ray meets the next surface at the height h; else nan."""
     k, (height, part) = solve.surface, solve.numbers
     like = lens.wavelengths
-    rays = _behind(lens, k, like.new_zeros(2), like.new_tensor([0.0, part]), like[lens.primary_wavelength])
+    rays = _behind(lens, k, like.new_zeros(2), like.new_tensor([0.0, part]), lens.primary)
     (_, y, z), (_, M, N) = rays.position, rays.direction
     crosses = rays.valid & (M != 0)
     ratio = N / torch.where(crosses, M, torch.ones_like(M))

@@ -80,7 +80,7 @@ def aim_at_image(
     A field is 0 where not found. through(field, pupil): rays; height: (2, ...) mm; estimate: (2, ...), where to begin;
     radius: of the stop, whose centre the chief ray passes, or None where it passes that of the paraxial entrance pupil.
     """
-    wavelength = lens.wavelengths[lens.primary_wavelength]
+    wavelength = lens.primary
     size = torch.linalg.vector_norm(height.detach(), dim=0)
     size = torch.where(size > 0, size, 1.0)
 

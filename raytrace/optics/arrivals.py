@@ -115,7 +115,7 @@ def unclipped(lens: Lens, pupil: Tensor, fields: Tensor, wavelengths: Tensor) ->
 
 def chief_reference(lens: Lens, fields: Tensor) -> Tensor:
     """Where the primary wavelength's chief rays of fields (2, F) meet the sensor, (2, F, 1) mm; nan where none does."""
-    points, valid = chief_points(lens, fields, lens.wavelengths[lens.primary_wavelength][None])
+    points, valid = chief_points(lens, fields, lens.primary[None])
     return torch.where(valid, points, torch.nan)
 
 

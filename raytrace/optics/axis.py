@@ -1,4 +1,7 @@
-"""Axis: whether light along it stays on it, from the object to the image, in a straight line."""
+"""Axis: whether light along it stays on it, from the object to the image, in a straight line; ray aiming by that."""
+
+from collections.abc import Sequence
+from itertools import islice
 
 import torch
 from torch import Tensor
@@ -10,7 +13,7 @@ from raytrace.optics.trace import lens_steps
 from raytrace.system.lens import Lens
 from raytrace.system.phases import kind_of
 from raytrace.system.rays import Rays
-from raytrace.system.surface import is_posed, is_round
+from raytrace.system.surface import Surface, is_posed, is_round
 from raytrace.words import named
 
 _STRAIGHT = 1e-9  # mm and direction cosines: an axial ray that leaves the axis by less has not left it
@@ -23,24 +26,42 @@ def is_round_about_axis(lens: Lens) -> bool:
 
 def is_bent(lens: Lens) -> bool:
     """Whether the axis bends: a surface is tilted or decentred, a coordinate break, or takes an axial ray off it."""
-    if any(map(is_posed, lens.surfaces)):
+    return _bends(lens, lens.surfaces)
+
+
+def aiming_of(lens: Lens) -> str:
+    """How rays of a lens find the stop, "off", "paraxial" or "real": its `ray_aiming`, or what "auto" comes to.
+
+    "auto" is "real" where a surface in front of the stop bends the axis, or the stop is tilted or decentred: the
+    straightened entrance pupil is no image of the stop there. Where the axis bends behind the stop it is "off".
+    """
+    if lens.ray_aiming != "auto":
+        return lens.ray_aiming
+    stop = lens.surfaces[lens.stop]
+    moved = stop.is_break or stop.before is not None
+    return "real" if moved or _bends(lens, lens.surfaces[: lens.stop]) else "off"
+
+
+def _bends(lens: Lens, surfaces: Sequence[Surface]) -> bool:
+    """Whether the first surfaces of a lens, which these are, bend its axis."""
+    if any(map(is_posed, surfaces)):
         return True
-    if all(map(is_round, lens.surfaces)):
+    if all(map(is_round, surfaces)):
         return False
     if any(isinstance(n, Tensor) and is_functorch_wrapped_tensor(n) for n in pytree.tree_leaves(lens)):
         # Numbers cannot be looked at inside a transform.
-        phases = [kind_of(surface.phase) for surface in lens.surfaces if surface.phase is not None]
+        phases = [kind_of(surface.phase) for surface in surfaces if surface.phase is not None]
         return any(not kind.is_round and not kind.slopes for kind in phases)
-    return _leaves_the_axis(detached(lens))
+    return _leaves_the_axis(detached(lens), len(surfaces))
 
 
 @torch.no_grad()
-def _leaves_the_axis(lens: Lens) -> bool:
-    wavelength = lens.wavelengths[lens.primary_wavelength]
+def _leaves_the_axis(lens: Lens, count: int) -> bool:
+    wavelength = lens.primary
     axis = lens.surfaces[-2].thickness.new_tensor([0.0, 0.0, 1.0])
     rays = Rays(0 * axis, axis, axis[2] > 0)
     off = [0 * axis[:2]]
-    for crossing in lens_steps(lens, rays, wavelength):
+    for crossing in islice(lens_steps(lens, rays, wavelength), count - 1):
         off += [crossing.rays.position[:2], crossing.rays.direction[:2]]
     return bool((torch.stack(off).abs() > _STRAIGHT).any())
 

@@ -45,7 +45,7 @@ class BaseRay:
         closest to it.
     entrance_pupil_position: from the plane of the vertex of surface 1 to the image of the stop in object space.
     exit_pupil_position: from the image surface to that in image space; diameters > 0.
-    working_f_number: 1/(2 n′ |u′|) of rays from the axial object point through the rim of the stop.
+    paraxial_working_f_number: 1/(2 n′ |u′|) of rays from the axial object point through the rim of the stop.
     magnification: of the image of each section, 0 for an object at infinity; its sign as that of the focal length.
     A quantity that does not exist (the focal length of an afocal lens, say) comes out infinite.
     """
@@ -61,7 +61,7 @@ class BaseRay:
     exit_pupil_position: Tensor
     exit_pupil_diameter: Tensor
     image_distance: Tensor
-    working_f_number: Tensor
+    paraxial_working_f_number: Tensor
     magnification: Tensor
 
 
@@ -88,7 +88,7 @@ def base_ray(lens: Lens, wavelength: Tensor | None = None) -> BaseRay:
     `first_order` has the straightened figures, as OpticStudio prints them; the two agree in a lens with an axis.
     First derivatives by every number of the lens are exact; second ones lack the third derivatives of the trace.
     """
-    wavelength = lens.wavelengths[lens.primary_wavelength] if wavelength is None else wavelength
+    wavelength = lens.primary if wavelength is None else wavelength
     near = _near(lens, wavelength)
     one, kappa = torch.eye(2, dtype=near.X.dtype, device=near.X.device), near.vergence[..., None, None]
     parallel = near.behind(one, 0 * one)
@@ -111,7 +111,7 @@ def base_ray(lens: Lens, wavelength: Tensor | None = None) -> BaseRay:
         exit_pupil_position=_first(exit_pupil),
         exit_pupil_diameter=_first(2 * _length(across)),
         image_distance=_first(image + near.last[..., None]),
-        working_f_number=_first(_over(0.5, near.index[..., None] * _length(rim[1]))),
+        paraxial_working_f_number=_first(_over(0.5, near.index[..., None] * _length(rim[1]))),
         magnification=_first(_magnification(near, image)),
     )
 
@@ -129,7 +129,7 @@ def _magnification(near: "_Near", image: Tensor) -> Tensor:
 
 def entrance_of(lens: Lens) -> Entrance:
     """Where rays of the primary wavelength go in that fill the stop of a bent lens."""
-    near = _near(lens, lens.wavelengths[lens.primary_wavelength])
+    near = _near(lens, lens.primary)
     kappa = near.vergence
     first, second = torch.diagonal(near.E, dim1=-2, dim2=-1).unbind(-1)
     # The plane halfway between the images of the stop in both sections, if those are one; else that of the vertex.
@@ -207,7 +207,8 @@ def _near(lens: Lens, wavelength: Tensor) -> _Near:
     X, D, to_stop = (torch.movedim(part, (0, 1), (-2, -1)) for part in (X, D, to_stop))
     A, B = to_stop[..., :2], to_stop[..., 2:]
     Q, H_inverse = _polar(A)
-    vergence = 1 / (distance * _length(torch.stack([*(aim / distance), torch.ones_like(aim[0])]), 0))
+    # Not 1/(distance · length), whose derivative by the length is 0 · inf for an object at infinity.
+    vergence = (1 / distance) / _length(torch.stack([*(aim / distance), torch.ones_like(aim[0])]), 0)
     position, direction, last, *ways = (part[:, 0] for part in (position, direction, last, *ways))
     return _Near(
         A, B, X, D, _inverse(A) @ B, Q, H_inverse, aim, begun, position, direction, valid[0],
@@ -313,7 +314,7 @@ def _stop_radius(lens: Lens, H_inverse: Tensor, of_turn: Tensor) -> Tensor:
         return lens.aperture.value + 0 * batch
     straight = first_order(lens)
     if lens.aperture.kind in ("object_na", "object_cone_angle"):
-        found = torch.tan(cone_angle(lens, media(lens, lens.wavelengths[lens.primary_wavelength])[0]))
+        found = torch.tan(cone_angle(lens, media(lens, lens.primary)[0]))
         found = found * _length(of_turn, -1)
     else:
         found = _over(0.5 * straight.entrance_pupil_diameter, _length(H_inverse)[..., 0])

@@ -11,6 +11,7 @@ from raytrace.formats import write_lens
 from raytrace.maths import pupil
 from raytrace.maths.result import Result, number, numbers
 from raytrace.maths.value import value
+from raytrace.optics.filling import warn_of_filling
 from raytrace.optics.focus import (
     focus_of_mean_radius,
     focus_of_rms,
@@ -89,6 +90,9 @@ class Focus(Result):
     def words(self) -> dict:
         return {"place": [words for words, _ in self._places()]}
 
+    def units(self) -> dict[str, str]:
+        return {"sensor_distance": "mm", "rms_radius": "mm"}
+
     def document(self) -> dict:
         alone = len(self.object_distances) == 1
         before = self.before.surfaces[-2].thickness
@@ -162,8 +166,9 @@ def focus(
         raise ValueError(f"criterion {criterion!r}: expected one of rms, paraxial, mean")
     distances = vector(lens.surfaces[0].thickness if object_distances is None else object_distances, like=lens)
     fields = field_points(fields, like=lens)
-    primary = lens.wavelengths[lens.primary_wavelength][None]
+    primary = lens.primary[None]
     wavelengths = primary if wavelengths is None else wavelengths_of(lens, wavelengths)
+    warn_of_filling(with_object_distance(lens, distances.min()), fields)
     like = lens.surfaces[-2].thickness
     at, weights = pupil.sampled(sampling, rings=rings, points=points, seed=seed, dtype=like.dtype, device=like.device)
     paraxial = paraxial_sensor(lens, distances)

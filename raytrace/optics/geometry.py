@@ -131,7 +131,7 @@ def _edge_radius(surface: Surface) -> float:
 
 def _gaps(lens: Lens) -> list[tuple[int, int, float]]:
     """Powered surfaces that follow one another on one axis, and the direction of the light along z between them."""
-    indices = media(lens, lens.wavelengths[lens.primary_wavelength])
+    indices = media(lens, lens.primary)
     surfaces, found, before, side = lens.surfaces, [], None, 1.0
     for k, surface in enumerate(surfaces[:-1]):
         if k == 0:
@@ -153,7 +153,7 @@ def _of_gap(lens: Lens, k: int, end: int, side: float, heights: list[float]) -> 
     """The defects of the gap between two surfaces."""
     front, back = lens.surfaces[k], lens.surfaces[end]
     gap = side * sum(float(surface.thickness) for surface in lens.surfaces[k:end])
-    index = abs(float(media(lens, lens.wavelengths[lens.primary_wavelength])[k]))
+    index = abs(float(media(lens, lens.primary)[k]))
     medium = "glass" if index > 1.01 else "air"
     if gap < -_LEAST:
         return [Defect(k, "gap", gap, f"the {medium} between surfaces {k} and {end} is {gap:.6g} mm thick: negative")]

@@ -15,7 +15,7 @@ from torch import Tensor
 from raytrace.maths.numerics import broadcast_shape, dot, dot_2, safe_divide, safe_sqrt, unit
 from raytrace.maths.pupil import gauss_rings
 from raytrace.optics.aiming import aim_at_image, aim_at_stop, at_stop
-from raytrace.optics.axis import is_bent
+from raytrace.optics.axis import aiming_of, is_bent
 from raytrace.optics.base_ray import Entrance, entrance_of
 from raytrace.optics.paraxial import FirstOrder, first_order
 from raytrace.optics.vignetting import vignette
@@ -156,7 +156,7 @@ def paraxial_field(lens: Lens, field: Tensor, paraxial: FirstOrder) -> Tensor:
         if at_infinity:
             raise ValueError("fields are object heights but the object is at infinity: give angles, or a distance")
         return field
-    index = index_behind(lens, 0, lens.wavelengths[lens.primary_wavelength])
+    index = index_behind(lens, 0, lens.primary)
     scale = paraxial.power / index if at_infinity else 1 / paraxial.magnification
     return _scaled(field, scale)
 
@@ -170,7 +170,7 @@ def _part_of_field(lens: Lens, field: Tensor, fraction: float) -> Tensor:
 
 
 def _is_aimed(lens: Lens) -> bool:
-    return lens.ray_aiming != "off" and not lens.fields.telecentric
+    return aiming_of(lens) != "off" and not lens.fields.telecentric
 
 
 def _entrance(lens: Lens) -> Entrance | None:
@@ -185,8 +185,8 @@ def _turned(matrix: Tensor, points: Tensor) -> Tensor:
 
 
 def with_ray_aiming(lens: Lens, ray_aiming: str | None) -> Lens:
-    """The lens with another kind of ray aiming, a key of RAY_AIMING; its own where that is None or "file"."""
-    if ray_aiming in (None, "file", lens.ray_aiming):
+    """The lens with another kind of ray aiming, a key of RAY_AIMING; its own where that is None."""
+    if ray_aiming in (None, lens.ray_aiming):
         return lens
     if ray_aiming not in RAY_AIMING:
         raise ValueError(f"ray aiming {ray_aiming!r}: expected one of {', '.join(RAY_AIMING)}")
@@ -199,35 +199,49 @@ def stop_radius(lens: Lens) -> Tensor:
     The paraxial ray where rays are aimed by it, or where the real one does not reach the stop; else the real one. At
     the primary wavelength. Where the axis bends it counts from the base ray.
     """
-    return _stop_radius(lens, first_order(lens), _entrance(lens))
+    return _stop_radius(lens, first_order(lens), _entrance(lens))[0]
 
 
-def _stop_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> Tensor:
+def points_of_stop(lens: Lens, pupil: Tensor) -> tuple[Tensor, Tensor]:
+    """The points (2, ...) mm of the stop that pupil points (2, ...) stand for where rays are aimed, as in this lens,
+    and the radius of the stop, mm."""
+    paraxial, entrance = first_order(lens), _entrance(lens)
+    radius = _stop_radius(lens, paraxial, entrance)[0]
+    target = pupil if entrance is None else _turned(entrance.turn, pupil)
+    return _signed(radius, paraxial, entrance) * target, radius
+
+
+def _stop_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> tuple[Tensor, Tensor | None]:
+    """And whether the real marginal ray tells it, None where that is not asked."""
     if lens.aperture.kind == "float_by_stop":
-        return lens.aperture.value
+        return lens.aperture.value, None
     estimate = paraxial.stop_height.abs() if entrance is None else entrance.radius
     if lens.ray_aiming == "paraxial":
-        return estimate
+        return estimate, None
     height, arrives = _marginal_height(lens, paraxial, entrance)
-    return torch.where(arrives, height.abs(), estimate)
+    return torch.where(arrives, height.abs(), estimate), arrives
 
 
-def _aimed_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> Tensor:
-    """The radius of the stop with the sign of `FirstOrder.stop_height`; warns MarginalRayLost.
+def _signed(radius: Tensor, paraxial: FirstOrder, entrance: Entrance | None) -> Tensor:
+    """The radius of the stop with the sign of `FirstOrder.stop_height`.
 
     Where the axis bends an `Entrance` tells what an inverted image of the stop turns, and the sign is +.
     """
-    by_real_ray = lens.ray_aiming == "real" and lens.aperture.kind != "float_by_stop"
-    if by_real_ray and not bool(_marginal_height(lens, paraxial, entrance)[1].all()):
+    return radius * torch.where(paraxial.stop_height.detach() < 0, -1.0, 1.0) if entrance is None else radius
+
+
+def _aimed_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> Tensor:
+    """The radius of the stop with its sign, as `_signed`; warns MarginalRayLost."""
+    radius, arrives = _stop_radius(lens, paraxial, entrance)
+    if arrives is not None and not bool(arrives.all()):
         message = "the real marginal ray does not reach the stop; rays are aimed over the radius of the paraxial one"
         warnings.warn(message, MarginalRayLost, stacklevel=4)
-    radius = _stop_radius(lens, paraxial, entrance)
-    return radius * torch.where(paraxial.stop_height.detach() < 0, -1.0, 1.0) if entrance is None else radius
+    return _signed(radius, paraxial, entrance)
 
 
 def _marginal_height(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -> tuple[Tensor, Tensor]:
     """Height in mm at the stop of the real axial ray through the edge of the entrance pupil, and whether it arrives."""
-    wavelength = lens.wavelengths[lens.primary_wavelength]
+    wavelength = lens.primary
     edge = lens.wavelengths.new_tensor([0.0, 1.0]).to(paraxial.entrance_pupil_diameter.dtype)
     index = index_behind(lens, 0, wavelength).to(edge.dtype)
     rays = _through_entrance_pupil(lens, torch.zeros_like(edge), edge, paraxial, index, entrance)
@@ -295,7 +309,7 @@ def _telecentric_radius(lens: Lens, paraxial: FirstOrder, index: Tensor) -> Tens
 
 def _field_of_real_height(lens, height: Tensor, estimate: Tensor, paraxial: FirstOrder) -> tuple[Tensor, Tensor]:
     """The field (2, ...) whose real chief ray meets the image at `height` (2, ...) mm, and whether there is one."""
-    wavelength = lens.wavelengths[lens.primary_wavelength]
+    wavelength = lens.primary
     index = index_behind(lens, 0, wavelength).to(height.dtype)
 
     entrance = _entrance(lens)

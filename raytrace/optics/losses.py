@@ -139,7 +139,7 @@ def check_reach(lens: Lens, fields: Tensor | None = None, *, every: bool) -> Non
     """
     tried = torch.stack([lens.fields.x, lens.fields.y]) if fields is None else fields
     pupil, _ = hexapolar(_RINGS, dtype=lens.wavelengths.dtype, device=lens.wavelengths.device)
-    primary = lens.wavelengths[lens.primary_wavelength][None]
+    primary = lens.primary[None]
     F, P = tried.shape[1], pupil.shape[1]
     afford(RAY_BYTES * F * P, f"{F * P:,} rays that try {F:,} fields", helps="ask for fewer fields")
     with warnings.catch_warnings():

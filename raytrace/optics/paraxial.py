@@ -26,7 +26,7 @@ class FirstOrder:
     entrance_pupil_position: from surface 1; entrance_pupil_diameter > 0.
     exit_pupil_position: from the image surface; exit_pupil_diameter > 0.
     stop_height: of the marginal ray at the stop; negative where the entrance pupil is an inverted image of the stop.
-    f_number: |EFL| / entrance pupil diameter; working_f_number: 1/(2 n′ |u′|) of the marginal ray.
+    f_number: |EFL| / entrance pupil diameter; paraxial_working_f_number: 1/(2 n′ |u′|) of the marginal ray.
     paraxial_image_distance: from the last surface before the image to the paraxial image of the object.
     magnification: of that image (0 for an object at infinity).
     angular_magnification: ū′/ū of the chief ray, the slopes through the centres of the pupils.
@@ -47,7 +47,7 @@ class FirstOrder:
     exit_pupil_diameter: Tensor
     stop_height: Tensor
     f_number: Tensor
-    working_f_number: Tensor
+    paraxial_working_f_number: Tensor
     paraxial_image_distance: Tensor
     magnification: Tensor
     angular_magnification: Tensor
@@ -108,7 +108,7 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
 
     A quantity that does not exist (the focal length of an afocal lens, say) comes out infinite.
     """
-    wavelength = lens.wavelengths[lens.primary_wavelength] if wavelength is None else wavelength
+    wavelength = lens.primary if wavelength is None else wavelength
     surfaces = lens.surfaces[1:-1]
     n = signed(surfaces, media(lens, wavelength)[:-1])
     n_object, n_image = n[0], n[-1]
@@ -143,7 +143,7 @@ def first_order(lens: Lens, wavelength: Tensor | None = None) -> FirstOrder:
         exit_pupil_diameter=diameter * (A1 / D2).abs(),
         stop_height=0.5 * diameter * A1,
         f_number=focal_length.abs() / diameter,
-        working_f_number=0.5 / (n_image * slope_image).abs(),
+        paraxial_working_f_number=0.5 / (n_image * slope_image).abs(),
         paraxial_image_distance=image_distance,
         magnification=vergence / omega,
         angular_magnification=n_object * D2 / (n_image * A1),
@@ -177,7 +177,7 @@ def largest_field(lens: Lens) -> Tensor:
 
 def marginal_ray(lens: Lens) -> tuple[Tensor, Tensor]:
     """(y, ω) in mm and 1 of the marginal ray in front of surface 1, at the primary wavelength."""
-    wavelength = lens.wavelengths[lens.primary_wavelength]
+    wavelength = lens.primary
     n_object = media(lens, wavelength)[0]
     data = first_order(lens)
     vergence = n_object / object_distance_of(lens)
@@ -187,7 +187,7 @@ def marginal_ray(lens: Lens) -> tuple[Tensor, Tensor]:
 
 def paraxial_image_distance(lens: Lens, object_distance: Tensor, wavelength: Tensor | None = None) -> Tensor:
     """Paraxial image distance (...) mm from the last surface before the image; object_distance: (...) mm or inf."""
-    wavelength = lens.wavelengths[lens.primary_wavelength] if wavelength is None else wavelength
+    wavelength = lens.primary if wavelength is None else wavelength
     surfaces = lens.surfaces[1:-1]
     n = signed(surfaces, media(lens, wavelength)[:-1])
     A, B, C, D = system_matrix(surfaces, n, wavelength)
@@ -239,7 +239,7 @@ def _entrance_pupil_diameter(lens, focal_length, entrance_pupil, A1, n_object, n
         return focal_length.abs() / number
     if kind == "float_by_stop":
         return 2 * number / A1.abs()
-    if kind == "working_f_number":
+    if kind == "paraxial_working_f_number":
         slope = 0.5 / (number * n_image.abs())
         return 2 * (slope * n_image / omega * (1 + entrance_pupil * vergence / n_object)).abs()
     distance = lens.surfaces[0].thickness + entrance_pupil

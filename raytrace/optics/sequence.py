@@ -32,7 +32,7 @@ def _imaging(surface: Surface, vergence: Tensor) -> Surface:
 
 def _vergences(lens: Lens) -> list[Tensor]:
     """u/y in 1/mm of the marginal ray before every surface after the object, along the light."""
-    wavelength = lens.wavelengths[lens.primary_wavelength]
+    wavelength = lens.primary
     indices, surfaces, side = media(lens, wavelength), lens.surfaces[1:], 1
     y, omega = torch.ones_like(indices[0]), indices[0] / lens.surfaces[0].thickness
     found = []

@@ -10,6 +10,7 @@ from raytrace.maths import pupil
 from raytrace.maths.result import Result, axis, cell, number, numbers
 from raytrace.maths.value import value
 from raytrace.optics.arrivals import Arrivals, arrivals, chief_reference
+from raytrace.optics.filling import warn_of_filling
 from raytrace.optics.launch import with_ray_aiming
 from raytrace.optics.losses import STATUS, LostRays, warn_of_losses
 from raytrace.optics.spot import Spot, spot_of, spot_of_points
@@ -63,6 +64,11 @@ class Spots(Result):
             "centroid_x": self.centroid[0], "centroid_y": self.centroid[1],
             **{name: getattr(self.each, name) for name in names},
         }  # fmt: skip
+
+    def units(self) -> dict[str, str]:
+        field = FIELD_UNITS[self.lens.fields.kind]
+        lengths = ("centroid_x", "centroid_y", "rms_radius", "geometric_radius")
+        return {"field_x": field, "field_y": field, "wavelength": "µm", **dict.fromkeys(lengths, "mm")}
 
     def document(self) -> dict:
         places = [(f, w) for f in range(self.fields.shape[1]) for w in range(len(self.lens.wavelengths))]
@@ -140,7 +146,7 @@ def spot(
     so many sobol or random rays for each field and wavelength, traced in chunks of no more than max_bytes, none kept
     and nothing differentiated. reference: radii about the "centroid" or the "chief" ray of the primary wavelength;
     weights: rays count by their share of the pupil's "area", or all "equal". ray_aiming: a key of RAY_AIMING.
-    Warns LostRays for fields that lose all their rays. Raises ValueError for what is not known.
+    Warns LostRays for fields that lose all their rays, UnfilledStop. Raises ValueError for what is not known.
     progress: called with (work, unit), gives what is gone through or a bar to update.
     """
     for name, word, known in (("reference", reference, _REFERENCES), ("weights", weights, _WEIGHTS)):
@@ -148,6 +154,7 @@ def spot(
             raise ValueError(f"{name} {word!r}: expected one of {', '.join(known)}")
     lens = lens if wavelengths is None else with_wavelengths(lens, wavelengths)
     fields = field_points(fields, like=lens)
+    warn_of_filling(lens, fields, ray_aiming=ray_aiming)
     if rays is not None:
         _refuse_of_many(sampling, rings, points, reference, weights)
         how = {"seed": seed, "ray_aiming": ray_aiming, "max_bytes": max_bytes}

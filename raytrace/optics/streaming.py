@@ -16,6 +16,7 @@ from raytrace.fused.choice import WORTH_COMPILING, prepare
 from raytrace.maths import pupil
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.value import to, value
+from raytrace.optics.axis import aiming_of
 from raytrace.optics.launch import is_at_infinity, launch, with_ray_aiming
 from raytrace.optics.sequence import sequence_of
 from raytrace.optics.spot import where_lit
@@ -164,7 +165,7 @@ def _disc(uniform: Tensor) -> Tensor:
 def shot(lens: Lens, field: Tensor, wavelength: Tensor, *, ray_aiming: str | None = None) -> Shot:
     """What all rays of one field (2,) and wavelength () µm share. Three rays tell the beam, in float64."""
     lens = with_ray_aiming(lens, ray_aiming)
-    if lens.ray_aiming != "off" and not lens.fields.telecentric:
+    if aiming_of(lens) != "off" and not lens.fields.telecentric:
         return Shot(lens, field, wavelength, media(lens, wavelength), None)
     exact = to(lens, dtype=torch.float64)
     corners = field.new_tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)

@@ -17,6 +17,7 @@ from torch import Tensor
 from raytrace.files import write_atomically
 from raytrace.maths.result import Result, called
 from raytrace.maths.value import value
+from raytrace.optics.filling import warn_of_filling
 from raytrace.optics.launch import rays as launched
 from raytrace.optics.losses import STATUS, LostRays
 from raytrace.optics.sequence import sequence_of
@@ -164,13 +165,14 @@ def trace(
 
 
 def _chosen(lens: Lens, wavelengths: Tensor | Sequence[float] | None) -> Tensor:
-    primary = lens.wavelengths[lens.primary_wavelength][None]
+    primary = lens.primary[None]
     return primary if wavelengths is None else wavelengths_of(lens, wavelengths)
 
 
 def _chief_and_marginal(lens: Lens, object_distances, fields, wavelengths, ray_aiming) -> tuple[Rays, Tensor]:
     pupil = lens.wavelengths.new_tensor([[0.0, 0.0, 0.0, 1.0], [0.0, 1.0, -1.0, 0.0]])
     fields, wavelengths = field_points(fields, like=lens), _chosen(lens, wavelengths)
+    warn_of_filling(lens, fields, ray_aiming=ray_aiming)
     distance = lens.surfaces[0].thickness
     how = {"fields": fields, "pupil": pupil, "wavelengths": wavelengths, "ray_aiming": ray_aiming}
     if object_distances is None:

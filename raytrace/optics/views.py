@@ -9,8 +9,11 @@ from torch import Tensor
 from raytrace.maths.result import Result, number, numbers
 from raytrace.maths.value import detached, value
 from raytrace.media.environment import told
+from raytrace.media.glass import label
+from raytrace.optics.axis import aiming_of
 from raytrace.optics.base_ray import base_ray
-from raytrace.optics.f_number import real_working_f_number
+from raytrace.optics.f_number import working_f_number
+from raytrace.optics.filling import warn_of_filling
 from raytrace.optics.geometry import defects, warn_of_defects
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.remarks import entries, remarks
@@ -19,14 +22,14 @@ from raytrace.system.configurations import count
 from raytrace.system.lens import FIELD_UNITS, Lens, field_points, name_of_field, wavelengths_of
 from raytrace.system.surface import Surface, is_posed, is_round, vertex_curvature
 
-#: Lines of `raytrace info`: words, entry of FirstOrder (and the real working F/#), unit.
+#: Lines of `raytrace info`: words, entry of FirstOrder (and the working F/# of real light), unit.
 FIRST_ORDER_LINES = (
     ("effective focal length", "effective_focal_length", "mm"),
     ("back focal distance", "back_focal_distance", "mm, from the last surface before the image"),
     ("front focal distance", "front_focal_distance", "mm, from surface 1"),
     ("F/#", "f_number", "focal length / entrance pupil diameter"),
-    ("working F/#", "working_f_number", "1/(2 n' u')"),
-    ("real working F/#", "real_working_f_number", "1/(2 n' sin θ') of the real marginal ray"),
+    ("paraxial working F/#", "paraxial_working_f_number", "1/(2 n' u')"),
+    ("working F/#", "working_f_number", "1/(2 n' sin θ') of the real marginal ray"),
     ("entrance pupil position", "entrance_pupil_position", "mm, from surface 1"),
     ("entrance pupil diameter", "entrance_pupil_diameter", "mm"),
     ("exit pupil position", "exit_pupil_position", "mm, from the image"),
@@ -49,7 +52,7 @@ BASE_RAY_LINES = (
     ("exit pupil position", "exit_pupil_position", "mm along the base ray, from the image"),
     ("exit pupil diameter", "exit_pupil_diameter", "mm"),
     ("image distance", "image_distance", "mm along the base ray, from the last surface that is no break"),
-    ("working F/#", "working_f_number", "1/(2 n' u')"),
+    ("paraxial working F/#", "paraxial_working_f_number", "1/(2 n' u')"),
     ("magnification", "magnification", ""),
 )
 
@@ -78,7 +81,7 @@ class Info(Result):
         lens = detached(self.lens)
         surfaces = lens.surfaces
         return {
-            "glass": [s.glass.name for s in surfaces],
+            "glass": [label(s.glass) for s in surfaces],
             "note": [_remarks(lens, k) for k in range(len(surfaces))],
         }
 
@@ -92,6 +95,8 @@ class Info(Result):
             "wavelengths": numbers(lens.wavelengths),
             "wavelength_weights": numbers(lens.wavelength_weights),
             "primary_wavelength": lens.primary_wavelength,
+            "ray_aiming": lens.ray_aiming,
+            "rays_aimed": aiming_of(lens),
             "field_type": lens.fields.kind,
             "field_unit": FIELD_UNITS[lens.fields.kind],
             "fields": [
@@ -110,7 +115,7 @@ class Info(Result):
                     "coefficients": [] if surface.coefficients is None else numbers(surface.coefficients),
                     **entries(surface),
                     "thickness": number(surface.thickness),
-                    "glass": surface.glass.name or None,
+                    "glass": label(surface.glass) or None,
                     "indices": numbers(indices[k].expand_as(lens.wavelengths)),
                     "semi_diameter": number(surface.semi_diameter),
                     "comment": surface.comment,
@@ -130,11 +135,13 @@ class Info(Result):
         points = ", ".join(f"({x:g}, {y:g})" for x, y in field_points(None, like=lens).T.tolist())
         several, which = len(lens.wavelengths) > 1, _configuration(lens)
         shown = [
-            f"{w:g}" + ("*" if i == lens.primary_wavelength and several else "")
+            f"{w:g}" + ("*" if i == lens.primary_wavelength - 1 and several else "")
             for i, w in enumerate(lens.wavelengths.tolist())
         ]
         lines += [
-            f"  {'wavelengths':<24} {', '.join(shown)} µm" + ("  (* primary)" if several else ""),
+            f"  {'wavelengths':<24} {', '.join(shown)} µm"
+            + (f"  (* primary: number {lens.primary_wavelength})" if several else ""),
+            f"  {'ray aiming':<24} {_aiming(lens)}",
             *([f"  {'configuration':<24} {' of '.join(map(str, which.values()))}"] if which else []),
             f"  {'fields':<24} {points} {FIELD_UNITS[lens.fields.kind]}, {lens.fields.kind.replace('_', ' ')}",
             *([f"  {'environment':<24} {told(lens.environment)}"] if lens.environment else []),
@@ -145,7 +152,7 @@ class Info(Result):
             size = surface.semi_diameter
             lines.append(
                 f"  {k:>7} {_radius_in_words(surface):>13} {float(surface.thickness):>12.7g} "
-                f"{surface.glass.name:<12} {index:>9.6f} {'' if size is None else f'{size:.5g}':>10}  "
+                f"{label(surface.glass):<12} {index:>9.6f} {'' if size is None else f'{size:.5g}':>10}  "
                 f"{_remarks(lens, k)}".rstrip()
             )
         return "\n".join(lines)
@@ -186,8 +193,10 @@ class Layout(Result):
 
 
 def info(lens: Lens) -> Info:
-    """First-order data and prescription; what `print(lens)` shows. Warns Unbuildable of what cannot be made."""
+    """First-order data and prescription; what `print(lens)` shows. Warns UnfilledStop, and Unbuildable of a lens that
+    cannot be made."""
     warn_of_defects(lens)
+    warn_of_filling(lens, field_points(None, like=lens))
     return Info(lens)
 
 
@@ -205,8 +214,8 @@ def layout(
     fields: y, (x, y) or (2, F), in the lens's own kind of field, by default its own; rays: how many of the fan of each,
     in the plane that is shown; view: a key of VIEWS; wavelengths: µm, by default the primary one; rays of several are
     coloured by wavelength; configuration: of `lens.configurations`, from 1, or "all": superimposed, rays coloured by
-    configuration. Warns Unbuildable of what cannot be made. Raises ValueError for a view or a configuration that there
-    is not.
+    configuration. Warns UnfilledStop, and Unbuildable of a lens that cannot be made. Raises ValueError for a view or a
+    configuration that there is not.
     """
     if view not in VIEWS:
         raise ValueError(f"`view={view}`: expected one of {', '.join(VIEWS)}")
@@ -218,13 +227,15 @@ def layout(
     for one in lens.configurations if configuration == ALL else (lens,):
         warn_of_defects(one)
     every = ALL if configuration == ALL else None
-    return Layout(lens, field_points(fields, like=lens), rays, view, chosen, every, fields is not None)
+    points = field_points(fields, like=lens)
+    warn_of_filling(lens, points)
+    return Layout(lens, points, rays, view, chosen, every, fields is not None)
 
 
 def text(lens: Lens) -> str:
     """What `print(lens)` shows: the lens as `info` tells it, or its bare numbers where it cannot be traced."""
     try:
-        return str(info(lens))
+        return str(Info(lens))
     except (ValueError, RuntimeError):
         return repr(lens)
 
@@ -233,6 +244,11 @@ def _configuration(lens: Lens) -> dict[str, int]:
     """Which of its configurations a lens is in, and how many there are; nothing of a lens with one."""
     several = count(lens.operands)
     return {"configuration": lens.current_configuration, "configurations": several} if several > 1 else {}
+
+
+def _aiming(lens: Lens) -> str:
+    """The ray aiming of a lens, and what "auto" comes to."""
+    return lens.ray_aiming if lens.ray_aiming != "auto" else f"auto: {aiming_of(lens)}"
 
 
 def _radius(surface) -> float:
@@ -256,7 +272,7 @@ def _environment(holder: Lens | Surface) -> dict:
 
 
 def _indices(lens: Lens) -> list[float]:
-    return [float(index) for index in media(lens, lens.wavelengths[lens.primary_wavelength])]
+    return [float(index) for index in media(lens, lens.primary)]
 
 
 def _quantity(value: float) -> str:
@@ -268,7 +284,7 @@ def _quantity(value: float) -> str:
 
 def _figures(lens: Lens) -> list[float]:
     """The numbers of FIRST_ORDER_LINES; nan or infinite where a quantity does not exist."""
-    data, real = first_order(lens), real_working_f_number(lens)
+    data, real = first_order(lens), working_f_number(lens)
     return [float(getattr(data, name, real)) for _, name, _ in FIRST_ORDER_LINES]
 
 

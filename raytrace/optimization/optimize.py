@@ -16,6 +16,7 @@ from raytrace.merit.model import Model
 from raytrace.merit.readings import Readings, readings_of
 from raytrace.merit.value import Merit, in_unit, merit_for
 from raytrace.merit.vary import Freedom, bounds_of, freedom, name_of
+from raytrace.optics.filling import warn_of_filling
 from raytrace.optics.geometry import warn_of_defects
 from raytrace.optimization.bfgs import Function, lowest
 from raytrace.optimization.checkpoint import BadCheckpoint, Checkpoint, Kept, Log, resumed
@@ -29,7 +30,7 @@ from raytrace.optimization.problem import Condition, NoProblem, Problem, intent_
 from raytrace.optimization.reached import NotReached, reached, refuse_contradictions
 from raytrace.optimization.result import Optimized
 from raytrace.system.intent import Row, Vary
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, field_points
 
 
 def optimize(
@@ -78,6 +79,7 @@ def optimize(
     Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadCheckpoint.
     """
     prepare()
+    warn_of_filling(lens, field_points(None, like=lens))
     free, glasses = without_glass(_freedom(lens, vary), vary)
     names = tuple(name_of(one) for one in free.variables)
     model = Model(free.lens, free.variables, free.solves)

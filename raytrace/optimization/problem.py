@@ -128,7 +128,7 @@ def _held(lens: Lens, rows: Sequence[Row], conditions: Sequence[Condition]) -> I
     """Rows that do not count among the squares, and the signs of their relations; rows before them say of which
     configuration and primary wavelength they are, where the merit function or a condition does."""
     if any(row.operand == "PRIM" for row in rows):
-        yield Row("PRIM", (0, lens.primary_wavelength + 1)), 0
+        yield Row("PRIM", (0, lens.primary_wavelength)), 0
     several = any(row.operand == "CONF" for row in rows) or any(one.configuration for one in conditions)
     for one in conditions:
         if several:

@@ -19,6 +19,7 @@ from raytrace.merit.hold import Condition, conditions_of
 from raytrace.merit.readings import Readings, readings_of
 from raytrace.merit.value import Merit, in_unit, merit_for
 from raytrace.merit.vary import Freedom, bounds_of, freedom
+from raytrace.optics.filling import warn_of_filling
 from raytrace.optimization.asked import Asked
 from raytrace.optimization.insertion import Insertion
 from raytrace.optimization.journal import Ended, Journal, Stopped
@@ -33,7 +34,7 @@ from raytrace.optimization.stages import FOLLOW, LONG, Stage, descended
 from raytrace.optimization.starts import Space
 from raytrace.shards import Share
 from raytrace.system.intent import Row
-from raytrace.system.lens import Lens
+from raytrace.system.lens import Lens, field_points
 from raytrace.system.naming import parse_range
 
 STARTS = 64
@@ -87,6 +88,7 @@ def search(
     Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadSearch.
     """
     prepare()
+    warn_of_filling(lens, field_points(None, like=lens))
     begun = time.monotonic()
     function = merit_for(
         lens, merit, rings=rings, arms=arms, reference=reference, frequencies=frequencies, field_weights=field_weights,

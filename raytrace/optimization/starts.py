@@ -151,14 +151,14 @@ def _ends(model: Model, one: Vary, length: float | None, glass: Range, air: Rang
 
 def _glasses(model: Model) -> Sequence[int]:
     view = model.views[0]
-    return [k for k, n in enumerate(view.indices[model.lens.primary_wavelength]) if abs(n) > 1.01]
+    return [k for k, n in enumerate(view.indices[model.lens.primary_wavelength - 1]) if abs(n) > 1.01]
 
 
 def _pupil_radius(model: Model, length: float) -> float:
     aperture = model.lens.aperture
     if aperture.kind == "entrance_pupil_diameter":
         return 0.5 * float(aperture.value)
-    if aperture.kind in ("image_f_number", "working_f_number"):
+    if aperture.kind in ("image_f_number", "paraxial_working_f_number"):
         return 0.5 * length / float(aperture.value)
     found = float(model.views[0].moment(model.start).entrance_pupil_diameter)
     return 0.5 * found if np.isfinite(found) and found > 0 else length / 16

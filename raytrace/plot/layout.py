@@ -36,7 +36,7 @@ def layout(found: Layout) -> Figure:
     system is drawn as it stands. Raises ValueError for a lens with an infinite thickness inside.
     """
     lens, fields = style.detached(found.lens), found.fields.detach()
-    wavelengths = lens.wavelengths[lens.primary_wavelength][None] if found.wavelengths is None else found.wavelengths
+    wavelengths = lens.primary[None] if found.wavelengths is None else found.wavelengths
     if found.configuration == ALL:
         return _superimposed(found, lens.configurations, fields, wavelengths.detach())
     if found.view == "3d":
@@ -124,8 +124,17 @@ def draw_layout(
     view: str = "yz",
 ) -> None:
     """Draw the cross section into axes, equal in both directions, without ticks; wavelengths: (W,) µm, or primary."""
-    wavelengths = lens.wavelengths[lens.primary_wavelength][None] if wavelengths is None else wavelengths
+    wavelengths = lens.primary[None] if wavelengths is None else wavelengths
     _framed(axes, [_drawn(axes, lens, fields=fields, wavelengths=wavelengths, rays=rays, view=view)])
+
+
+def on_one_scale(panels: Sequence[Axes]) -> None:
+    """Give cross sections in axes of one size the same scale: each stays in the middle of what it shows."""
+    limits = [(panel.get_xlim(), panel.get_ylim()) for panel in panels]
+    width, height = (max(abs(one[k][1] - one[k][0]) for one in limits) for k in (0, 1))
+    for panel, ((left, right), (low, high)) in zip(panels, limits, strict=True):
+        panel.set_xlim(0.5 * (left + right - width), 0.5 * (left + right + width))
+        panel.set_ylim(0.5 * (low + high - height), 0.5 * (low + high + height))
 
 
 class _Drawn(NamedTuple):

@@ -9,8 +9,8 @@ from matplotlib.ticker import MaxNLocator
 from raytrace.optics.paraxial import first_order
 from raytrace.optimization.result import STOPPED, Optimized
 from raytrace.plot import style
-from raytrace.plot.layout import draw_layout
-from raytrace.plot.spots import airy_radius, draw_spot, field_spots, panel_size, wavelength_handles
+from raytrace.plot.layout import draw_layout, on_one_scale
+from raytrace.plot.spots import airy_radius, draw_spot_to_scale, field_spots, panel_size, wavelength_handles
 from raytrace.system.lens import Lens
 
 _MOST_FIELDS = 5
@@ -21,8 +21,8 @@ _BEFORE, _AFTER = style.FAINT, style.FIELD_COLOURS[0]
 
 @style.styled
 def optimize_report(found: Optimized) -> Figure:
-    """One page: the lens and its spots before and after in its configurations, the merit by cycle, the operands that
-    are left, and what conditions and boundaries asked for and reached."""
+    """One page: the lens and its spots before and after in its configurations, each on one scale, the merit by cycle, the
+    operands that are left, and what conditions and boundaries asked for and reached."""
     each, conditions = _configurations(found), found.shown_conditions()
     count, below = len(each), 0.16 * (len(conditions) + 3) if conditions else 0.0
     heights = [2.8 * count, 4.2 * count, 2.9, *([below] if conditions else [])]
@@ -36,6 +36,7 @@ def optimize_report(found: Optimized) -> Figure:
             (row[1], after, "After", found.merit_after),
         ):
             _draw_lens(axes, lens, f"{when}, {label}" if label else f"{when}: merit {style.number_text(merit)}")
+        on_one_scale(row)
     _draw_spots(middle, each)
     left, right = bottom.subplots(1, 2, width_ratios=(1.0, 1.0))
     _draw_history(left, found)
@@ -87,22 +88,24 @@ def drawn_fields(lens: Lens):
 
 
 def _draw_spots(page, each: list[tuple[str, Lens, Lens]]) -> None:
-    """A row of spots before and one after, of every configuration, each on a scale of its own, which its bars tell."""
+    """A row of spots before and one after, of every configuration, both on one scale; small ones are enlarged in a corner
+    of their panel."""
     panels = page.subplots(2 * len(each), max(drawn_fields(after).shape[1] for _, _, after in each), squeeze=False)
     first = each[0][2]
     wavelengths, airy = style.array(first.wavelengths), float(airy_radius(first))
-    states = [
-        (label, lens, when) for label, *both in each for lens, when in zip(both, ("before", "after"), strict=True)
-    ]
-    for row, (label, lens, when) in zip(panels, states, strict=True):
-        fields, airy_here = drawn_fields(lens), float(airy_radius(lens))
-        whole, dots = field_spots(lens, fields=fields)
-        half = panel_size(style.array(whole.geometric_radius), airy_here)
+    states = []
+    for label, *both in each:
+        spots = [field_spots(lens, fields=drawn_fields(lens)) for lens in both]
+        half = panel_size(np.concatenate([style.array(whole.geometric_radius) for whole, _ in spots]), airy)
+        states += [(label, *state, half) for state in zip(both, spots, ("before", "after"), strict=True)]
+    for row, (label, lens, (whole, dots), when, half) in zip(panels, states, strict=True):
+        fields = drawn_fields(lens)
+        look = {"wavelengths": style.array(lens.wavelengths), "airy": float(airy_radius(lens)), "half": half}
         for f, panel in enumerate(row):
             if f >= fields.shape[1]:
                 panel.axis("off")
                 continue
-            draw_spot(panel, whole, dots, f, wavelengths=style.array(lens.wavelengths), airy=airy_here, half=half)
+            draw_spot_to_scale(panel, whole, dots, f, **look)
             if when == "before":
                 colour = style.field_colours(len(row))[f]
                 panel.set_title(style.field_label(lens, style.array(fields)[:, f]), color=colour, fontsize=8.5)

@@ -12,14 +12,12 @@ from raytrace.optics.paraxial import first_order, paraxial_image_distance
 from raytrace.plot import style
 from raytrace.plot.curve import FocusRays, draw_curves, focus_rays, focus_span, through_focus_curve
 from raytrace.plot.layout import draw_layout
-from raytrace.plot.spots import airy_radius, draw_dots, draw_spot, field_spots, panel_size, wavelength_handles
+from raytrace.plot.spots import airy_radius, draw_spot_to_scale, field_spots, panel_size, wavelength_handles
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.rays import Rays
 
 _MOST_SPOTS = 5  # columns of spots that stay legible
 _DASHES = {"sensor before": (0, (6, 2.5)), "sensor after": "solid", "paraxial focus": (0, (1, 1.6))}
-_INSET = 0.395  # of a panel's width
-_MAGNIFY = 4.0  # where the spot after is smaller than its panel by more than this, an enlargement is set into it
 
 
 @style.styled
@@ -114,7 +112,7 @@ def _draw_spots(page, before: Lens, after: Lens, distances: list[float], labels:
     for row, when in enumerate(("before", "after")):
         for column, (whole, dots, f) in enumerate(panels[row]):
             panel, look = axes[row, column], {"wavelengths": wavelengths, "airy": airy}
-            draw_spot(panel, whole, dots, f, half=half, **look)
+            draw_spot_to_scale(panel, whole, dots, f, half=half, **look)
             if count == 1:
                 panel.set_title(f"Spot {when}", fontweight="bold", pad=8)
             else:
@@ -124,12 +122,6 @@ def _draw_spots(page, before: Lens, after: Lens, distances: list[float], labels:
                     panel.set_title(
                         label.replace(", ", "\n", 1), color=style.field_colours(len(labels))[column], fontsize=8.5
                     )
-            size = panel_size([float(whole.geometric_radius[f])], airy)
-            if bool(whole.rms_radius[f].isfinite()) and half > _MAGNIFY * size:
-                inset = panel.inset_axes((0.985 - _INSET, 0.985 - _INSET, _INSET, _INSET), zorder=8)
-                draw_dots(inset, whole, dots, f, half=size, **look)
-                inset.set_facecolor("#fbfbfb")
-                inset.set_xlabel(f"{style.number_text(_INSET * half / size, 2)}×", fontsize=7, labelpad=1)
     words = f"the first {count} of {len(labels)} spots" if count < len(labels) else None
     page.legend(
         handles=wavelength_handles(wavelengths, airy), loc="outside lower center", ncols=2, handletextpad=0.3,

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from raytrace.optimization.searched import Searched
 from raytrace.plot import style
-from raytrace.plot.layout import draw_layout
+from raytrace.plot.layout import draw_layout, on_one_scale
 from raytrace.plot.optimize import drawn_fields
 from raytrace.system.lens import Lens
 
@@ -16,7 +16,7 @@ _MOST, _COLUMNS = 9, 3
 
 @style.styled
 def best(found: Searched) -> Figure:
-    """The best lenses, each with its merit, its spots and how often it was found."""
+    """The best lenses on one scale, each with its merit, its spots and how often it was found."""
     count = min(_MOST, len(found.lenses))
     columns = min(_COLUMNS, count)
     rows = -(-count // columns)
@@ -30,6 +30,7 @@ def best(found: Searched) -> Figure:
             _draw(axes, found, k)
         else:
             axes.set_axis_off()
+    on_one_scale(panels[:count])
     return figure
 
 

@@ -24,11 +24,13 @@ from raytrace.plot import style
 from raytrace.system.lens import Lens
 
 _DOT_RINGS = 12  # 469 dots of a wavelength
+_INSET = 0.395  # of a panel's width
+_MAGNIFY = 4.0  # a spot smaller than its panel by more than this has an enlargement in it
 
 
 def airy_radius(lens: Lens) -> Tensor:
     """Radius in mm of the first dark ring, 1.22 λ N: λ the primary wavelength, N the paraxial working F/#."""
-    return 1.22e-3 * lens.wavelengths[lens.primary_wavelength] * axial_f_number(lens)
+    return 1.22e-3 * lens.primary * axial_f_number(lens)
 
 
 def field_spots(
@@ -136,6 +138,21 @@ def draw_spot(
         return
     rms, largest = (1e3 * float(r[number]) for r in (whole.rms_radius, whole.geometric_radius))
     axes.set_xlabel(f"RMS {style.number_text(rms)} µm\nGEO {style.number_text(largest)} µm", labelpad=4)
+
+
+def draw_spot_to_scale(
+    axes: Axes, whole: Spot, dots: Spot, number: int, *, wavelengths: np.ndarray, airy: float, half: float
+) -> None:
+    """As `draw_spot`, on the scale of other panels; a spot much smaller than its panel is enlarged in a corner of it,
+    with the factor below."""
+    look = {"wavelengths": wavelengths, "airy": airy}
+    draw_spot(axes, whole, dots, number, half=half, **look)
+    size = panel_size([float(whole.geometric_radius[number])], airy)
+    if bool(whole.rms_radius[number].isfinite()) and half > _MAGNIFY * size:
+        inset = axes.inset_axes((0.985 - _INSET, 0.985 - _INSET, _INSET, _INSET), zorder=8)
+        draw_dots(inset, whole, dots, number, half=size, **look)
+        inset.set_facecolor("#fbfbfb")
+        inset.set_xlabel(f"{style.number_text(_INSET * half / size, 2)}×", fontsize=7, labelpad=1)
 
 
 def draw_dots(

@@ -208,7 +208,7 @@ def first_order_text(lens: Lens, paraxial: FirstOrder) -> str:
     focal_length = float(paraxial.effective_focal_length)
     if math.isfinite(focal_length):
         parts += [f"EFL {length_text(focal_length)}", f"F/{number_text(float(paraxial.f_number), 3)}"]
-    distance, working = float(lens.surfaces[0].thickness), float(paraxial.working_f_number)
+    distance, working = float(lens.surfaces[0].thickness), float(paraxial.paraxial_working_f_number)
     parts.append(f"object at {object_text(distance)}")
     if math.isfinite(distance) and math.isfinite(working):
         parts.append(f"working F/{number_text(working, 3)}")

@@ -27,11 +27,11 @@ def lens(
     field_kind: str = "",
     wavelengths: Sequence[float] = (0.5875618,),
     wavelength_weights: Sequence[float] | None = None,
-    primary_wavelength: int | None = None,
+    primary_wavelength: int = 1,
     object_distance: float = math.inf,
     name: str = "",
     catalogs: Sequence[str] = (),
-    ray_aiming: str = "off",
+    ray_aiming: str = "auto",
     **aperture: float,
 ) -> Lens:
     """A lens from rows of plain numbers, surface 1 to the last before the sensor; object and image are added.
@@ -43,7 +43,7 @@ def lens(
     stop: number of the stop surface, counted from 1. One aperture by name, as f_number=3.5 or
     entrance_pupil_diameter=10; f_number is the image-space F/#, the others are keys of APERTURE_KINDS.
     fields: y, or (x, y), in degrees where the object is at infinity, else object heights in mm; field_kind: a key of
-    FIELD_UNITS for another kind. wavelengths: µm; primary_wavelength: 0-based, the middle one by default.
+    FIELD_UNITS for another kind. wavelengths: µm; primary_wavelength: its number, from 1, the first by default.
     object_distance: mm from surface 1. Raises BadPrescription, UnknownGlass.
     """
     rows = rows.to_dict("records") if hasattr(rows, "to_dict") else list(rows)
@@ -65,7 +65,7 @@ def lens(
         fields=Fields(kind, points[0], points[1], torch.ones_like(points[0])),
         wavelengths=wavelengths,
         wavelength_weights=weights,
-        primary_wavelength=len(wavelengths) // 2 if primary_wavelength is None else primary_wavelength,
+        primary_wavelength=primary_wavelength,
         name=name,
         catalogs=tuple(catalogs),
         ray_aiming=ray_aiming,

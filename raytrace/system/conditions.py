@@ -12,8 +12,9 @@ FIELD_UNITS = {
     "real_image_height": "mm",
 }
 
-#: How rays find the stop, in the order of OpticStudio's numbers 0, 1, 2.
+#: How rays find the stop. "auto" is that of a lens, or of a file, that specifies none.
 RAY_AIMING = {
+    "auto": "real where the axis bends in front of the stop, or the stop is off it; else off",
     "off": "through points of the paraxial entrance pupil",
     "paraxial": "to points of the stop, whose radius is that of the paraxial marginal ray",
     "real": "to points of the stop, whose radius is that of the real marginal ray",
@@ -23,7 +24,7 @@ RAY_AIMING = {
 APERTURE_KINDS = {
     "entrance_pupil_diameter": "mm",
     "image_f_number": "EFL / entrance pupil diameter",
-    "working_f_number": "paraxial working F/#",
+    "paraxial_working_f_number": "paraxial working F/#",
     "object_na": "n sin θ of the marginal ray at the object",
     "object_cone_angle": "degrees, half angle of the marginal ray at the object",
     "float_by_stop": "mm, semi-diameter of the stop",

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.value import value
-from raytrace.media.glass import Glass
+from raytrace.media.glass import Glass, label
 
 Whole = TypeVar("Whole")
 
@@ -60,7 +60,7 @@ class Operand:
         """What it is in every configuration, to be shown: numbers, names of glasses or words."""
         if self.numbers is not None:
             return self.numbers.detach().tolist()
-        return [glass.name for glass in self.media] or [words[0] if words else "" for words in self.words]
+        return [label(glass) for glass in self.media] or [words[0] if words else "" for words in self.words]
 
 
 def count(operands: Sequence[Operand]) -> int:

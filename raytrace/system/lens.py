@@ -38,7 +38,8 @@ class Lens:
         the sensor distance.
     stop: number of the stop surface.
     aperture, fields: SystemAperture, Fields.
-    wavelengths: (W,) µm; wavelength_weights: (W,); primary_wavelength: 0-based position in `wavelengths`.
+    wavelengths: (W,) µm; wavelength_weights: (W,); primary_wavelength: its number in
+        `wavelengths`, from 1, the first where none is specified; `lens.primary` is it, () µm.
     name, notes: title and comment lines of the file.
     catalogs: glass catalogs in the order of the file.
     ray_aiming: a key of RAY_AIMING.
@@ -54,11 +55,11 @@ class Lens:
     fields: Fields
     wavelengths: Tensor
     wavelength_weights: Tensor
-    primary_wavelength: int = 0
+    primary_wavelength: int = 1
     name: str = ""
     notes: tuple[str, ...] = ()
     catalogs: tuple[str, ...] = ()
-    ray_aiming: str = "off"
+    ray_aiming: str = "auto"
     environment: Environment | None = None
     operands: tuple[Operand, ...] = ()
     current_configuration: int = 1
@@ -67,6 +68,12 @@ class Lens:
     with_configurations = multiple.made
     configuration = multiple.chosen
     configurations = property(multiple.every)
+
+    @property
+    def primary(self) -> Tensor:
+        """The primary wavelength, () µm."""
+        return self.wavelengths[self.primary_wavelength - 1]
+
     __str__ = lent("optics.views.text")
     _repr_html_ = lent("plot.notebook.page")
 
@@ -245,7 +252,7 @@ def with_wavelengths(
     wavelengths = vector(wavelengths, like=lens).to(lens.wavelengths)
     check_media(lens, wavelengths[~torch.isin(wavelengths, lens.wavelengths)], where=where)
     weights = torch.ones_like(wavelengths) if weights is None else weights
-    return dataclasses.replace(lens, wavelengths=wavelengths, wavelength_weights=weights, primary_wavelength=0)
+    return dataclasses.replace(lens, wavelengths=wavelengths, wavelength_weights=weights, primary_wavelength=1)
 
 
 def with_environment(lens: Lens, temperature: Tensor | float | None, pressure: Tensor | float | None) -> Lens:
@@ -331,8 +338,9 @@ def check(lens: Lens) -> None:
     if not 1 <= lens.stop < last:
         raise ValueError(f"the stop is surface {lens.stop}; expected one from 1 to {last - 1}")
     check_unit(lens.wavelengths, believed=lens.wavelengths)
-    if not 0 <= lens.primary_wavelength < len(lens.wavelengths):
-        raise ValueError(f"primary wavelength {lens.primary_wavelength + 1} of {len(lens.wavelengths)}")
+    if not 1 <= lens.primary_wavelength <= len(lens.wavelengths):
+        last_one = len(lens.wavelengths)
+        raise ValueError(f"primary wavelength number {lens.primary_wavelength}; expected one from 1 to {last_one}")
     if not float(lens.aperture.value) > 0:
         raise ValueError(f"aperture {lens.aperture.kind} {float(lens.aperture.value):g}: expected a number above 0")
     for number, surface in enumerate(lens.surfaces[1:], 1):
@@ -387,6 +395,6 @@ def _check_cone(lens: Lens) -> None:
     if kind == "object_cone_angle" and (number == 90 or number >= 180):
         raise ValueError(f"aperture object_cone_angle {number:g} degrees: expected less than 180, and not 90")
     if kind == "object_na":
-        index = float(index_behind(lens, 0, lens.wavelengths[lens.primary_wavelength]))
+        index = float(index_behind(lens, 0, lens.primary))
         if number >= index:
             raise ValueError(f"aperture object_na {number:g}: expected less than the index {index:g} before surface 1")

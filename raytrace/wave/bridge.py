@@ -37,6 +37,7 @@ from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to
 from raytrace.maths.zernike import noll
 from raytrace.media.glass import index
+from raytrace.optics.filling import warn_of_filling
 from raytrace.optics.launch import rays_of_field
 from raytrace.optics.scene import Scene, chief_landing, scene, symmetry
 from raytrace.optics.sequence import sequence_of
@@ -158,6 +159,7 @@ def hybrid_psf(
     distances, colours = (
         torch.as_tensor(t).to(like) for t in (distances, like if wavelengths is None else wavelengths)
     )
+    warn_of_filling(lens, fields)
     view = scene(lens, fields, distances, colours)
     parts = (elements,) if isinstance(elements, Element) else tuple(elements)
     return kernels(view, parts, make_grid(like.new_tensor(pixel), size, chief_landing(view)), order=order)

@@ -147,7 +147,7 @@ def _light(arguments: argparse.Namespace) -> dict[str, Sequence[float]]:
     if wavelengths or weights:
         raise CommandError("--file-wavelengths takes the file's own: leave out --wavelength and --wavelength-weights")
     lens = lens_of_file(arguments)
-    order = sorted(range(len(lens.wavelengths)), key=lambda k: k != lens.primary_wavelength)
+    order = sorted(range(len(lens.wavelengths)), key=lambda k: k != lens.primary_wavelength - 1)
     names = ("wavelengths", "wavelength_weights")
     return {name: getattr(lens, name)[order].tolist() for name in names}
 
