@@ -119,10 +119,11 @@ def _remove_abandoned(target: Path) -> None:
                 target.with_name(name).unlink()
 
 
-def append_text(path: str | os.PathLike, text: str, *, end: int | None = None) -> None:
+def append_text(path: str | os.PathLike, text: str, *, end: int | None = None, sync: bool = True) -> None:
     """Append a text in UTF-8 to a file, as a whole or not at all. Raises OSError naming `path`.
 
-    end: the length in bytes that the file is cut to first, of what a killed process began to append.
+    end: the length in bytes that the file is cut to first, of what a killed process began to append; sync: wait until
+    the disk has it.
     """
     try:
         with open(path, "ab", buffering=0) as file:
@@ -132,7 +133,8 @@ def append_text(path: str | os.PathLike, text: str, *, end: int | None = None) -
             try:
                 while left:
                     left = left[file.write(left) :]
-                os.fsync(file.fileno())
+                if sync:
+                    os.fsync(file.fileno())
             except BaseException:
                 file.truncate(whole)
                 raise

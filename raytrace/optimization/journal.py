@@ -17,6 +17,7 @@ import torch
 from raytrace.files import NotWritten
 from raytrace.shards import agreeing, share, total
 from raytrace.stores import DamagedLine, Lines, anything, listed, mapped, number, record, text
+from raytrace.system.identity import unlike
 
 FILE = "search.jsonl"
 _ADVICE = "it keeps no search: name a new folder"
@@ -73,8 +74,8 @@ class Journal:
             if not share().rank:
                 self.store.begin(about)
             return
-        if other := [name for name in about if before.get(name) != about[name]]:
-            raise BadSearch(f"`folder`: {self.path} keeps a search of other {', '.join(other)}; name a new folder")
+        if words := unlike(before, about):
+            raise BadSearch(f"`folder`: {self.path} keeps a search of {words}; name a new folder")
         for line, one in records:
             self.lines[one["task"]] = line
             self.known[one["task"]] = Ended(*(one[name] for name in Ended._fields[:4]), np.array(one["x"]))

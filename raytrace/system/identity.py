@@ -82,6 +82,26 @@ def other_lens(before: Mapping, now: Mapping) -> str:
     return f"{names[0]!r} with other numbers of its surfaces"
 
 
+def unlike(before: Mapping, now: Mapping) -> str:
+    """How what stored numbers depend on differs from what it is now, "" where it does not.
+
+    Both: `identity` of a lens, the names of its variables, and whatever else decides the numbers, by name.
+    """
+    try:
+        if "prescription" in now and "prescription" not in before:
+            return "a lens that it does not tell; an older version wrote it"
+        if "variables" in now and before["variables"] != now["variables"]:
+            missing = [name for name in now["variables"] if name not in before["variables"]]
+            expected = f"{missing[0]} among them" if missing else ", ".join(now["variables"])
+            return f"other variables: {', '.join(map(str, before['variables']))}; expected {expected}"
+        if "prescription" in now and (words := other_lens(before, now)):
+            return f"another lens: {words}"
+    except (KeyError, TypeError, ValueError, AttributeError):
+        return "a lens that its damaged identity does not tell"
+    other = [name for name in now if name not in ("lens", "surfaces") and before.get(name) != now[name]]
+    return f"other {', '.join(other)}" if other else ""
+
+
 def _alike(one: object, other: object) -> bool:
     if isinstance(one, float) and isinstance(other, float):
         return abs(one - other) <= 1e-6 * max(abs(one), abs(other))  # float32
