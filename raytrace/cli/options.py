@@ -2,11 +2,29 @@
 
 import argparse
 import importlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import PurePath
 
 SAMPLINGS = ("gauss", "hexapolar", "square", "sobol", "random")
 PICTURES = (".png", ".pdf", ".svg")
+
+
+class InputFile(str):
+    """The name of a file that is read, or of something that a file may be given for."""
+
+    __slots__ = ()
+
+
+class OutputFile(str):
+    """The name of a file that is written; suffixes: those that it may have, any if there are none."""
+
+    suffixes: Iterable[str] = ()
+
+
+class OutputFolder(str):
+    """The name of a folder that is written in; may_be_file: or of a file, next to a folder without its suffix."""
+
+    may_be_file: bool = False
 
 
 class Names:
@@ -95,28 +113,56 @@ def seed_number(text: str) -> int:
     return number
 
 
-def file_name(text: str) -> str:
-    """The name of a file; an empty one is refused."""
+def file_name(text: str) -> InputFile:
+    """The name of a file to read; an empty one is refused."""
     if not text:
         raise argparse.ArgumentTypeError("the name of the file is empty")
-    return text
+    return InputFile(text)
 
 
-def data_file(text: str) -> str:
-    """The name of a file of data; that of a picture is refused."""
+def output_file(text: str) -> OutputFile:
+    """The name of a file to write; an empty one is refused."""
+    return OutputFile(file_name(text))
+
+
+def folder_name(text: str) -> OutputFolder:
+    """The name of a folder to write in; that of a picture is refused."""
+    return OutputFolder(data_file(text))
+
+
+def folder_or_lens(text: str) -> OutputFolder:
+    """The name of a folder to write in, or of a lens file next to it."""
+    folder = folder_name(text)
+    folder.may_be_file = bool(PurePath(text).suffix)
+    return folder
+
+
+def data_file(text: str) -> OutputFile:
+    """The name of a file of data to write; that of a picture is refused."""
     if PurePath(file_name(text)).suffix.lower() in PICTURES:
         raise argparse.ArgumentTypeError(f"{text!r} is a picture: figures are saved by --plot, data by -o")
-    return text
+    return OutputFile(text)
 
 
-def picture_file(text: str) -> str:
+def file_of(suffixes: Iterable[str]) -> Callable[[str], OutputFile]:
+    """What reads the name of a file of data to write, with one of these suffixes."""
+
+    def reader(text: str) -> OutputFile:
+        found = data_file(text)
+        found.suffixes = suffixes
+        return found
+
+    return reader
+
+
+def picture_file(text: str) -> OutputFile:
     """The name of a figure: .png, .pdf or .svg."""
     if PurePath(file_name(text)).suffix.lower() not in PICTURES:
         listed = ", ".join(PICTURES)
         raise argparse.ArgumentTypeError(
             f"{text!r} is no picture ({listed}); data are written by -o, where there is one"
         )
-    return text
+    return OutputFile(text)
 
 
 def field_point(text: str) -> tuple[float, float]:
@@ -331,12 +377,20 @@ def log(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def output(parser: argparse.ArgumentParser, what: str) -> None:
-    parser.add_argument("-o", "--output", metavar="FILE", type=data_file, help=what)
+def output(parser: argparse.ArgumentParser, what: str, suffixes: Iterable[str]) -> None:
+    """-o FILE; suffixes: those that the file may have."""
+    parser.add_argument("-o", "--output", metavar="FILE", type=file_of(suffixes), help=what)
 
 
-def output_folder(parser: argparse.ArgumentParser, what: str, *, required: bool = False) -> None:
-    parser.add_argument("-o", "--output", dest="folder", metavar="FOLDER", type=data_file, help=what, required=required)
+def output_lens(parser: argparse.ArgumentParser, what: str) -> None:
+    """-o FILE, a lens file."""
+    output(parser, what, Names("formats", "WRITTEN"))
+
+
+def output_folder(
+    parser: argparse.ArgumentParser, what: str, *, required: bool = False, type: Callable = folder_name
+) -> None:
+    parser.add_argument("-o", "--output", dest="folder", metavar="FOLDER", type=type, help=what, required=required)
 
 
 def window(group, *, normalise: str) -> None:

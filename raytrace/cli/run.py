@@ -11,6 +11,7 @@ from types import ModuleType
 
 import raytrace
 from raytrace.cli.door import CONDITIONS, CommandError, open_lens, print_json, say
+from raytrace.cli.outputs import check_outputs
 from raytrace.cli.progress import progress
 from raytrace.maths.result import Result, called
 from raytrace.shards import processes, share
@@ -34,18 +35,22 @@ def carry_out(command: ModuleType, arguments: argparse.Namespace) -> None:
 
 
 def _carry_out(command: ModuleType, arguments: argparse.Namespace) -> None:
+    check_outputs(arguments)
     run = getattr(command, "run", None) or partial(verb_of_lens, command)
     run = called(run) if isinstance(run, str) else run
     distances = getattr(arguments, "object_distances", None)
     if not distances or takes(command, "object_distances"):
         present(run(arguments), arguments)
         return
-    documents = []
+    documents, failed = [], None
     for distance, one in _each(arguments, distances):
         if len(distances) > 1 and not arguments.json:
             print(f"object at {_words(distance)}", flush=True)
         found = run(one)
-        save(found, one)
+        try:
+            save(found, one)
+        except (OSError, ValueError) as error:  # said when all results are printed
+            failed = failed or error
         if arguments.json:
             place = {} if len(distances) == 1 else {"object_distance": distance if math.isfinite(distance) else None}
             documents.append({**place, **found.document()})
@@ -53,6 +58,8 @@ def _carry_out(command: ModuleType, arguments: argparse.Namespace) -> None:
             print(found)
     if arguments.json:
         print_json(documents[0] if len(distances) == 1 else {"results_by_object_distance": documents})
+    if failed:
+        raise failed
 
 
 def takes(command: ModuleType, keyword: str) -> bool:
@@ -94,14 +101,30 @@ def verb_of_lens(command: ModuleType, arguments: argparse.Namespace) -> Result:
 
 
 def present(found: Result | None, arguments: argparse.Namespace) -> None:
-    """Save a result where --plot and -o ask for it, then print it, as text or as JSON."""
+    """Save a result where --plot and -o ask for it, then print it, as text or as JSON: also what cannot be saved."""
     if found is None or share().rank:
         return
-    save(found, arguments)
+    with printed_anyway(found, arguments):
+        save(found, arguments)
+    print_result(found, arguments)
+
+
+@contextmanager
+def printed_anyway(found: Result, arguments: argparse.Namespace) -> Iterator[None]:
+    """A result whose files cannot be written is printed before the error."""
+    try:
+        yield
+    except (OSError, ValueError):
+        print_result(found, arguments)
+        raise
+
+
+def print_result(found: Result, arguments: argparse.Namespace) -> None:
+    """A result as text or as JSON."""
     if getattr(arguments, "json", False):
         print_json(found.document())
     else:
-        print(found)
+        print(found, flush=True)
 
 
 def save(found: Result, arguments: argparse.Namespace) -> None:

@@ -224,5 +224,11 @@ def _line(words: Sequence[str]) -> str:
 
 
 def _words(cycle: Cycle) -> list[str]:
-    numbers = cycle.number, cycle.merit, cycle.missed, cycle.step, cycle.damping, cycle.evaluations
-    return [*map(repr, numbers), f"{cycle.seconds:.3f}", cycle.limits.replace(",", ";")]
+    numbers = map(float, (cycle.merit, cycle.missed, cycle.step, cycle.damping))
+    return [
+        str(cycle.number),
+        *map(repr, numbers),
+        str(cycle.evaluations),
+        f"{cycle.seconds:.3f}",
+        cycle.limits.replace(",", ";"),
+    ]

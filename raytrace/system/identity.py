@@ -90,12 +90,12 @@ def unlike(before: Mapping, now: Mapping) -> str:
     try:
         if "prescription" in now and "prescription" not in before:
             return "a lens that it does not tell; an older version wrote it"
+        if "prescription" in now and (words := other_lens(before, now)):
+            return f"another lens: {words}"
         if "variables" in now and before["variables"] != now["variables"]:
             missing = [name for name in now["variables"] if name not in before["variables"]]
             expected = f"{missing[0]} among them" if missing else ", ".join(now["variables"])
             return f"other variables: {', '.join(map(str, before['variables']))}; expected {expected}"
-        if "prescription" in now and (words := other_lens(before, now)):
-            return f"another lens: {words}"
     except (KeyError, TypeError, ValueError, AttributeError):
         return "a lens that its damaged identity does not tell"
     other = [name for name in now if name not in ("lens", "surfaces") and before.get(name) != now[name]]
