@@ -3,28 +3,13 @@
 import argparse
 import importlib
 from collections.abc import Callable, Iterable, Iterator
-from pathlib import PurePath
+
+from raytrace.cli.paths import data_file as data_file
+from raytrace.cli.paths import file_name, file_of, folder_name, picture_file
+from raytrace.cli.paths import folder_or_lens as folder_or_lens
+from raytrace.cli.paths import output_file as output_file
 
 SAMPLINGS = ("gauss", "hexapolar", "square", "sobol", "random")
-PICTURES = (".png", ".pdf", ".svg")
-
-
-class InputFile(str):
-    """The name of a file that is read, or of something that a file may be given for."""
-
-    __slots__ = ()
-
-
-class OutputFile(str):
-    """The name of a file that is written; suffixes: those that it may have, any if there are none."""
-
-    suffixes: Iterable[str] = ()
-
-
-class OutputFolder(str):
-    """The name of a folder that is written in; may_be_file: or of a file, next to a folder without its suffix."""
-
-    may_be_file: bool = False
 
 
 class Names:
@@ -111,58 +96,6 @@ def seed_number(text: str) -> int:
     if not 0 <= number < 2**63:
         raise argparse.ArgumentTypeError(f"{text!r} is not from 0 to 2**63 - 1")
     return number
-
-
-def file_name(text: str) -> InputFile:
-    """The name of a file to read; an empty one is refused."""
-    if not text:
-        raise argparse.ArgumentTypeError("the name of the file is empty")
-    return InputFile(text)
-
-
-def output_file(text: str) -> OutputFile:
-    """The name of a file to write; an empty one is refused."""
-    return OutputFile(file_name(text))
-
-
-def folder_name(text: str) -> OutputFolder:
-    """The name of a folder to write in; that of a picture is refused."""
-    return OutputFolder(data_file(text))
-
-
-def folder_or_lens(text: str) -> OutputFolder:
-    """The name of a folder to write in, or of a lens file next to it."""
-    folder = folder_name(text)
-    folder.may_be_file = bool(PurePath(text).suffix)
-    return folder
-
-
-def data_file(text: str) -> OutputFile:
-    """The name of a file of data to write; that of a picture is refused."""
-    if PurePath(file_name(text)).suffix.lower() in PICTURES:
-        raise argparse.ArgumentTypeError(f"{text!r} is a picture: figures are saved by --plot, data by -o")
-    return OutputFile(text)
-
-
-def file_of(suffixes: Iterable[str]) -> Callable[[str], OutputFile]:
-    """What reads the name of a file of data to write, with one of these suffixes."""
-
-    def reader(text: str) -> OutputFile:
-        found = data_file(text)
-        found.suffixes = suffixes
-        return found
-
-    return reader
-
-
-def picture_file(text: str) -> OutputFile:
-    """The name of a figure: .png, .pdf or .svg."""
-    if PurePath(file_name(text)).suffix.lower() not in PICTURES:
-        listed = ", ".join(PICTURES)
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is no picture ({listed}); data are written by -o, where there is one"
-        )
-    return OutputFile(text)
 
 
 def field_point(text: str) -> tuple[float, float]:

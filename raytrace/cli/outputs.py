@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from raytrace.cli.door import CommandError
-from raytrace.cli.options import InputFile, OutputFile, OutputFolder
+from raytrace.cli.paths import InputFile, OutputFile, OutputFolder
 from raytrace.files import check_output, check_output_folder
 from raytrace.formats import shipped_lens
 

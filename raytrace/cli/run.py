@@ -13,6 +13,7 @@ import raytrace
 from raytrace.cli.door import CONDITIONS, CommandError, open_lens, print_json, say
 from raytrace.cli.outputs import check_outputs
 from raytrace.cli.progress import progress
+from raytrace.formats import LensFileError
 from raytrace.maths.result import Result, called
 from raytrace.shards import processes, share
 
@@ -49,7 +50,7 @@ def _carry_out(command: ModuleType, arguments: argparse.Namespace) -> None:
         found = run(one)
         try:
             save(found, one)
-        except (OSError, ValueError) as error:  # said when all results are printed
+        except (OSError, LensFileError) as error:  # said when all results are printed
             failed = failed or error
         if arguments.json:
             place = {} if len(distances) == 1 else {"object_distance": distance if math.isfinite(distance) else None}
@@ -114,7 +115,7 @@ def printed_anyway(found: Result, arguments: argparse.Namespace) -> Iterator[Non
     """A result whose files cannot be written is printed before the error."""
     try:
         yield
-    except (OSError, ValueError):
+    except (OSError, LensFileError):
         print_result(found, arguments)
         raise
 

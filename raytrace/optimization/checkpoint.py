@@ -112,7 +112,7 @@ _ENDS = ("gradient", "step", "merit", "cycles", "seconds", "interrupted")  # of 
 _NUMBERS = ("damping", "factor", "share", "price")
 _VECTOR = listed(number())
 _POSITIVE = number(0)
-_SIZE = number(infinite=True)
+_SIZE = number(0)
 
 
 def _cycle(value: object) -> Cycle:
@@ -158,9 +158,9 @@ def resumed(path: str | PathLike, of: Mapping, names: Sequence[str]) -> Kept:
             raise Unfit(f"variables: found {', '.join(found['variables'])}, expected {', '.join(names)}")
         glasses = {int(k): (catalog, name) for k, (catalog, name) in found.get("glasses", {}).items() if _is_number(k)}
         course = _course(found["descent"], len(names)) if "descent" in found else None
-        evaluated = np.array(found.get("evaluated", []), dtype=float)
-        if len(evaluated) and evaluated.shape[1:] != (1 + 2 * len(names),):
+        if any(len(one) != 1 + 2 * len(names) for one in found.get("evaluated", [])):
             raise Unfit(f"evaluated: expected lists of {1 + 2 * len(names)}")
+        evaluated = np.array(found.get("evaluated", []), dtype=float)
         x = np.array([found["variables"][name] for name in names])
         return Kept(x, glasses, tuple(found.get("tested", ())), course, evaluated)
 
