@@ -113,12 +113,14 @@ def optimize(
         raise BadCheckpoint(f"{resume}: glasses: found surfaces {[*kept.glasses]}, expected some of {[*glasses]}")
     start, choice, opening = np.clip(kept.x, lower, upper), None, []
     before, seconds_of_end = _timed(lambda: problem.evaluated(model.start))
-    until -= seconds_of_end  # the result is evaluated once more
     if not kept.glasses and kept.course is None:
         start = opened(
             problem, start, lower=lower, upper=upper, typical=how["typical"], until=until, watch=opening.append
         )
-        _refuse_undefined(problem, problem.evaluated(start))
+        begin, again = _timed(lambda: problem.evaluated(start))
+        _refuse_undefined(problem, begin)
+        seconds_of_end = min(seconds_of_end, again)  # the first evaluation takes longer
+    until -= seconds_of_end  # the result is evaluated once more
     bar = progress and progress(cycles, "cycle")
     with _Told(log, Checkpoint(checkpoint, of, names), bar, kept.course) as told:
         if glasses:
@@ -188,10 +190,10 @@ def _by_gradient(
     model = function.model
     if not names:
         raise NoProblem("nothing varies: name variables by `vary`, as 'curvature thickness'")
-    before, seconds_of_one = _timed(lambda: function(model.start)[0])
+    before = function(model.start)[0]
     if not np.isfinite(before):
         raise NoProblem(f"the merit is {before:g} at the start: nothing to follow")
-    left = None if np.isinf(until) else until - seconds_of_one - time.monotonic()
+    left = None if np.isinf(until) else until - time.monotonic()
     watch = lambda cycle, x: told.tell_evaluated(cycle, x, function.evaluated)  # noqa: E731
     x, stopped, cycles = lowest(function, start, watch=watch, seconds=left, **how)
     after = function(x)[0]
