@@ -2,14 +2,23 @@
 
 import csv
 import errno
+import fcntl
 import io
 import json
 import os
+import re
 import secrets
 import stat
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
+
+_OPEN_FILES = "/proc/self/fd"  # where a file without a name is found again to be named
+
+
+class NotWritten(UserWarning):
+    """An output could not be written; the work went on without it."""
 
 
 def shipped(folder: str) -> Path:
@@ -50,26 +59,119 @@ def encoding(content: bytes) -> str:
 
 
 def write_atomically(path: str | os.PathLike, write: Callable[[BinaryIO], None]) -> None:
-    """Replace a file as a whole or not at all: `write` fills a temporary file beside it, which is then renamed.
+    """Replace a file as a whole or not at all: `write` fills a temporary file, which is then renamed.
 
-    A link is written through. Raises OSError naming `path` where it cannot be written, or is no regular file; what
-    `write` raises passes through. Nothing is left behind.
+    The temporary file, in the same folder, has no name until it is complete, where the system allows that: a process
+    killed by then leaves
+    nothing behind. What killed processes left otherwise is removed by the next write of the same file. A link is
+    written through. Raises OSError naming `path` where it cannot be written, or is no regular file; what else `write`
+    raises passes through.
     """
     target = Path(os.path.realpath(path))
     if target.exists() and not target.is_file():
         raise OSError(errno.EINVAL, "is not a regular file; give the name of a file to write", str(path))
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(6)}.tmp")
     try:
-        with open(temporary, "xb") as file:
+        _remove_abandoned(target)
+        with _unnamed(target.parent) or open(temporary, "xb") as file:
+            with suppress(OSError):  # not every file system has locks
+                fcntl.flock(file, fcntl.LOCK_EX)  # held until the file is closed, or the process ends: it is in use
             write(file)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(temporary, target)
+            if not isinstance(file.name, str | os.PathLike):
+                _give_name(file, temporary)
+            os.replace(temporary, target)
     except BaseException as error:
-        temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.filename in (str(temporary), temporary):
-            raise OSError(error.errno, f"cannot be written: {error.strerror}", str(path)) from error
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename in (None, str(temporary), temporary):
+            raise OSError(error.errno, f"cannot be written: {error.strerror or error}", str(path)) from error
         raise
+
+
+def _unnamed(folder: Path) -> BinaryIO | None:
+    """A new file of a folder, open for writing, that has no name; None where the system has no such files."""
+    if not hasattr(os, "O_TMPFILE") or not os.path.isdir(_OPEN_FILES):
+        return None
+    try:
+        return os.fdopen(os.open(folder, os.O_WRONLY | os.O_TMPFILE | os.O_CLOEXEC, 0o666), "wb")
+    except OSError:
+        return None
+
+
+def _give_name(file: BinaryIO, path: Path) -> None:
+    """Name a file that has none."""
+    folder = os.open(path.parent, os.O_RDONLY)  # with it `link` follows the symbolic link that an open file is
+    try:
+        os.link(f"{_OPEN_FILES}/{file.fileno()}", path, src_dir_fd=folder, follow_symlinks=True)
+    finally:
+        os.close(folder)
+
+
+def _remove_abandoned(target: Path) -> None:
+    """Remove temporary files of a target that no living process writes: those are locked."""
+    pattern = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{12}}\.tmp")
+    with suppress(OSError):
+        for name in filter(pattern.fullmatch, os.listdir(target.parent)):
+            with suppress(OSError), open(target.with_name(name), "rb") as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                target.with_name(name).unlink()
+
+
+def append_text(path: str | os.PathLike, text: str, *, end: int | None = None, sync: bool = True) -> None:
+    """Append a text in UTF-8 to a file, as a whole or not at all. Raises OSError naming `path`.
+
+    end: the length in bytes that the file is cut to first, of what a killed process began to append; sync: wait until
+    the disk has it.
+    """
+    try:
+        with open(path, "ab", buffering=0) as file:
+            if end is not None:
+                file.truncate(end)
+            whole, left = file.seek(0, os.SEEK_END), memoryview(text.encode())
+            try:
+                while left:
+                    left = left[file.write(left) :]
+                if sync:
+                    os.fsync(file.fileno())
+            except BaseException:
+                file.truncate(whole)
+                raise
+    except OSError as error:
+        raise OSError(error.errno, f"cannot be written: {error.strerror}", str(path)) from error
+
+
+def check_output(path: str | os.PathLike, suffixes: Sequence[str] = ()) -> None:
+    """Refuse a file that cannot be written before the work whose result it is for.
+
+    suffixes: those that are known, all if none are given. Raises ValueError for another suffix, and OSError for a
+    folder that does not exist or cannot be written in, or for what is no regular file.
+    """
+    target = Path(os.path.realpath(path))
+    if suffixes and target.suffix.lower() not in suffixes:
+        raise ValueError(f"{path}: expected a name that ends in {', '.join(filter(None, suffixes))}")
+    if target.is_dir():
+        raise OSError(errno.EISDIR, "is a folder; give the name of a file to write", str(path))
+    if target.exists() and not target.is_file():
+        raise OSError(errno.EINVAL, "is not a regular file; give the name of a file to write", str(path))
+    _check_folder(target.parent, path)
+
+
+def check_output_folder(path: str | os.PathLike) -> None:
+    """Refuse a folder that can neither be written in nor made, before the work. Raises OSError."""
+    target = Path(os.path.realpath(path))
+    if target.exists() and not target.is_dir():
+        raise OSError(errno.ENOTDIR, "is a file; give the name of a folder to write in", str(path))
+    _check_folder(next(one for one in (target, *target.parents) if one.exists()), path)
+
+
+def _check_folder(folder: Path, path: str | os.PathLike) -> None:
+    if not folder.is_dir():
+        found = "is a file, not a folder" if folder.exists() else "does not exist; make it first"
+        raise OSError(errno.ENOENT, f"cannot be written: the folder {folder} {found}", str(path))
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise OSError(errno.EACCES, f"cannot be written: no permission to write in {folder}", str(path))
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:

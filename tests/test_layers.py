@@ -20,6 +20,7 @@ FLOORS = {
     "words": 0,
     "maths": 1,
     "pages": 1,
+    "stores": 1,
     # nouns
     "media": 2,
     "system": 3,

@@ -225,5 +225,5 @@ def test_exchanges_go_on_where_they_were_interrupted(triplet, tmp_path, monkeypa
     again = rt.optimize(triplet, resume=path, **how)
     assert [s.glass.name for s in again.lens.surfaces] == [s.glass.name for s in whole.lens.surfaces]
     assert again.merit_after == pytest.approx(whole.merit_after, rel=1e-12)
-    with pytest.raises(BadCheckpoint, match="a checkpoint of glasses that vary"):
+    with pytest.raises(BadCheckpoint, match="a checkpoint of other glasses that vary"):
         rt.optimize(triplet, resume=path, **(how | {"vary": "curvature"}))

@@ -3,7 +3,6 @@
 import csv
 import dataclasses
 import itertools
-import json
 import math
 
 import pytest
@@ -19,7 +18,7 @@ from raytrace.studies.codesign import optima
 from raytrace.studies.codesign.claims import CLAIMS, Seen, claims, is_of_paper
 from raytrace.studies.codesign.closed_form import even_distances, optimise_closed_form, power_spectrum, scan
 from raytrace.studies.codesign.conjugates import paraxial_image
-from raytrace.studies.codesign.experiment import Outcome, batch, camera, lens_at_start
+from raytrace.studies.codesign.experiment import Outcome, batch, camera, lens_at_start, write_outcome
 from raytrace.studies.codesign.figures import _marks
 from raytrace.studies.codesign.optima import Optimum, closed_form, closed_forms
 from raytrace.studies.codesign.page import CAPTIONS, Report
@@ -257,7 +256,7 @@ def test_summaries_are_means_and_deviations_of_the_runs(tmp_path):
 def keep(study, row, one):
     folder = run_folder(study, row, one.seed)
     (folder / "joint").mkdir(parents=True)
-    (folder / "outcome.json").write_text(json.dumps(dataclasses.asdict(one)))
+    write_outcome(one, folder)
     (folder / "joint" / "log.csv").write_text(f"step,loss,sensor\n0,0.5,{one.sensor_mm}\n1,0.25,57.5\n")
 
 

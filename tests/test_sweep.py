@@ -11,11 +11,11 @@ import pytest
 import torch
 from PIL import Image
 
-from raytrace.camera.training import DamagedRun
 from raytrace.cli import main
 from raytrace.files import shipped, write_table
 from raytrace.formats import read_lens
 from raytrace.pages import KEPT, kept_of, markdown
+from raytrace.stores import DamagedLine
 from raytrace.studies.codesign import sweep as module
 from raytrace.studies.codesign.closed_form import power_spectrum
 from raytrace.studies.codesign.figures import sweep_figure
@@ -313,20 +313,24 @@ def test_optima_are_kept_and_not_sought_again(quick, monkeypatch):
     ("line", "reason"),
     [
         ("[{", "Expecting property name"),
-        ("[{}]", "not enough values"),
-        ('[{"colour": 1}, {}]', "unexpected keyword argument 'colour'"),
-        ("[1, 2]", "'int' object has no attribute 'items'"),
-        ('[{"vary": {}}, {}]', "unhashable"),
+        ("[{}]", "a list of 1, expected 2 of them"),
+        ('[{"colour": 1}, {"error": 1}]', "unexpected keyword argument 'colour'"),
+        ("[1, 2]", "entry 1: found 1, expected names and values"),
+        ('[{"vary": {}}, {"error": 1}]', "unhashable"),
+        ("[{}, {}]", "'error' is missing"),
+        ('[{}, {"error": NaN}]', "error: found NaN, expected a finite number"),
         ("\udcff", "can't decode byte 0xff"),
     ],
 )
-def test_a_damaged_line_of_kept_optima_is_named(line, reason, tmp_path):
-    kept = Kept(tmp_path / "optima.jsonl")
+def test_a_damaged_line_of_kept_optima_is_reported_and_the_others_stay(line, reason, tmp_path):
+    kept = Kept(tmp_path / "optima.jsonl", ("error",))
     kept.add(SMALL, {"error": 0.01})
     with kept.path.open("a", encoding="utf-8", errors="surrogateescape") as file:
         file.write(f"{line}\n")
-    with pytest.raises(DamagedRun, match=rf"optima.jsonl: line 2 holds no settings .*{reason}.*; delete it"):
-        kept.read()
+    other = dataclasses.replace(SMALL, seed=7)
+    kept.add(other, {"error": 0.02})
+    with pytest.warns(DamagedLine, match=rf"optima.jsonl, line 2: .*{reason}.*; the line is ignored"):
+        assert kept.read() == {SMALL: {"error": 0.01}, other: {"error": 0.02}}
 
 
 @pytest.mark.parametrize(

@@ -1,21 +1,27 @@
 """Variables of a lens: which numbers they move, by how much, within what bounds."""
 
 import dataclasses
+import json
 import math
 from pathlib import Path
 
 import pytest
 import torch
 from problems import scalar
+from torch.utils import _pytree as pytree
 
+from raytrace.camera.camera import Camera
 from raytrace.camera.limits import BadLimits, Limits, edge_thickness, limits_of, parse_range, violation
-from raytrace.camera.variables import BadVariables, Variables, parse_bounds
+from raytrace.camera.phase import PhaseVariables
+from raytrace.camera.variables import BadVariables, OtherLens, Variables, parse_bounds
 from raytrace.formats import read_lens
+from raytrace.media.catalog import find_glass
 from raytrace.media.glass import AIR, MIRROR, constant, is_air, model_glass, nd
 from raytrace.system.departure import ZernikeSag
 from raytrace.system.lens import with_sensor_distance
 from raytrace.system.places import places
 from raytrace.system.surface import Surface, sag
+from raytrace.wave.element import Element, Rings
 
 LENSES = Path(__file__).parents[1] / "lenses"
 NANOMETRE = 1e-6
@@ -69,8 +75,108 @@ def test_a_state_is_restored_by_name():
         one.curvature_3 -= 0.01
     other.load_state_dict(one.state_dict())
     assert one.numbers() == other.numbers()
-    with pytest.raises(RuntimeError, match="curvature_3"):
-        Variables(read_lens("double_gauss"), "sensor").load_state_dict(one.state_dict())
+
+
+LENS = read_lens("cooke_triplet")
+ELEMENT = Element(
+    Rings(torch.zeros(8, dtype=torch.float64), torch.tensor(0.1, dtype=torch.float64)),
+    torch.tensor(0.8, dtype=torch.float64),
+    find_glass("PMMA"),
+)
+OTHERS = {  # a module whose state is loaded into another -> the two, and words of the error
+    "lens": (LENS, "sensor", {}, read_lens("tessar"), "sensor", {}, "Cooke triplet.* of 8 surfaces, not 'Tessar"),
+    "thickness": (
+        LENS,
+        "sensor",
+        {},
+        LENS.replace(2, thickness=7.0),
+        "sensor",
+        {},
+        "thickness 12.93 of surface 2, not 7",
+    ),
+    "glass": (
+        LENS,
+        "sensor",
+        {},
+        LENS.replace(1, glass=find_glass("N-BK7")),
+        "sensor",
+        {},
+        "SK4' of surface 1, not 'N-BK7",
+    ),
+    "sensor": (
+        LENS,
+        "curvature:1",
+        {},
+        LENS.at(sensor_distance=77.0),
+        "curvature:1",
+        {},
+        "thickness 77.405 of surface 7",
+    ),
+    "variables": (LENS, "sensor curvature:3", {}, LENS, "sensor", {}, "the variables sensor, curvature_3, not sensor"),
+    "held": (LENS, "curvature:1-3", {"hold": "efl"}, LENS, "curvature:1-3", {}, "efl.* is held, not nothing"),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_state_of_another_lens_is_refused_by_name_and_nothing_is_loaded(name):
+    lens, vary, how, other, others, more, words = OTHERS[name]
+    state = Variables(lens, vary, **how).state_dict()
+    for entry in state.values():
+        if entry.dtype != torch.uint8:
+            entry.add_(0.25)
+    variables = Variables(other, others, **more)
+    camera = Camera(variables, torch.nn.Conv2d(1, 1, 1))
+    with pytest.raises(OtherLens, match=words):
+        variables.load_state_dict(state)
+    with pytest.raises(OtherLens, match=words):
+        camera.load_state_dict({f"variables.{key}": entry for key, entry in state.items()}, strict=False)
+    assert not any(bool(p.any()) for p in variables.parameters())
+
+
+def test_a_state_is_of_the_prescription_under_any_conditions_and_in_any_precision(tmp_path):
+    """Wavelengths, aperture and precision change no meaning of an offset; what is loaded comes from a file."""
+    one = Variables(LENS, "sensor curvature:3")
+    with torch.no_grad():
+        one.sensor += 0.25
+    torch.save(one.state_dict(), tmp_path / "state.pt")
+    state = torch.load(tmp_path / "state.pt", weights_only=True)
+    single = pytree.tree_map(lambda t: t.float() if isinstance(t, torch.Tensor) and t.is_floating_point() else t, LENS)
+    for lens in (LENS.at(wavelengths=[0.5], f_number=8.0), LENS.at(object_distance=1e4), single):
+        variables = Variables(lens, "sensor curvature:3")
+        variables.load_state_dict(state)
+        assert float(variables.sensor) == 0.25
+    told = json.loads(bytes(state["_extra_state"].tolist()).decode())
+    assert told["lens"] == LENS.name
+    assert told["variables"]["sensor"] == [77.405, 1.0]
+
+
+def test_a_state_of_an_older_version_is_refused_with_the_way_to_load_it():
+    variables = Variables(LENS, "sensor")
+    state = {"sensor": torch.tensor(0.25, dtype=torch.float64)}
+    with pytest.raises(OtherLens, match=r"an older version wrote it\. .* set state\['_extra_state'\]"):
+        variables.load_state_dict(state)
+    variables.load_state_dict(state | {"_extra_state": variables.get_extra_state()})
+    assert float(variables.sensor) == 0.25
+    with pytest.raises(OtherLens, match="its identity is damaged"):
+        variables.load_state_dict(state | {"_extra_state": torch.tensor([91, 49, 93], dtype=torch.uint8)})
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"unit": 1e-4}, "unit 0.001, not 0.0001"),
+        ({"others": (ELEMENT,)}, "other others"),
+        ({"basis": torch.ones(8, 8, dtype=torch.float64)}, "other basis"),
+        ({"element": dataclasses.replace(ELEMENT, glass=find_glass("N-BK7"))}, "glass PMMA, not N-BK7"),
+        ({"element": ELEMENT.with_numbers(ELEMENT.numbers + 1e-3)}, "other start"),
+        ({"element": dataclasses.replace(ELEMENT, radius=ELEMENT.radius / 2)}, "aperture 1.6, not 0.8"),
+    ],
+)
+def test_a_state_of_another_element_is_refused(change, words):
+    state = PhaseVariables(ELEMENT).state_dict()
+    PhaseVariables(ELEMENT).load_state_dict(state)
+    with pytest.raises(OtherLens, match=f"the state is of an element of {words}"):
+        PhaseVariables(**{"element": ELEMENT} | change).load_state_dict(state)
 
 
 def test_bounds_hold_after_a_step():

@@ -154,7 +154,7 @@ def test_heights_keep_the_material_that_they_were_learned_for(run, tmp_path):
     (tmp_path / "rings.npy.json").write_text('{"material": "F_SILICA", "formula": "sellmeier_1"}')
     code, _, err = run(*arguments)
     assert code == 1
-    assert "rings.npy.json: is no label of a height map (KeyError: 'coefficients'); remove it" in err
+    assert "rings.npy.json: is no label of a height map ('catalog' is missing); remove it" in err
     (tmp_path / "rings.npy.json").unlink()
     code, _, err = run(*arguments)
     assert code == 1

@@ -10,6 +10,7 @@ import torch
 
 from raytrace.bench.report import Asked, Measured
 from raytrace.cli.door import CommandError, open_lens, say
+from raytrace.cli.run import printed_anyway
 from raytrace.pages import machine
 from raytrace.shards import torch_threads
 from raytrace.system.lens import Lens
@@ -43,10 +44,11 @@ def run(arguments: argparse.Namespace) -> Measured:
             return machine() | (peers.versions() if peers else {})
 
         found = subject.bench(Asked(arguments, _open, peers, about, threads))
-    if arguments.csv:
-        found.save_table(arguments.csv)
-    if arguments.docs:
-        found.save_page(arguments.docs)
+    with printed_anyway(found, arguments):
+        if arguments.csv:
+            found.save_table(arguments.csv)
+        if arguments.docs:
+            found.save_page(arguments.docs)
     return found
 
 

@@ -13,6 +13,7 @@ import io
 import json
 import math
 import time
+import warnings
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -21,9 +22,10 @@ from types import MappingProxyType
 import torch
 from torch import Tensor, nn
 
-from raytrace.files import write_atomically
+from raytrace.files import append_text, write_atomically
 from raytrace.fused import prepare
 from raytrace.shards import Share, share, total
+from raytrace.stores import DamagedLine, anything, mapped, read_document
 
 #: What a step reports: numbers by name, a column of the log each.
 Record = dict[str, float]
@@ -130,7 +132,12 @@ class Run:
         if not self.log.exists():
             return
         header, *rows = _lines(self.log)
-        kept = [row for row in rows if len(row) == len(header) and row and row[0].isdecimal() and int(row[0]) < step]
+        whole = [_numbers(row, len(header)) is not None for row in rows]
+        for line, row in enumerate(rows[:-1], 2):  # the last one may be torn
+            if not whole[line - 2]:
+                words = f"found {_words(','.join(row))!r}, expected {len(header)} numbers; the line is dropped"
+                warnings.warn(f"{self.log}, line {line}: {words}", DamagedLine, stacklevel=2)
+        kept = [row for row, is_whole in zip(rows, whole, strict=True) if is_whole and int(row[0]) < step]
         write_atomically(self.log, lambda file: file.write(_csv([header, *kept]).encode()))
 
     def append(self, rows: list[tuple[int, Record]]) -> None:
@@ -139,18 +146,29 @@ class Run:
         new = not self.log.exists()
         header = [["step", *rows[0][1]]] if new else []
         lines = [[step, *(repr(value) for value in record.values())] for step, record in rows]
-        with self.log.open("a", newline="") as file:
-            file.write(_csv(header + lines))
+        append_text(self.log, _csv(header + lines))
 
 
 def read_log(path: Path) -> list[dict[str, float]]:
     """A log as numbers, a dict for every step. Raises DamagedRun."""
     header, *rows = _lines(path)
+    found = []
+    for line, row in enumerate(rows, 2):
+        if (numbers := _numbers(row, len(header))) is None:
+            expected = f"expected {len(header)} numbers, of {_words(','.join(header))}"
+            raise DamagedRun(f"{path}, line {line}: found {_words(','.join(row))!r}, {expected}")
+        found.append(dict(zip(header, numbers, strict=True)))
+    return found
+
+
+def _numbers(row: list[str], count: int) -> list[float] | None:
+    """A row of a log, whose first number is its step; None where it is damaged."""
     try:
-        return [{key: float(value) for key, value in zip(header, row, strict=True)} for row in rows]
-    except ValueError as error:
-        found = f"expected numbers under {_words(','.join(header))} ({_words(error)})"
-        raise DamagedRun(f"{path}: {found}") from error
+        numbers = list(map(float, row))
+    except ValueError:
+        return None
+    is_whole = len(numbers) == count and not any(map(math.isnan, numbers)) and row[0].isdecimal()
+    return numbers if is_whole else None
 
 
 def _lines(path: Path) -> list[list[str]]:
@@ -163,13 +181,7 @@ def _lines(path: Path) -> list[list[str]]:
 
 def read_json(path: Path) -> dict:
     """A document of settings or results. Raises DamagedRun."""
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise DamagedRun(f"{path}: no JSON ({_words(error)})") from error
-    if not isinstance(found, dict):
-        raise DamagedRun(f"{path}: holds a {type(found).__name__}; expected names and values")
-    return found
+    return read_document(path, mapped(anything), DamagedRun, "remove the folder to begin anew")
 
 
 def _words(error: object) -> str:

@@ -13,7 +13,10 @@ from torch import Tensor, nn
 
 from raytrace.camera.held import held, solved
 from raytrace.camera.limits import limits_of, violation
+from raytrace.camera.owned import OtherLens as OtherLens
+from raytrace.camera.owned import Owned
 from raytrace.optics.paraxial import first_order
+from raytrace.system.identity import identity, other_lens
 from raytrace.system.lens import Lens
 from raytrace.system.naming import BadVariables as BadVariables
 from raytrace.system.naming import counted, place_named, sensor
@@ -44,7 +47,7 @@ class Variable:
         return "sensor" if self.kind == "sensor" else f"{self.kind}_{self.surface}"
 
 
-class Variables(nn.Module):
+class Variables(Owned):
     """The variables of a lens as parameters: 0 at the start, in units of `Variable.unit`.
 
     vary: "sensor", and lists like "thickness:5,6,10 curvature:1-4 a4:3", of the file's surface numbers; beside
@@ -54,6 +57,7 @@ class Variables(nn.Module):
         it is then no parameter but solved for (`held`), and its bounds count in `violation`.
     glass_thickness, air_thickness: least and greatest in mm at the axis; edge: least of glass at its edge; by default
     they go with the size of the lens (`limits_of`). `violation` says how far the lens is from them.
+    `state_dict` carries the lens that the parameters are offsets from, and loads into that one alone (`Owned`).
     """
 
     def __init__(
@@ -90,6 +94,32 @@ class Variables(nn.Module):
         """The lens with its variables where they are now."""
         lens = self._free()
         return lens if self.held is None else _with_value(lens, self.held.by, self._solved(lens))
+
+    def identity(self) -> dict:
+        """The lens (`identity.identity`), and each variable's number in it and unit."""
+        every = (*self.variables, *([] if self.held is None else [self.held.by]))
+        starts = {variable.name: [variable.start, variable.unit] for variable in every}
+        held = None if self.held is None else ["efl", self.held.focal_length, self.held.by.name]
+        return {**identity(self.lens), "variables": starts, "hold": held}
+
+    def difference(self, before: dict) -> str:
+        """How a stored identity differs from this one, "" where it does not."""
+        now = self.identity()
+        try:
+            if words := other_lens(before, now):
+                return words
+            if set(before["variables"]) != set(now["variables"]):
+                return f"the variables {', '.join(before['variables'])}, not {', '.join(now['variables'])}"
+            if not _alike(before["hold"], now["hold"]):
+                return f"variables of which {before['hold'] or 'nothing'} is held, not {now['hold'] or 'nothing'}"
+            for name, pair in before["variables"].items():
+                if not _alike(pair, now["variables"][name]):
+                    return "{} from {:.9g} in units of {:.9g}, not from {:.9g} in units of {:.9g}".format(
+                        name, *pair, *now["variables"][name]
+                    )
+        except (KeyError, TypeError, ValueError, AttributeError):
+            return "a lens that its damaged identity does not tell"
+        return ""
 
     def _free(self) -> Lens:
         """The lens with what is not solved for."""
@@ -145,6 +175,15 @@ class Variables(nn.Module):
         value, unit = number_at(lens.surfaces[self.held.by.surface], self.held.by.place), self.held.by.unit
         low, high = self._range()
         return lacks + ((low - value).clamp_min(0) / unit).square() + ((value - high).clamp_min(0) / unit).square()
+
+
+def _alike(one: object, other: object) -> bool:
+    """Whether plain values are the same, their numbers to what float32 holds."""
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(_alike, one, other))
+    if isinstance(one, float) and isinstance(other, float):
+        return math.isclose(one, other, rel_tol=1e-6)
+    return one == other
 
 
 def _with_value(lens: Lens, variable: Variable, value: Tensor) -> Lens:

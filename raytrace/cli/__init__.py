@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from raytrace.budget import keep_freed_memory
 from raytrace.cli.command import as_options
+from raytrace.files import NotWritten
 from raytrace.words import did_you_mean
 
 DESCRIPTION = "A sequential, differentiable ray tracer: read a lens file, trace it, focus it, plot it."
@@ -96,13 +97,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     with warnings.catch_warnings():
         warnings.simplefilter("always")
         spelled = arguments.spelled
-        warnings.showwarning = _shower(spelled)
+        shown: set[type[Warning]] = set()
+        warnings.showwarning = _shower(spelled, shown)
         try:
             with (
                 importlib.import_module("raytrace.cli.progress").heartbeat(arguments.command),
                 importlib.import_module("raytrace.budget").within(getattr(arguments, "max_bytes", None)),
             ):
-                return importlib.import_module("raytrace.cli.run").carry_out(arguments.run, arguments)
+                code = importlib.import_module("raytrace.cli.run").carry_out(arguments.run, arguments)
+            return 1 if any(issubclass(category, NotWritten) for category in shown) else code
         except KeyboardInterrupt:
             return _fail("interrupted", 130)
         except BrokenPipeError:
@@ -144,14 +147,16 @@ def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def _shower(spelled: Mapping[str, str]) -> Callable[..., None]:
-    """Shows warnings of this package, one line each and none twice; those of libraries speak to programmers."""
+def _shower(spelled: Mapping[str, str], shown: set[type[Warning]]) -> Callable[..., None]:
+    """Shows warnings of this package, one line each and none twice, and adds their categories to `shown`; those of
+    libraries speak to programmers."""
     said = set()
 
     def show(message, category, filename, lineno, file=None, line=None) -> None:
         words = as_options(_one_line(message), spelled)
         if category.__module__.startswith("raytrace") and words not in said:
             said.add(words)
+            shown.add(category)
             print(f"raytrace: warning: {words}", file=sys.stderr)
 
     return show

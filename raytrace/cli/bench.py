@@ -1,6 +1,6 @@
 """`raytrace bench`: its words and options; `bench.command` runs it."""
 
-from raytrace.cli.options import count, file_name, json, output, plot
+from raytrace.cli.options import count, file_name, folder_name, json, output, output_file, plot
 
 SUMMARY = "measure speed against error"
 DESCRIPTION = (
@@ -37,10 +37,10 @@ def options(parser):
     parser.add_argument("--repeats", metavar="N", type=count, default=5, help="runs of which the median is kept")
     parser.add_argument("--threads", metavar="N", type=count, help="threads of torch")
     parser.add_argument("--no-peers", action="store_true", help="leave out Optiland even if it is installed")
-    output(parser, "report to write (.md)")
-    parser.add_argument("--csv", metavar="FILE", type=file_name, help="psf: table to write, one line a figure")
+    output(parser, "report to write (.md)", (".md",))
+    parser.add_argument("--csv", metavar="FILE", type=output_file, help="psf: table to write, one line a figure")
     parser.add_argument(
-        "--docs", metavar="DOCS", type=file_name,
+        "--docs", metavar="DOCS", type=folder_name,
         help="wave, speed, optimise: folder for wave_bench.md and wave/, or speed.md or optimise.md, .csv and .png",
     )  # fmt: skip
     parser.add_argument("--quick", action="store_true", help="speed: few rays, to try it; its ratios mean little")

@@ -3,7 +3,7 @@
 import argparse
 
 import raytrace
-from raytrace.cli.options import catalog, configuration, file_name, json, substitute
+from raytrace.cli.options import Names, catalog, configuration, file_name, file_of, json, substitute
 
 SUMMARY = "write a lens in another format"
 DESCRIPTION = "Read a lens file and write it as the suffix of OUT says. Every number comes back bit for bit."
@@ -16,7 +16,10 @@ EXAMPLES = """examples:
 def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", metavar="IN", type=file_name, help="lens file, or the name of a shipped lens")
     parser.add_argument(
-        "target", metavar="OUT", type=file_name, help="lens file to write: .zmx, .seq, .csv, .tsv, .txt"
+        "target",
+        metavar="OUT",
+        type=file_of(Names("formats", "WRITTEN")),
+        help="lens file to write: .zmx, .seq, .csv, .tsv, .txt",
     )
     configuration(parser)
     catalog(parser)

@@ -33,7 +33,7 @@ def options(parser):
         choices=("field", "wavelength"),
         help="draw the through-focus curves alone, one a field, or one a wavelength of the first field",
     )
-    words.output(parser, "lens file to write with the new sensor distance")
+    words.output_lens(parser, "lens file to write with the new sensor distance")
 
 
 def run(arguments):
@@ -42,7 +42,7 @@ def run(arguments):
     import warnings
 
     from raytrace.cli.door import catalogs, find_lens, say
-    from raytrace.cli.run import verb_of_lens
+    from raytrace.cli.run import printed_anyway, verb_of_lens
     from raytrace.formats import read_lens, write_lens
     from raytrace.system.lens import with_sensor_distance
 
@@ -53,7 +53,8 @@ def run(arguments):
             path, one = find_lens(arguments.lens), arguments.configuration
             how = {"catalogs": catalogs(arguments), "substitute": arguments.substitute}
             original = read_lens(path, **how, configuration=one)
-        write_lens(with_sensor_distance(original, found.sensor_distance), arguments.output)
+        with printed_anyway(found, arguments):
+            write_lens(with_sensor_distance(original, found.sensor_distance), arguments.output)
         say(f"written: {arguments.output}")
         arguments.output = None
     return found

@@ -2,11 +2,14 @@
 
 import argparse
 import importlib
-from collections.abc import Iterator
-from pathlib import PurePath
+from collections.abc import Callable, Iterable, Iterator
+
+from raytrace.cli.paths import data_file as data_file
+from raytrace.cli.paths import file_name, file_of, folder_name, picture_file
+from raytrace.cli.paths import folder_or_lens as folder_or_lens
+from raytrace.cli.paths import output_file as output_file
 
 SAMPLINGS = ("gauss", "hexapolar", "square", "sobol", "random")
-PICTURES = (".png", ".pdf", ".svg")
 
 
 class Names:
@@ -93,30 +96,6 @@ def seed_number(text: str) -> int:
     if not 0 <= number < 2**63:
         raise argparse.ArgumentTypeError(f"{text!r} is not from 0 to 2**63 - 1")
     return number
-
-
-def file_name(text: str) -> str:
-    """The name of a file; an empty one is refused."""
-    if not text:
-        raise argparse.ArgumentTypeError("the name of the file is empty")
-    return text
-
-
-def data_file(text: str) -> str:
-    """The name of a file of data; that of a picture is refused."""
-    if PurePath(file_name(text)).suffix.lower() in PICTURES:
-        raise argparse.ArgumentTypeError(f"{text!r} is a picture: figures are saved by --plot, data by -o")
-    return text
-
-
-def picture_file(text: str) -> str:
-    """The name of a figure: .png, .pdf or .svg."""
-    if PurePath(file_name(text)).suffix.lower() not in PICTURES:
-        listed = ", ".join(PICTURES)
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is no picture ({listed}); data are written by -o, where there is one"
-        )
-    return text
 
 
 def field_point(text: str) -> tuple[float, float]:
@@ -343,12 +322,20 @@ def log(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def output(parser: argparse.ArgumentParser, what: str) -> None:
-    parser.add_argument("-o", "--output", metavar="FILE", type=data_file, help=what)
+def output(parser: argparse.ArgumentParser, what: str, suffixes: Iterable[str]) -> None:
+    """-o FILE; suffixes: those that the file may have."""
+    parser.add_argument("-o", "--output", metavar="FILE", type=file_of(suffixes), help=what)
 
 
-def output_folder(parser: argparse.ArgumentParser, what: str, *, required: bool = False) -> None:
-    parser.add_argument("-o", "--output", dest="folder", metavar="FOLDER", type=data_file, help=what, required=required)
+def output_lens(parser: argparse.ArgumentParser, what: str) -> None:
+    """-o FILE, a lens file."""
+    output(parser, what, Names("formats", "WRITTEN"))
+
+
+def output_folder(
+    parser: argparse.ArgumentParser, what: str, *, required: bool = False, type: Callable = folder_name
+) -> None:
+    parser.add_argument("-o", "--output", dest="folder", metavar="FOLDER", type=type, help=what, required=required)
 
 
 def window(group, *, normalise: str) -> None:

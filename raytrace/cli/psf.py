@@ -52,6 +52,7 @@ def options(parser) -> None:
         parser,
         "arrays to write (.npz): psf[distance, field, y, x], or [distance, field, wavelength, y, x], pixel_pitch, "
         "energy, error, wavelengths, model",
+        (".npz",),
     )
     plot(parser, "the kernels, finely in windows that they fill (with --pixel or --size: the pixels),")
     log(parser)

@@ -11,7 +11,9 @@ from types import ModuleType
 
 import raytrace
 from raytrace.cli.door import CONDITIONS, CommandError, open_lens, print_json, say
+from raytrace.cli.outputs import check_outputs
 from raytrace.cli.progress import progress
+from raytrace.formats import LensFileError
 from raytrace.maths.result import Result, called
 from raytrace.shards import processes, share
 
@@ -35,6 +37,7 @@ def carry_out(command: ModuleType, arguments: argparse.Namespace) -> int:
 
 
 def _carry_out(command: ModuleType, arguments: argparse.Namespace) -> int:
+    check_outputs(arguments)
     run = getattr(command, "run", None) or partial(verb_of_lens, command)
     run = called(run) if isinstance(run, str) else run
     distances = getattr(arguments, "object_distances", None)
@@ -42,13 +45,16 @@ def _carry_out(command: ModuleType, arguments: argparse.Namespace) -> int:
         found = run(arguments)
         present(found, arguments)
         return int(found is not None and found.falls_short)
-    documents, short = [], 0
+    documents, short, failed = [], False, None
     for distance, one in _each(arguments, distances):
         if len(distances) > 1 and not arguments.json:
             print(f"object at {_words(distance)}", flush=True)
         found = run(one)
-        save(found, one)
         short |= found.falls_short
+        try:
+            save(found, one)
+        except (OSError, LensFileError) as error:  # said when all results are printed
+            failed = failed or error
         if arguments.json:
             place = {} if len(distances) == 1 else {"object_distance": distance if math.isfinite(distance) else None}
             documents.append({**place, **found.document()})
@@ -56,6 +62,8 @@ def _carry_out(command: ModuleType, arguments: argparse.Namespace) -> int:
             print(found)
     if arguments.json:
         print_json(documents[0] if len(distances) == 1 else {"results_by_object_distance": documents})
+    if failed:
+        raise failed
     return int(short)
 
 
@@ -98,14 +106,30 @@ def verb_of_lens(command: ModuleType, arguments: argparse.Namespace) -> Result:
 
 
 def present(found: Result | None, arguments: argparse.Namespace) -> None:
-    """Save a result where --plot and -o ask for it, then print it, as text or as JSON."""
+    """Save a result where --plot and -o ask for it, then print it, as text or as JSON: also what cannot be saved."""
     if found is None or share().rank:
         return
-    save(found, arguments)
+    with printed_anyway(found, arguments):
+        save(found, arguments)
+    print_result(found, arguments)
+
+
+@contextmanager
+def printed_anyway(found: Result, arguments: argparse.Namespace) -> Iterator[None]:
+    """A result whose files cannot be written is printed before the error."""
+    try:
+        yield
+    except (OSError, LensFileError):
+        print_result(found, arguments)
+        raise
+
+
+def print_result(found: Result, arguments: argparse.Namespace) -> None:
+    """A result as text or as JSON."""
     if getattr(arguments, "json", False):
         print_json(found.document())
     else:
-        print(found)
+        print(found, flush=True)
 
 
 def save(found: Result, arguments: argparse.Namespace) -> None:

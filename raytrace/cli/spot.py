@@ -46,7 +46,8 @@ def options(parser):
         help="rays count by their share of the pupil's area (default) or all alike; OpticStudio's spots are "
         "--sampling hexapolar --rings 6 --weights equal --reference chief",
     )
-    words.output(parser, "table of the rays to write (.csv): field, wavelength, pupil point, x, y, weight, status")
+    what = "table of the rays to write (.csv): field, wavelength, pupil point, x, y, weight, status"
+    words.output(parser, what, (".csv", ""))
     words.plot(parser, "the spot diagram")
 
 
@@ -54,10 +55,9 @@ def run(arguments):
     """The spots; what cannot be saved is refused before the rays are traced."""
     import sys
 
-    from raytrace.cli.door import CommandError, refuse_suffix
+    from raytrace.cli.door import CommandError
     from raytrace.cli.run import verb_of_lens
 
-    refuse_suffix("-o", arguments.output, (".csv", ""))
     for option, given in (("--plot", arguments.plot), ("-o", arguments.output)):
         if given and arguments.rays:
             raise CommandError(f"{option} needs the rays, and --rays keeps none: leave one out")

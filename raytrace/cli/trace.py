@@ -25,7 +25,7 @@ def options(parser):
         help="rays to trace: columns x,y,z,l,m,n in the frame of surface 1, optional wavelength; "
         "by default the chief and marginal rays of every field",
     )
-    words.output(parser, "table to write (.csv); default: standard output")
+    words.output(parser, "table to write (.csv); default: standard output", (".csv", ".txt", ""))
     words.conditions(parser, several="rays from each")
     words.fields(parser)
 

@@ -40,6 +40,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     output(
         parser,
         "arrays to write (.npz): psf[depth, wavelength, y, x], pixel_pitch, energy, depths, wavelengths, engine, error",
+        (".npz",),
     )
     plot(parser, "the kernels")
     figures = parser.add_argument_group("more figures")
@@ -50,14 +51,14 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace):
     import raytrace
-    from raytrace.cli.door import catalogs, refuse_suffix, say
-    from raytrace.cli.run import options_of
+    from raytrace.cli.door import catalogs, say
+    from raytrace.cli.run import options_of, printed_anyway
 
-    refuse_suffix("-o", arguments.output, (".npz",))
     wanted = options_of(raytrace.cli.wave_psf, arguments) | {"catalog": catalogs(arguments)}
     found = raytrace.wave_psf(**wanted)
     for name in _FIGURES:
         if path := vars(arguments).pop(f"plot_{name}"):
-            found.plot(path, what=name, progress=wanted["progress"])
+            with printed_anyway(found, arguments):
+                found.plot(path, what=name, progress=wanted["progress"])
             say(f"written: {path}")
     return found

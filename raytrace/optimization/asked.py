@@ -11,6 +11,7 @@ from raytrace.merit.model import Model
 from raytrace.merit.vary import Freedom, name_of
 from raytrace.optimization.problem import Problem
 from raytrace.optimization.starts import Range, Space, length_of, space_of
+from raytrace.system.identity import identity
 from raytrace.system.intent import Row
 
 
@@ -50,6 +51,7 @@ class Asked:
     def about(self, seed: int) -> dict:
         """What a search depends on, for its journal."""
         return {
+            **identity(self.free.lens),
             "variables": [name_of(one) for one in self.model.variables],
             "start": self.model.start.tolist(),
             "bounds": [self.space.lower.tolist(), self.space.upper.tolist()],

@@ -6,7 +6,7 @@ Source: Byrd, Lu, Nocedal & Zhu 1995.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.optimize import minimize
@@ -26,18 +26,28 @@ class _Ended(Exception):
 
 
 class Function:
-    """A merit of a lens as a function of the variables of a model."""
+    """A merit of a lens as a function of the variables of a model.
 
-    def __init__(self, model: Model, function: Callable[[Lens], Tensor]):
-        self.view = model.views[model.lens.current_configuration - 1]
-        self.function, self.evaluations = function, 0
+    evaluated: (E, n + 1 + n) variables, value and gradient of evaluations that are known: a descent that is resumed
+    passes through them again, without evaluating, to where it was.
+    """
+
+    def __init__(self, model: Model, function: Callable[[Lens], Tensor], evaluated: Sequence[np.ndarray] = ()):
+        self.model, self.view = model, model.views[model.lens.current_configuration - 1]
+        self.function, self.evaluations, self.evaluated = function, 0, [*evaluated]
+        self.known = {one[: len(one) // 2].tobytes(): one for one in self.evaluated}
 
     def __call__(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """The merit and its gradient (n,)."""
         self.evaluations += 1
-        moment = self.view.moment(Dual(np.asarray(x, dtype=float), np.eye(len(x))))
+        x = np.array(x, dtype=float)
+        if (known := self.known.get(x.tobytes())) is not None:
+            return float(known[len(x)]), known[len(x) + 1 :].copy()
+        moment = self.view.moment(Dual(x, np.eye(len(x))))
         (found,) = moment.through_torch(lambda lens: [self.function(lens).reshape(())], clips=True)
-        return float(value_of(found)), slope_of(found, len(x))
+        value, slope = float(value_of(found)), slope_of(found, len(x))
+        self.evaluated.append(np.array([*x, value, *slope]))
+        return value, slope
 
 
 def lowest(
@@ -55,10 +65,14 @@ def lowest(
     begun, told = time.monotonic(), []
     scale = np.where(np.isfinite(typical), typical, np.maximum(np.abs(x), 1e-3))
     start = merit(x)[0]
-    best = [start, x]
+    best, last = [start, x], [0.0]  # last: s of an evaluation
 
     def cost(y: np.ndarray) -> tuple[float, np.ndarray]:
+        begun_here = time.monotonic()
+        if seconds is not None and begun_here + last[0] > begun + seconds:
+            raise _Ended
         here, by = merit(y * scale)
+        last[0] = time.monotonic() - begun_here
         if not (np.isfinite(here) and np.isfinite(by).all()):
             return _FAR * max(abs(start), 1.0), np.zeros_like(y)
         if here < best[0]:

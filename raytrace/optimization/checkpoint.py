@@ -1,89 +1,234 @@
 """Checkpoints and the log of an optimisation: files that tell how far it has come."""
 
-import json
+import dataclasses
 import time
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from os import PathLike
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from raytrace.files import write_atomically
-from raytrace.optimization.least_squares import Cycle
+from raytrace.files import NotWritten, append_text, write_json, write_text
+from raytrace.maths.result import plain
+from raytrace.optimization.least_squares import Cycle, Standing
+from raytrace.optimization.paths import MANNERS, Course
+from raytrace.stores import Unfit, anything, either, exactly, listed, mapped, number, read_document, record, text, whole
+from raytrace.system.identity import unlike
 
 EVERY = 2.0  # s between two checkpoints
 _COLUMNS = ("cycle", "merit", "missed", "step", "damping", "evaluations", "seconds", "limits")
+_ADVICE = "expected what `checkpoint` wrote; start anew without `resume`"
 
 
 class BadCheckpoint(ValueError):
-    """A checkpoint that is none, or of another lens; the message says what was found and what was expected."""
+    """A checkpoint that is none, or of another optimisation; the message says what was found and what was expected."""
 
 
 class Kept(NamedTuple):
-    """What a checkpoint keeps: the variables (n,); of glasses that vary (catalog, name) by surface, and the surfaces
-    that no exchange has helped at since the last one."""
+    """What a checkpoint keeps.
+
+    x: the variables (n,); glasses: of surfaces where they vary, (catalog, name); tested: surfaces at which no exchange
+    has helped since the last one; course: how far the descent came, None before it began; evaluated: of a merit that is
+    no sum of squares, every evaluation so far (E, n + 1 + n): variables, value, gradient.
+    """
 
     x: np.ndarray
     glasses: dict[int, tuple[str, str]]
     tested: tuple[int, ...] = ()
+    course: Course | None = None
+    evaluated: np.ndarray = np.zeros((0, 0))
 
 
 class Checkpoint:
-    """Keeps the best variables in a file, replaced as a whole: {"variables": {name: number}, "merit": …, …}.
+    """Keeps how far an optimisation has come in a file, replaced as a whole.
 
-    With "glasses": {surface: [catalog, name]} and "tested" where glasses vary.
+    {"of": what it depends on, "merit": …, "cycles": …, "variables": {name: number} of the last cycle, at the end of the
+    best lens, "descent": all that decides the next cycle}; with "glasses": {surface: [catalog, name]} and "tested"
+    where glasses vary, and with "evaluated" in the place of "descent" for a merit that is not a sum of squares.
     """
 
-    def __init__(self, path: str | PathLike | None, names: Sequence[str]):
-        self.path, self.names, self.last, self.more = path, names, -np.inf, {}
+    def __init__(self, path: str | PathLike | None, of: Mapping, names: Sequence[str]):
+        self.path, self.of, self.names, self.last, self.more = path, of, names, -np.inf, {}
 
     def keep_glasses(self, kept: Kept, merit: float) -> None:
         """Keep a state of the choice of glasses, and these glasses with all variables that follow."""
         self.more = {"glasses": {str(k): list(one) for k, one in kept.glasses.items()}, "tested": list(kept.tested)}
         self.keep(kept.x, merit, 0, now=True)
 
-    def keep(self, x: np.ndarray, merit: float, cycle: int, *, now: bool = False) -> None:
+    def keep(
+        self,
+        x: np.ndarray,
+        merit: float,
+        cycles: int,
+        *,
+        course: Course | None = None,
+        evaluated: Sequence[np.ndarray] = (),
+        now: bool = False,
+    ) -> None:
+        """Keep the best variables and how far the descent has come, at most every few seconds unless it must be now.
+
+        Warns NotWritten where the file cannot be written; the optimisation goes on.
+        """
         if self.path is None or (not now and time.monotonic() < self.last + EVERY):
             return
-        variables = dict(zip(self.names, x.tolist(), strict=True))
-        text = json.dumps({"merit": merit, "cycles": cycle, "variables": variables, **self.more}, indent=1)
-        write_atomically(self.path, lambda file: file.write(text.encode()))
+        document = {
+            "of": self.of,
+            "merit": merit,
+            "cycles": cycles,
+            "variables": dict(zip(self.names, x.tolist(), strict=True)),
+            **self.more,
+        }
+        if course is not None:
+            document["descent"] = _written(course)
+        if evaluated:
+            document["evaluated"] = [plain(one.tolist()) for one in evaluated]
+        try:
+            write_json(self.path, document)
+        except OSError as error:
+            words = f"{self.path}: {error.strerror}; the optimisation goes on, but cannot resume from here"
+            warnings.warn(words, NotWritten, stacklevel=2)
+            self.path = None
         self.last = time.monotonic()
 
 
-def resumed(path: str | PathLike, names: Sequence[str]) -> Kept:
-    """What a checkpoint of these variables keeps. Raises BadCheckpoint and OSError."""
-    try:
-        told = json.loads(Path(path).read_text(encoding="utf-8"))
-        found = {str(name): float(number) for name, number in told["variables"].items()}
-        glasses = {int(k): (str(catalog), str(name)) for k, (catalog, name) in told.get("glasses", {}).items()}
-        tested = tuple(map(int, told.get("tested", ())))
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise BadCheckpoint(f"{path}: no checkpoint of an optimisation; expected what `checkpoint` wrote") from error
-    if missing := [name for name in names if name not in found]:
-        raise BadCheckpoint(
-            f"{path}: a checkpoint of other variables: {', '.join(found)}; expected {missing[0]} among them"
-        )
-    return Kept(np.array([found[name] for name in names]), glasses, tested)
+def _written(course: Course) -> dict:
+    """A course as JSON holds it."""
+    now = course.standing
+    return {
+        "path": course.path,
+        "start": course.start.tolist(),
+        "before": [len(course.before), course.evaluations],
+        "best": None if course.best is None else [course.best[0].tolist(), course.best[1]],
+        "x": now.x.tolist(),
+        **{name: float(getattr(now, name)) for name in _NUMBERS},
+        "scale": None if now.scale is None else now.scale.tolist(),
+        "evaluations": now.evaluations,
+        "history": [list(dataclasses.astuple(cycle)) for cycle in course.history],
+    }
+
+
+_ENDS = ("gradient", "step", "merit", "cycles", "seconds", "interrupted")  # of a path: `result.STOPPED`
+_NUMBERS = ("damping", "factor", "share", "price")
+_VECTOR = listed(number())
+_POSITIVE = number(0)
+_SIZE = number(0)
+
+
+def _cycle(value: object) -> Cycle:
+    """A cycle of a history. Raises Unfit."""
+    first, *numbers, evaluations, seconds, words = listed(anything, len(_COLUMNS), len(_COLUMNS))(value)
+    return Cycle(whole()(first), *map(_SIZE, numbers), whole()(evaluations), number()(seconds), text(words))
+
+
+_DESCENT = record(
+    {
+        "path": whole(0, len(MANNERS) - 1),
+        "start": _VECTOR,
+        "before": listed(whole(), 2, 2),
+        "best": either(exactly(None), listed(anything, 2, 2)),
+        "x": _VECTOR,
+        **dict.fromkeys(_NUMBERS, _POSITIVE),
+        "scale": either(exactly(None), _VECTOR),
+        "evaluations": whole(),
+        "history": listed(_cycle),
+    }
+)
+_DOCUMENT = record(
+    {"of": mapped(anything), "variables": mapped(number()), "cycles": whole()},
+    {
+        "glasses": mapped(listed(text, 2, 2)),
+        "tested": listed(whole()),
+        "descent": _DESCENT,
+        "evaluated": listed(listed(either(exactly(None), number(infinite=True)), 1)),
+    },
+)
+
+
+def resumed(path: str | PathLike, of: Mapping, names: Sequence[str]) -> Kept:
+    """What a checkpoint of this optimisation keeps. Raises BadCheckpoint and OSError."""
+
+    def kept(value: object) -> tuple[Mapping, Kept]:
+        if isinstance(value, dict) and "of" not in value and "variables" in value:
+            raise Unfit("does not say which lens it is of; an older version wrote it")
+        found = _DOCUMENT(value)
+        if words := unlike(found["of"], of):
+            raise BadCheckpoint(f"{path}: a checkpoint of {words}; resume with the options that it was made with")
+        if set(found["variables"]) != set(names):
+            raise Unfit(f"variables: found {', '.join(found['variables'])}, expected {', '.join(names)}")
+        glasses = {int(k): (catalog, name) for k, (catalog, name) in found.get("glasses", {}).items() if _is_number(k)}
+        course = _course(found["descent"], len(names)) if "descent" in found else None
+        if any(len(one) != 1 + 2 * len(names) for one in found.get("evaluated", [])):
+            raise Unfit(f"evaluated: expected lists of {1 + 2 * len(names)}")
+        evaluated = np.array(found.get("evaluated", []), dtype=float)
+        x = np.array([found["variables"][name] for name in names])
+        return Kept(x, glasses, tuple(found.get("tested", ())), course, evaluated)
+
+    return read_document(path, kept, BadCheckpoint, _ADVICE)
+
+
+def _is_number(name: str) -> bool:
+    if not name.isascii() or not name.isdecimal() or len(name) > 6:
+        raise Unfit(f"glasses: found {name[:20]!r}, expected the number of a surface")
+    return True
+
+
+def _course(found: Mapping, count: int) -> Course:
+    """A course as it was written, of so many variables. Raises Unfit."""
+    vectors = [found["start"], found["x"], *([] if found["scale"] is None else [found["scale"]])]
+    best = found["best"]
+    if best is not None:
+        best = np.array(_VECTOR(best[0])), exactly(*_ENDS)(best[1])
+        vectors.append(best[0])
+    if any(len(one) != count for one in vectors):
+        raise Unfit(f"descent: expected lists of {count} variables")
+    history = found["history"]
+    before, evaluations = found["before"]
+    if before > len(history):
+        raise Unfit("descent: history: expected the cycles of every path")
+    own = [
+        dataclasses.replace(one, number=one.number - before, evaluations=one.evaluations - evaluations)
+        for one in history[before:]
+    ]
+    standing = Standing(
+        np.array(found["x"]),
+        *(found[name] for name in _NUMBERS),
+        None if found["scale"] is None else np.array(found["scale"]),
+        found["evaluations"],
+        tuple(own),
+    )
+    return Course(found["path"], np.array(found["start"]), standing, tuple(history[:before]), evaluations, best)
 
 
 class Log:
-    """A line of comma-separated values for every cycle."""
+    """A line of comma-separated values for every cycle; the file is begun anew, with the cycles so far."""
 
-    def __init__(self, path: str | PathLike | None):
-        self.file = None if path is None else open(path, "w", encoding="utf-8")  # noqa: SIM115
-        self._write(_COLUMNS)
+    def __init__(self, path: str | PathLike | None, cycles: Sequence[Cycle] = ()):
+        self.path = path
+        if path is not None:
+            write_text(path, "".join(map(_line, [_COLUMNS, *map(_words, cycles)])))
 
     def tell(self, cycle: Cycle) -> None:
-        numbers = cycle.number, cycle.merit, cycle.missed, cycle.step, cycle.damping, cycle.evaluations
-        self._write([*map(repr, numbers), f"{cycle.seconds:.3f}", cycle.limits.replace(",", ";")])
+        """Add a cycle. Warns NotWritten where the file cannot be written; the optimisation goes on."""
+        if self.path is None:
+            return
+        try:
+            append_text(self.path, _line(_words(cycle)), sync=False)
+        except OSError as error:
+            warnings.warn(f"{self.path}: {error.strerror}; the log ends here", NotWritten, stacklevel=2)
+            self.path = None
 
-    def _write(self, words: Sequence[str]) -> None:
-        if self.file is not None:
-            self.file.write(",".join(words) + "\n")
-            self.file.flush()
 
-    def close(self) -> None:
-        if self.file is not None:
-            self.file.close()
+def _line(words: Sequence[str]) -> str:
+    return ",".join(words) + "\n"
+
+
+def _words(cycle: Cycle) -> list[str]:
+    numbers = map(float, (cycle.merit, cycle.missed, cycle.step, cycle.damping))
+    return [
+        str(cycle.number),
+        *map(repr, numbers),
+        str(cycle.evaluations),
+        f"{cycle.seconds:.3f}",
+        cycle.limits.replace(",", ";"),
+    ]

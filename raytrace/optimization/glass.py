@@ -160,6 +160,7 @@ class Choice:
         self.rows, self.conditions, self.options = rows, conditions, options
         self.cycles = _CYCLES if cycles is None else min(cycles, _CYCLES)
         self.until, self.begun, self.evaluations, self.tell = until, time.monotonic(), 0, tell or (lambda step: None)
+        self.descended = 0  # cycles
         self.steps, self.keep = [], keep or (lambda kept, merit: None)
 
     @cached_property
@@ -180,15 +181,18 @@ class Choice:
         if kept is not None and kept.glasses:
             chosen = own | {k: self._named(k, *one) for k, one in kept.glasses.items()}
             self.best = Design(x, chosen, self.limited(self.problem(chosen, ()), ())(x, True))
-            with suppress(KeyboardInterrupt):  # the best so far
-                self.swap(kept.tested)
+            if kept.course is None:  # else all exchanges were done
+                with suppress(KeyboardInterrupt):  # the best so far
+                    self.swap(kept.tested)
             return self.best
         first = self.descend(Design(x, own, None), (), self.cycles)
         self._tell(GlassStep("own", first.merit, self.seconds))
         self.best = first
         with suppress(KeyboardInterrupt):
-            snapped = self.snapped(first)
             known = all(glass.catalog for glass in own.values())
+            if known and time.monotonic() > self.until:
+                return first
+            snapped = self.snapped(first, known=known)
             self.best = min(first, snapped, key=Design.rank) if known else snapped
             self._keep(())
             self.swap()
@@ -205,13 +209,16 @@ class Choice:
         glasses = {k: (glass.catalog, glass.name) for k, glass in self.best.glasses.items()}
         self.keep(Kept(self.best.x, glasses, tuple(sorted(tested))), self.best.merit)
 
-    def snapped(self, design: Design) -> Design:
-        """The design with model glasses first, then with glasses of the catalogs in their places, one by one."""
-        model = {k: self.pool.model(self.pool.numbers_of(glass)) for k, glass in design.glasses.items()}
+    def snapped(self, design: Design, *, known: bool) -> Design:
+        """The design with model glasses first, then with glasses of the catalogs in their places, one by one; as it is
+        where no time is left for that, and its glasses are known ones."""
+        first, model = design, {k: self.pool.model(self.pool.numbers_of(glass)) for k, glass in design.glasses.items()}
         design = self.descend(Design(design.x, model, None), self.surfaces, self.cycles)
         self._tell(GlassStep("model", design.merit, self.seconds))
         waiting = list(self.surfaces)
         while waiting:
+            if known and time.monotonic() > self.until:
+                return first
             design = self.snap(design, waiting)
         return self.descend(design, (), self.cycles)
 
@@ -269,6 +276,7 @@ class Choice:
         if found.stopped == "interrupted":
             raise KeyboardInterrupt
         self.evaluations += found.evaluations
+        self.descended += len(found.cycles)
         count, k = len(self.free.variables), self.pool.count
         end = found.state.x
         numbers = {s: end[count + k * j : count + k * (j + 1)] for j, s in enumerate(open_)}

@@ -50,12 +50,12 @@ class Place:
         media = tuple((one.glass.name, *one.glass.coefficients.tolist()) for one in lens.surfaces)
         return media, lens.stop, variables
 
-    def gone(self, sign: float) -> Ended:
-        """The minimum on one side of the saddle, of a lens of real thickness."""
+    def gone(self, sign: float, until: float = np.inf) -> Ended:
+        """The minimum on one side of the saddle, of a lens of real thickness. Raises Stopped."""
         first = self.stage(0.0, _CYCLES[0], _CAREFUL)
         thicker = [self.stage(part, _CYCLES[1], _CAREFUL) for part in _PARTS]
         x = self.beside(first, sign)
-        return descended(x, [first, *thicker, self.stage(1.0, LONG, FOLLOW)])
+        return descended(x, [first, *thicker, self.stage(1.0, LONG, FOLLOW)], until)
 
     def beside(self, stage: Stage, sign: float) -> np.ndarray:
         """(n,) off the saddle to one side: as far as the merit falls, with the conditions met again."""
@@ -111,7 +111,8 @@ class Insertion:
         """The lens itself, then both sides at every place. Raises Stopped and NoProblem."""
         model, space = self.asked.model, self.asked.space
         stage = Stage(self.asked.whole, LONG, FOLLOW, space.lower, space.upper)
-        own = self.journal.each([("the lens", lambda: descended(model.start, [stage]))], len(model.start))[0]
+        until = self.journal.until
+        own = self.journal.each([("the lens", lambda: descended(model.start, [stage], until))], len(model.start))[0]
         if not own.is_whole:
             raise NoProblem("`insert`: the lens itself loses rays or misses what is held; search without insert first")
         lens, work = model.lens_at(own.x), own.seconds
@@ -125,7 +126,10 @@ class Insertion:
 
     def _both(self, place: Place, work: float, bar) -> float:
         """The two sides of a saddle; the seconds that they took."""
-        tasks = [(f"surface {place.k}, {side}", lambda sign=sign: place.gone(sign)) for side, sign in SIDES.items()]
+        tasks = [
+            (f"surface {place.k}, {side}", lambda sign=sign: place.gone(sign, self.journal.until))
+            for side, sign in SIDES.items()
+        ]
         space = place.asked.space
         ends = self.journal.each(tasks, len(space.lower))
         ranges = np.maximum(space.upper - space.lower, 1e-300)

@@ -4,8 +4,8 @@ A search is a fixed sequence of tasks, each told by its key alone. What a task f
 one that goes on takes the same way as one that was never interrupted. Processes share the tasks of a batch.
 """
 
-import json
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
@@ -14,9 +14,17 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from raytrace.files import NotWritten
 from raytrace.shards import agreeing, share, total
+from raytrace.stores import DamagedLine, Lines, anything, listed, mapped, number, record, text
+from raytrace.system.identity import unlike
 
 FILE = "search.jsonl"
+_ADVICE = "it keeps no search: name a new folder"
+_TASK = record(
+    {"task": text, "x": listed(number()), "seconds": number(0)}
+    | dict.fromkeys(("lost", "missed", "merit"), number(0, infinite=True))
+)
 
 
 class BadSearch(ValueError):
@@ -52,34 +60,30 @@ class Journal:
     def __init__(self, folder: str | PathLike | None, about: dict, until: float):
         """about: what the tasks depend on, for a folder serves one search; until: a time of `time.monotonic`."""
         self.path = None if folder is None else Path(folder) / FILE
-        self.until, self.known, self.resumed, self.begun = until, {}, 0, time.monotonic()
-        lines = self._lines()
-        if lines and lines[0] != about:
-            other = [name for name in about if lines[0].get(name) != about[name]]
-            raise BadSearch(f"`folder`: {self.path} keeps a search of other {', '.join(other)}; name a new folder")
-        for line in lines[1:]:
-            self.known[line["task"]] = Ended(
-                line["lost"], line["missed"], line["merit"], line["seconds"], np.array(line["x"])
-            )
+        self.until, self.known, self.lines, self.begun = until, {}, {}, time.monotonic()
+        self.store = None
+        if self.path is not None:
+            self.store = Lines(self.path, _TASK, head=mapped(anything))
+            self._read(about)
         self.resumed = len(self.known)
-        if self.path is not None and not share().rank:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            text = [json.dumps(line) + "\n" for line in (lines or [about])]
-            self.path.write_text("".join(text), encoding="utf-8")  # without a last line that was not finished
 
-    def _lines(self) -> list[dict]:
-        if self.path is None or not self.path.exists():
-            return []
-        found = []
-        for line in self.path.read_text(encoding="utf-8").splitlines():
-            try:
-                found.append(json.loads(line))
-            except ValueError:
-                break
-        return found
+    def _read(self, about: dict) -> None:
+        """What is known; the file is begun where there is none. Raises BadSearch."""
+        before, records = self.store.read(BadSearch, _ADVICE)
+        if before is None:
+            if not share().rank:
+                self.store.begin(about)
+            return
+        if words := unlike(before, about):
+            raise BadSearch(f"`folder`: {self.path} keeps a search of {words}; name a new folder")
+        for line, one in records:
+            self.lines[one["task"]] = line
+            self.known[one["task"]] = Ended(*(one[name] for name in Ended._fields[:4]), np.array(one["x"]))
 
     def each(self, tasks: Sequence[tuple[str, Callable[[], Ended]]], count: int) -> list[Ended]:
         """What each of the tasks, of a key and a function, found at (count,) variables. Raises Stopped."""
+        for key, _ in tasks:
+            self._forget_misfit(key, count)
         left = [(key, task) for key, task in tasks if key not in self.known]
         mine = share()
         table = torch.zeros(len(left), 5 + count, dtype=torch.float64)
@@ -106,9 +110,21 @@ class Journal:
             raise Stopped
         return [self.known[key] for key, _ in tasks]
 
+    def _forget_misfit(self, key: str, count: int) -> None:
+        """A record of another number of variables is no record of this task."""
+        if key in self.known and len(self.known[key].x) != count:
+            found = f"x: found a list of {len(self.known.pop(key).x)}, expected {count} of them"
+            place = f"{self.path}, line {self.lines[key]}"
+            warnings.warn(f"{place}: {found}; the line is ignored", DamagedLine, stacklevel=3)
+
     def _keep(self, key: str, ended: Ended) -> None:
         self.known[key] = ended
-        if self.path is not None and not share().rank:
-            numbers = dict(zip(Ended._fields[:4], map(float, ended[:4]), strict=True))
-            with open(self.path, "a", encoding="utf-8") as file:
-                file.write(json.dumps({"task": key, **numbers, "x": ended.x.tolist()}) + "\n")
+        if self.store is None or share().rank:
+            return
+        numbers = dict(zip(Ended._fields[:4], map(float, ended[:4]), strict=True))
+        try:
+            self.store.append({"task": key, **numbers, "x": ended.x.tolist()})
+        except OSError as error:
+            self.store = None
+            words = f"{self.path}: {error.strerror}; the search goes on, but cannot resume from here"
+            warnings.warn(words, NotWritten, stacklevel=3)

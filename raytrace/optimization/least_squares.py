@@ -73,6 +73,24 @@ class Cycle:
 
 
 @dataclasses.dataclass(frozen=True)
+class Standing:
+    """All that decides the next cycle.
+
+    x: the variables (n,); damping, and factor by which it is raised next; share: of missed conditions that a step makes
+    good, and their price; scale: of the variables (n,); evaluations and cycles so far.
+    """
+
+    x: np.ndarray
+    damping: float
+    factor: float
+    share: float
+    price: float
+    scale: np.ndarray | None
+    evaluations: int
+    cycles: tuple[Cycle, ...]
+
+
+@dataclasses.dataclass(frozen=True)
 class Descent:
     """Where it ended and why."""
 
@@ -110,14 +128,21 @@ def least_squares(
     manner: Manner = Manner(),
     cycles: int = 1000,
     until: float = np.inf,
-    watch: Callable[[Cycle, State], None] | None = None,
+    watch: Callable[[Cycle, Standing], None] | None = None,
+    standing: Standing | None = None,
 ) -> Descent:
     """Descend from x, which is within the bounds, so many cycles, or until a time of `time.monotonic`.
 
-    watch: told of every cycle; a KeyboardInterrupt ends with the best state.
+    No evaluation begins that would not end in time, as long as the last of its kind took. watch: invoked after each
+    cycle; standing: where an earlier descent stood, which is resumed bit-identically: cycles count from its beginning.
+    A KeyboardInterrupt ends with the best state.
     """
     typical = np.full(len(x), np.inf) if typical is None else typical
-    return _Run(evaluate, lower, upper, typical, manner, until, watch).descend(x, cycles)
+    return _Run(evaluate, lower, upper, typical, manner, until, watch).descend(x, cycles, standing)
+
+
+class _OutOfTime(Exception):
+    """The next evaluation would not end in time."""
 
 
 class _Run:
@@ -127,33 +152,64 @@ class _Run:
         self.evaluations, self.told, self.begun = 0, [], time.monotonic()
         self.damping, self.share, self.price = manner.damping, 1.0, 0.0
         self.scale = None
+        self.factor = 2.0
+        self.seconds = {False: 0.0, True: 0.0}  # of the last evaluation without and with derivatives
 
     def at(self, x: np.ndarray, derivatives: bool = False) -> State:
+        """The state at x. Raises _OutOfTime."""
+        begun = time.monotonic()
+        if begun + self.seconds[derivatives] > self.until:
+            raise _OutOfTime
         self.evaluations += 1
-        return self.evaluate(x, derivatives)
+        state = self.evaluate(x, derivatives)
+        self.seconds[derivatives] = time.monotonic() - begun
+        return state
 
-    def descend(self, x: np.ndarray, cycles: int) -> Descent:
-        self.state = self.at(x, True)
-        stopped = "cycles"
+    def descend(self, x: np.ndarray, cycles: int, standing: Standing | None) -> Descent:
+        if standing is not None:
+            x = self._resume(standing)
         try:
-            for number in range(1, cycles + 1):
-                if reason := self._cycle(number):
-                    stopped = reason
-                    break
+            self.state = self.at(x, True)
+            self.evaluations -= standing is not None  # it was counted before
+        except _OutOfTime:
+            return Descent(self.evaluate(x, False), "seconds", tuple(self.told), self.evaluations, self.damping)
+        try:
+            ended = self._idle() if standing is not None and len(self.told) < cycles else ""
+            stopped = ended or self._cycles(cycles)
         except KeyboardInterrupt:
             stopped = "interrupted"
         return Descent(self.state, stopped, tuple(self.told), self.evaluations, self.damping)
 
-    def _cycle(self, number: int) -> str:
-        """One accepted step; the reason where there is none to come."""
-        if time.monotonic() > self.until:
+    def _cycles(self, cycles: int) -> str:
+        """Cycles up to so many in all, and why they end."""
+        try:
+            for number in range(len(self.told) + 1, cycles + 1):
+                if reason := self._cycle(number):
+                    return reason
+        except _OutOfTime:
             return "seconds"
+        return "cycles"
+
+    def _resume(self, standing: Standing) -> np.ndarray:
+        """Take up what an earlier descent ended its last cycle with; its variables."""
+        self.damping, self.factor, self.share = standing.damping, standing.factor, standing.share
+        self.price, self.scale = standing.price, standing.scale
+        self.evaluations, self.told = standing.evaluations, [*standing.cycles]
+        self.begun -= standing.cycles[-1].seconds if standing.cycles else 0.0
+        return standing.x
+
+    def _standing(self) -> Standing:
+        return Standing(
+            self.state.x, self.damping, self.factor, self.share, self.price, self.scale, self.evaluations,
+            tuple(self.told),
+        )  # fmt: skip
+
+    def _cycle(self, number: int) -> str:
+        """One accepted step; the reason where there is none to come. Raises _OutOfTime."""
         linear = self._linear()
         if self._is_flat(linear):
             return "gradient"
         for _ in range(_TRIES):
-            if time.monotonic() > self.until:
-                return "seconds"
             trial, step, foretold = self._try(linear)
             if (
                 step is not None
@@ -163,7 +219,12 @@ class _Run:
             ):
                 return "gradient"
             if trial is not None and self._takes(trial, foretold):
-                self.state = self.at(trial.x, True)
+                try:
+                    self.state = self.at(trial.x, True)
+                except _OutOfTime:
+                    self.state = trial  # its derivatives are not needed any more
+                    self._tell(number, step)
+                    return "seconds"
                 self._tell(number, step)
                 return self._idle()
             self.damping, self.factor = self.damping * self.factor, 2 * self.factor
@@ -174,8 +235,6 @@ class _Run:
             if np.linalg.norm(self.scale * step) <= _STILL * (np.linalg.norm(self.scale * self.state.x) + 1e-300):
                 return "step"
         return "step"
-
-    factor = 2.0
 
     def _linear(self) -> Linear:
         state = self.state
@@ -272,4 +331,4 @@ class _Run:
         )  # fmt: skip
         self.told.append(told)
         if self.watch is not None:
-            self.watch(told, state)
+            self.watch(told, self._standing())

@@ -5,11 +5,12 @@ cycles, then more is opened; what does not lose more at the next opening is kept
 """
 
 import time
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
 
-from raytrace.optimization.least_squares import Manner, least_squares
+from raytrace.optimization.least_squares import Cycle, Manner, least_squares
 from raytrace.optimization.paths import is_better
 from raytrace.optimization.problem import Problem, typical_of
 
@@ -30,10 +31,12 @@ def opened(
     upper: np.ndarray,
     typical: np.ndarray | None = None,
     until: float = np.inf,
+    watch: Callable[[Cycle], None] | None = None,
 ) -> np.ndarray:
     """Variables (n,) at which less light is lost than at x; x itself where next to none is, or no way was found.
 
-    lower, upper, typical: as for `least_squares`. until: of `time.monotonic`, when it ends.
+    lower, upper, typical: as for `least_squares`. until: of `time.monotonic`, when it ends; watch: invoked after each
+    cycle.
     """
     begin = best = problem.state(x, False)
     if begin.lost <= _FEW * (problem.evaluation.weights != 0).sum():
@@ -43,7 +46,7 @@ def opened(
     for stage, wider in pairwise(stages):
         if time.monotonic() > until:
             break
-        trial = _descended(stage, x, until, lower=lower, upper=upper, typical=typical)
+        trial = _descended(stage, x, until, watch, lower=lower, upper=upper, typical=typical)
         if trial is None or wider.state(trial, False).lost > wider.state(x, False).lost:
             continue
         x, whole = trial, problem.state(trial, False)
@@ -60,11 +63,14 @@ def _no_steeper(problem: Problem, x: np.ndarray, lower: np.ndarray, upper: np.nd
     return np.maximum(lower, np.minimum(x, -steepest)), np.minimum(upper, np.maximum(x, steepest))
 
 
-def _descended(problem: Problem, x: np.ndarray, until: float, **bounds) -> np.ndarray | None:
+def _descended(problem: Problem, x: np.ndarray, until: float, watch, **bounds) -> np.ndarray | None:
     """Where a few cycles lead; None where numbers overflow on the way."""
     try:
         with np.errstate(all="ignore"):
-            state = least_squares(problem.state, x, manner=_DAMPED, cycles=_CYCLES, until=until, **bounds).state
+            each = watch and (lambda cycle, standing: watch(cycle))
+            state = least_squares(
+                problem.state, x, manner=_DAMPED, cycles=_CYCLES, until=until, watch=each, **bounds
+            ).state
     except np.linalg.LinAlgError:
         return None
     return state.x if state.is_finite else None

@@ -1,6 +1,7 @@
 """Optimising: the lens whose merit function is least, from the lens as it is."""
 
 import dataclasses
+import os
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -9,7 +10,9 @@ from os import PathLike
 import numpy as np
 import torch
 
+from raytrace.files import check_output
 from raytrace.fused import prepare
+from raytrace.maths.result import plain
 from raytrace.merit.hold import conditions_of
 from raytrace.merit.merit import Evaluated
 from raytrace.merit.model import Model
@@ -25,12 +28,16 @@ from raytrace.optimization.glass_freedom import without_glass
 from raytrace.optimization.glass_pool import catalogs_of, pool_of
 from raytrace.optimization.least_squares import Cycle
 from raytrace.optimization.opening import opened
-from raytrace.optimization.paths import Found, best_of_paths
+from raytrace.optimization.paths import Course, Found, best_of_paths
 from raytrace.optimization.problem import Condition, NoProblem, Problem, intent_of, typical_of
 from raytrace.optimization.reached import NotReached, reached, refuse_contradictions
 from raytrace.optimization.result import Optimized
+from raytrace.system.identity import digest, identity
 from raytrace.system.intent import Row, Vary
 from raytrace.system.lens import Lens, field_points
+
+#: Suffixes of the files that an optimisation writes beside its lens.
+LOGS, CHECKPOINTS = (".csv", ".txt", ".log"), (".json",)
 
 
 def optimize(
@@ -71,31 +78,36 @@ def optimize(
     which it ends, by default 500 cycles a path; paths: how many ways of damping are tried. skip_unknown: leave rows of
     unknown operands out; readings: where an operand is open (`Readings`). catalog: names of shipped catalogs, or AGF
     files, for glasses that vary, by default those of the lens, else SCHOTT (`optimization.glass`). log: a file with a
-    line for every cycle; checkpoint: a file that keeps the best variables, and the glasses; resume: one that they are
-    taken from. Ctrl-C ends with the best lens.
+    line for every cycle; checkpoint: a file (.json) that keeps all that decides the next cycle; resume: one of the same
+    lens, variables and merit function, which is resumed bit-identically, cycles counted from its beginning
+    (`checkpoint.py`). Ctrl-C ends with the best lens.
     Conditions that exclude one another for certain are refused. Conditions and boundaries that are not met at the end
     are in `Optimized.conditions` with the reason; they are warned of (NotReached), as are surfaces and gaps that cannot
     be made (Unbuildable).
     Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadCheckpoint.
     """
     prepare()
+    begun = time.monotonic()
+    until = np.inf if seconds is None else begun + seconds
+    _check_files(log, checkpoint, resume)
     warn_of_filling(lens, field_points(None, like=lens))
     free, glasses = without_glass(_freedom(lens, vary), vary)
     names = tuple(name_of(one) for one in free.variables)
     model = Model(free.lens, free.variables, free.solves)
     lower, upper = _bounds(free, bounds, names)
-    kept = Kept(model.start, {}) if resume is None else resumed(resume, names)
-    if set(kept.glasses) - set(glasses):
-        raise BadCheckpoint(f"{resume}: a checkpoint of glasses that vary: go on with the `vary` that it was made with")
-    start = np.clip(kept.x, lower, upper)
-    how = {"lower": lower, "upper": upper, "typical": typical_of(model), "cycles": cycles, "seconds": seconds}
+    how = {"lower": lower, "upper": upper, "typical": typical_of(model), "cycles": cycles}
+    of = {**identity(lens), "variables": list(names), "solves": digest(repr(free.solves)), "paths": paths}
+    of |= {"glasses that vary": list(glasses), "bounds": plain([lower.tolist(), upper.tolist()])}
     if callable(merit) and not isinstance(merit, Merit):
         if glasses:
             raise NoProblem("`vary=glass` goes with a merit of rows: make the function a row")
         if hold:
             raise NoProblem("`hold` goes with a merit of rows: of a function give `bounds`, or make it a row")
-        with _Told(names, log, checkpoint, progress and progress(cycles, "cycle")) as told:
-            return _warned(_by_gradient(lens, model, merit, names, start, how, told))
+        of["merit"] = getattr(merit, "__qualname__", type(merit).__name__)
+        kept = Kept(model.start, {}) if resume is None else resumed(resume, of, names)
+        with _Told(log, Checkpoint(checkpoint, of, names), progress and progress(cycles, "cycle"), kept.course) as told:
+            start, function = np.clip(model.start, lower, upper), Function(model, merit, kept.evaluated)
+            return _warned(_by_gradient(lens, function, names, start, how, told, begun, until))
     function = merit_for(
         lens, merit, rings=rings, arms=arms, reference=reference, frequencies=frequencies, field_weights=field_weights,
         wavelength_weights=wavelength_weights, glass_thickness=glass_thickness, air_thickness=air_thickness, edge=edge,
@@ -103,39 +115,72 @@ def optimize(
     conditions = _conditions(lens, hold, function.unit)
     of_rows = {"unit": function.unit, "skip_unknown": skip_unknown, "readings": readings_of(readings)}
     problem = Problem(model, function.rows, conditions, **of_rows)
+    of |= {"merit": digest([repr(row) for row in function.rows], of_rows), "hold": digest(repr(conditions))}
+    kept = Kept(model.start, {}) if resume is None else resumed(resume, of, names)
+    if set(kept.glasses) - set(glasses):
+        raise BadCheckpoint(f"{resume}: glasses: found surfaces {[*kept.glasses]}, expected some of {[*glasses]}")
+    start, choice, opening = np.clip(kept.x, lower, upper), None, []
     refuse_contradictions(problem, start, lower=lower, upper=upper)
-    begun, before = time.monotonic(), problem.evaluated(model.start)
-    until, choice = np.inf if seconds is None else begun + seconds, None
-    if not kept.glasses:
-        start = opened(problem, start, lower=lower, upper=upper, typical=how["typical"], until=until)
-        _refuse_undefined(problem, problem.evaluated(start))
-    how["seconds"] = None if seconds is None else until - time.monotonic()
-    with _Told(names, log, checkpoint, progress and progress(cycles, "cycle")) as told:
+    before, seconds_of_end = _timed(lambda: problem.evaluated(model.start))
+    if not kept.glasses and kept.course is None:
+        start = opened(
+            problem, start, lower=lower, upper=upper, typical=how["typical"], until=until, watch=opening.append
+        )
+        begin, again = _timed(lambda: problem.evaluated(start))
+        _refuse_undefined(problem, begin)
+        seconds_of_end = min(seconds_of_end, again)  # the first evaluation takes longer
+    until -= seconds_of_end  # the result is evaluated once more
+    bar = progress and progress(cycles, "cycle")
+    with _Told(log, Checkpoint(checkpoint, of, names), bar, kept.course) as told:
         if glasses:
             pool, limits = pool_of(lens, catalogs_of(lens, catalog)), (lower, upper)
             how_chosen = {"cycles": cycles, "until": until, "keep": told.kept.keep_glasses, **of_rows}
             choice = Choice(free, glasses, pool, function.rows, conditions, limits, **how_chosen)
             start, problem = choice.run(start, kept).x, choice.problem(choice.best.glasses, ())
-            how["seconds"] = None if seconds is None else until - time.monotonic()
-        found = best_of_paths(
-            problem.state, start, paths=paths, watch=lambda cycle, state: told.tell(cycle, state.x), **how
+        how["seconds"] = None if seconds is None else until - time.monotonic()
+        found = best_of_paths(problem.state, start, paths=paths, watch=told.tell, course=kept.course, **how)
+        told.kept.keep(
+            found.state.x, float(np.sqrt(found.state.cost)), len(found.history), course=told.course, now=True
         )
-        told.kept.keep(found.state.x, float(np.sqrt(found.state.cost)), found.cycles, now=True)
+    found = dataclasses.replace(found, cycles=found.cycles + len(opening) + (choice.descended if choice else 0))
     done = _result(lens, problem, names, before, found, time.monotonic() - begun)
     ends = reached(problem, found.state.x, lower=lower, upper=upper)
     done = dataclasses.replace(done, lens=_with_bounds(done.lens, free.variables, lower, upper), conditions=ends)
     return _warned(_with_choice(done, choice))
 
 
+def _check_files(log, checkpoint, resume) -> None:
+    """Refuse files that cannot be written, or that are one file, before the work. Raises ValueError and OSError."""
+    for path, suffixes in ((log, LOGS), (checkpoint, CHECKPOINTS)):
+        if path is not None:
+            check_output(path, suffixes)
+    for option, path in (("checkpoint", checkpoint), ("resume", resume)):
+        if None not in (log, path) and os.path.realpath(log) == os.path.realpath(path):
+            raise ValueError(f"{log}: `log` and `{option}` are one file; give them two")
+
+
 class _Told:
-    """Who is told of every cycle: a log, a checkpoint and a bar of progress."""
+    """Who is told of every cycle: a log, a checkpoint and a bar of progress; course: what is resumed."""
 
-    def __init__(self, names: Sequence[str], log, checkpoint, bar):
-        self.log, self.kept, self.bar = Log(log), Checkpoint(checkpoint, names), bar
+    def __init__(self, log, kept: Checkpoint, bar, course: Course | None):
+        cycles = () if course is None else course.history
+        self.log, self.kept, self.bar, self.course = Log(log, cycles), kept, bar, course
+        if bar is not None and cycles:
+            bar.update(len(cycles))
 
-    def tell(self, cycle: Cycle, x: np.ndarray) -> None:
+    def tell(self, cycle: Cycle, course: Course) -> None:
+        """After a cycle of damped least squares."""
+        self.course = course
+        self.kept.keep(course.standing.x, cycle.merit, cycle.number, course=course)
+        self._show(cycle)
+
+    def tell_evaluated(self, cycle: Cycle, x: np.ndarray, evaluated: Sequence[np.ndarray]) -> None:
+        """After a cycle of a merit that is no sum of squares."""
+        self.kept.keep(x, cycle.merit, cycle.number, evaluated=evaluated)
+        self._show(cycle)
+
+    def _show(self, cycle: Cycle) -> None:
         self.log.tell(cycle)
-        self.kept.keep(x, cycle.merit, cycle.number)
         if self.bar is not None:
             self.bar.update(1)
             self.bar.set_postfix_str(_words(cycle))
@@ -144,24 +189,33 @@ class _Told:
         return self
 
     def __exit__(self, *error) -> None:
-        self.log.close()
         if self.bar is not None:
             self.bar.close()
 
 
-def _by_gradient(lens: Lens, model: Model, merit: Callable, names: tuple[str, ...], start, how: dict, told: _Told):
+def _by_gradient(
+    lens: Lens, function: Function, names: tuple[str, ...], start, how: dict, told: _Told, begun: float, until: float
+) -> Optimized:
     """The lens where a function of it is least."""
+    model = function.model
     if not names:
         raise NoProblem("nothing varies: name variables by `vary`, as 'curvature thickness'")
-    function, begun = Function(model, merit), time.monotonic()
     before = function(model.start)[0]
     if not np.isfinite(before):
         raise NoProblem(f"the merit is {before:g} at the start: nothing to follow")
-    x, stopped, cycles = lowest(function, start, watch=told.tell, **how)
+    left = None if np.isinf(until) else until - time.monotonic()
+    watch = lambda cycle, x: told.tell_evaluated(cycle, x, function.evaluated)  # noqa: E731
+    x, stopped, cycles = lowest(function, start, watch=watch, seconds=left, **how)
     after = function(x)[0]
-    told.kept.keep(x, after, len(cycles), now=True)
+    told.kept.keep(x, after, len(cycles), evaluated=function.evaluated, now=True)
     found = Found(x, tuple(cycles), stopped, len(cycles), function.evaluations)
     return _optimized(lens, model, names, x, found, time.monotonic() - begun, merit_before=before, merit_after=after)
+
+
+def _timed(evaluate: Callable):
+    """What a function gives, and the seconds that it takes."""
+    begun = time.monotonic()
+    return evaluate(), time.monotonic() - begun
 
 
 def _freedom(lens: Lens, vary: str | Sequence[str | Vary] | None) -> Freedom:

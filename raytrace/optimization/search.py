@@ -6,6 +6,7 @@ hops over their walls. What a batch decides follows from the batches before it a
 """
 
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -13,6 +14,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from raytrace.files import NotWritten, check_output_folder
+from raytrace.formats import LensFileError
 from raytrace.fused import prepare
 from raytrace.merit.default import KINDS
 from raytrace.merit.hold import Condition, conditions_of
@@ -87,6 +90,8 @@ def search(
     ended before. Ctrl-C ends with what was found.
     Raises NoProblem, BadMerit, BadVariables, BadHold, BadRow, UnknownOperand, BadSearch.
     """
+    if folder is not None:
+        check_output_folder(folder)
     prepare()
     warn_of_filling(lens, field_points(None, like=lens))
     begun = time.monotonic()
@@ -117,7 +122,10 @@ def search(
         lens, run.each(), starts=run.begun, descents=run.followed, stopped=stopped, seconds=time.monotonic() - begun
     )
     if folder is not None and not (share and share.rank):
-        found.save(folder)
+        try:
+            found.save(folder)
+        except (OSError, LensFileError) as error:
+            warnings.warn(f"{folder}: not all minima are written: {error}", NotWritten, stacklevel=2)
     return found
 
 
@@ -209,7 +217,10 @@ class _Run:
 
     def _follow(self, tasks: Sequence[tuple[str, np.ndarray]], bar) -> None:
         ends = self._each(
-            [(key, lambda x=x: descended(x, [Stage(self.whole, LONG, FOLLOW, *self._bounds)])) for key, x in tasks]
+            [
+                (key, lambda x=x: descended(x, [Stage(self.whole, LONG, FOLLOW, *self._bounds)], self.journal.until))
+                for key, x in tasks
+            ]
         )
         self.followed += len(tasks)
         for (key, _), end in zip(tasks, ends, strict=True):
@@ -223,9 +234,12 @@ class _Run:
         points = [self.space.prepared(x) for x in points]
         best = min(points, key=self._worth)
         if self._worth(best)[0]:
-            best = opened(self.whole, best, lower=self.space.lower, upper=self.space.upper)
+            best = opened(self.whole, best, lower=self.space.lower, upper=self.space.upper, until=self.journal.until)
+            if time.monotonic() > self.journal.until:
+                raise Stopped
         narrow = Stage(self.narrow, _SHORT[0], _DAMPED, *self._bounds)
-        return descended(best, [narrow, Stage(self.whole, _SHORT[1], Manner(), *self._bounds)])
+        stages = [narrow, Stage(self.whole, _SHORT[1], Manner(), *self._bounds)]
+        return descended(best, stages, self.journal.until)
 
     @property
     def _bounds(self) -> tuple[np.ndarray, np.ndarray]:

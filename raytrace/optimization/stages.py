@@ -30,12 +30,15 @@ class Stage(NamedTuple):
         return (x - self.lower > near) & (self.upper - x > near)
 
 
-def descended(x: np.ndarray, stages: Sequence[Stage]) -> Ended:
-    """Where x comes to on each of the stages in turn; all rays are lost where there is no way from there."""
+def descended(x: np.ndarray, stages: Sequence[Stage], until: float = np.inf) -> Ended:
+    """Where x comes to on each of the stages in turn; all rays are lost where there is no way from there.
+
+    until: a time of `time.monotonic`, after which a descent is no task that is done. Raises Stopped.
+    """
     begun = time.process_time()
     for stage in stages:
         with np.errstate(all="ignore"):
-            end = _end(stage, np.clip(x, stage.lower, stage.upper))
+            end = _end(stage, np.clip(x, stage.lower, stage.upper), until)
         if end is None:
             return Ended(np.inf, np.inf, np.inf, time.process_time() - begun, x)
         x = end.x
@@ -43,16 +46,17 @@ def descended(x: np.ndarray, stages: Sequence[Stage]) -> Ended:
     return Ended(end.lost, missed, float(np.sqrt(end.cost)), time.process_time() - begun, end.x)
 
 
-def _end(stage: Stage, x: np.ndarray) -> State | None:
+def _end(stage: Stage, x: np.ndarray, until: float) -> State | None:
     """The state that a stage ends in; None where there is no way from x. Raises Stopped."""
     if not stage.problem.state(x, False).is_finite:
         return None
     try:
         end = least_squares(
-            stage.problem.state, x, lower=stage.lower, upper=stage.upper, manner=stage.manner, cycles=stage.cycles
-        )
+            stage.problem.state, x, lower=stage.lower, upper=stage.upper, manner=stage.manner, cycles=stage.cycles,
+            until=until,
+        )  # fmt: skip
     except (np.linalg.LinAlgError, RuntimeError):
         return None  # numbers that overflow on the way
-    if end.stopped == "interrupted":
+    if end.stopped in ("interrupted", "seconds"):
         raise Stopped
     return end.state if end.state.is_finite else None

@@ -21,7 +21,7 @@ _BEFORE, _AFTER = style.FAINT, style.FIELD_COLOURS[0]
 
 @style.styled
 def optimize_report(found: Optimized) -> Figure:
-    """One page: the lens and its spots before and after in its configurations, each on one scale, the merit by cycle, the
+    """One page: the lens and its spots before and after in its configurations, on one scale, the merit by cycle, the
     operands that are left, and what conditions and boundaries asked for and reached."""
     each, conditions = _configurations(found), found.shown_conditions()
     count, below = len(each), 0.16 * (len(conditions) + 3) if conditions else 0.0
@@ -88,7 +88,7 @@ def drawn_fields(lens: Lens):
 
 
 def _draw_spots(page, each: list[tuple[str, Lens, Lens]]) -> None:
-    """A row of spots before and one after, of every configuration, both on one scale; small ones are enlarged in a corner
+    """A row of spots before and one after, of every configuration, on one scale; small ones are enlarged in a corner
     of their panel."""
     panels = page.subplots(2 * len(each), max(drawn_fields(after).shape[1] for _, _, after in each), squeeze=False)
     first = each[0][2]

@@ -5,7 +5,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Self
 
-from raytrace.cli.options import count, file_name, positive_finite, seed_number
+from raytrace.cli.options import count, file_name, folder_name, positive_finite, seed_number
 
 _READ = {int: {"type": count, "metavar": "N"}, float: {"type": positive_finite}}
 
@@ -111,4 +111,4 @@ def picture_words(arguments: argparse.Namespace, limit: int) -> list[str]:
 
 def documents(group, what: str) -> None:
     """--docs."""
-    group.add_argument("--docs", metavar="DOCS", type=file_name, help=f"folder of {what}")
+    group.add_argument("--docs", metavar="DOCS", type=folder_name, help=f"folder of {what}")

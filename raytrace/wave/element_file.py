@@ -6,23 +6,26 @@ A smooth element is a few coefficients: it stands in its label alone, smooth.jso
 """
 
 import dataclasses
-import json
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 
-from raytrace.files import write_json
+from raytrace.files import read_bytes, write_json
 from raytrace.media.catalog import find_glass
 from raytrace.media.formulas import FORMULAS
 from raytrace.media.glass import Glass
+from raytrace.stores import Unfit, either, exactly, listed, number, parsed, record, text
 from raytrace.wave.element import Element, EvenPowers, Rings, Zernike, is_flat, wrapped
 from raytrace.wave.exchange import FORMATS, HeightMapError, read_heights, write_heights
 
 #: Suffix of smooth elements, and their profiles by the name that they have there.
 SMOOTH = ".json"
 _PROFILES = {"even powers of r, mm^(1 - 2k)": EvenPowers, "Noll's polynomials, mm RMS": Zernike}
+
+_MOST = 1 << 26  # bytes of a label
 
 #: Suffixes of all files that hold an element.
 ELEMENT_FORMATS = (*FORMATS, SMOOTH)
@@ -141,36 +144,49 @@ def read_label(path: str | os.PathLike) -> Label | None:
     if not file.exists():
         return None
     try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-        coefficients = torch.tensor(found["coefficients"], dtype=torch.float64)
-        if FORMULAS[found["formula"]].count != len(coefficients):
-            raise ValueError(f"{len(coefficients)} coefficients of {found['formula']}")
-        span = found["wavelength_range"]
-        profile = _profile_of(found)
-        sizes = ("design_wavelength", "aperture", *([] if profile else ["pitch"]))
-        numbers = {key: float(found[key]) for key in sizes}
-        if not all(0 < number < float("inf") for number in numbers.values()):
-            raise ValueError(f"found {numbers}, expected numbers above 0")
-        glass = Glass(
-            str(found["material"]),
-            found["formula"],
-            coefficients,
-            str(found["catalog"]),
-            wavelength_range=None if span is None else (float(span[0]), float(span[1])),
-        )
-    except (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
-        words = f"{type(error).__name__}: {' '.join(str(error).split())[:120]}"
-        raise HeightMapError(f"is no label of a height map ({words}); remove it", str(file)) from error
-    return Label(glass, **numbers, profile=profile)
+        found = _label(parsed(read_bytes(file, _MOST)))
+    except (OSError, Unfit) as error:
+        line = error.line or None if isinstance(error, Unfit) else None
+        raise HeightMapError(f"is no label of a height map ({error}); remove it", str(file), line) from error
+    sizes = ("design_wavelength", "aperture", *([] if "profile" in found else ["pitch"]))
+    span = found["wavelength_range"]
+    glass = Glass(
+        found["material"],
+        found["formula"],
+        torch.tensor(found["coefficients"], dtype=torch.float64),
+        found["catalog"],
+        wavelength_range=None if span is None else tuple(span),
+    )
+    profile = None
+    if "profile" in found:
+        coefficients = torch.tensor(found["coefficients_of_profile"], dtype=torch.float64)
+        profile = _PROFILES[found["profile"]](coefficients)
+    return Label(glass, **{name: found[name] for name in sizes}, profile=profile)
 
 
-def _profile_of(document: dict) -> EvenPowers | Zernike | None:
-    if "profile" not in document:
-        return None
-    coefficients = torch.tensor(document["coefficients_of_profile"], dtype=torch.float64)
-    if coefficients.dim() != 1 or not len(coefficients) or not bool(torch.isfinite(coefficients).all()):
-        raise ValueError("expected a list of coefficients")
-    return _PROFILES[document["profile"]](coefficients)
+_ABOVE_0 = number(math.ulp(0.0))
+_GLASS = {
+    "material": text,
+    "catalog": text,
+    "formula": exactly(*FORMULAS),
+    "coefficients": listed(number()),
+    "wavelength_range": either(exactly(None), listed(_ABOVE_0, 2, 2)),
+    "design_wavelength": _ABOVE_0,
+    "aperture": _ABOVE_0,
+}
+_OF_HEIGHTS = record(_GLASS | {"pitch": _ABOVE_0})
+_SMOOTH = record(_GLASS | {"profile": exactly(*_PROFILES), "coefficients_of_profile": listed(number(), 1)})
+
+
+def _label(value: object) -> dict:
+    """A label as JSON has it. Raises Unfit."""
+    found = (_SMOOTH if isinstance(value, dict) and "profile" in value else _OF_HEIGHTS)(value)
+    count, span = FORMULAS[found["formula"]].count, found["wavelength_range"]
+    if len(found["coefficients"]) != count:
+        raise Unfit(f"coefficients: found a list of {len(found['coefficients'])}, expected {count} of them")
+    if span is not None and not span[0] < span[1]:
+        raise Unfit(f"wavelength_range: found {span[0]:g} to {span[1]:g} µm, expected the shorter wavelength first")
+    return found
 
 
 def _label_of(path: str | os.PathLike) -> Path:

@@ -3,7 +3,7 @@
 import argparse
 import importlib
 
-from raytrace.cli.options import catalog, file_name, json, output_folder, seed_number, substitute
+from raytrace.cli.options import catalog, file_name, folder_or_lens, json, output_folder, seed_number, substitute
 from raytrace.studies.codesign.settings import AFTER_PARAXIAL, MODELS, Settings
 from raytrace.studies.options import add_options, documents, pictures
 from raytrace.words import did_you_mean
@@ -84,6 +84,7 @@ def options(parser: argparse.ArgumentParser) -> None:
         parser,
         "folder of the run, or of all runs of compare, in each of which lens.zmx is the learned lens; or a lens file "
         "(.zmx, .csv) for it, the run then being kept in a folder of the same name without suffix",
+        type=folder_or_lens,
     )
     parser.add_argument("--resume", action="store_true", help="only go on with a run that was begun in FOLDER")
     add_options(parser, Settings, "model")

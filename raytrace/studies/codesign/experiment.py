@@ -21,13 +21,14 @@ from torch import Tensor
 from raytrace.camera.camera import Camera
 from raytrace.camera.limits import parse_range
 from raytrace.camera.network import RedNet, RedNetShape
-from raytrace.camera.training import DamagedRun, Record, Run, Share, read_json, train
+from raytrace.camera.training import DamagedRun, Record, Run, Share, train
 from raytrace.camera.variables import Variables, parse_bounds
 from raytrace.files import write_json
 from raytrace.formats import write_lens
 from raytrace.maths.grid import grid
 from raytrace.maths.result import plain
 from raytrace.optics.focus import focused, real_image_distance
+from raytrace.stores import fields_of, read_document
 from raytrace.studies.codesign import conjugates
 from raytrace.studies.codesign.closed_form import (
     Course,
@@ -337,12 +338,9 @@ def outcome(folder: Path) -> Outcome | None:
     path = Path(folder) / "outcome.json"
     if not path.exists():
         return None
-    document = read_json(path)
-    document |= {key: math.inf for key in _INFINITE if document.get(key, 0.0) is None}
-    try:
-        return Outcome(**document)
-    except TypeError as error:
-        raise DamagedRun(f"{path}: not what a run found ({error})") from error
+    check = fields_of(Outcome, nullable=_INFINITE)
+    document = read_document(path, check, DamagedRun, "remove it to find it anew")
+    return Outcome(**document | {key: math.inf for key in _INFINITE if document.get(key, 0.0) is None})
 
 
 def _run(settings: Settings, folder: Path, about: dict, name: str) -> Run:

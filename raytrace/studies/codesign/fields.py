@@ -80,7 +80,12 @@ def _found(lens: Lens, settings: Settings, spectrum: Tensor) -> dict:
     found = closed_form(lens, settings, spectrum)
     own = camera_at(lens, found.sensor_mm, dataclasses.replace(settings, model="drt", rays=None))
     by_field = error_by_field(own, spectrum, even_distances(own, spread=settings.spread))
-    return {**{name: getattr(found, name) for name in optima.COLUMNS}, "by_field": by_field.tolist()}
+    values = (*(getattr(found, name) for name in optima.COLUMNS), by_field.tolist())
+    return dict(zip(FOUND, values, strict=True))
+
+
+#: What an optimum is kept with.
+FOUND = (*optima.COLUMNS, "by_field")
 
 
 def camera_at(lens: Lens, sensor: float, settings: Settings) -> Camera:

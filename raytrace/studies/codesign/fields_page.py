@@ -17,6 +17,7 @@ from raytrace.studies.codesign.claims import percent
 from raytrace.studies.codesign.fields import (
     COLUMNS,
     ENERGY_COLUMNS,
+    FOUND,
     TIME_COLUMNS,
     Row,
     camera_at,
@@ -159,7 +160,7 @@ def fields(arguments: argparse.Namespace) -> None:
     if not any(settings.fields) or settings.vary != "sensor":
         raise CommandError("no field beside the axis: give --field 0 9.8 14, and leave out --vary")
     given, folder = experiment(arguments, settings), arguments.folder
-    kept = Kept(Run(folder, given.about).folder / "fields.jsonl") if folder and not share().rank else None
+    kept = Kept(Run(folder, given.about).folder / "fields.jsonl", FOUND) if folder and not share().rank else None
     rows = fields_all(
         given.lens,
         settings,

@@ -1,49 +1,55 @@
 """Kept: optima in a file, each under the settings that it is the optimum for, so that none is sought twice."""
 
 import dataclasses
-import json
+import functools
 import math
-import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol, TypeVar
 
 from raytrace.camera.training import DamagedRun
 from raytrace.maths.result import plain
+from raytrace.stores import Lines, Unfit, anything, either, exactly, listed, mapped, number, record, text
 from raytrace.studies.codesign.settings import Settings
 from raytrace.studies.options import read
+
+_NUMBER = either(exactly(None), number())
+_ENTRY = either(exactly(None, True, False), text, listed(either(text, _NUMBER)), mapped(_NUMBER), number())
+_ADVICE = "delete the file, and its optima are sought anew"
 
 
 @dataclasses.dataclass(frozen=True)
 class Kept:
-    """Optima in a file of lines of JSON, [settings, optimum], of which one that was begun is no more than not there."""
+    """Optima in a file of lines of JSON, [settings, optimum]; truncated records are ignored.
+
+    names: what every optimum has.
+    """
 
     path: Path
+    names: tuple[str, ...] = ()
+
+    @functools.cached_property
+    def _lines(self) -> Lines:
+        return Lines(self.path, self._pair)
+
+    def _pair(self, value: object) -> tuple[Settings, dict]:
+        """Settings and their optimum as they were written; a focus at infinity is null there. Raises Unfit."""
+        settings, optimum = listed(mapped(anything), 2, 2)(value)
+        optimum = record(dict.fromkeys(self.names, anything))(mapped(_ENTRY)(optimum))
+        try:
+            found = read(Settings, settings)
+            hash(found)
+        except TypeError as error:
+            raise Unfit(f"holds no settings ({error})") from error
+        return found, {name: math.inf if value is None else value for name, value in optimum.items()}
 
     def read(self) -> dict[Settings, dict]:
-        """All optima that are whole. Raises DamagedRun."""
-        lines, found = self.path.read_bytes().split(b"\n")[:-1] if self.path.exists() else [], {}
-        for number, line in enumerate(lines, 1):
-            try:
-                settings, optimum = json.loads(line)
-                found[read(Settings, settings)] = _numbers(optimum)
-            except (ValueError, TypeError, AttributeError, RecursionError) as error:
-                words = f"line {number} holds no settings and their optimum ({error})"
-                raise DamagedRun(f"{self.path}: {words}; delete it, and that one is sought anew") from error
-        return found
+        """All optima that are whole. Warns DamagedLine of lines that hold none. Raises DamagedRun."""
+        return dict(pair for _, pair in self._lines.read(DamagedRun, _ADVICE)[1])
 
     def add(self, settings: Settings, optimum: dict) -> None:
         """Write one more, behind what is whole."""
-        if self.path.exists():
-            whole = self.path.read_bytes().rpartition(b"\n")
-            os.truncate(self.path, len(whole[0]) + len(whole[1]))
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps([dataclasses.asdict(settings), plain(optimum)]) + "\n")
-
-
-def _numbers(optimum: dict) -> dict:
-    """An optimum as it was written; a focus at infinity is null there."""
-    return {name: math.inf if value is None else value for name, value in optimum.items()}
+        self._lines.append([dataclasses.asdict(settings), plain(optimum)])
 
 
 class Sought(Protocol):

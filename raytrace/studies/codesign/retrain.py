@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 import scipy.stats
 
-from raytrace.camera.training import DamagedRun, Record, Run, read_json
+from raytrace.camera.training import DamagedRun, Record, Run
 from raytrace.files import write_json
+from raytrace.stores import fields_of, read_document
 from raytrace.studies.codesign.experiment import Progress, camera, held_out_error, optimise, usual
 from raytrace.studies.codesign.settings import NAMES, Settings
 from raytrace.studies.codesign.study import of_last_epochs
@@ -141,10 +142,7 @@ def retrained(folder: Path) -> Retrained | None:
     path = Path(folder) / "outcome.json"
     if not path.exists():
         return None
-    try:
-        return Retrained(**read_json(path))
-    except TypeError as error:
-        raise DamagedRun(f"{path}: not what a run found ({error})") from error
+    return Retrained(**read_document(path, fields_of(Retrained), DamagedRun, "remove it to find it anew"))
 
 
 def effects(found: Sequence[Retrained], reference: str = "gaussian", losses: Sequence[str] = LOSSES) -> list[Effect]:

@@ -56,7 +56,8 @@ class Row(optima.Place):
         return {**found, **{f"{name}_mm": value for name, value in found.pop("variables").items() if name != "sensor"}}
 
 
-_FOUND = (*optima.COLUMNS, "refocused_mm", "error_refocused", "efl_mm", "at_bound", "variables")
+#: What an optimum is kept with.
+FOUND = (*optima.COLUMNS, "refocused_mm", "error_refocused", "efl_mm", "at_bound", "variables")
 
 
 def columns(rows: Sequence[Row]) -> tuple[str, ...]:
@@ -108,7 +109,7 @@ def _found(lens: Lens, settings: Settings, spectrum: Tensor) -> dict:
         *(refocused.sensor_mm, refocused.error, float(first_order(found.lens).effective_focal_length)),
         *(" ".join(found.at_end), found.variables),
     )
-    return dict(zip(_FOUND, (*(getattr(found, name) for name in optima.COLUMNS), *more), strict=True))
+    return dict(zip(FOUND, (*(getattr(found, name) for name in optima.COLUMNS), *more), strict=True))
 
 
 def _refocused(found: Optimum, settings: Settings, spectrum: Tensor) -> Optimum:

@@ -19,7 +19,7 @@ from raytrace.studies.codesign.experiment import lens_at_start, variables
 from raytrace.studies.codesign.kept import Kept
 from raytrace.studies.codesign.settings import MODELS, NAMES
 from raytrace.studies.codesign.setup import Experiment, experiment, lens_of_file, settings_of
-from raytrace.studies.codesign.spaces import ALONE, Row, best, columns, gains
+from raytrace.studies.codesign.spaces import ALONE, FOUND, Row, best, columns, gains
 from raytrace.studies.codesign.spaces import spaces as spaces_all
 from raytrace.studies.publish import publish
 
@@ -189,7 +189,7 @@ def spaces(arguments: argparse.Namespace) -> None:
         variables(lens, dataclasses.replace(settings, bounds=f"{settings.bounds} {box}".strip()))
     given = experiment(arguments, settings)
     folder = arguments.folder
-    kept = Kept(Run(folder, given.about).folder / "spaces.jsonl") if folder and not share().rank else None
+    kept = Kept(Run(folder, given.about).folder / "spaces.jsonl", FOUND) if folder and not share().rank else None
     rows = spaces_all(
         given.lens, settings, boxes, given.spectrum(), progress=lambda cases: progress(cases, "case"), kept=kept
     )

@@ -17,6 +17,7 @@ from raytrace.cli.run import present
 from raytrace.files import table
 from raytrace.maths.result import Result, plain
 from raytrace.pages import picture
+from raytrace.studies.codesign import optima
 from raytrace.studies.codesign.claims import is_of_paper
 from raytrace.studies.codesign.closed_form import SPECTRUM_COLUMNS, spectrum_rows
 from raytrace.studies.codesign.kept import Kept
@@ -171,4 +172,5 @@ def _kept(given: Experiment, folder: str) -> dict[float, Kept]:
     """Optima of this lens and these pictures in a folder, by the scale of the pictures. Raises OtherSettings for one of
     others."""
     own = Run(folder, given.about).folder
-    return {scale: Kept(own / ("optima.jsonl" if scale == 1 else f"optima_{scale:g}.jsonl")) for scale in SCALES}
+    files = {scale: own / ("optima.jsonl" if scale == 1 else f"optima_{scale:g}.jsonl") for scale in SCALES}
+    return {scale: Kept(file, optima.COLUMNS) for scale, file in files.items()}

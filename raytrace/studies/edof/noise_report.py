@@ -4,7 +4,6 @@ import argparse
 import dataclasses
 import functools
 import io
-import json
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,13 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.camera.training import Run
+from raytrace.camera.training import DamagedRun, Run
 from raytrace.cli.door import CommandError
 from raytrace.cli.progress import progress
 from raytrace.files import table, write_atomically, write_json
 from raytrace.maths.result import Result
 from raytrace.maths.value import detached
 from raytrace.pages import grid, picture
+from raytrace.stores import number, read_document
 from raytrace.studies.edof.command import LIMIT
 from raytrace.studies.edof.noise import (
     FILTERS,
@@ -177,7 +177,7 @@ class Kept:
         file = self.folder / f"{name}.json"
         if not file.exists():
             write_json(file, make())
-        return json.loads(file.read_text())
+        return read_document(file, number(infinite=True), DamagedRun, "remove it to find it anew")
 
     def find(self, name: str, world: World, make: Callable[[], Tensor]) -> dict[str, Errors]:
         """Errors by content of transfer functions, made only where they are not kept."""

@@ -2,7 +2,7 @@
 
 import argparse
 
-from raytrace.cli.options import count, file_name, json, plot
+from raytrace.cli.options import count, json, output_file, plot
 from raytrace.cli.wave_options import camera, feature, light, pixels
 from raytrace.studies.options import Settings, add_options
 
@@ -40,7 +40,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     add_options(parser, Settings, "seed")
     json(parser)
     what = "height map to write: .npy, .csv, .dat, .grd, or as the grey of a picture: .png, .tif"
-    parser.add_argument("-o", "--output", metavar="FILE", type=file_name, help=what)
+    parser.add_argument("-o", "--output", metavar="FILE", type=output_file, help=what)
     plot(parser, "height map, PSF and image over the steps")
 
 

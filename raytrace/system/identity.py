@@ -1,0 +1,112 @@
+"""Identity: what a lens is known by in the files that hold numbers for it."""
+
+import dataclasses
+import hashlib
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from raytrace.maths.result import number, plain
+from raytrace.system.lens import Lens
+
+#: Fields that change no ray.
+_WORDS = {
+    *("name", "notes", "comment", "catalogs", "intent", "catalog", "status", "nd_listed", "abbe_listed"),
+    *("alternatives", "listed_name", "records", "wavelength_range"),
+}
+_SHOWN = ("curvature", "thickness")  # of a surface, in its identity
+
+
+def identity(lens: Lens) -> dict:
+    """The lens's name, the curvatures (1/mm), thicknesses (mm) and glasses of its surfaces, and two digests: of all
+    numbers of the surfaces behind the object, and of the conditions, such as object distance, fields and wavelengths.
+
+    Plain values, for JSON. A lens has one identity in float32 and float64: digests are of numbers to seven digits.
+    """
+    surfaces = [
+        [*(number(getattr(one, name)) for name in _SHOWN), one.glass.name if one.glass else ""] for one in lens.surfaces
+    ]
+    conditions = {field.name: getattr(lens, field.name) for field in dataclasses.fields(lens)} | {
+        "surfaces": lens.surfaces[0]
+    }
+    return {
+        "lens": lens.name,
+        "surfaces": plain(surfaces),
+        "prescription": digest(lens.surfaces[1:]),
+        "conditions": digest(conditions),
+    }
+
+
+def digest(*values: object) -> str:
+    """A digest of tensors, numbers, texts, and dataclasses and lists of them, but for their comments."""
+    found = hashlib.sha256()
+    _add(found, values)
+    return found.hexdigest()[:32]
+
+
+def _add(found, value: object) -> None:
+    if isinstance(value, Tensor):
+        found.update(repr(tuple(value.shape)).encode())
+        numbers = value.detach().cpu()
+        # + 0.0 makes -0 a 0
+        found.update((numbers.to(torch.float32) + 0.0).contiguous().numpy().tobytes())
+    elif isinstance(value, float):
+        _add(found, torch.tensor(value))
+    elif dataclasses.is_dataclass(value):
+        found.update(type(value).__name__.encode())
+        _add(found, {field.name: getattr(value, field.name) for field in dataclasses.fields(value)})
+    elif isinstance(value, Mapping):
+        _add(found, [(name, one) for name, one in value.items() if name not in _WORDS])
+    elif isinstance(value, Sequence) and not isinstance(value, str):
+        found.update(b"[")
+        for one in value:
+            _add(found, one)
+        found.update(b"]")
+    else:
+        found.update(f"{value!r};".encode())
+
+
+def other_lens(before: Mapping, now: Mapping) -> str:
+    """How one lens differs from another by their identities, "" where it does not; conditions are not compared."""
+    if before["prescription"] == now["prescription"]:
+        return ""
+    names = before["lens"] or "a lens without a name", now["lens"] or "a lens without a name"
+    counts = [len(one["surfaces"]) - 1 for one in (before, now)]
+    if names[0] != names[1] or counts[0] != counts[1]:
+        return f"{names[0]!r} of {counts[0]} surfaces, not {names[1]!r} of {counts[1]}"
+    for k, (a, b) in enumerate(zip(before["surfaces"], now["surfaces"], strict=True)):
+        for quantity, one, other in zip((*_SHOWN, "glass"), a, b, strict=True):
+            if k and not _alike(one, other):
+                return f"{names[0]!r} with {quantity} {_shown(one)} of surface {k}, not {_shown(other)}"
+    return f"{names[0]!r} with other numbers of its surfaces"
+
+
+def unlike(before: Mapping, now: Mapping) -> str:
+    """How what stored numbers depend on differs from what it is now, "" where it does not.
+
+    Both: `identity` of a lens, the names of its variables, and whatever else decides the numbers, by name.
+    """
+    try:
+        if "prescription" in now and "prescription" not in before:
+            return "a lens that it does not tell; an older version wrote it"
+        if "prescription" in now and (words := other_lens(before, now)):
+            return f"another lens: {words}"
+        if "variables" in now and before["variables"] != now["variables"]:
+            missing = [name for name in now["variables"] if name not in before["variables"]]
+            expected = f"{missing[0]} among them" if missing else ", ".join(now["variables"])
+            return f"other variables: {', '.join(map(str, before['variables']))}; expected {expected}"
+    except (KeyError, TypeError, ValueError, AttributeError):
+        return "a lens that its damaged identity does not tell"
+    other = [name for name in now if name not in ("lens", "surfaces") and before.get(name) != now[name]]
+    return f"other {', '.join(other)}" if other else ""
+
+
+def _alike(one: object, other: object) -> bool:
+    if isinstance(one, float) and isinstance(other, float):
+        return abs(one - other) <= 1e-6 * max(abs(one), abs(other))  # float32
+    return one == other
+
+
+def _shown(value: object) -> str:
+    return f"{value:.9g}" if isinstance(value, float) else repr(value)
