@@ -277,7 +277,7 @@ def height_range(element: Element) -> tuple[float, float]:
     radius, kind = element.radius, element.kind
     if isinstance(element.profile, Rings):
         heights = fabricated(element).numbers[: features(radius, element.profile.pitch)]
-        return float(heights.min()), float(heights.max())
+        return float(heights.min()) + 0.0, float(heights.max()) + 0.0
     if isinstance(element.profile, Pixels):
         step = element.profile.pitch
         y, x = ((torch.arange(n).to(radius) - 0.5 * (n - 1)) * step for n in element.numbers.shape)
@@ -286,4 +286,4 @@ def height_range(element: Element) -> tuple[float, float]:
         y = torch.zeros_like(x[:1]) if kind.is_radial else x
     y, x = torch.meshgrid(y, x, indexing="ij")
     heights = height(element, x, y)[torch.hypot(x, y) <= radius * (1 + 1e-6)]
-    return float(heights.min()), float(heights.max())
+    return float(heights.min()) + 0.0, float(heights.max()) + 0.0
