@@ -297,13 +297,13 @@ def test_the_command_learns_judges_and_goes_on(capsys, monkeypatch, tmp_path):
     first = json.loads(capsys.readouterr().out)
     rows = {(row["content"], row["filter"], row["row"]): row for row in first["rows"]}
     base, own = (rows["sharp leaves", "blind", name] for name in ("fresnel", "learned-smooth"))
-    assert base["gain"] == base["low"] == base["high"] == 0
+    assert base["gain"] == base["gain_low"] == base["gain_high"] == 0
     assert own["starts"] == 2
-    assert own["low"] <= own["gain"] <= own["high"]
+    assert own["gain_low"] <= own["gain"] <= own["gain_high"]
     assert own["gain"] > 4
     page = (tmp_path / "docs/wave_noise.md").read_text()
     wiener = rows["sharp leaves", "wiener", "learned-smooth"]
-    assert f"{wiener['gain']:+.2f} ({wiener['low']:+.2f} … {wiener['high']:+.2f})" in page
+    assert f"{wiener['gain']:+.2f} ({wiener['gain_low']:+.2f} … {wiener['gain_high']:+.2f})" in page
     assert (tmp_path / "docs/wave/noise.png").stat().st_size > 10_000
     assert main(words) == 0
     assert json.loads(capsys.readouterr().out) == first
@@ -322,4 +322,4 @@ def test_a_file_of_heights_is_judged_as_the_element_it_was_written_from(capsys, 
     own, other = ([row for row in rows if row["row"].startswith("learned")] for rows in (run, again))
     assert [row["row"] for row in other] == ["learned-0.01"] * 4
     for a, b in zip(own, other, strict=True):
-        assert (a["psnr"], a["gain"], a["low"]) == pytest.approx((b["psnr"], b["gain"], b["low"]), abs=1e-6)
+        assert (a["psnr"], a["gain"], a["gain_low"]) == pytest.approx((b["psnr"], b["gain"], b["gain_low"]), abs=1e-6)
