@@ -112,8 +112,11 @@ PUBLIC = {
     "grid": "maths.grid",
     "psf": "kernels",
     # waves behind thin elements
+    "as_pixels": "wave.element",
+    "as_rings": "wave.element",
     "element_lens": "wave.bridge",
     "elements": "wave.compute",
+    "fabricated": "wave.element",
     "hybrid_psf": "wave.bridge",
     "read_element": "wave.element_file",
     "wave_psf": "wave.compute",

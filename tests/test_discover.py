@@ -124,7 +124,7 @@ def test_the_command_keeps_its_plates(capsys, tmp_path):
     rows = {row["start"]: row for row in first["plates"]}
     assert rows["plain lens"]["gain"] == 0
     assert rows["4 prescribed places"]["places"] == 4
-    assert rows["4 prescribed places"]["low"] > 3
+    assert rows["4 prescribed places"]["gain_low"] > 3
     assert (tmp_path / "docs/wave/discover.png").stat().st_size > 5_000
     assert main(words) == 0
     assert json.loads(capsys.readouterr().out) == first

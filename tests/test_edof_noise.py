@@ -5,6 +5,7 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -13,8 +14,8 @@ from raytrace.camera.training import OtherSettings
 from raytrace.cli import main
 from raytrace.studies.edof import free_report, noise_report, report
 from raytrace.studies.edof.noise import (
-    FILTERS,
     Bank,
+    Gains,
     Interval,
     Unit,
     best_strengths,
@@ -23,6 +24,7 @@ from raytrace.studies.edof.noise import (
     errors_of,
     gain,
     mean_psnr,
+    pooled_psnr,
     units,
 )
 from raytrace.studies.edof.noise_command import Settings
@@ -30,6 +32,7 @@ from raytrace.studies.edof.noise_report import Kept, OverNoise, Score, judge_fil
 from raytrace.studies.edof.octant import Octant, fits
 from raytrace.studies.edof.table import Content
 from raytrace.studies.edof.world import (
+    FILTERS,
     ClosedForm,
     World,
     expected_error,
@@ -40,7 +43,7 @@ from raytrace.studies.edof.world import (
     spectrum,
     transfer,
 )
-from raytrace.studies.pictures import dead_leaves
+from raytrace.studies.pictures import Pictures, dead_leaves
 from raytrace.studies.quantise import process_report
 from raytrace.wave.designs import aim, baseline
 from raytrace.wave.element import Element, Zernike, as_rings
@@ -108,7 +111,11 @@ def test_errors_of_pictures_are_those_of_pictures_restored():
     torch.testing.assert_close(found["blind"], torch.stack(left, 1), rtol=0.02, atol=0)
     table = quality(elements, SMALL, train=PICTURES[:5], test=PICTURES[5:])
     for name in ("wiener", "blind"):
-        assert float(mean_psnr(found[name])) == pytest.approx(table.mean[name], abs=1e-9)
+        assert float(pooled_psnr(found[name])) == pytest.approx(table.mean[name], abs=1e-9)
+        assert float(mean_psnr(found[name])) == pytest.approx(table.of_pictures[name], abs=1e-9)
+        single = [float(pooled_psnr(own[None])) for own in found[name]]
+        assert float(mean_psnr(found[name])) == pytest.approx(sum(single) / len(single), abs=1e-9)
+        assert float(mean_psnr(found[name])) > float(pooled_psnr(found[name]))  # -log is convex
 
 
 def test_intervals_hold_the_mean_of_many_pictures():
@@ -116,13 +123,40 @@ def test_intervals_hold_the_mean_of_many_pictures():
     generator = torch.Generator().manual_seed(0)
     base = torch.ones(100, 1, 1, dtype=torch.float64)
     own = base * (1 + 0.05 * torch.randn(100, 1, 1, generator=generator, dtype=torch.float64))
-    found = gain(own, base, drawn(100))
+    found = gain(own, base, drawn(range(100)))
     half = 1.96 * 10 / math.log(10) * float(own.std()) / 10 / float(own.mean())
     assert (found.high - found.low) / 2 == pytest.approx(half, rel=0.1)
     assert found.low < found.value < found.high
     assert found.value == pytest.approx(float(-psnr(base.mean()) + psnr(own.mean())))
-    same = gain(base, base, drawn(100))
+    same = gain(base, base, drawn(range(100)))
     assert (same.value, same.low, same.high) == (0, 0, 0)
+
+
+def test_classes_are_drawn_whole():
+    """Ten classes of ten pictures, equal in each: √10 times the interval of a hundred draws."""
+    classes = [f"class {number // 10}" for number in range(100)]
+    weights = drawn(classes)
+    assert weights.shape == (2000, 100)
+    assert all(len(set(row.reshape(10, 10)[0].tolist())) == 1 for row in weights[:20])
+    assert torch.equal(weights.sum(1), torch.full((2000,), 100.0, dtype=torch.float64))
+    generator = torch.Generator().manual_seed(0)
+    base = torch.ones(100, 1, 1, dtype=torch.float64)
+    of_class = 1 + 0.05 * torch.randn(10, 1, 1, generator=generator, dtype=torch.float64)
+    own = base * of_class.repeat_interleave(10, 0)
+    wide, narrow = (gain(own, base, of) for of in (weights, drawn(range(100))))
+    assert (wide.high - wide.low) / (narrow.high - narrow.low) == pytest.approx(10**0.5, rel=0.1)
+
+
+def test_a_class_is_a_folder():
+    """Of pictures in several folders; where there is one folder, or none, each picture is its own class."""
+    grey = (np.zeros((4, 4), np.uint8),) * 3
+    assert Pictures(grey, ("t/banded/a.png", "t/banded/b.png", "t/bumpy/a.png")).classes == (
+        "t/banded", "t/banded", "t/bumpy",
+    )  # fmt: skip
+    assert Pictures(grey, ("t/a.png", "t/b.png", "t/c.png")).classes == ("t/a.png", "t/b.png", "t/c.png")
+    assert len(set(dead_leaves(2, size=32).classes)) == 2
+    bank = Bank.of("pictures", PICTURES[:5], PICTURES[5:7], ["banded", "banded"])
+    assert bank.drawn().tolist() == [[1, 1]] * 2000
 
 
 def test_every_noise_and_row_once_before_any_a_second_time():
@@ -168,9 +202,14 @@ def test_the_start_of_least_expected_error_is_kept(tmp_path):
     }
     for filter in ("wiener", "blind"):
         own, base = rows[filter, "learned"], rows[filter, "fresnel"]
-        assert own.psnr == pytest.approx(float(mean_psnr(found["cubic-refractive"]["leaves"][filter])))
-        assert own.gain.value == own.starts[0] == pytest.approx(own.psnr - base.psnr)
-        assert own.gain.low < own.gain.value < own.gain.high
+        errors = found["cubic-refractive"]["leaves"][filter]
+        assert own.gains.pooled_psnr == pytest.approx(float(pooled_psnr(errors)))
+        assert own.gains.mean_psnr == pytest.approx(float(mean_psnr(errors)))
+        assert own.gains.pooled.value == own.starts[0]
+        assert own.gains.pooled.value == pytest.approx(own.gains.pooled_psnr - base.gains.pooled_psnr)
+        assert own.gains.mean.value == pytest.approx(own.gains.mean_psnr - base.gains.mean_psnr)
+        for one in (own.gains.pooled, own.gains.mean):
+            assert one.low < one.value < one.high
         assert len(own.starts) == 2
     for train, test in ((PICTURES[:4], PICTURES[4:]), (PICTURES[:4], PICTURES[5:])):
         with pytest.raises(OtherSettings):
@@ -235,10 +274,9 @@ def test_files_of_one_name_are_refused(command, capsys, tmp_path):
 
 
 def test_the_figure_over_noise_draws_files_by_their_names():
-    one = Interval(1.0, 0.9, 1.1)
-    rows = [
-        Score("sharp leaves", filter, 0.01, row, 20.0, one) for filter in FILTERS for row in ("fresnel", "own-0.01")
-    ]
+    own = Interval(1.0, 0.9, 1.1)
+    gains = Gains(20.0, own, 20.5, own)
+    rows = [Score("sharp leaves", filter, 0.01, row, gains) for filter in FILTERS for row in ("fresnel", "own-0.01")]
     figure = OverNoise(rows, {"sharp leaves": 8}).plot()
     assert "own-0.01" in [text.get_text() for legend in figure.legends for text in legend.get_texts()]
 
@@ -259,13 +297,13 @@ def test_the_command_learns_judges_and_goes_on(capsys, monkeypatch, tmp_path):
     first = json.loads(capsys.readouterr().out)
     rows = {(row["content"], row["filter"], row["row"]): row for row in first["rows"]}
     base, own = (rows["sharp leaves", "blind", name] for name in ("fresnel", "learned-smooth"))
-    assert base["gain"] == base["low"] == base["high"] == 0
+    assert base["gain"] == base["gain_low"] == base["gain_high"] == 0
     assert own["starts"] == 2
-    assert own["low"] <= own["gain"] <= own["high"]
+    assert own["gain_low"] <= own["gain"] <= own["gain_high"]
     assert own["gain"] > 4
     page = (tmp_path / "docs/wave_noise.md").read_text()
     wiener = rows["sharp leaves", "wiener", "learned-smooth"]
-    assert f"{wiener['gain']:+.2f} ({wiener['low']:+.2f} … {wiener['high']:+.2f})" in page
+    assert f"{wiener['gain']:+.2f} ({wiener['gain_low']:+.2f} … {wiener['gain_high']:+.2f})" in page
     assert (tmp_path / "docs/wave/noise.png").stat().st_size > 10_000
     assert main(words) == 0
     assert json.loads(capsys.readouterr().out) == first
@@ -284,4 +322,4 @@ def test_a_file_of_heights_is_judged_as_the_element_it_was_written_from(capsys, 
     own, other = ([row for row in rows if row["row"].startswith("learned")] for rows in (run, again))
     assert [row["row"] for row in other] == ["learned-0.01"] * 4
     for a, b in zip(own, other, strict=True):
-        assert (a["psnr"], a["gain"], a["low"]) == pytest.approx((b["psnr"], b["gain"], b["low"]), abs=1e-6)
+        assert (a["psnr"], a["gain"], a["gain_low"]) == pytest.approx((b["psnr"], b["gain"], b["gain_low"]), abs=1e-6)

@@ -195,12 +195,13 @@ def test_a_claim_that_is_not_answered_says_why():
     """Not by a run that is missing where all have ended, but more than the sensor varied, or at other distances."""
     told = {one.text: one for one in claims(paper(), TIMES, dataclasses.replace(SEEN, settled={}))}
     early, near = (told[number_of(text)] for text in ("The focus is near", "All lose less at 10 m"))
-    assert (early.holds, early.figures) == (None, "told where the sensor alone varies")
+    assert (early.holds, early.figures) == (None, "answered only where the sensor alone varies")
     assert (near.holds, near.figures) == (None, "no losses at 10 and 15 m")
-    nothing = {one.text: one for one in claims([], (), SEEN)}
+    assert early.answer == near.answer == "not applicable"
+    nothing = {one.text: one for one in claims([], (), SEEN, pending=SIMULATED)}
     assert nothing[number_of("Paraxial and Fourier optics agree")].figures == "no finished run of paraxial"
     fewer = dataclasses.replace(SEEN, settled={"paraxial": 0.3})
-    runs = {one.text: one for one in claims(paper()[:2], TIMES, fewer)}
+    runs = {one.text: one for one in claims(paper()[:2], TIMES, fewer, pending=["fourier"])}
     assert runs[number_of("The focus is near")].figures == "no finished run of fourier"
 
 
@@ -219,22 +220,32 @@ def test_what_a_course_is_settled_after():
     ],
 )
 def test_the_order_of_costs_is_the_papers(milliseconds, answers_of_costs):
-    """Simple optics, then Gaussian DRT, then DRT; between paraxial and Fourier the paper names no order."""
+    """Simple optics, then Gaussian DRT, then DRT; between paraxial and Fourier the paper names no order. Without DRT
+    there is no answer."""
     times = [StepTime(model, psf, 1.0, 80.0) for model, psf in zip(SIMULATED, milliseconds, strict=True)]
     assert answers((), times)[-2:] == answers_of_costs
-    assert answers((), times[:3])[-2:] == ["not run yet"] * 2
+    assert answers((), times[:3])[-2:] == ["not applicable"] * 2
     by_time = sorted(zip(milliseconds, ("paraxial", "Fourier", "Gaussian DRT", "DRT"), strict=True))
     assert claims((), times)[-2].figures == ", ".join(f"{name} {time:.1f} ms" for time, name in by_time)
 
 
-def test_missing_runs_leave_claims_open():
+@pytest.mark.parametrize(
+    ("pending", "answer", "why"),
+    [
+        (("gaussian", "drt"), "not run yet", "no finished run of gaussian"),
+        ((), "not applicable", "Gaussian DRT is not among the models of this study"),
+    ],
+)
+def test_missing_runs_leave_claims_open(pending, answer, why):
+    """Not run yet where the study has the model, else not applicable: no run will answer it."""
     found = [one for one in paper() if one.model != "gaussian"]
-    answered = {claim.text for claim in claims(found, ()) if claim.answer != "not run yet"}
     simple = ("Paraxial and Fourier optics agree", "… at 33.9", "The simple models lose much")
-    assert answered == {number_of(one) for one in simple}
-    of = {claim.text: claim.figures for claim in claims(found, TIMES)}
-    assert of[number_of("… most at 20")] == "no finished run of gaussian"
-    assert set(answers([])) == {"not run yet"}
+    asked = {claim.text: claim for claim in claims(found, TIMES, pending=pending)}
+    most = asked[number_of("… most at 20")]
+    assert (most.answer, most.figures, most.pending) == (answer, why, bool(pending))
+    assert {asked[number_of(one)].answer for one in simple} <= {"yes", "no"}
+    assert {claim.answer for claim in claims([], (), pending=SIMULATED)} == {"not run yet"}
+    assert set(answers([])) == {"not applicable"}
 
 
 def test_summaries_are_means_and_deviations_of_the_runs(tmp_path):

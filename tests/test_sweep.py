@@ -187,7 +187,12 @@ def test_the_page_answers_and_keeps_what_was_written_below():
     assert f"{claim} +15.5 % to +15.5 % and +15.5 % to +17.9 % | 0 of 0 | – |" in text
     assert kept_of(text) == "By hand."
     yes = markdown(found_of(known(default=(27.0, 31.0), other=(55.0, 30.0))).parts())
-    assert "**Yes.** The paper's 33.9, 35.7, 27.3 m appear, to 2 m, when focus is the paraxial conjugate" in yes
+    assert (
+        "**Yes, in 1 of 2 readings, in 1 of them with a gain.** Each reading is tried with 3 definitions of focus"
+        in yes
+    )
+    assert "The paper's 33.9, 35.7, 27.3 m appear, to 2 m, when focus is the paraxial conjugate" in yes
+    assert "root of the error (as set: +" in yes
     assert "## Where the descent" not in yes
     elsewhere = [dataclasses.replace(one, downhill_mm=one.sensor_mm + 0.1 * (one.model == "drt")) for one in rows]
     assert "| F/4 | DRT | 57.7600 | 57.8600 | 50.0 |" in markdown(found_of(elsewhere).parts())

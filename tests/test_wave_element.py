@@ -18,7 +18,7 @@ from raytrace.wave.element import (
     Rings,
     Zernike,
     designed_height,
-    fabricated,
+    fabricated_height,
     height,
     is_radial,
     path,
@@ -128,7 +128,7 @@ def test_sixteen_levels_are_exactly_sixteen_heights():
 def test_steps_lie_below_the_height_by_less_than_one():
     top = number(1.2e-3)
     h = torch.linspace(-2e-3, 2e-3, 1000, dtype=torch.float64)
-    lost = fabricated(h, top) - fabricated(h, top, 16)
+    lost = fabricated_height(h, top) - fabricated_height(h, top, 16)
     assert (lost > -1e-4 * top / 16).all()  # a height at a step to rounding is that step
     assert (lost < top / 16).all()
 
@@ -137,10 +137,10 @@ def test_steps_lie_below_the_height_by_less_than_one():
 def test_steps_stay_as_they_are(levels):
     top = period(SILICA, 0.55)
     steps = torch.arange(levels) * (top / levels)
-    assert torch.equal(fabricated(steps, top, levels), steps)
+    assert torch.equal(fabricated_height(steps, top, levels), steps)
     # as read from a file that keeps 10 digits
     rounded = number([float(f"{h:.10g}") for h in steps.tolist()])
-    assert (fabricated(rounded, top, levels) - steps).abs().max() < 1e-9 * top
+    assert (fabricated_height(rounded, top, levels) - steps).abs().max() < 1e-9 * top
 
 
 def test_gradients_pass_the_steps_as_if_they_were_not_there():

@@ -12,7 +12,17 @@ from PIL import Image
 from problems import number
 
 from raytrace.media.catalog import find_glass
-from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, as_made, as_pixels, fabricated, period, wrapped
+from raytrace.wave.element import (
+    Element,
+    EvenPowers,
+    Pixels,
+    Rings,
+    as_pixels,
+    fabricated,
+    fabricated_height,
+    period,
+    wrapped,
+)
 from raytrace.wave.exchange import FORMATS, HeightMapError, read_heights, write_heights
 
 EXACT = (".npy", ".csv")
@@ -89,11 +99,11 @@ def test_a_made_element_is_read_and_stepped_as_it_was(suffix, tmp_path):
     """A lens in 16 levels, read back with the same period and levels: the same steps, none lost to rounding."""
     glass = find_glass("F_SILICA")
     lens = Element(EvenPowers(number([-0.03])), number(0.3), glass)
-    made = as_made(wrapped(as_pixels(lens, 0.01), 0.55, levels=16))
+    made = fabricated(wrapped(as_pixels(lens, 0.01), 0.55, levels=16))
     found = there_and_back(made.profile, tmp_path / f"map{suffix}")
     assert len(torch.unique(found.heights)) == 16
     assert torch.equal(found.heights, made.profile.heights)
-    assert (fabricated(found.heights, period(glass, 0.55), 16) - made.profile.heights).abs().max() < 1e-18
+    assert (fabricated_height(found.heights, period(glass, 0.55), 16) - made.profile.heights).abs().max() < 1e-18
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".csv"])

@@ -1,11 +1,14 @@
 """Fabrication: sampling at the size of features, wrapping and tolerance."""
 
+import dataclasses
+import json
 import math
 
 import pytest
 import torch
 from problems import generator, number
 
+import raytrace as rt
 from raytrace.media.catalog import find_glass
 from raytrace.wave.element import (
     Element,
@@ -13,10 +16,11 @@ from raytrace.wave.element import (
     Pixels,
     Rings,
     Zernike,
-    as_made,
     as_pixels,
     as_rings,
+    fabricated,
     height,
+    height_range,
     period,
     with_tolerance,
     wrapped,
@@ -99,7 +103,7 @@ def test_tolerance_is_uniform_keyed_and_leaves_the_element():
     assert (off.period, off.levels) == (None, 0)  # what is off a step is not put back on it
 
 
-def test_no_tolerance_is_the_element_as_made():
+def test_no_tolerance_is_the_element_as_fabricated():
     made = wrapped(as_pixels(lens(), 0.02), 0.55, levels=16)
     off = with_tolerance(made, 0.0, generator=generator(0))
     x = torch.linspace(-0.4, 0.4, 57, dtype=torch.float64)
@@ -107,20 +111,61 @@ def test_no_tolerance_is_the_element_as_made():
 
 
 def test_a_smooth_profile_has_no_features_to_be_off():
-    for function in (as_made, lambda element: with_tolerance(element, 20e-6)):
+    for function in (fabricated, lambda element: with_tolerance(element, 20e-6)):
         with pytest.raises(ValueError, match="use as_rings or as_pixels first"):
             function(lens())
 
 
-def test_as_made_is_the_same_element_with_its_heights_written_out():
+def test_fabricated_is_the_same_element_with_its_heights_written_out():
     element = wrapped(as_rings(lens(), 0.02), 0.55, levels=16)
-    made = as_made(element)
+    made = fabricated(element)
     x = torch.linspace(-0.4, 0.4, 57, dtype=torch.float64)
     assert torch.equal(height(made, x, -x), height(element, x, -x))
     assert len(torch.unique(made.profile.heights)) > 8
     assert (made.profile.heights >= 0).all()
     assert (made.profile.heights < element.period).all()
     assert (made.period, made.levels) == (None, 0)
+
+
+@pytest.mark.parametrize("levels", [0, 16])
+@pytest.mark.parametrize("suffix", [".npy", ".csv", ".tif"])
+def test_files_hold_what_was_simulated(tmp_path, suffix, levels):
+    """Heights wrapped and in steps, of rings and of pixels made of them: the file alone is the element, no period."""
+    rings = rt.as_rings(lens(), 0.02)
+    rt.write_element(rings, tmp_path / f"whole{suffix}", design_wavelength=0.55)
+    read = rt.read_element(tmp_path / f"whole{suffix}", aperture=1.0, design_wavelength=0.55, levels=levels)
+    assert float(read.numbers.abs().max()) > 4 * float(read.period)  # whole heights, wrapped when they are used
+    for name, element in (("rings", read), ("pixels", rt.as_pixels(read, 0.02))):
+        file = tmp_path / f"{name}{suffix}"
+        rt.write_element(element, file, design_wavelength=0.55)
+        again = rt.read_element(file, aperture=1.0)
+        x = torch.linspace(-0.35, 0.35, 57, dtype=torch.float64)
+        # A picture of 16 bits has its range in 65,535 steps, rounded to the nearest; steps come back bit for bit.
+        most = 0.0 if levels or suffix != ".tif" else float(read.period) / 131_070 * 1.001
+        assert (height(again, x, -x) - height(element, x, -x)).abs().max() <= most
+        assert float(again.numbers.min()) >= 0
+        assert float(again.numbers.max()) < float(read.period)
+        assert again.period is None
+        if levels:
+            assert len(torch.unique(again.numbers)) <= levels
+        # A map of pixels goes on beyond the aperture, to the corners of its square.
+        low, high = json.loads((tmp_path / f"{name}{suffix}.json").read_text())["height_range"]
+        assert float(again.numbers.min()) - most <= low <= high <= float(again.numbers.max()) + most
+
+
+def test_the_range_of_heights_is_that_inside_the_aperture():
+    """h = c r² over a radius of 0.5 mm: 0 to c/4 mm; of rings that of their middles; of a tilt both ways; wrapped."""
+    whole, c = lens(), -0.1
+    parabola = dataclasses.replace(whole, profile=EvenPowers(number([c])))
+    assert height_range(parabola) == pytest.approx((c / 4, 0.0), abs=1e-12)
+    last = 0.5 - 0.0005
+    assert height_range(as_rings(parabola, 0.001)) == pytest.approx((c * last**2, c * 0.0005**2), abs=1e-12)
+    low, high = height_range(as_pixels(parabola, 0.001))
+    assert (low, high) == pytest.approx((c / 4, 0.0), abs=2e-3 * abs(c))
+    tilt = dataclasses.replace(whole, profile=Zernike(number([0.0, 0.01])))
+    assert height_range(tilt) == pytest.approx((-0.02, 0.02), abs=1e-9)
+    low, high = height_range(wrapped(parabola, 0.55, levels=4))
+    assert (low, high) == pytest.approx((0, 0.75 * float(period(SILICA, 0.55))), abs=1e-12)
 
 
 def test_gradients_pass_sampling_steps_and_tolerance():

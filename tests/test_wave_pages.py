@@ -13,12 +13,12 @@ from raytrace.cli.studies import command
 from raytrace.studies.edof import free_report, network_report, noise_report, report
 from raytrace.studies.edof.free_command import Settings as Free
 from raytrace.studies.edof.network_command import Settings as Network
-from raytrace.studies.edof.noise import FILTERS, Interval
+from raytrace.studies.edof.noise import Gains, Interval
 from raytrace.studies.edof.noise_command import Settings as Noise
 from raytrace.studies.edof.noise_report import OverNoise, Score
 from raytrace.studies.edof.settings import NANOMETRE
 from raytrace.studies.edof.table import Content
-from raytrace.studies.edof.world import World
+from raytrace.studies.edof.world import FILTERS, World
 from raytrace.studies.publish import published
 from raytrace.studies.quantise import report as quantise_report
 from raytrace.studies.quantise.command import Settings as Quantise
@@ -95,10 +95,10 @@ def test_files_are_named_as_the_reader_has_them(tmp_path, monkeypatch):
 
 
 def over_noise(*rows: str) -> OverNoise:
-    one = Interval(1.0, 0.9, 1.1)
-    return OverNoise([Score("sharp leaves", filter, 0.02, row, 20.0, one) for filter in FILTERS for row in rows], {
-        "sharp leaves": 8
-    })  # fmt: skip
+    own = Interval(1.0, 0.9, 1.1)
+    gains = Gains(20.0, own, 20.5, own)
+    scores = [Score("sharp leaves", filter, 0.02, row, gains) for filter in FILTERS for row in rows]
+    return OverNoise(scores, {"sharp leaves": 8})
 
 
 def test_the_page_over_noise_names_its_files(tmp_path, monkeypatch):
@@ -143,10 +143,11 @@ def test_the_table_is_repeated_and_counts_its_pictures():
     given = [
         Content(name, torch.ones(4, 2, 2), torch.ones(count, 2, 2)) for name, count in (("leaves", 1), ("pictures", 3))
     ]
-    text = "\n".join(report._parts(report.Table({}), given, World(), line, []))
+    text = "\n".join(report._parts(report.Table({}), given, World(), line, [], {"lens": baseline("singlet", aim())[0]}))
     assert (
         "Judged on 1 pictures of leaves, 3 pictures, expected over noise, none drawn; filters are made for 4, 4" in text
     )
+    assert "Heights, largest less smallest inside the aperture: lens " in text
 
 
 def test_free_heights_say_how_they_began(tmp_path):

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from raytrace.camera.image import blur
+from raytrace.camera.image import as_picture, blur
 from raytrace.camera.noise import add_noise
 from raytrace.camera.variables import Variables
 from raytrace.kernels import MODELS, NotConverged, psf
@@ -29,6 +29,8 @@ from raytrace.optics.filling import warn_of_filling
 from raytrace.optics.reuse import Memo
 from raytrace.optics.scene import chief_landing, scene
 from raytrace.system.lens import Lens, field_points
+
+_LARGEST = 2.0  # of a picture in [0, 1] whose resampling overshoots
 
 
 class Camera(nn.Module):
@@ -120,13 +122,20 @@ class Camera(nn.Module):
         return dataclasses.replace(self.pixels, centre=self.pixels.centre[:, None, None] + chief)
 
     def image(self, picture: Tensor, object_distances: Tensor, field: int = 0) -> Tensor:
-        """What falls on the sensor, without noise: (B, H - margin, W - margin)."""
+        """What falls on the sensor, without noise: (B, H - margin, W - margin).
+
+        picture: (B, H, W), or one (H, W) for all distances (B,), in [0, 1]; integers of 8 or 16 bits become that.
+        Raises ValueError for other shapes, as those of colour pictures, and other ranges, as 0 to 255.
+        """
+        picture = _grey(picture, object_distances)
         return blur(picture, self.kernels(object_distances, field).to(picture.dtype))
 
     def restore(self, image: Tensor) -> Tensor:
         """The network's answer (B, h, w) to a noisy image."""
         with torch.autocast(image.device.type, self.network_dtype, enabled=self.network_dtype is not None):
-            stack = image[:, None].contiguous(memory_format=torch.channels_last)
+            image = as_picture(image, "image")
+            like = next((p.dtype for p in self.network.parameters() if p.is_floating_point()), image.dtype)
+            stack = image[:, None].to(like, memory_format=torch.channels_last)
             return self.network(stack)[:, 0].to(image.dtype)
 
     def forward(
@@ -146,6 +155,23 @@ class Camera(nn.Module):
 
     def target(self, picture: Tensor) -> Tensor:
         """What a perfect camera gives: the picture without its margin."""
+        picture = as_picture(picture)
         rows, columns = self.pixels.rows // 2, self.pixels.columns // 2
         bottom, right = self.pixels.rows - 1 - rows, self.pixels.columns - 1 - columns
         return picture[..., rows : picture.shape[-2] - bottom, columns : picture.shape[-1] - right]
+
+
+def _grey(picture: Tensor, object_distances: Tensor) -> Tensor:
+    """Pictures (B, H, W) or (H, W) of object distances (B,) in [0, 1]."""
+    picture = as_picture(picture)
+    shape, count = tuple(picture.shape), len(object_distances)
+    if not (picture.dim() == 2 or (picture.dim() == 3 and (count == 1 or shape[0] in (1, count)))):
+        raise ValueError(
+            f"pictures of shape {shape} at {count} object distances: expected grey ones (B, H, W), one for each "
+            "distance; colours are a batch, as picture.flatten(0, 1) with distances.repeat_interleave(3)"
+        )
+    if (most := float(picture.detach().max())) > _LARGEST:
+        raise ValueError(
+            f"a picture with values up to {most:g}: expected 0 to 1, as the noise is; divide it by its white"
+        )
+    return picture

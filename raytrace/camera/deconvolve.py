@@ -14,7 +14,7 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace.camera.image import EXTENSIONS, check_fit, extend
+from raytrace.camera.image import EXTENSIONS, as_picture, check_axes, check_fit, extend
 from raytrace.maths.numerics import safe_divide
 
 
@@ -114,6 +114,8 @@ def restore(image: Tensor, filter: Tensor, *, boundary: str = "circular") -> Ten
     boundary "taper" keeps the jump between opposite borders from ringing, by reflection that fades from one to the
     other; "reflect" and "zero" are those of `image.extend`. Differentiable in both.
     """
+    image = as_picture(image, "image")
+    check_axes(image=image, filter=filter)
     size, shape = image.shape[-2:], filter.shape[-2:]
     if boundary in EXTENSIONS:
         image = extend(image, (shape[0], shape[1]), boundary=boundary)
@@ -130,7 +132,13 @@ def power_spectrum(pictures: Tensor, *, window: str = "hann") -> Tensor:
 
     window: "hann" fades pictures (about their mean) out towards their borders, whose edges would else look like
     texture; "none" is right for periodic ones, and adds up to their mean square exactly.
+    Raises ValueError for a single picture without the axis B.
     """
+    pictures = as_picture(pictures, "set of pictures")
+    if pictures.dim() < 3:
+        raise ValueError(
+            f"pictures of shape {tuple(pictures.shape)}: expected (B, ..., rows, columns); add an axis by picture[None]"
+        )
     if window not in ("hann", "none"):
         raise ValueError(f"window {window!r}: expected hann, none")
     rows, columns = pictures.shape[-2:]
@@ -170,11 +178,20 @@ def within(picture: Tensor, margin: int | tuple[int, int]) -> Tensor:
 
 def mean_square_error(estimate: Tensor, picture: Tensor, *, margin: int | tuple[int, int] = 0) -> Tensor:
     """(...) of pictures (..., H, W), by their last two axes, within a margin."""
-    return within(estimate - picture, margin).square().mean((-2, -1))
+    return within(as_picture(estimate) - as_picture(picture), margin).square().mean((-2, -1))
 
 
 def psnr(mean_square: Tensor, *, peak: float = 1.0) -> Tensor:
-    """Peak signal over a mean square error, 10 log₁₀(peak²/e) dB; average the errors of colours first."""
+    """Peak signal over a mean square error, 10 log₁₀(peak²/e) dB; average the errors of colours first.
+
+    Raises ValueError for errors of integer pictures, whose differences wrap around.
+    """
+    mean_square = torch.as_tensor(mean_square)
+    if not mean_square.is_floating_point():
+        kind = str(mean_square.dtype).removeprefix("torch.")
+        raise ValueError(
+            f"a mean square error of {kind}: expected floating-point numbers; convert pictures before subtraction"
+        )
     return 20 * math.log10(peak) - 10 * torch.log10(mean_square)
 
 

@@ -1,5 +1,7 @@
 """Image: what a camera makes of a picture: blur by point spread functions at one or many depths.
 
+Pictures are floating-point numbers in any unit; integers of 8 or 16 bits are read as 0 to 1 (`as_picture`).
+
 Kernels (..., h, w) are spots around their middle pixel (h//2, w//2); a kernel whose only value stands there gives the
 picture back. A spot centred on a `Grid` of even size lies half a pixel before it, between pixels: such a kernel moves a
 picture by half a pixel, which deconvolution with the same kernel undoes, or origin="grid" takes out of both.
@@ -7,10 +9,11 @@ picture by half a pixel, which deconvolution with the same kernel undoes, or ori
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import safe_divide
+from raytrace.maths.numerics import broadcast_shape, safe_divide
 
 #: What lies beyond the borders of a picture: "zero" darkens them, "reflect" mirrors the picture there, "taper" fades
 #: from the mirror image at one border to that at the opposite one, so that the whole is periodic without a jump.
@@ -18,6 +21,24 @@ EXTENSIONS = ("zero", "reflect", "taper")
 BOUNDARIES = ("valid", "circular", *EXTENSIONS)
 COMPOSITIONS = ("masked", "sum", "occlusion")
 _ORIGINS = ("pixel", "grid")
+#: White of integer pictures.
+_WHITE = {torch.uint8: 255, torch.uint16: 65535}
+
+
+def as_picture(picture: Tensor | np.ndarray, what: str = "picture") -> Tensor:
+    """A picture as floating-point numbers: as it is, or of integers of 8 or 16 bits, whose largest value becomes 1.
+
+    Raises ValueError for other integers, whose white is unknown, and for complex numbers.
+    """
+    picture = torch.as_tensor(picture)
+    if picture.is_floating_point():
+        return picture
+    if picture.dtype not in _WHITE:
+        raise ValueError(
+            f"a {what} of {str(picture.dtype).removeprefix('torch.')}: its white is unknown; expected floating-point "
+            "numbers, or uint8 or uint16; convert it, as picture.float() / 255"
+        )
+    return picture.to(torch.get_default_dtype()) / _WHITE[picture.dtype]
 
 
 def blur(picture: Tensor, kernel: Tensor, *, boundary: str = "valid", origin: str = "pixel") -> Tensor:
@@ -29,9 +50,13 @@ def blur(picture: Tensor, kernel: Tensor, *, boundary: str = "valid", origin: st
     (..., H - h + 1, W - w + 1), that of the picture's part `visible`: no border darkens. All others return (..., H, W):
     "circular" takes the picture as periodic, `EXTENSIONS` go beyond its borders. origin: "pixel", or "grid": the middle
     of an even kernel is (h - 1)/2, and its half pixel is taken out by phases (not for "valid", where what wraps around
-    would come in). By FFT. Raises ValueError for a kernel larger than a valid or circular picture.
+    would come in). By FFT. Raises ValueError for a kernel larger than a valid or circular picture, and for axes that do
+    not broadcast.
     """
+    picture = as_picture(picture)
     _check_choice(boundary, BOUNDARIES, "boundary")
+    _check_kernel(kernel)
+    check_axes(picture=picture, kernel=kernel)
     size, spot = picture.shape[-2:], kernel.shape[-2:]
     _check_origin(boundary, origin, spot)
     shape = _work_shape(size, spot, boundary)
@@ -130,8 +155,21 @@ def blur_layers(
     With occlusion the blurred near layer covers what lies behind; division by the coverage A fills in what the picture
     does not show there (after Ikoma et al., 2021). A flat picture stays flat by "masked" and "occlusion".
     picture: (..., C, H, W); masks: (..., D, H, W) from far to near, summing to one; kernels: (..., D, C, h, w).
-    boundary: as for `blur`.
+    boundary: as for `blur`. Raises ValueError for other shapes.
     """
+    picture = as_picture(picture)
+    _check_kernel(kernels)
+    for what, tensor, axes in (
+        ("picture", picture, "C, H, W"),
+        ("masks", masks, "D, H, W"),
+        ("kernels", kernels, "D, C, h, w"),
+    ):
+        if tensor.dim() < axes.count(",") + 1:
+            raise ValueError(f"{what} of shape {tuple(tensor.shape)}: expected (..., {axes})")
+    colours, of_kernels = picture.shape[-3], kernels.shape[-3]
+    if colours != of_kernels and 1 not in (colours, of_kernels):
+        raise ValueError(f"a picture of {colours} colours and kernels of {of_kernels}: expected one each")
+    masks = masks if masks.is_floating_point() else masks.to(kernels.dtype)  # shares of 0 and 1
     _check_choice(composition, COMPOSITIONS, "composition")
     if masks.shape[-3] != kernels.shape[-4] and kernels.shape[-4] != 1:
         raise ValueError(f"{masks.shape[-3]} masks and kernels of {kernels.shape[-4]} depths: expected one each")
@@ -221,6 +259,23 @@ def _gaussian(deviation: float, like: Tensor) -> Tensor:
 
 def _pair(size: int | tuple[int, int]) -> tuple[int, int]:
     return (size, size) if isinstance(size, int) else (size[0], size[1])
+
+
+def check_axes(**given: Tensor) -> None:
+    """Raises ValueError unless what is before the axes (rows, columns) of pictures, kernels or filters broadcasts."""
+    try:
+        broadcast_shape(*(tensor.shape[:-2] for tensor in given.values()))
+    except ValueError:
+        shapes = " and ".join(f"a {name} of shape {tuple(tensor.shape)}" for name, tensor in given.items())
+        raise ValueError(
+            f"{shapes}: the axes before (rows, columns) do not broadcast; expected equal numbers, or 1"
+        ) from None
+
+
+def _check_kernel(kernel: Tensor) -> None:
+    if not kernel.is_floating_point():
+        kind = str(kernel.dtype).removeprefix("torch.")
+        raise ValueError(f"a kernel of {kind}: expected floating-point numbers, the share of the light in each pixel")
 
 
 def _check_choice(choice: str, known: tuple[str, ...], what: str) -> None:

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d
 
+from raytrace.camera.image import as_picture
+
 
 @dataclasses.dataclass(frozen=True)
 class RedNetShape:
@@ -52,7 +54,13 @@ class RedNet(nn.Module):
             self.decoder[-1].weight.zero_()
 
     def forward(self, picture: Tensor) -> Tensor:
-        """picture: (B, 1, H, W); returns the restored one of the same shape."""
+        """picture: (B, 1, H, W); returns the restored one of the same shape. Raises ValueError for other shapes."""
+        picture = as_picture(picture)
+        if picture.dim() != 4 or picture.shape[1] != 1:
+            raise ValueError(
+                f"pictures of shape {tuple(picture.shape)}: expected grey ones (B, 1, H, W); colours are a batch, "
+                "as picture.flatten(0, 1)[:, None]"
+            )
         features, x = [], picture
         for layer in self.encoder:
             x = layer(x).relu_()

@@ -38,6 +38,12 @@ class Pictures:
     def __len__(self) -> int:
         return len(self.samples)
 
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Of each picture its folder: pictures of one are alike. Where there is but one, each is its own class."""
+        folders = tuple(str(Path(name).parent) for name in self.names)
+        return folders if len(set(folders)) > 1 else self.names
+
 
 def digest(samples: Sequence[np.ndarray]) -> str:
     """How many pictures, and a hash of all their pixels: what a run is known by that learns from them."""

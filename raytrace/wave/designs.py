@@ -27,7 +27,7 @@ from raytrace.wave.element import (
     Rings,
     Zernike,
     as_rings,
-    fabricated,
+    fabricated_height,
     features,
     period,
     wrapped,
@@ -241,7 +241,7 @@ def encircled_energy(aim: Aim, wavelengths: Tensor, *, spot: float, pitch: float
 
 def _energy(forms: Tensor, wavelengths: Tensor, element: Element) -> Tensor:
     """E_λ = Σ |forms_λ · e^(ik (n - 1) h)|² (W,) of an element of rings. forms: (W, M, R)."""
-    heights = fabricated(element.profile.heights, element.period, element.levels).double()
+    heights = fabricated_height(element.profile.heights, element.period, element.levels).double()
     phase = _phase(element.glass, wavelengths) * heights
     field = (forms @ torch.polar(torch.ones_like(phase), phase)[..., None])[..., 0]
     return (field.real**2 + field.imag**2).sum(-1)

@@ -1,4 +1,4 @@
-"""Element: a thin phase element, its height over the aperture, as it is designed and as it is made.
+"""Element: a thin phase element, its height over the aperture, as it is designed and as it is fabricated.
 
     path(x, y, λ) = (n(λ) - 1) h(x, y)
 
@@ -152,8 +152,8 @@ def is_smooth(element: Element) -> bool:
 
 
 def height(element: Element, x: Tensor, y: Tensor) -> Tensor:
-    """h (...) mm at points (...) mm, as it can be made; beyond the outermost pixel or ring, that of its neighbour."""
-    return fabricated(designed_height(element, x, y), element.period, element.levels)
+    """h (...) mm at points (...) mm, as it is fabricated; beyond the outermost pixel or ring, that of its neighbour."""
+    return fabricated_height(designed_height(element, x, y), element.period, element.levels)
 
 
 def designed_height(element: Element, x: Tensor, y: Tensor) -> Tensor:
@@ -168,7 +168,7 @@ def slopes_of(element: Element, x: Tensor, y: Tensor) -> Tensor:
         return torch.stack(torch.autograd.grad(designed_height(element, x, y).sum(), (x, y)))
 
 
-def fabricated(height: Tensor, period: Tensor | None, levels: int = 0) -> Tensor:
+def fabricated_height(height: Tensor, period: Tensor | None, levels: int = 0) -> Tensor:
     """Heights modulo a period, and lowered to the step below: floor(h/H·L)·H/L. The gradient is that of the height."""
     if period is None:
         return height
@@ -202,7 +202,7 @@ def path(elements: Sequence[Element], x: Tensor, y: Tensor, wavelengths: Tensor)
     return total
 
 
-# -- as it is made -----------------------------------------------------------------------------------------------------
+# -- as it is fabricated -----------------------------------------------------------------------------------------------
 
 
 def as_rings(element: Element, pitch: float | Tensor) -> Element:
@@ -244,24 +244,46 @@ def wrapped(element: Element, wavelength: float | Tensor, *, levels: int = 0) ->
     return dataclasses.replace(element, period=period(element.glass, wavelength).to(element.radius), levels=levels)
 
 
-def as_made(element: Element) -> Element:
-    """The element with the heights of its rings or pixels wrapped and stepped, as they are to be written to a file.
+def fabricated(element: Element) -> Element:
+    """The element with the heights (rows, columns) or (R,) mm of its pixels or rings wrapped and stepped: as light sees
+    them, and as `write_element` writes them.
 
     Raises ValueError for a smooth profile, which has no features.
     """
     if not is_flat(element):
         kind = type(element.profile).__name__
-        raise ValueError(f"a profile of {kind} has no features to be made; use as_rings or as_pixels first")
-    heights = fabricated(element.numbers, element.period, element.levels)
+        raise ValueError(f"a profile of {kind} has no features to be fabricated; use as_rings or as_pixels first")
+    heights = fabricated_height(element.numbers, element.period, element.levels)
     return dataclasses.replace(element.with_numbers(heights), period=None, levels=0)
 
 
 def with_tolerance(element: Element, tolerance: float | Tensor, *, generator: torch.Generator | None = None) -> Element:
-    """The element as made, but each ring or pixel off by a uniform draw of ± `tolerance` mm.
+    """The element as fabricated, but each ring or pixel off by a uniform draw of ± `tolerance` mm.
 
     The same generator state gives the same errors. Raises ValueError for a smooth profile, which has no features.
     """
-    made = as_made(element)
+    made = fabricated(element)
     heights = made.numbers
     draw = torch.rand(heights.shape, generator=generator, dtype=heights.dtype, device=heights.device)
     return made.with_numbers(heights + tolerance * (2 * draw - 1))
+
+
+@torch.no_grad()
+def height_range(element: Element) -> tuple[float, float]:
+    """The smallest and the largest height in mm inside the aperture, wrapped and stepped.
+
+    Of pixels and rings exact; of a smooth profile from 4,097 points of a radius, or of 513 × 513 of the square around.
+    """
+    radius, kind = element.radius, element.kind
+    if isinstance(element.profile, Rings):
+        heights = fabricated(element).numbers[: features(radius, element.profile.pitch)]
+        return float(heights.min()) + 0.0, float(heights.max()) + 0.0
+    if isinstance(element.profile, Pixels):
+        step = element.profile.pitch
+        y, x = ((torch.arange(n).to(radius) - 0.5 * (n - 1)) * step for n in element.numbers.shape)
+    else:
+        x = radius * torch.linspace(0 if kind.is_radial else -1, 1, 4097 if kind.is_radial else 513).to(radius)
+        y = torch.zeros_like(x[:1]) if kind.is_radial else x
+    y, x = torch.meshgrid(y, x, indexing="ij")
+    heights = height(element, x, y)[torch.hypot(x, y) <= radius * (1 + 1e-6)]
+    return float(heights.min()) + 0.0, float(heights.max()) + 0.0

@@ -18,7 +18,7 @@ from raytrace.media.catalog import find_glass
 from raytrace.media.formulas import FORMULAS
 from raytrace.media.glass import Glass
 from raytrace.stores import Unfit, either, exactly, listed, number, parsed, record, text
-from raytrace.wave.element import Element, EvenPowers, Rings, Zernike, is_flat, wrapped
+from raytrace.wave.element import Element, EvenPowers, Rings, Zernike, fabricated, height_range, is_flat, wrapped
 from raytrace.wave.exchange import FORMATS, HeightMapError, read_heights, write_heights
 
 #: Suffix of smooth elements, and their profiles by the name that they have there.
@@ -49,11 +49,12 @@ def write_element(element: Element, path: str | os.PathLike, *, design_wavelengt
     """Write the heights of an element in the format of the suffix, and its label next to them; both paths. A smooth
     element's name ends in .json: it is its own label.
 
-    Raises HeightMapError for what the format cannot hold.
+    Heights are those of `fabricated`: modulo the period, in steps, as light sees them; the file has no period. The
+    label has their range in the aperture, mm. Raises HeightMapError for what the format cannot hold.
     """
     path, glass = Path(path), element.glass
     if is_flat(element) or path.suffix.lower() != SMOOTH:
-        write_heights(element.profile, path)
+        write_heights((fabricated(element) if is_flat(element) else element).profile, path)
         own = {"pitch": float(element.profile.pitch.detach())}
     elif element.period is not None:
         raise HeightMapError("a smooth profile that is wrapped is no smooth one; take as_rings or as_pixels", str(path))
@@ -68,6 +69,7 @@ def write_element(element: Element, path: str | os.PathLike, *, design_wavelengt
         "wavelength_range": glass.wavelength_range,
         "design_wavelength": design_wavelength,
         "aperture": 2 * float(element.radius.detach()),
+        "height_range": height_range(element),
         **own,
     }
     write_json(_label_of(path), document)

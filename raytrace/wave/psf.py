@@ -18,7 +18,7 @@ from raytrace.maths.result import Result, number, object_text, rows
 from raytrace.maths.value import value
 from raytrace.optics.reuse import Memo
 from raytrace.wave import plan as planning
-from raytrace.wave.element import EvenPowers
+from raytrace.wave.element import Element, EvenPowers, height_range
 from raytrace.wave.plan import Plan
 from raytrace.wave.scene import WaveScene, aperture
 
@@ -104,6 +104,7 @@ class ElementPsf(Result):
     def document(self) -> dict:
         return {
             "element": self.element,
+            "height_range": [[*height_range(element)] for element in self.scene.elements],
             "engine": self.plan.engine,
             "samples": self.plan.samples,
             "error": number(self.plan.error),
@@ -122,6 +123,7 @@ class ElementPsf(Result):
         return "\n".join(
             [
                 self.title,
+                *map(_heights, self.scene.elements),
                 f"{self.plan.engine} engine, {self.plan.samples} samples, predicted error {self.plan.error:.1e}; "
                 f"{self.grid.columns} × {self.grid.rows} pixels of {1e3 * float(self.pitch):g} µm",
                 f"{'object':>12} {'wavelength':>11} {'energy':>8} {'peak':>10} {'half-energy':>12}",
@@ -147,6 +149,11 @@ class ElementPsf(Result):
             "element": self.element,
         }
         write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
+
+
+def _heights(element: Element) -> str:
+    low, high = height_range(element)
+    return f"{element.kind.words} of {element.glass.name or 'constant index'}, heights over {1e3 * (high - low):.4g} µm"
 
 
 def _row(depth: float | None, wavelength: float, energy: float, peak: float, half_energy_radius: float | None) -> str:

@@ -20,7 +20,7 @@ from raytrace.wave.element import (
     Rings,
     designed_height,
     excess_index,
-    fabricated,
+    fabricated_height,
     height,
     is_flat,
     slopes_of,
@@ -211,11 +211,11 @@ def _edges(element: Element, scene: WaveScene, waves: Tensor) -> Tensor:
         return 2 - 2 * torch.cos(2 * math.pi * waves.reshape(-1, *[1] * jumps.dim()) * jumps)
 
     if isinstance(profile, Pixels):
-        heights = fabricated(profile.heights, element.period, element.levels)
+        heights = fabricated_height(profile.heights, element.period, element.levels)
         pairs = [heights.diff(dim=dim) for dim in (0, 1) if heights.shape[dim] > 1]
         return sum((squares(pair).mean((-2, -1)) / profile.pitch for pair in pairs), torch.zeros_like(waves))
     if isinstance(profile, Rings):
-        heights = fabricated(profile.heights, element.period, element.levels)
+        heights = fabricated_height(profile.heights, element.period, element.levels)
         r = profile.pitch * torch.arange(1, len(heights), dtype=heights.dtype, device=heights.device)
         return (squares(heights.diff()) * r * (r < R)).sum(-1) * 2 / R**2
     if element.period is None:

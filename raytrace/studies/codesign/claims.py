@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import statistics
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
 from raytrace.studies.codesign.experiment import Outcome
 from raytrace.studies.codesign.settings import NAMES
@@ -19,16 +19,22 @@ OURS = "gaussian"
 
 @dataclasses.dataclass(frozen=True)
 class Claim:
-    """What the paper says, when we call it true, whether it is (None: runs are missing), and the figures."""
+    """What the paper says, when we call it true, whether it is (None: not answered), and the figures, or the reason.
+
+    pending: whether runs of this study that are not finished will answer it; without them it is not applicable.
+    """
 
     text: str
     criterion: str
     holds: bool | None
     figures: str
+    pending: bool = False
 
     @property
     def answer(self) -> str:
-        return {True: "yes", False: "no", None: "not run yet"}[self.holds]
+        if self.holds is None:
+            return "not run yet" if self.pending else "not applicable"
+        return "yes" if self.holds else "no"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,24 +80,42 @@ def is_of_paper(lens: Lens) -> bool:
     return len(bent) == len(_RADII) and all(math.isclose(a, b, rel_tol=1e-4) for a, b in zip(bent, _RADII, strict=True))
 
 
-def claims(found: Sequence[Outcome], times: Sequence[StepTime], seen: Seen = _NOTHING) -> list[Claim]:
-    """All claims, over the finished runs of a study, the measured times of a step and what its figures show."""
+def claims(
+    found: Sequence[Outcome],
+    times: Sequence[StepTime],
+    seen: Seen = _NOTHING,
+    *,
+    pending: Collection[str] = (),
+) -> list[Claim]:
+    """All claims, over the finished runs of a study, the measured times of a step and what its figures show.
+
+    pending: models of the study with runs that are not finished.
+    """
     of, ms = {one.model: one for one in summaries(found)}, {time.model: time.psf for time in times}
     evidence = Evidence(found, of, ms, seen)
-    return [_answered(evidence, *row) for row in CLAIMS]
+    return [_answered(evidence, pending, *row) for row in CLAIMS]
 
 
 class _Untold(LookupError):
     """Why a claim cannot be answered, in words."""
 
 
-def _answered(evidence: Evidence, text: str, criterion: str, judge: Callable[[Evidence], tuple[bool, str]]) -> Claim:
+def _answered(
+    evidence: Evidence,
+    pending: Collection[str],
+    text: str,
+    criterion: str,
+    judge: Callable[[Evidence], tuple[bool, str]],
+) -> Claim:
     try:
         return Claim(text, criterion, *judge(evidence))
     except _Untold as why:
         return Claim(text, criterion, None, str(why))
     except KeyError as missing:
-        return Claim(text, criterion, None, f"no finished run of {missing.args[0]}")
+        model = missing.args[0]
+        if model in pending:
+            return Claim(text, criterion, None, f"no finished run of {model}", pending=True)
+        return Claim(text, criterion, None, f"{NAMES.get(model, model)} is not among the models of this study")
 
 
 def penalty(summary: Summary) -> float:
@@ -207,6 +231,8 @@ def _most_at_20_to_30_m(given: Evidence) -> tuple[bool, str]:
 
 
 def _less_at_10_than_15_m(given: Evidence) -> tuple[bool, str]:
+    if not given.runs:
+        raise KeyError(OURS)
     distances, losses = losses_by_distance(given.runs)
     near, next_one = (distances.index(z) if z in distances else None for z in (10e3, 15e3))
     if near is None or next_one is None:
@@ -218,7 +244,7 @@ def _less_at_10_than_15_m(given: Evidence) -> tuple[bool, str]:
 
 def _settled(given: Evidence) -> tuple[bool, str]:
     if given.runs and not given.seen.settled:
-        raise _Untold("told where the sensor alone varies")
+        raise _Untold("answered only where the sensor alone varies")
     found = {model: given.seen.settled[model] for model in PAPER}
     return max(found.values()) <= 0.5, ", ".join(f"{NAMES[model]} after {part:.0%}" for model, part in found.items())
 

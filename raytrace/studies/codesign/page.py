@@ -56,7 +56,9 @@ class Report(Result):
     @property
     def claims(self) -> list[Claim]:
         """Those of the paper, if the lens is its."""
-        return claims(self.found, self.times, self.seen) if self.of_paper else []
+        if not self.of_paper:
+            return []
+        return claims(self.found, self.times, self.seen, pending={row for row, _ in self.missing})
 
     def document(self) -> dict:
         return plain(

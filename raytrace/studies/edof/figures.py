@@ -83,7 +83,7 @@ def noise_figure(found) -> Figure:
         rows = {row: own for row, own in found.of(content, filter).items() if row != "fresnel"}
         for row, own in rows.items():
             noises = sorted(own)
-            gains = [own[noise].gain for noise in noises]
+            gains = [own[noise].gains.pooled for noise in noises]
             look = _look(row, list(rows))
             panel.plot(noises, [one.value for one in gains], label=title_of(row), **look)
             low, high = ([getattr(one, end) for one in gains] for end in ("low", "high"))

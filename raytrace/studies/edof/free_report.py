@@ -19,11 +19,11 @@ from raytrace.pages import grid, picture
 from raytrace.studies.edof.command import LIMIT
 from raytrace.studies.edof.free import SPREAD, STARTS, TERMS, WHITE, Case, PixelForm, departure, learn_free
 from raytrace.studies.edof.free_command import Settings
-from raytrace.studies.edof.noise import FILTERS, Bank, Errors, Interval, drawn, gain, mean_psnr
+from raytrace.studies.edof.noise import Bank, Errors, Gains
 from raytrace.studies.edof.noise_command import Settings as Noise
-from raytrace.studies.edof.noise_report import TITLES, Kept, judge_baselines
+from raytrace.studies.edof.noise_report import TITLES, Kept, counted, judge_baselines
 from raytrace.studies.edof.report import contents_of
-from raytrace.studies.edof.world import WAVELENGTH, ClosedForm, World, depth_text, periodic, spectrum
+from raytrace.studies.edof.world import FILTERS, WAVELENGTH, ClosedForm, World, depth_text, periodic, spectrum
 from raytrace.studies.options import picture_words
 from raytrace.studies.publish import publish, published
 from raytrace.wave.element import Element, Rings, as_pixels
@@ -42,16 +42,16 @@ class Judged:
     filter: str
     row: str
     expected: float
-    psnr: float
-    over_control: Interval
-    over_fresnel: Interval
+    over_control: Gains
+    over_fresnel: Gains
     unround: float
 
     def record(self) -> dict:
-        own = {name: getattr(self, name) for name in ("content", "filter", "row", "expected", "psnr", "unround")}
+        own = {name: getattr(self, name) for name in ("content", "filter", "row", "expected", "unround")}
+        own |= {"psnr": self.over_fresnel.pooled_psnr, "mean_psnr": self.over_fresnel.mean_psnr}
         for name in ("over_control", "over_fresnel"):
             one = getattr(self, name)
-            own |= {name: one.value, f"{name}_low": one.low, f"{name}_high": one.high}
+            own |= one.pooled.record(name) | one.mean.record(f"mean_{name}")
         return own
 
 
@@ -65,12 +65,13 @@ class Shown:
 
 @dataclasses.dataclass(frozen=True)
 class Freed(Result):
-    """Every element; shown: maps by row; pictures: how many, by content."""
+    """Every element; shown: maps by row; pictures, classes: how many, by content."""
 
     rows: list[Judged]
     shown: dict[str, Shown]
     pictures: dict[str, int]
     settings: Settings
+    classes: dict[str, int] = dataclasses.field(default_factory=dict)
 
     FIGURE = "studies.edof.figures.free_figure"
 
@@ -79,8 +80,9 @@ class Freed(Result):
 
     def lines(self, content: str, filter: str) -> list[tuple[str, ...]]:
         return [
-            (title_of(one.row), f"{one.expected:.2f}", f"{one.psnr:.2f}", _beside(one, "control"),
-             str(one.over_fresnel), f"{one.unround:.0f}")
+            (title_of(one.row), f"{one.expected:.2f}", f"{one.over_fresnel.pooled_psnr:.2f}",
+             _over_control(one), str(one.over_fresnel.pooled), f"{one.over_fresnel.mean_psnr:.2f}",
+             str(one.over_fresnel.mean), f"{one.unround:.0f}")
             for one in self.rows
             if (one.content, one.filter) == (content, filter)
         ]  # fmt: skip
@@ -95,7 +97,16 @@ class Freed(Result):
         return "\n".join(text)
 
 
-_HEADER = ("element", "expected", "PSNR", "over the rings learned on", "over the Fresnel lens", "not round, nm RMS")
+_HEADER = (
+    "element",
+    "expected",
+    "PSNR, pooled",
+    "over the rings learned on",
+    "over the Fresnel lens",
+    "mean of PSNRs",
+    "over the Fresnel lens",
+    "not round, nm RMS",
+)
 _ROWS = {"given": "rings as given", "cut": "rings cut to pixels", "control": "rings learned on"}
 
 
@@ -103,8 +114,8 @@ def title_of(row: str) -> str:
     return _ROWS[row] if row in _ROWS else f"free heights {STARTS[row][0]}"
 
 
-def _beside(one: Judged, base: str) -> str:
-    return "–" if one.row == base else str(one.over_control)
+def _over_control(one: Judged) -> str:
+    return "–" if one.row == "control" else str(one.over_control.pooled)
 
 
 def free(arguments: argparse.Namespace) -> Freed:
@@ -115,7 +126,7 @@ def free(arguments: argparse.Namespace) -> Freed:
         raise CommandError(f"--from {arguments.rings}: holds no rings; expected heights of rings")
     contents, train = contents_of(arguments)
     S = spectrum(periodic(train, 256))
-    banks = [Bank.of(content.name, content.train, content.test) for content in contents]
+    banks = [Bank.of(content.name, content.train, content.test, content.classes) for content in contents]
     del contents
     kept = Kept(root / "judged", banks)  # refuses other pictures before anything is learned
     elements = {"given": rings, "cut": as_pixels(rings, settings.feature)}
@@ -127,7 +138,13 @@ def free(arguments: argparse.Namespace) -> Freed:
     found = {row: _judged(row, element, S, settings, kept) for row, element in progress(list(elements.items()), "map")}
     rows = list(_rows(found, base, elements, banks, settings))
     shown = {row: _shown(element, settings) for row, element in elements.items() if row not in ("given", "cut")}
-    result = Freed(rows, shown, {one.name: len(one.powers) for one in banks}, settings)
+    result = Freed(
+        rows,
+        shown,
+        {one.name: len(one.powers) for one in banks},
+        settings,
+        {one.name: one.class_count for one in banks},
+    )
     if arguments.docs:
         _publish(result, arguments)
     return result
@@ -165,13 +182,13 @@ def _rows(
 ) -> Iterator[Judged]:
     unround = {row: departure(element) for row, element in elements.items()}
     for bank in banks:
-        weights = drawn(len(bank.powers), seed=settings.seed)
+        weights = bank.drawn(seed=settings.seed)
         for filter in FILTERS:
             control, fresnel = found["control"][1][bank.name][filter], base[bank.name][filter]
             for row, (expected, errors) in found.items():
                 own = errors[bank.name][filter]
-                gains = gain(own, control, weights), gain(own, fresnel, weights)
-                yield Judged(bank.name, filter, row, expected, float(mean_psnr(own)), *gains, unround[row])
+                gains = (Gains.of(own, base, weights) for base in (control, fresnel))
+                yield Judged(bank.name, filter, row, expected, *gains, unround[row])
 
 
 @torch.no_grad()
@@ -211,7 +228,6 @@ def _publish(found: Freed, arguments: argparse.Namespace) -> None:
 
 def _parts(found: Freed, command: str) -> list[str]:
     shown = "pictures" if "pictures" in found.pictures else next(iter(found.pictures))
-    counted = ", ".join(f"{count} of {name}" for name, count in found.pictures.items())
     own = found.settings
     across = round(2 * World().radius / own.feature)
     size = 4e-6 * across**2  # MB, in single precision
@@ -225,8 +241,8 @@ def _parts(found: Freed, command: str) -> list[str]:
         f"depth-invariant filter: {own.steps} steps of Adam {begun}; each with a random change of "
         f"{1e3 * WHITE:g} nm RMS of every pixel. *Rings learned on*: the same rings, as many steps of the same rate, "
         "round. *Expected*: PSNR of the closed form on sharp leaves, which all are learned for. *Not "
-        f"round*: what is left of the heights without their mean over each ring. Restored: {counted}; filters are "
-        "made for others.",
+        f"round*: what is left of the heights without their mean over each ring. Restored: "
+        f"{counted(found.pictures, found.classes)}; filters are made for others.",
         picture(
             "wave/free.png", "Heights beyond a smooth lens, and PSFs from 0.5 m to infinity at 550 nm, five decades."
         ),

@@ -2,7 +2,7 @@
 
 import argparse
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -17,8 +17,8 @@ from raytrace.pages import grid
 from raytrace.studies.edof.command import LIMIT
 from raytrace.studies.edof.network import Filtered, errors_behind, learn_network, patches
 from raytrace.studies.edof.network_command import USUAL, Settings
-from raytrace.studies.edof.noise import Interval, best_strengths, cases, drawn, gain, mark_of_elements, mean_psnr
-from raytrace.studies.edof.noise_report import element_words, elements_in
+from raytrace.studies.edof.noise import Gains, best_strengths, cases, drawn, mark_of_elements
+from raytrace.studies.edof.noise_report import OF_INTERVALS, element_words, elements_in
 from raytrace.studies.edof.report import contents_of
 from raytrace.studies.edof.table import ROWS, Content, title_of
 from raytrace.studies.edof.world import World, kernels, spectrum, transfer
@@ -36,27 +36,28 @@ class Behind:
     over those of the first row."""
 
     row: str
-    filter: float
-    network: float
-    brings: Interval
-    over_filter: Interval
-    over_network: Interval
+    brings: Gains
+    over_filter: Gains
+    over_network: Gains
 
     def record(self) -> dict:
-        found = {"row": self.row, "filter": self.filter, "network": self.network}
+        found = {"row": self.row}
+        for name, one in (("filter", self.over_filter), ("network", self.over_network)):
+            found |= {name: one.pooled_psnr, f"mean_{name}": one.mean_psnr}
         for name in ("brings", "over_filter", "over_network"):
             own = getattr(self, name)
-            found |= {name: own.value, f"{name}_low": own.low, f"{name}_high": own.high}
+            found |= own.pooled.record(name) | own.mean.record(f"mean_{name}")
         return found
 
 
 @dataclasses.dataclass(frozen=True)
 class Networks(Result):
-    """Every element; trained, pictures: how many were learned from, and restored."""
+    """Every element; trained, pictures, classes: how many were learned from, restored, and of how many classes."""
 
     rows: list[Behind]
     trained: int
     pictures: int
+    classes: int
     kind: str
     noise: float
 
@@ -65,15 +66,17 @@ class Networks(Result):
 
     def lines(self) -> list[tuple[str, ...]]:
         return [
-            (title_of(one.row), f"{one.filter:.2f}", f"{one.network:.2f}", str(one.brings), str(one.over_filter),
-             str(one.over_network))
+            (title_of(one.row), f"{one.over_filter.pooled_psnr:.2f}", f"{one.over_network.pooled_psnr:.2f}",
+             str(one.brings.pooled), str(one.brings.mean), str(one.over_filter.pooled), str(one.over_filter.mean),
+             str(one.over_network.pooled), str(one.over_network.mean))
             for one in self.rows
         ]  # fmt: skip
 
     @property
     def header(self) -> tuple[str, ...]:
         first = title_of(self.rows[0].row)
-        return ("element", "filter", "network", "network brings", f"gain over the {first}, filters", "networks")
+        gains = ("network brings", f"gain over the {first}, filters", "networks")
+        return ("element", "filter", "network", *(f"{gain}, {mean}" for gain in gains for mean in ("pooled", "mean")))
 
     def __str__(self) -> str:
         lines = [f"{row[0]:>32}" + "".join(f"{cell:>26}" for cell in row[1:]) for row in [self.header, *self.lines()]]
@@ -92,8 +95,10 @@ def networks(arguments: argparse.Namespace) -> Networks:
     found, mark = {}, digest([*content.train.numpy(), *content.test.numpy()])
     for name, elements in _elements(arguments, files, settings, content):
         found[name] = _judged(name, elements, content, mark, settings, Path(arguments.folder))
-    counts = min(_TRAINED, len(content.train)), min(_RESTORED, len(content.test))
-    result = Networks(_rows(found, settings), *counts, content.name, settings.noise)
+    judged = _evenly(len(content.test), _RESTORED)
+    classes = [content.classes[place] if content.classes else place for place in judged]
+    counts = min(_TRAINED, len(content.train)), len(judged), len(set(classes))
+    result = Networks(_rows(found, classes, settings), *counts, content.name, settings.noise)
     if arguments.docs:
         words = [f"--rows {' '.join(arguments.rows)}"] if tuple(arguments.rows) != USUAL else []
         words += [*element_words(arguments), *picture_words(arguments, LIMIT), *settings.words()]
@@ -132,7 +137,7 @@ def _judged(
     folder = root / f"{name}-{settings.noise:g}"
     network = learn_network(
         folder,
-        lambda: patches(camera(), _evenly(content.train, _TRAINED), seed=settings.seed),
+        lambda: patches(camera(), content.train[_evenly(len(content.train), _TRAINED)], seed=settings.seed),
         about,
         steps=settings.steps,
         seed=settings.seed,
@@ -141,27 +146,29 @@ def _judged(
     file = folder / "errors.json"
     if not file.exists():
         errors = errors_behind(
-            camera(), network, _evenly(content.test, _RESTORED), progress=lambda own: progress(own, name)
+            camera(),
+            network,
+            content.test[_evenly(len(content.test), _RESTORED)],
+            progress=lambda own: progress(own, name),
         )
         write_json(file, {one: own.tolist() for one, own in errors.items()})
     return {one: torch.tensor(own, dtype=torch.float64) for one, own in read_json(file).items()}
 
 
-def _evenly(pictures: Tensor, most: int) -> Tensor:
-    """At most so many of all pictures: neighbours are of one kind."""
-    count = min(most, len(pictures))
-    return pictures[torch.arange(count) * len(pictures) // count]
+def _evenly(total: int, most: int) -> list[int]:
+    """Places of at most so many of all pictures: neighbours are of one kind."""
+    count = min(most, total)
+    return [number * total // count for number in range(count)]
 
 
-def _rows(found: dict[str, dict[str, Tensor]], settings: Settings) -> list[Behind]:
-    first = next(iter(found.values()))
-    weights = drawn(len(first["filter"]), seed=settings.seed)
+def _rows(found: dict[str, dict[str, Tensor]], classes: Sequence, settings: Settings) -> list[Behind]:
+    """classes: of each restored picture."""
+    first, weights = next(iter(found.values())), drawn(classes, seed=settings.seed)
     return [
         Behind(
             name,
-            *(float(mean_psnr(own[one])) for one in ("filter", "network")),
-            gain(own["network"], own["filter"], weights),
-            *(gain(own[one], first[one], weights) for one in ("filter", "network")),
+            Gains.of(own["network"], own["filter"], weights),
+            *(Gains.of(own[one], first[one], weights) for one in ("filter", "network")),
         )
         for name, own in found.items()
     ]
@@ -174,9 +181,9 @@ def _parts(found: Networks, command: str) -> list[str]:
         "Camera, depths and colours of [wave_edof.md](wave_edof.md). Elements stay as they are; behind the best "
         "depth-invariant filter stands a network of 10,000 weights (RED-Net, 6 layers of 16 maps), told neither depth "
         f"nor colour, learned from patches of {found.trained} {pictures_of(found.kind)} at depths drawn, noise "
-        f"{found.noise:g}. Judged on {found.pictures} others, all depths and colours, noise drawn once and the same "
-        "for both. PSNR in dB, mean over depths; in brackets the interval of 95 % of 2,000 samples of the pictures "
-        "drawn with replacement.",
+        f"{found.noise:g}. Judged on {found.pictures} others of {found.classes} classes, all depths and colours, noise "
+        "drawn once and the same for both. PSNR in dB, mean over depths, of errors pooled over pictures; gains of "
+        f"these and of the mean of the PSNRs of pictures, in brackets the {OF_INTERVALS}.",
         grid(found.header, found.lines()),
         "All figures: [network.csv](wave/network.csv).",
     ]

@@ -2,13 +2,18 @@
 
     e = ⟨P |1 - G H|²⟩ + σ² ⟨|G|²⟩       P: the power of one picture; ⟨·⟩ over frequencies: the mean over noise, undrawn
 
-Every picture has its own error, so that pictures drawn with replacement (bootstrap; Efron and Tibshirani, 1993) say how
-far a mean over them is to be trusted. Gains are paired: both elements on the same pictures.
+Two means over pictures are in use, and differ by about 1 dB:
+
+    pooled: 10 log₁₀(1/⟨e⟩)         the mean of the errors: the pictures that are restored worst decide
+    mean:   ⟨10 log₁₀(1/e)⟩         the mean of the PSNRs of single pictures: the usual one
+
+Intervals are of samples of pictures drawn with replacement (bootstrap; Efron and Tibshirani, 1993). Pictures of one
+class are alike, so that whole classes are drawn. Gains are paired: both elements on the same pictures.
 """
 
 import dataclasses
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +23,11 @@ from torch import Tensor
 from raytrace.camera.deconvolve import blind_error, blind_filter, psnr, wiener
 from raytrace.studies.edof.settings import Settings
 from raytrace.studies.edof.table import ROWS, STRENGTHS
-from raytrace.studies.edof.world import World, best_gamma, kernels, transfer
+from raytrace.studies.edof.world import World, best_gamma, errors_of_pictures, kernels, power, transfer
 from raytrace.studies.pictures import draws
 from raytrace.wave.designs import aim, baseline
 from raytrace.wave.element import Element
 
-FILTERS = ("wiener", "blind")
 _STEPS_OF_SMOOTH = 60
 _DRAWS = 2000  # of the pictures
 _BOOTSTRAP = 25  # last number of the key of a draw
@@ -82,11 +86,15 @@ def mark_of_elements(elements: Sequence[Element]) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Bank:
-    """A content's pictures: S (n, n) of those that filters are made for, P (B, n, n) the power of each restored one."""
+    """A content's pictures: S (n, n) of those that filters are made for, P (B, n, n) the power of each restored one.
+
+    classes: of each restored one; by default each is a class of its own.
+    """
 
     name: str
     spectrum: Tensor
     powers: Tensor
+    classes: tuple[str, ...] = ()
 
     @property
     def mark(self) -> str:
@@ -94,15 +102,18 @@ class Bank:
         return mark_of(self.spectrum, self.powers)
 
     @classmethod
-    def of(cls, name: str, train: Tensor, test: Tensor) -> "Bank":
-        """Periodic pictures (A, n, n) to make filters for, (B, n, n) to restore."""
-        powers = [_power(picture) for picture in test]
-        return cls(name, sum(map(_power, train)) / len(train), torch.stack(powers))
+    def of(cls, name: str, train: Tensor, test: Tensor, classes: Sequence[str] = ()) -> "Bank":
+        """Periodic pictures (A, n, n) to make filters for, (B, n, n) to restore, and the classes of the latter."""
+        powers = [power(picture) for picture in test]
+        return cls(name, sum(map(power, train)) / len(train), torch.stack(powers), tuple(classes))
 
+    @property
+    def class_count(self) -> int:
+        return len(set(self.classes)) or len(self.powers)
 
-def _power(picture: Tensor) -> Tensor:
-    transformed = torch.fft.fft2(picture)
-    return (transformed.real**2 + transformed.imag**2) / picture.numel()
+    def drawn(self, *, seed: int = 0) -> Tensor:
+        """`drawn` of the restored pictures."""
+        return drawn(self.classes or range(len(self.powers)), seed=seed)
 
 
 #: Errors (B, D, W) of every picture, by filter.
@@ -115,35 +126,42 @@ def errors_of(H: Tensor, world: World, bank: Bank) -> Errors:
     at_design = H[world.depths.index(world.design)]
     gamma = best_gamma(H, bank.spectrum, world.noise, at_design)
     filters = {"wiener": wiener(at_design, gamma), "blind": blind_filter(H, bank.spectrum, world.noise)}
-    return {name: _errors(H, G, world.noise, bank.powers) for name, G in filters.items()}
+    return {name: errors_of_pictures(H, G, world.noise, bank.powers) for name, G in filters.items()}
 
 
-def _errors(H: Tensor, G: Tensor, noise: float, powers: Tensor) -> Tensor:
-    left = torch.view_as_real(1 - G * H).square().sum(-1).flatten(2)  # (D, W, n²)
-    added = noise**2 * torch.view_as_real(G).square().sum(-1).mean((-2, -1))
-    return (left @ powers.flatten(1).T / left.shape[-1]).movedim(-1, 0) + added
-
-
-def mean_psnr(errors: Tensor, weights: Tensor | None = None) -> Tensor:
-    """PSNR (R,) in dB, mean over depths, of errors (B, D, W) over pictures and colours.
+def pooled_psnr(errors: Tensor, weights: Tensor | None = None) -> Tensor:
+    """PSNR (R,) in dB of the mean error over pictures and colours, mean over depths; errors: (B, D, W).
 
     weights: (R, B) of the pictures, by default once each.
     """
-    if weights is None:
-        weights = errors.new_ones(1, len(errors))
-    own = weights / weights.sum(1, keepdim=True) @ errors.mean(-1)
-    return psnr(own).mean(-1)
+    return psnr(_shares(errors, weights) @ errors.mean(-1)).mean(-1)
 
 
-def drawn(count: int, *, draws_of: int = _DRAWS, seed: int = 0) -> Tensor:
-    """How often (R, B) each of `count` pictures stands in samples as large, drawn with replacement."""
+def mean_psnr(errors: Tensor, weights: Tensor | None = None) -> Tensor:
+    """PSNR (R,) in dB of each picture at each depth, mean over pictures and depths; arguments: of `pooled_psnr`."""
+    return (_shares(errors, weights) @ psnr(errors.mean(-1))).mean(-1)
+
+
+def _shares(errors: Tensor, weights: Tensor | None) -> Tensor:
+    weights = errors.new_ones(1, len(errors)) if weights is None else weights
+    return weights / weights.sum(1, keepdim=True)
+
+
+def drawn(classes: Sequence, *, draws_of: int = _DRAWS, seed: int = 0) -> Tensor:
+    """How often (R, B) each picture occurs in samples of as many classes, drawn with replacement.
+
+    classes: (B,) of each picture.
+    """
+    order = sorted(set(classes))
+    count, place = len(order), [order.index(own) for own in classes]
     random = draws(seed, count, _BOOTSTRAP)
-    return torch.as_tensor(random.multinomial(count, np.full(count, 1 / count), draws_of).astype(np.float64))
+    times = random.multinomial(count, np.full(count, 1 / count), draws_of).astype(np.float64)
+    return torch.as_tensor(times)[:, place]
 
 
 @dataclasses.dataclass(frozen=True)
 class Interval:
-    """A number, and where it lies in 95 of 100 samples of pictures."""
+    """A number, and where it lies in 95 of 100 samples of classes of pictures."""
 
     value: float
     low: float
@@ -152,11 +170,34 @@ class Interval:
     def __str__(self) -> str:
         return f"{self.value:+.2f} ({self.low:+.2f} … {self.high:+.2f})"
 
+    def record(self, name: str) -> dict[str, float]:
+        """Columns NAME, NAME_low, NAME_high."""
+        return {name: self.value, f"{name}_low": self.low, f"{name}_high": self.high}
 
-def gain(errors: Tensor, base: Tensor, weights: Tensor) -> Interval:
-    """Mean PSNR of errors (B, D, W) over that of others, of the same pictures."""
-    between = (mean_psnr(errors, weights) - mean_psnr(base, weights)).quantile(weights.new_tensor([0.025, 0.975]))
-    return Interval(float(mean_psnr(errors) - mean_psnr(base)), *between.tolist())
+
+def gain(
+    errors: Tensor, base: Tensor, weights: Tensor, *, mean: Callable[[Tensor, Tensor | None], Tensor] = pooled_psnr
+) -> Interval:
+    """PSNR of errors (B, D, W) over that of others, of the same pictures; mean: over pictures, by which of the two."""
+    between = (mean(errors, weights) - mean(base, weights)).quantile(weights.new_tensor([0.025, 0.975]))
+    return Interval(float(mean(errors, None) - mean(base, None)), *between.tolist())
+
+
+@dataclasses.dataclass(frozen=True)
+class Gains:
+    """PSNR in dB of an element and its gain over another: of errors pooled over pictures, and as the mean of the PSNRs
+    of single pictures."""
+
+    pooled_psnr: float
+    pooled: Interval
+    mean_psnr: float
+    mean: Interval
+
+    @classmethod
+    def of(cls, errors: Tensor, base: Tensor, weights: Tensor) -> "Gains":
+        """Of errors (B, D, W) and those of the other element of the same pictures; weights: of `drawn`."""
+        both = ((float(mean(errors)), gain(errors, base, weights, mean=mean)) for mean in (pooled_psnr, mean_psnr))
+        return cls(*(one for pair in both for one in pair))
 
 
 # --- baselines

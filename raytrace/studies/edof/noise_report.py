@@ -22,34 +22,39 @@ from raytrace.pages import grid, picture
 from raytrace.stores import number, read_document
 from raytrace.studies.edof.command import LIMIT
 from raytrace.studies.edof.noise import (
-    FILTERS,
     Bank,
     Errors,
+    Gains,
     Interval,
     Unit,
     best_strengths,
     cases,
-    drawn,
     errors_of,
-    gain,
     mark_of,
     mark_of_elements,
-    mean_psnr,
+    pooled_psnr,
     units,
 )
 from raytrace.studies.edof.noise_command import Settings
-from raytrace.studies.edof.report import contents_of, learn
+from raytrace.studies.edof.report import contents_of, heights_of, learn
 from raytrace.studies.edof.table import ROWS, title_of
 from raytrace.studies.edof.training import EdofCamera
-from raytrace.studies.edof.world import WAVELENGTH, ClosedForm, World, kernels, transfer
+from raytrace.studies.edof.world import FILTERS, WAVELENGTH, ClosedForm, World, kernels, transfer
 from raytrace.studies.options import picture_words
 from raytrace.studies.pictures import Pictures
 from raytrace.studies.publish import publish, published
-from raytrace.wave.element import Element, Rings, as_made, is_flat
+from raytrace.wave.element import Element, Rings, fabricated, is_flat
 from raytrace.wave.element_file import SMOOTH, read_element, write_element
 from raytrace.words import did_you_mean
 
+#: What intervals of all pages of these studies are.
+OF_INTERVALS = "interval of 95 % of 2,000 samples of the classes of restored pictures, drawn with replacement"
 TITLES = {"wiener": "Wiener filter of the PSF at 1 m", "blind": "best depth-invariant filter"}
+#: Means over pictures, and PSNR and gain as text of each.
+MEANS: dict[str, Callable[[Gains], tuple[str, str]]] = {
+    "errors pooled over pictures": lambda one: (f"{one.pooled_psnr:.2f}", str(one.pooled)),
+    "mean of the PSNRs of pictures": lambda one: (f"{one.mean_psnr:.2f}", str(one.mean)),
+}
 _PUBLISHED = ROWS["learned"].published - ROWS["fresnel"].published
 
 
@@ -57,30 +62,32 @@ _PUBLISHED = ROWS["learned"].published - ROWS["fresnel"].published
 class Score:
     """One element on one content behind one filter at one noise: PSNR in dB and gain over the Fresnel lens.
 
-    starts: gains of all random starts it was kept from, that of least expected error first.
+    starts: gains, of pooled errors, of all random starts it was kept from, that of least expected error first.
     """
 
     content: str
     filter: str
     noise: float
     row: str
-    psnr: float
-    gain: Interval
+    gains: Gains
     starts: tuple[float, ...] = ()
 
     def record(self) -> dict:
         ends = (min(self.starts), max(self.starts)) if self.starts else (None, None)
-        own = {name: getattr(self, name) for name in ("content", "filter", "noise", "row", "psnr")}
-        own |= {"gain": self.gain.value, "low": self.gain.low, "high": self.gain.high}
+        own = {name: getattr(self, name) for name in ("content", "filter", "noise", "row")}
+        found = self.gains
+        own |= {"psnr": found.pooled_psnr, **found.pooled.record("gain")}
+        own |= {"mean_psnr": found.mean_psnr, **found.mean.record("mean_gain")}
         return own | {"starts": len(self.starts) or None, "least_start": ends[0], "greatest_start": ends[1]}
 
 
 @dataclasses.dataclass(frozen=True)
 class OverNoise(Result):
-    """Scores of all rows; pictures: how many are restored, by content."""
+    """Scores of all rows; pictures, classes: how many are restored, and of how many classes, by content."""
 
     scores: list[Score]
     pictures: dict[str, int]
+    classes: dict[str, int] = dataclasses.field(default_factory=dict)
 
     FIGURE = "studies.edof.figures.noise_figure"
 
@@ -109,9 +116,13 @@ class OverNoise(Result):
         text = []
         for content in self.pictures:
             for filter in FILTERS:
-                text.append(f"{content}, {TITLES[filter]}: PSNR in dB, gain over the Fresnel lens (95 % interval)")
-                header, lines = self.lines(content, filter, lambda one: f"{one.psnr:.2f} {one.gain}")
-                text += [f"{line[0]:>32}" + "".join(f"{cell:>30}" for cell in line[1:]) for line in [header, *lines]]
+                for mean, shown in MEANS.items():
+                    head = f"{content}, {TITLES[filter]}: PSNR in dB, gain over the Fresnel lens (95 % interval)"
+                    text.append(f"{head}, {mean}")
+                    header, lines = self.lines(content, filter, lambda one, shown=shown: " ".join(shown(one.gains)))
+                    text += [
+                        f"{line[0]:>32}" + "".join(f"{cell:>30}" for cell in line[1:]) for line in [header, *lines]
+                    ]
         return "\n".join(text)
 
 
@@ -122,7 +133,7 @@ def noise(arguments: argparse.Namespace) -> OverNoise:
     todo = list(units(rows, settings.noise, settings.starts))
     with tempfile.TemporaryDirectory() as unkept:
         root = Path(arguments.folder or unkept)
-        banks = [Bank.of(content.name, content.train, content.test) for content in contents]
+        banks = [Bank.of(content.name, content.train, content.test, content.classes) for content in contents]
         del contents
         kept = Kept(root / "judged", banks)  # refuses other pictures before anything is learned
         for unit in todo:
@@ -132,7 +143,8 @@ def noise(arguments: argparse.Namespace) -> OverNoise:
         bar = progress(todo, "learned element")
         learned = {unit: judge_learned(unit, settings, train, root, kept) for unit in bar}
         elements = _best_learned(todo, learned, settings, train, root)
-    found = OverNoise(list(scores(fixed, learned, banks, settings)), {one.name: len(one.powers) for one in banks})
+    counts = ({one.name: len(one.powers) for one in banks}, {one.name: one.class_count for one in banks})
+    found = OverNoise(list(scores(fixed, learned, banks, settings)), *counts)
     if arguments.docs:
         _publish(found, elements, settings, arguments)
     return found
@@ -263,7 +275,7 @@ def _best_learned(
     found = {}
     for (row, own), unit in best.items():
         element = detached(learn_unit(unit, settings, train, root).variables()[0])
-        name, made = (".npy", as_made(element)) if is_flat(element) else (SMOOTH, element)
+        name, made = (".npy", fabricated(element)) if is_flat(element) else (SMOOTH, element)
         found[f"{row}-{own:g}{name}"] = made
     return found
 
@@ -292,16 +304,15 @@ def scores(
     for unit, own in learned.items():
         by.setdefault((unit.row, unit.noise), []).append(own)
     for bank in banks:
-        weights = drawn(len(bank.powers), seed=settings.seed)
+        weights = bank.drawn(seed=settings.seed)
         for filter in FILTERS:
             base = {own: fixed["fresnel", own][bank.name][filter] for own in settings.noise}
             for (row, own), errors in [*fixed.items(), *by.items()]:
                 several = isinstance(errors, list)
                 ordered = [e for _, e in sorted(errors, key=lambda one: one[0])] if several else [errors]
                 given = [each[bank.name][filter] for each in ordered]
-                gains = tuple(float(mean_psnr(e) - mean_psnr(base[own])) for e in given) if several else ()
-                interval = gain(given[0], base[own], weights)
-                yield Score(bank.name, filter, own, row, float(mean_psnr(given[0])), interval, gains)
+                starts = tuple(float(pooled_psnr(e) - pooled_psnr(base[own])) for e in given) if several else ()
+                yield Score(bank.name, filter, own, row, Gains.of(given[0], base[own], weights), starts)
 
 
 # --- the page
@@ -331,30 +342,44 @@ def _publish(
     words += element_words(arguments)
     words += [*picture_words(arguments, LIMIT), *settings.words()]
     command = " ".join(["raytrace wave noise", *words, "-o FOLDER --docs docs"])
-    parts = _parts(found, list(elements), command)
+    parts = _parts(found, elements, command)
     publish(Path(arguments.docs) / "wave_noise.md", "wave", parts, tables=tables, figures={"noise.png": found.plot()})
 
 
-def _parts(found: OverNoise, files: Sequence[str], command: str) -> list[str]:
-    """files: names of those that hold the elements that were kept."""
+def _parts(found: OverNoise, elements: Mapping[str, Element], command: str) -> list[str]:
+    """elements: those that were kept, by the name of their file."""
     shown = "pictures" if "pictures" in found.pictures else next(iter(found.pictures))
-    counted = ", ".join(f"{count} of {name}" for name, count in found.pictures.items())
     others = [name for name in found.pictures if name != shown]
     return [
         "# Extended depth of field over noise",
         f"    {command}",
         "Camera, depths and colours of [wave_edof.md](wave_edof.md). For every noise elements are learned, filters "
         "made and the strength of cubic plates chosen anew; learned elements know only the spectrum of sharp dead "
-        "leaves. Of several random starts that of least expected error is kept. PSNR in dB, mean over depths; gains "
-        "are over the Fresnel lens on the same pictures, with the interval of 95 % of 2,000 samples of the restored "
-        f"pictures drawn with replacement. Restored: {counted}; filters are made for others.",
+        "leaves. Of several random starts that of least expected error is kept. PSNR in dB, mean over depths, of "
+        "errors pooled over pictures and, the usual one, as the mean of the PSNRs of single pictures; gains are over "
+        f"the Fresnel lens on the same pictures, with the {OF_INTERVALS}. Restored: "
+        f"{counted(found.pictures, found.classes)}; filters are made for others.",
         *headline(found, shown),
-        picture("wave/noise.png", f"Gain over the Fresnel lens on {shown}, bands: 95 % intervals over the pictures."),
+        picture(
+            "wave/noise.png",
+            f"Gain over the Fresnel lens on {shown}, errors pooled over pictures; bands: 95 % intervals over classes.",
+        ),
         *(part for filter in FILTERS for part in _tables(found, shown, filter)),
         *(part for name in others for part in _tables(found, name, "wiener", only_gain=True)),
         "All figures: [noise.csv](wave/noise.csv).",
-        *_again(found, files),
+        *([heights_of({Path(name).stem: one for name, one in elements.items()})] if elements else []),
+        *_again(found, list(elements)),
     ]
+
+
+def counted(pictures: Mapping[str, int], classes: Mapping[str, int]) -> str:
+    """How many pictures are restored, by content, and of how many classes where these are not single pictures."""
+
+    def of_classes(name: str) -> str:
+        several = classes.get(name, pictures[name])
+        return "" if several == pictures[name] else f" of {several} classes"
+
+    return ", ".join(f"{count} of {name}{of_classes(name)}" for name, count in pictures.items())
 
 
 def _again(found: OverNoise, files: Sequence[str]) -> Iterable[str]:
@@ -373,15 +398,17 @@ def _again(found: OverNoise, files: Sequence[str]) -> Iterable[str]:
 
 def _tables(found: OverNoise, content: str, filter: str, *, only_gain: bool = False) -> Iterable[str]:
     yield f"## {content[0].upper()}{content[1:]}, {TITLES[filter]}"
-    yield "Gain over the Fresnel lens, dB:"
-    yield grid(*found.lines(content, filter, lambda one: str(one.gain)))
+    for mean, shown in MEANS.items():
+        yield f"Gain over the Fresnel lens, dB, {mean}:"
+        yield grid(*found.lines(content, filter, lambda one, shown=shown: shown(one.gains)[1]))
     if only_gain:
         return
-    yield "PSNR, dB:"
-    yield grid(*found.lines(content, filter, lambda one: f"{one.psnr:.2f}"))
+    for mean, shown in MEANS.items():
+        yield f"PSNR, dB, {mean}:"
+        yield grid(*found.lines(content, filter, lambda one, shown=shown: shown(one.gains)[0]))
     started = {row: own for row, own in found.of(content, filter).items() if any(one.starts for one in own.values())}
     if started:
-        yield "Gain of every random start, from the least to the greatest:"
+        yield "Gain of every random start, errors pooled over pictures, from the least to the greatest:"
         header, _ = found.lines(content, filter, str)
         yield grid(
             header,
@@ -402,9 +429,11 @@ def headline(found: OverNoise, content: str) -> Iterable[str]:
         f"they report {_PUBLISHED:+.2f} dB"
     )
     verdicts = [
-        [f"{noise:g}", f"{one.psnr:.2f}", str(one.gain), _verdict(one.gain)] for noise, one in sorted(own.items())
+        [f"{noise:g}", *(cell for gain in (one.gains.pooled, one.gains.mean) for cell in (str(gain), _verdict(gain)))]
+        for noise, one in sorted(own.items())
     ]
-    yield grid(("noise", "PSNR, dB", "gain over the Fresnel lens, dB", f"beside {_PUBLISHED:+.2f} dB"), verdicts)
+    compared = f"compared with {_PUBLISHED:+.2f} dB"
+    yield grid(("noise", "gain, dB, pooled", compared, "gain, dB, mean of PSNRs", compared), verdicts)
 
 
 def _verdict(gain: Interval) -> str:

@@ -18,13 +18,23 @@ from raytrace.pages import grid, picture
 from raytrace.studies.edof.command import LIMIT
 from raytrace.studies.edof.scene import deep, flat
 from raytrace.studies.edof.settings import Settings
-from raytrace.studies.edof.table import ROWS, Content, elements_of, records, table_of
+from raytrace.studies.edof.table import ROWS, Content, elements_of, records, table_of, title_of
 from raytrace.studies.edof.training import EdofCamera, begin, learn_element
-from raytrace.studies.edof.world import Judged, Quality, World, depth_text, kernels, periodic, quality, spectrum
+from raytrace.studies.edof.world import (
+    FILTERS,
+    Judged,
+    Quality,
+    World,
+    depth_text,
+    kernels,
+    periodic,
+    quality,
+    spectrum,
+)
 from raytrace.studies.options import picture_words
 from raytrace.studies.pictures import Pictures, dead_leaves, digest, pictures, pictures_of, split
 from raytrace.studies.publish import publish
-from raytrace.wave.element import Element, as_made, as_pixels
+from raytrace.wave.element import Element, as_pixels, fabricated, height_range
 from raytrace.wave.element_file import write_element
 from raytrace.words import did_you_mean
 
@@ -85,7 +95,7 @@ def edof(arguments: argparse.Namespace) -> Learned:
         own = quality(elements, world, train=periodic(train, _WIDE), test=periodic(test, _WIDE), found=found)
     learned = Learned(elements, world, found, own, settings)
     write_json(folder / "outcome.json", learned.document())
-    made = as_made(elements[0]) if settings.kind == "rings" else as_pixels(elements[0], world.pixel)
+    made = fabricated(elements[0]) if settings.kind == "rings" else as_pixels(elements[0], world.pixel)
     write_element(made, folder / "heights.npy", design_wavelength=world.wavelengths[len(world.wavelengths) // 2])
     say(f"written: {folder / 'outcome.json'}, {folder / 'heights.npy'}")
     return learned
@@ -170,36 +180,45 @@ class Table(Result):
 
     def rows(self, content: str) -> Iterator[tuple]:
         """Of each row its record, its quality, and PSNR by filter and as published, gains over the Fresnel lens beside
-        them."""
+        them: of pooled errors, then as the mean of the PSNRs of pictures."""
         base = ROWS["fresnel"].published
         for record in records({content: self.found[content]}):
-            gains = [record[f"gain_{filter}"] for filter in ("wiener", "blind")]
-            beside = ["" if gain is None else f" ({gain:+.2f})" for gain in gains]
+            columns = [(f"{mean}{filter}", f"{mean}gain_{filter}") for mean in ("", "mean_") for filter in FILTERS]
             published = record["published"]
             yield (
                 record,
                 self.found[content][record["row"]],
-                *(f"{record[filter]:.2f}{gain}" for filter, gain in zip(("wiener", "blind"), beside, strict=True)),
+                *(
+                    f"{record[one]:.2f}" + ("" if record[gain] is None else f" ({record[gain]:+.2f})")
+                    for one, gain in columns
+                ),
                 f"{published:.2f} ({published - base:+.2f})" if published else "",
             )
 
     def __str__(self) -> str:
         text = []
         for content in self.found:
-            text.append(f"{content}: PSNR of restored pictures, dB (gain over the Fresnel lens)")
-            text.append(f"{'':>32} {'Wiener':>14} {'invariant':>14} {'spread':>7} {'Sitzmann 2018':>14}")
-            for record, _, classic, invariant, published in self.rows(content):
+            text.append(
+                f"{content}: PSNR of restored pictures, dB (gain over the Fresnel lens); errors pooled over "
+                "pictures, then the mean of their PSNRs"
+            )
+            text.append(
+                f"{'':>32}" + 2 * f" {'Wiener':>14} {'invariant':>14}" + f" {'spread':>7} {'Sitzmann 2018':>14}"
+            )
+            for record, _, *cells, published in self.rows(content):
                 title, spread = ROWS[record["row"]].title, record["spread_blind"]
-                text.append(f"{title:>32} {classic:>14} {invariant:>14} {spread:>7.2f} {published:>14}")
+                shown = "".join(f" {cell:>14}" for cell in cells)
+                text.append(f"{title:>32}{shown} {spread:>7.2f} {published:>14}")
             text.append("")
         return "\n".join(text)
 
     def markdown(self, content: str) -> str:
-        header = ("element", "Wiener, 1 m", "depth-invariant", "worst", "spread", "light in window", "Sitzmann 2018")
+        means = ("Wiener, 1 m", "depth-invariant", "Wiener, mean of PSNRs", "depth-invariant, mean of PSNRs")
+        header = ("element", *means, "worst", "spread", "light in window", "Sitzmann 2018")
         lines = []
-        for record, own, classic, invariant, published in self.rows(content):
+        for record, own, *psnrs, published in self.rows(content):
             base = record["row"] == "fresnel"
-            cells = [cell.partition(" ")[0] if base else cell for cell in (classic, invariant)]
+            cells = [cell.partition(" ")[0] if base else cell for cell in psnrs]
             numbers = (record["worst_blind"], record["spread_blind"], min(min(row) for row in own.energy))
             cells += [*(f"{number:.2f}" for number in numbers), published or "–"]
             lines.append([ROWS[record["row"]].title, *cells])
@@ -221,7 +240,9 @@ def table(arguments: argparse.Namespace) -> Table:
     found = table_of(contents, elements, world, progress=lambda given: progress(given, "row"))
     if arguments.docs:
         drawn = _figures(found, elements, world, arguments.seed or 0)
-        parts = _parts(Table(found), contents, world, _command(arguments), [name for name in CAPTIONS if name in drawn])
+        named = [name for name in CAPTIONS if name in drawn]
+        single = {title_of(name): own[0] for name, own in elements.items() if name in learned and len(own) == 1}
+        parts = _parts(Table(found), contents, world, _command(arguments), named, single)
         rows = {"table.csv": csv(records(found), floats=lambda number: round(number, 3))}
         publish(Path(arguments.docs) / "wave_edof.md", "wave", parts, tables=rows, figures=drawn)
     return Table(found)
@@ -233,7 +254,9 @@ def contents_of(arguments: argparse.Namespace) -> tuple[list[Content], Pictures]
     parts = {name: split(_pictures(leaves, name)) for name in progress(LEAVES, "dead leaf")}
     if arguments.data:
         parts["pictures"] = split(_pictures(arguments, "sharp leaves"))
-    contents = [Content(name, *(periodic(part, _WIDE) for part in both)) for name, both in parts.items()]
+    contents = [
+        Content(name, *(periodic(part, _WIDE) for part in both), both[1].classes) for name, both in parts.items()
+    ]
     return contents, parts["sharp leaves"][0]
 
 
@@ -281,7 +304,21 @@ def _figures(found, elements: Mapping[str, Sequence[Element]], world: World, see
     return made
 
 
-def _parts(table: Table, given: Sequence[Content], world: World, command: str, figures: Sequence[str]) -> list[str]:
+def heights_of(elements: Mapping[str, Element]) -> str:
+    """A sentence on the heights of elements inside their aperture, by title."""
+    ranges = {title: height_range(element) for title, element in elements.items()}
+    listed = "; ".join(f"{title} {1e3 * (high - low):.3g} µm" for title, (low, high) in ranges.items())
+    return f"Heights, largest less smallest inside the aperture: {listed}."
+
+
+def _parts(
+    table: Table,
+    given: Sequence[Content],
+    world: World,
+    command: str,
+    figures: Sequence[str],
+    learned: Mapping[str, Element],
+) -> list[str]:
     depths = ", ".join(map(depth_text, world.depths))
     colours = ", ".join(f"{1e3 * w:.0f}" for w in world.wavelengths)
     judged = ", ".join(f"{len(one.test)} {pictures_of(one.name)}" for one in given)
@@ -296,9 +333,11 @@ def _parts(table: Table, given: Sequence[Content], world: World, command: str, f
         f"{world.design / 1e3:g} m at 550 nm. Judged on {judged}, expected over noise, none drawn; filters are "
         f"made for {others} others. Learned elements know only the spectrum of sharp dead leaves.",
         *(part for parts in contents for part in parts),
-        "Mean PSNR over depths in dB, in brackets the gain over the Fresnel lens. Worst: the worst depth, spread: the "
-        "best less the worst, both behind the depth-invariant filter. Sitzmann 2018: as published by Sitzmann et "
-        "al., SIGGRAPH 2018, of other pictures. "
+        "PSNR in dB, mean over depths, of errors pooled over pictures and as the mean of the PSNRs of single pictures; "
+        "in brackets the gain over the Fresnel lens. Worst: the worst depth, spread: the best less the worst, both "
+        "behind the depth-invariant filter. Sitzmann 2018: as published by Sitzmann et al., SIGGRAPH 2018, of other "
+        "pictures. "
         "All figures: [table.csv](wave/table.csv).",
+        *([heights_of(learned)] if learned else []),
         *(picture(f"wave/{name}", CAPTIONS[name]) for name in figures),
     ]

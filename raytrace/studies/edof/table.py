@@ -62,11 +62,12 @@ STRENGTHS = (5.0, 10.0, 15.0, 20.0, 30.0)
 
 @dataclasses.dataclass(frozen=True)
 class Content:
-    """Pictures (B, n, n), periodic: to make filters for, and to restore."""
+    """Pictures (B, n, n), periodic: to make filters for, and to restore; classes: of those, each its own by default."""
 
     name: str
     train: Tensor
     test: Tensor
+    classes: tuple[str, ...] = ()
 
 
 def elements_of(
@@ -120,7 +121,12 @@ def records(found: Mapping[str, Mapping[str, Quality]]) -> list[dict]:
         base = rows.get("fresnel")
         for name, own in rows.items():
             gains = {f"gain_{filter}": own.mean[filter] - base.mean[filter] if base else None for filter in own.mean}
+            each = {f"mean_{filter}": value for filter, value in own.of_pictures.items()}
+            each |= {
+                f"mean_gain_{filter}": value - base.of_pictures[filter] if base else None
+                for filter, value in own.of_pictures.items()
+            }
             spread = {"spread_blind": own.spread["blind"], "worst_blind": min(own.by_depth["blind"])}
             head = {"content": content, "row": name}
-            result.append({**head, **own.mean, **gains, **spread, "published": ROWS[name].published})
+            result.append({**head, **own.mean, **gains, **each, **spread, "published": ROWS[name].published})
     return result

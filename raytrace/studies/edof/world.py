@@ -16,7 +16,7 @@ import scipy.optimize
 import torch
 from torch import Tensor, nn
 
-from raytrace.camera.deconvolve import blind_error, blind_filter, errors, power_spectrum, psnr, wiener
+from raytrace.camera.deconvolve import blind_error, blind_filter, power_spectrum, psnr, wiener
 from raytrace.camera.image import transfer_functions
 from raytrace.maths.grid import grid
 from raytrace.maths.result import Result
@@ -29,6 +29,7 @@ from raytrace.wave.plan import plan
 from raytrace.wave.psf import ElementPsf, psf
 from raytrace.wave.scene import WaveScene, is_round
 
+FILTERS = ("wiener", "blind")  # of restoration
 WAVELENGTH = 0.55  # µm: that elements are designed for, and wrapped at
 _START = 21  # last number of the key of a random start
 
@@ -117,6 +118,19 @@ def spectrum(pictures: Tensor) -> Tensor:
     return power_spectrum(pictures, window="none")
 
 
+def power(picture: Tensor) -> Tensor:
+    """|X|² (n, n) of a periodic picture (n, n), over the number of its pixels."""
+    transformed = torch.fft.fft2(picture)
+    return (transformed.real**2 + transformed.imag**2) / picture.numel()
+
+
+def errors_of_pictures(H: Tensor, G: Tensor, noise: float, powers: Tensor) -> Tensor:
+    """Mean square errors (B, D, W) of pictures of `power` (B, n, n) behind filters G, expected over noise."""
+    left = torch.view_as_real(1 - G * H).square().sum(-1).flatten(2)  # (D, W, n²)
+    added = noise**2 * torch.view_as_real(G).square().sum(-1).mean((-2, -1))
+    return (left @ powers.flatten(1).T / left.shape[-1]).movedim(-1, 0) + added
+
+
 def expected_error(H: Tensor, S: Tensor, noise: float) -> Tensor:
     """Mean square error behind the best blind filter, in closed form, mean over colours."""
     return blind_error(H, S, noise).mean()
@@ -153,13 +167,15 @@ class ClosedForm:
 class Quality:
     """What an element is worth, by filter: PSNR in dB of restored pictures.
 
-    by_depth: (D,) of each filter, of the error over pictures and colours; mean: over the depths; spread: best less
-    worst depth; by_colour: (W,), mean over the depths; gamma: of the Wiener filter; energy: (D, W) inside the window.
+    by_depth: (D,) of each filter, of the error pooled over pictures and colours; mean: over the depths; of_pictures:
+    the mean of the PSNRs of single pictures at each depth; spread: best less worst depth; by_colour: (W,), mean over
+    the depths; gamma: of the Wiener filter; energy: (D, W) inside the window.
     """
 
     by_depth: dict[str, tuple[float, ...]]
     by_colour: dict[str, tuple[float, ...]]
     mean: dict[str, float]
+    of_pictures: dict[str, float]
     spread: dict[str, float]
     gamma: float
     energy: tuple[tuple[float, ...], ...]
@@ -184,16 +200,19 @@ def quality(
         at_design = transfer(kernels(elements, world, depths=[world.design]), size)[0]
     gamma = best_gamma(H, S, world.noise, at_design)
     filters = {"wiener": wiener(at_design, gamma), "blind": blind_filter(H, S, world.noise)}
-    shown = spectrum(test)
-    by_depth, by_colour = {}, {}
+    powers = torch.stack([power(picture) for picture in test])
+    by_depth, by_colour, of_pictures = {}, {}, {}
     for name, G in filters.items():
-        left = errors(H, shown, world.noise, filter=G)  # (D, W)
+        each = errors_of_pictures(H, G, world.noise, powers)  # (B, D, W)
+        left = each.mean(0)
+        of_pictures[name] = float(psnr(each.mean(-1)).mean())
         by_depth[name] = tuple(psnr(left.mean(1)).tolist())
         by_colour[name] = tuple(psnr(left).mean(0).tolist())
     return Quality(
         by_depth,
         by_colour,
         {name: float(np.mean(values)) for name, values in by_depth.items()},
+        of_pictures,
         {name: max(values) - min(values) for name, values in by_depth.items()},
         gamma,
         tuple(map(tuple, found.energy.tolist())),

@@ -93,12 +93,12 @@ def etch_figure(found) -> Figure:
     for number, (filter, label) in enumerate((("wiener", "Wiener, 1 m"), ("blind", "depth-invariant"))):
         rows = [one for one in found.rows if (one.content, one.filter, one.noise) == (content, filter, noise)]
         place = np.arange(len(rows))[::-1] + 0.12 * (1 - 2 * number)
-        gains = [one.gains["fresnel"] for one in rows]
+        gains = [one.gains["fresnel"].pooled for one in rows]
         values = np.array([one.value for one in gains])
         beside = np.abs(np.array([(one.value - one.low, one.high - one.value) for one in gains]).T)
         axes.errorbar(values, place, xerr=beside, fmt="os"[number], ms=5, lw=1.2, capsize=2,
                       color=FIELD_COLOURS[number], label=f"{label} filter")  # fmt: skip
-        hybrid = rows[0].gains["fresnel"].value - rows[0].gains["hybrid"].value
+        hybrid = rows[0].gains["fresnel"].pooled.value - rows[0].gains["hybrid"].pooled.value
         axes.axvline(hybrid, color=FIELD_COLOURS[number], lw=0.9, ls=(0, (2, 2)))
     axes.set_yticks(np.arange(len(rows))[::-1], [one.title for one in rows])
     axes.set(xlabel=f"PSNR over that of the Fresnel lens (dB), {content}, noise {noise:g}; dashed: the hybrid achromat")

@@ -19,7 +19,7 @@ from raytrace.studies.edof.noise import Unit
 from raytrace.studies.edof.training import adam
 from raytrace.studies.edof.world import ClosedForm
 from raytrace.studies.pictures import draws
-from raytrace.wave.element import Element, as_made, with_tolerance
+from raytrace.wave.element import Element, fabricated, with_tolerance
 from raytrace.wave.etching import Process, matched
 
 _DRAW, _MOVE = 26, 27  # last numbers of the keys of errors of height, of rings that may move
@@ -68,7 +68,9 @@ def etch_rings(
     """Rings as the process makes them, learned: `steps` with any depth, then `moves` between levels; depths in mm."""
     wavelengths = model.radius.new_tensor(expected.world.wavelengths)
     start, _ = matched(model, dataclasses.replace(process, levels=0), wavelengths)
-    continuous = as_made(learn_depths(start, process, expected, steps=steps, rate=rate, seed=seed, progress=progress))
+    continuous = fabricated(
+        learn_depths(start, process, expected, steps=steps, rate=rate, seed=seed, progress=progress)
+    )
     if not process.levels:
         return continuous
     step = process.period(model) / process.levels

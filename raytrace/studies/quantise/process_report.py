@@ -15,7 +15,7 @@ from raytrace.maths.result import Result
 from raytrace.maths.value import detached
 from raytrace.pages import grid, picture
 from raytrace.studies.edof.command import LIMIT
-from raytrace.studies.edof.noise import FILTERS, Bank, Errors, Interval, drawn, gain, mean_psnr
+from raytrace.studies.edof.noise import Bank, Errors, Gains, pooled_psnr
 from raytrace.studies.edof.noise_command import Settings as Noise
 from raytrace.studies.edof.noise_report import (
     TITLES,
@@ -26,7 +26,7 @@ from raytrace.studies.edof.noise_report import (
     publish_elements,
 )
 from raytrace.studies.edof.report import contents_of
-from raytrace.studies.edof.world import ClosedForm, World, periodic, spectrum
+from raytrace.studies.edof.world import FILTERS, ClosedForm, World, periodic, spectrum
 from raytrace.studies.options import picture_words
 from raytrace.studies.pictures import Pictures, digest
 from raytrace.studies.publish import publish
@@ -54,15 +54,16 @@ class Etched:
     waves: int
     levels: int
     relief: float
-    psnr: float
-    gains: dict[str, Interval]
+    gains: dict[str, Gains]
     starts: tuple[float, ...]
     lost: float
 
     def record(self) -> dict:
-        own = {name: getattr(self, name) for name in ("content", "filter", "noise", "waves", "levels", "psnr", "lost")}
+        own = {name: getattr(self, name) for name in ("content", "filter", "noise", "waves", "levels")}
+        first = next(iter(self.gains.values()))
+        own |= {"psnr": first.pooled_psnr, "mean_psnr": first.mean_psnr, "lost": self.lost}
         for base, one in self.gains.items():
-            own |= {f"over_{base}": one.value, f"over_{base}_low": one.low, f"over_{base}_high": one.high}
+            own |= one.pooled.record(f"over_{base}") | one.mean.record(f"mean_over_{base}")
         return own | {"least_start": min(self.starts), "greatest_start": max(self.starts), "starts": len(self.starts)}
 
     @property
@@ -88,7 +89,9 @@ class Etching(Result):
     def lines(self, content: str, filter: str) -> list[tuple[str, ...]]:
         chosen = [one for one in self.rows if (one.content, one.filter) == (content, filter)]
         return [
-            (f"{one.noise:g}", one.title, f"{one.psnr:.2f}", *map(str, one.gains.values()),
+            (f"{one.noise:g}", one.title, f"{one.gains['fresnel'].pooled_psnr:.2f}",
+             *(str(gain.pooled) for gain in one.gains.values()), f"{one.gains['fresnel'].mean_psnr:.2f}",
+             *(str(gain.mean) for gain in one.gains.values()),
              f"{min(one.starts):+.2f} … {max(one.starts):+.2f}", f"{one.lost:.2f}")
             for one in chosen
         ]  # fmt: skip
@@ -102,7 +105,8 @@ class Etching(Result):
         return "\n".join(text)
 
 
-_HEADER = ("noise", "relief, levels", "PSNR", *(f"over the {name}" for name in BASES.values()), "starts", "lost")
+_OVER = tuple(f"over the {name}" for name in BASES.values())
+_HEADER = ("noise", "relief, levels", "PSNR, pooled", *_OVER, "mean of PSNRs", *_OVER, "starts, pooled", "lost")
 
 
 def etch(arguments: argparse.Namespace) -> Etching:
@@ -110,7 +114,7 @@ def etch(arguments: argparse.Namespace) -> Etching:
     settings, root = Settings.of(vars(arguments)), Path(arguments.folder)
     contents, train = contents_of(arguments)
     todo = list(cases(settings.waves, settings.levels, settings.noise, settings.starts))
-    banks = [Bank.of(content.name, content.train, content.test) for content in contents]
+    banks = [Bank.of(content.name, content.train, content.test, content.classes) for content in contents]
     del contents
     kept = Kept(root / "judged", banks)  # refuses other pictures before anything is learned
     elements = {case: etched(case, settings, train, root) for case in progress(todo, "process")}
@@ -183,16 +187,16 @@ def _rows(
     depth = _reliefs(settings)
     rows = []
     for bank in banks:
-        weights = drawn(len(bank.powers), seed=settings.seed)
+        weights = bank.drawn(seed=settings.seed)
         for filter in FILTERS:
             for (noise, waves, levels), given in several.items():
                 ordered = sorted(given, key=lambda one: one[0])
                 base = {name: fixed[name, noise][bank.name][filter] for name in BASES}
                 errors = [own[bank.name][filter] for _, _, own in ordered]
-                gains = {name: gain(errors[0], own, weights) for name, own in base.items()}
-                starts = tuple(float(mean_psnr(own) - mean_psnr(base["fresnel"])) for own in errors)
+                gains = {name: Gains.of(errors[0], own, weights) for name, own in base.items()}
+                starts = tuple(float(pooled_psnr(own) - pooled_psnr(base["fresnel"])) for own in errors)
                 about = (bank.name, filter, noise, waves, levels, depth.get((waves, levels), 0.0))
-                rows.append(Etched(*about, float(mean_psnr(errors[0])), gains, starts, ordered[0][1]))
+                rows.append(Etched(*about, gains, starts, ordered[0][1]))
     return rows
 
 

@@ -9,13 +9,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from raytrace.camera.deconvolve import psnr
 from raytrace.camera.training import Run, read_state
 from raytrace.cli.progress import progress
 from raytrace.files import table, write_atomically
 from raytrace.maths.result import Result
 from raytrace.pages import grid, picture
-from raytrace.studies.edof.noise import Interval, drawn, gain
+from raytrace.studies.edof.noise import Gains, drawn
 from raytrace.studies.edof.world import World, periodic, spectrum
 from raytrace.studies.options import picture_words
 from raytrace.studies.pictures import Pictures, dead_leaves, digest, pictures, pictures_of, split
@@ -43,12 +42,12 @@ class Plated:
 
     colours: str
     found: Found
-    psnr: float
-    gain: Interval
+    gains: Gains
 
     def record(self) -> dict:
-        own = {"colours": self.colours} | self.found.record() | {"psnr": self.psnr}
-        return own | {"gain": self.gain.value, "low": self.gain.low, "high": self.gain.high}
+        own = {"colours": self.colours} | self.found.record()
+        own |= {"psnr": self.gains.pooled_psnr, **self.gains.pooled.record("gain")}
+        return own | {"mean_psnr": self.gains.mean_psnr, **self.gains.mean.record("mean_gain")}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +70,13 @@ class Discovered(Result):
             if one.colours == colours:
                 own, places = one.found, one.found.places
                 light = f"{sum(place.light for place in places):.2f}"
-                cells = (f"{own.before:.2f}", f"{own.after:.2f}", f"{one.psnr:.2f}", str(one.gain))
+                cells = (
+                    f"{own.before:.2f}",
+                    f"{own.after:.2f}",
+                    f"{one.gains.pooled_psnr:.2f}",
+                    str(one.gains.pooled),
+                    str(one.gains.mean),
+                )
                 rows.append((own.start, *cells, str(len(places)), light))
         return rows
 
@@ -90,7 +95,16 @@ class Discovered(Result):
         return [_HEADER, *self.lines(colours)]
 
 
-_HEADER = ("plate", "expected, start", "learned", "restored", "over the plain lens", "places", "light in them")
+_HEADER = (
+    "plate",
+    "expected, start",
+    "learned",
+    "restored",
+    "over the plain lens, pooled",
+    "mean of PSNRs",
+    "places",
+    "light in them",
+)
 
 
 def discover_places(arguments: argparse.Namespace) -> Discovered:
@@ -125,7 +139,7 @@ def _camera(
     plates = []
     for title, path, learned in progress(todo, "plate"):
         plates.append(_kept(run, title, path, error, settings.steps * learned))
-    return _judged(plates, name, error, _scenes(test), settings)
+    return _judged(plates, name, error, _scenes(test), test.classes, settings)
 
 
 def _kept(run: Run, title: str, path: Tensor, error: Error, steps: int) -> Found:
@@ -151,17 +165,16 @@ def _scenes(test: Pictures) -> Tensor:
     return torch.stack(found).double()
 
 
-def _judged(plates: Sequence[Found], name: str, error: Error, scenes: Tensor, settings: Settings) -> list[Plated]:
-    """Pictures count as wholes where samples are drawn: scenes of one are not independent."""
-    weights = drawn(len(scenes), seed=settings.seed)
+def _judged(
+    plates: Sequence[Found], name: str, error: Error, scenes: Tensor, classes: Sequence[str], settings: Settings
+) -> list[Plated]:
+    """Classes of pictures count as wholes where samples are drawn: scenes of one are not independent."""
+    weights = drawn(classes, seed=settings.seed)
     left = []
     for one in plates:
         own = errors_of_scenes(one.kernel, error.C, error.world.noise, _FACTOR, scenes.flatten(0, 1))
         left.append(own.unflatten(0, scenes.shape[:2]).mean(1)[:, None])  # (B, 1, W)
-    return [
-        Plated(name, one, float(psnr(own.mean())), gain(own, left[0], weights))
-        for one, own in zip(plates, left, strict=True)
-    ]
+    return [Plated(name, one, Gains.of(own, left[0], weights)) for one, own in zip(plates, left, strict=True)]
 
 
 def _parts(found: Discovered, command: str) -> list[str]:
@@ -175,7 +188,8 @@ def _parts(found: Discovered, command: str) -> list[str]:
         "a wide sensor: neither places nor their number are part of it. *Expected*: that error as PSNR in dB; "
         f"*restored*: of scenes out of {found.pictures} {pictures_of(found.kind)} that the restoration was not made "
         "for, expected over noise, its gain over the plain lens behind its own best restoration with the interval of "
-        "95 % of 2,000 samples of the pictures; *places*: peaks that hold 4 % of the light or more, in the middle "
+        "95 % of 2,000 samples of the classes of pictures, of errors pooled over pictures and of the mean of their "
+        "PSNRs; *places*: peaks that hold 4 % of the light or more, in the middle "
         "colour.",
         picture("wave/discover.png", "Kernels of the plates, logarithmic over three decades, circles at their places."),
         *(part for colours in found.cameras for part in (f"## {colours}", grid(_HEADER, found.lines(colours)))),
