@@ -10,6 +10,7 @@ from problems import MICROMETRE, double_gauss, scalar, vector
 
 from raytrace.formats import read_lens
 from raytrace.kernels import gaussian
+from raytrace.kernels import pixels as rules
 from raytrace.kernels.pixels import gaussian_pixels
 from raytrace.kernels.rays import trace_clearances
 from raytrace.maths.grid import Grid, grid
@@ -66,6 +67,38 @@ def test_energy_of_a_pixel_is_exact(place, mean, covariance, energy, allowed):
 def test_a_large_grid_holds_all_the_energy(rho, sigma):
     covariance = (sigma**2, rho * sigma * 3 * sigma, 9 * sigma**2)
     assert pixels((0.0011, -0.0007), covariance, pitch=0.02, size=81).sum().item() == pytest.approx(1, abs=1e-13)
+
+
+#: σ_x, σ_y in pixels and ρ: blurs of many pixels, of one, thin ones along a diagonal; the last is for both rules.
+ROTATED = [(8.0, 5.0, 0.3), (1.0, 1.5, -0.6), (0.7, 0.6, 0.7), (3.0, 2.0, 0.98), (0.9, 25.0, -0.9), (1.5, 2.0, -0.966)]
+
+
+@pytest.mark.parametrize(("sigma_x", "sigma_y", "rho"), ROTATED)
+def test_a_rotated_gaussian_is_that_of_a_dense_rule(sigma_x, sigma_y, rho):
+    """60 × 60 Gauss nodes in each pixel: 1e-14 of it and the rounding of xy, 2⁻⁵³/(1 - ρ²) for each unit of E < 10; in
+    tails E < 575, and exp(-t²/2) itself is known to 2e-13.
+    """
+    covariance = vector(sigma_x**2, rho * sigma_x * sigma_y, sigma_y**2)
+    mean, node, weight = vector(0.3, -1.4), *(torch.as_tensor(t.astype("float64")) for t in rules._gauss(60))
+    centre = torch.arange(11.0, dtype=torch.float64)[:, None] - 5 + 0.5 * node
+    u = (centre - mean[0]) / sigma_x
+    v = ((centre - mean[1])[:, None, :, None] / sigma_y - rho * u[:, None, :]) / math.sqrt(1 - rho**2)
+    density = torch.exp(-0.5 * (u[:, None, :] ** 2 + v**2)) / (2 * math.pi * sigma_x * sigma_y * math.sqrt(1 - rho**2))
+    expected = torch.einsum("yxnm,n,m->yx", density, weight, weight) / 4
+    found = gaussian_pixels(grid(scalar(1.0), 11), mean, covariance)
+    error = (found - expected).abs() / expected.clamp_min(1e-290)
+    assert float(error[expected > 1e-6].max()) < 1e-14 + 10 * ROUNDING / (1 - rho**2)
+    assert float(error[expected > 1e-250].max()) < 2e-13 + 575 * ROUNDING / (1 - rho**2)
+
+
+def test_narrow_pixels_of_a_batch_take_the_cheap_rule_and_the_others_stay_exact(monkeypatch):
+    widths = [(9e-6, 3e-6, 9e-6), (1e-8, 5e-9, 1e-8), (0.0, 0.0, 0.0), (2.5e-5, 2.5e-5, 2.5e-5), (4e-6, -3e-6, 9e-6)]
+    alone = [pixels((0.001, 0.002), covariance) for covariance in widths]
+    mean, counted, rule = vector(0.001, 0.002)[:, None].expand(2, 5), [], rules._rule
+    monkeypatch.setattr(rules, "_rule", lambda *given: counted.append(len(given[2])) or rule(*given))
+    batch = gaussian_pixels(grid(scalar(0.005), 7), mean, vector(*map(list, widths)).T)
+    torch.testing.assert_close(batch, torch.stack(alone), rtol=2e-14, atol=1e-300)
+    assert counted == [3]
 
 
 def test_pixels_of_a_rotated_gaussian_mirror_with_it():

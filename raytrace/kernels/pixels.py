@@ -1,10 +1,14 @@
 """Pixels: the energy of a two-dimensional Gaussian in every pixel of a grid."""
 
+import functools
 import itertools
+import math
 
 import numpy as np
 import torch
+from numpy.polynomial import legendre
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
 
 from raytrace.maths.grid import Grid, centres, edges
 from raytrace.maths.numerics import safe_divide, safe_sqrt
@@ -16,7 +20,12 @@ _NARROW = 0.25
 _TERMS = 8  # of that series: the next one is 1e-18 of the first
 #: The rotated rule leaves out what lies e^-37 below its peak, and takes Φ(t) as 1 beyond t = 8.3.
 _DROP, _SATURATED = 74.0, 8.3
-_NODES, _WEIGHTS = (x.tolist() for x in np.polynomial.legendre.leggauss(28))
+_NODES, _WEIGHTS = (x.tolist() for x in legendre.leggauss(28))
+#: The product rule: half a pixel over the smaller conditional deviation, σ_x √(1 - ρ²) or σ_y √(1 - ρ²), up to which
+#: it serves; its relative error, of pixels within so many σ of the centroid and of all that are not 0.
+_WIDEST = 1.5
+_CLOSE, _CLOSE_ERROR, _TAIL_ERROR = 6.0, 2e-16, 3e-14
+_NOTHING = 38.0  # σ beyond which a density is 0
 
 
 def gaussian_pixels(grid: Grid, centroid: Tensor, covariance: Tensor) -> Tensor:
@@ -25,18 +34,17 @@ def gaussian_pixels(grid: Grid, centroid: Tensor, covariance: Tensor) -> Tensor:
         P = ∬_pixel exp(-½ rᵀ Σ⁻¹ r) / (2π √det Σ) dx dy,   r = (x, y) - centroid
 
     centroid: (2, ...) mm; covariance: (3, ...) mm², xx, xy, yy, or (2, ...), xx and yy of a Gaussian known to have no
-    xy: then P is a product of two differences of Φ, of rows + columns numbers. In general P is an integral over x of
-    Φ differences in y, by a rule of fixed cost that keeps relative precision in the tails and has the limits xy = 0
-    and det Σ = 0, a line. A variance of 0 is a point: all in one pixel, halves on an edge, and derivative 0.
+    xy: then P is a product of two differences of Φ, of rows + columns numbers. In general P is an integral of the
+    density by a product of Gauss rules where pixels are narrow, else over x of Φ differences in y: rules that keep
+    relative precision in the tails, the latter in the limits xy = 0 and det Σ = 0, a line, too. A variance of 0 is a
+    point: all in one pixel, halves on an edge, and derivative 0.
     First and second derivatives are exact in all of centroid, covariance, pitch and centre.
     """
     x, y = centres(grid)
-    left_right, low_high = edges(grid)
+    x_edges, y_edges = edges(grid)
     half = 0.5 * grid.pitch
-    x, left_right = x - centroid[0][..., None], left_right - centroid[0][..., None]
-    y, low_high = y - centroid[1][..., None], low_high - centroid[1][..., None]
-    across = left_right[..., None, :-1], left_right[..., None, 1:], x[..., None, :], half
-    along = low_high[..., :-1, None], low_high[..., 1:, None], y[..., :, None], half
+    x, x_edges = ((t - centroid[0][..., None])[..., None, :] for t in (x, x_edges))
+    y, y_edges = ((t - centroid[1][..., None])[..., :, None] for t in (y, y_edges))
     # A σ of 1e-30 mm is a point: its derivatives would overflow.
     smallest = 1e-60 if covariance.dtype == torch.float64 else 1e-16
     both = (covariance[0] > smallest) & (covariance[-1] > smallest)
@@ -44,8 +52,18 @@ def gaussian_pixels(grid: Grid, centroid: Tensor, covariance: Tensor) -> Tensor:
         torch.where(t > smallest, t, 0.0)[..., None, None] for t in (covariance[0], covariance[-1])
     )
     if len(covariance) == 2:
+        across, along = _sides(x, x_edges, y, y_edges, half)
         return _interval(*across, safe_sqrt(variance_x)) * _interval(*along, safe_sqrt(variance_y))
-    return _rotated(across, along, variance_x, torch.where(both, covariance[1], 0.0)[..., None, None], variance_y)
+    xy = torch.where(both, covariance[1], 0.0)[..., None, None]
+    return _Rotated.apply(x, y, half, variance_x, variance_y, xy, x_edges, y_edges)
+
+
+def _sides(x: Tensor, x_edges: Tensor, y: Tensor, y_edges: Tensor, half: Tensor) -> tuple[tuple, tuple]:
+    """Lower and upper edge, middle and half width of the pixels along x (..., 1, columns) and y (..., rows, 1)."""
+    return (
+        (x_edges[..., :-1], x_edges[..., 1:], x, half),
+        (y_edges[..., :-1, :], y_edges[..., 1:, :], y, half),
+    )
 
 
 def _standard(distance: Tensor, sigma: Tensor) -> Tensor:
@@ -90,27 +108,155 @@ def _density(distance: Tensor, sigma: Tensor) -> Tensor:
     return safe_divide(_bell(_standard(distance, sigma)), sigma)
 
 
-def _rotated(across: tuple, along: tuple, xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
-    """The value by quadrature outside the graph, its derivatives in closed form.
+class _Rotated(torch.autograd.Function):
+    """The value by quadrature, its derivatives in closed form.
 
     With p the density, ∂P/∂x is p integrated over an edge; as ∂p/∂Σxx = ½ ∂²p/∂x² and ∂p/∂Σxy = ∂²p/∂x∂y (Plackett
     1954), derivatives in the covariance are integrals over edges and values at corners. An edge is a density in
     one coordinate times a Φ difference in the other.
+
+    Arguments: middles x (..., 1, columns) and y (..., rows, 1), the half width, Σxx, Σyy, Σxy (..., 1, 1); and the
+    edges (..., 1, columns + 1) and (..., rows + 1, 1), which move with the middles and the half width: these have the
+    derivative.
     """
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(x, y, half, xx, yy, xy, x_edges, y_edges):
+        return _energy(*_sides(x, x_edges, y, y_edges, half), xx, xy, yy)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.save_for_backward(*inputs)
+        ctx.save_for_forward(*inputs)
+
+    @staticmethod
+    def backward(ctx, gradient):
+        slopes = (gradient * slope for slope in _slopes(*ctx.saved_tensors))
+        return *(_summed(g, t) for g, t in zip(slopes, ctx.saved_tensors, strict=False)), None, None
+
+    @staticmethod
+    def jvp(ctx, *tangents):
+        pairs = zip(_slopes(*ctx.saved_tensors), tangents, strict=False)
+        return sum(slope * tangent for slope, tangent in pairs if tangent is not None)
+
+
+def _summed(gradient: Tensor, like: Tensor) -> Tensor:
+    """The gradient of a tensor that was broadcast."""
+    return gradient.sum_to_size(like.shape)
+
+
+def _slopes(x, y, half, xx, yy, xy, x_edges, y_edges) -> tuple[Tensor, ...]:
+    """∂P by x, y, half, xx, yy and xy (..., rows, columns)."""
+    det, (across, along) = _determinant(xx, xy, yy), _sides(x, x_edges, y, y_edges, half)
+    by_x, by_y = _edges(across, along, xx, xy, det), _edges(along, across, yy, xy, det)
+    return by_x[0], by_y[0], by_x[1] + by_y[1], 0.5 * by_x[2], 0.5 * by_y[2], by_x[3]
+
+
+def _energy(across: tuple, along: tuple, xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
+    """P by the product rule where half a pixel is no wider than 1.5 conditional σ, else by `_rule`."""
     det = _determinant(xx, xy, yy)
-    x, y = _edges(across, along, xx, xy, det), _edges(along, across, yy, xy, det)
-    derivatives = [
-        (across[2], x[0]),
-        (across[3], x[1]),
-        (along[2], y[0]),
-        (along[3], y[1]),
-        (xx, 0.5 * x[2]),
-        (yy, 0.5 * y[2]),
-        (xy, x[3]),
+    if any(map(is_functorch_wrapped_tensor, (*across, *along, xx, xy, yy))):
+        return _rule(across, along, xx, xy, yy, det)  # what is chosen by numbers cannot be mapped
+    width = across[3] * safe_sqrt(safe_divide(torch.maximum(xx, yy), det))
+    narrow = (det > 0) & (width <= _WIDEST)
+    if bool(narrow.all()):
+        return _product_rule(across, along, xx, xy, yy, det)
+    if not bool(narrow.any()):
+        return _rule(across, along, xx, xy, yy, det)
+    batch = torch.broadcast_shapes(*(t.shape[:-2] for t in (xx, across[2], along[2])))
+    narrow = narrow.expand(*batch, 1, 1)[..., 0, 0]
+
+    def chosen(mask: Tensor) -> tuple:
+        def some(t: Tensor) -> Tensor:
+            return t.expand(*batch, *t.shape[-2:])[mask] if t.dim() else t
+
+        return *(tuple(map(some, side)) for side in (across, along)), *map(some, (xx, xy, yy, det))
+
+    found = xx.new_zeros(*batch, along[2].shape[-2], across[2].shape[-1])
+    found[narrow] = _product_rule(*chosen(narrow))
+    found[~narrow] = _rule(*chosen(~narrow))
+    return found
+
+
+def _product_rule(across: tuple, along: tuple, xx: Tensor, xy: Tensor, yy: Tensor, det: Tensor) -> Tensor:
+    """∬ p dx dy over narrow pixels by Gauss nodes ξ, η of [-1, 1] about their centre (x, y), with Λ = Σ⁻¹:
+
+        P = 4h² √det Λ/2π e^(-E) Σ_k c^k/k! Σ_ξ w ξ^k e^(-αhξ - Λxx h²ξ²/2) Σ_η w η^k e^(-βhη - Λyy h²η²/2)
+
+    c = -Λxy h²; E = rᵀΛr/2 and (α, β) = Λr at the centre. Half of E goes with either sum, so that nothing overflows.
+    """
+    (x, h), (y, _) = across[2:], along[2:]
+    # By conditional deviations: Λ itself cancels where ρ is near 1.
+    s_x, s_y = det / yy, det / xx
+    from_y, from_x = x - xy / yy * y, y - xy / xx * x
+    twice_energy = x * x / xx + from_x * from_x / s_y
+    c = h * h * xy / det
+    largest = torch.stack([t.abs().max() for t in (h * h / s_x, h * h / s_y, c, twice_energy)]).tolist()
+    width, reach = max(largest[:2]) ** 0.5, min(largest[3] ** 0.5, _NOTHING)
+    # In steps of a twelfth, so that few rules are made.
+    nodes = _count_nodes(*(math.ceil(12 * math.log2(max(t, 2.0**-20))) for t in (width, reach * width)))
+    node, moments = (xx.new_tensor(t) for t in _gauss_moments(nodes, _count_terms(largest[2])))
+    sums = [
+        torch.exp(
+            (-0.25 * twice_energy)[..., None] - (h * slope)[..., None] * node - (0.5 * h * h / s)[..., None] * node**2
+        )
+        @ moments
+        for slope, s in ((from_y / s_x, s_x), (from_x / s_y, s_y))
     ]
-    value = _rule(*([t.detach() for t in side] for side in (across, along)), *(t.detach() for t in (xx, xy, yy, det)))
-    # Σ (p - p₀) ½ (g(p) + g(p₀)) is 0 and has the first derivative g and the second derivative ∂g of P itself.
-    return value + sum((p - p.detach()) * (0.5 * (g + g.detach())) for p, g in derivatives)
+    return (2 / torch.pi) * h * h / safe_sqrt(det) * (_powers(c, moments.shape[1]) * sums[0] * sums[1]).sum(-1)
+
+
+def _powers(c: Tensor, terms: int) -> Tensor:
+    """c^k/k! (..., K)."""
+    k = torch.arange(terms, dtype=c.dtype, device=c.device)
+    return c[..., None] ** k / torch.exp(torch.lgamma(k + 1))
+
+
+def _count_terms(c: float) -> int:
+    """Terms of exp(c ξη) for ξη in [-1, 1]."""
+    return next(k for k in itertools.count(1) if c**k <= _CLOSE_ERROR * math.factorial(k))
+
+
+@functools.cache
+def _count_nodes(width: int, slope: int) -> int:
+    """Gauss nodes that integrate exp(-a s - b² s²/2) over [-1, 1], b half a pixel over σ and a up to 6 b and more.
+
+    width, slope: 12 log₂ of b and of the largest a.
+    """
+    b, steepest = (2 ** (t / 12) for t in (width, slope))
+    cases = (min(steepest, _CLOSE * b), _CLOSE_ERROR), (steepest, _TAIL_ERROR)
+
+    def integral(count: int, a: float) -> np.longdouble:
+        s, weight = _gauss(count)
+        return weight @ np.exp(-a * (s + 1) - 0.5 * (b * s) ** 2)
+
+    def serves(count: int) -> bool:
+        return all(abs(integral(count, a) / integral(count + 12, a) - 1) <= error for a, error in cases)
+
+    return next((count for count in range(4, 48, 2) if serves(count)), 48)
+
+
+@functools.cache
+def _gauss_moments(nodes: int, terms: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Legendre nodes (N,) of [-1, 1] and w ξ^k/2 (N, K)."""
+    node, weight = _gauss(nodes)
+    moments = 0.5 * weight[:, None] * node[:, None] ** np.arange(terms)
+    return node.astype(np.float64), moments.astype(np.float64)
+
+
+@functools.cache
+def _gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Legendre nodes and weights 2/((1 - x²) P'(x)²), in long double: numpy's err by 4e-14 of a weight."""
+    x = legendre.leggauss(count)[0].astype(np.longdouble)
+    for _ in range(3):
+        before, now = np.ones_like(x), x
+        for n in range(2, count + 1):
+            before, now = now, ((2 * n - 1) * x * now - (n - 1) * before) / n
+        slope = count * (before - x * now) / (1 - x**2)
+        weight, x = 2 / ((1 - x**2) * slope**2), x - now / slope
+    return x, weight
 
 
 def _determinant(xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
