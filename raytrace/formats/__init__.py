@@ -11,6 +11,8 @@ from typing import NamedTuple
 from raytrace.files import shipped, write_atomically
 from raytrace.formats import (
     oslo_read,
+    roa_parts,
+    roa_read,
     seq_read,
     seq_write,
     table_read,
@@ -59,6 +61,7 @@ FORMATS = {
     ".zar": Format(zemax_archive.read, load=zemax_archive.load, configurations=True),
     ".seq": Format(seq_read.read, seq_write.write),
     ".len": Format(oslo_read.read),
+    ".roa": Format(roa_read.read, load=roa_parts.load),
     ".csv": Format(table_read.read, table_write.write),
     ".tsv": Format(table_read.read, partial(table_write.write, separator="\t")),
     ".txt": Format(table_read.read, partial(table_write.write, separator="\t")),
@@ -76,7 +79,8 @@ def read_lens(
     configuration: int | None = None,
     substitute: Substitute = None,
 ) -> Lens:
-    """The lens of a file, in mm and µm: .zmx, .zar (OpticStudio), .seq (CODE V), .len (OSLO), or a table.
+    """The lens of a file, in mm and µm: .zmx, .zar (OpticStudio), .seq (CODE V), .len (OSLO), .roa (ray-optics), or a
+    table.
 
     path: of a file, or the name of a shipped lens, as "double_gauss". catalogs: further glass catalogs (.agf), searched
     as `raytrace.media.catalog.find_glass` does; a catalog that the file names and that lies beside it, or in it, is
