@@ -17,10 +17,13 @@ from raytrace.merit.model import Model
 from raytrace.merit.vary import freedom, name_of
 from raytrace.optimization.least_squares import Manner, State, least_squares
 from raytrace.optimization.lost import Recovery
+from raytrace.optimization.paths import LIMIT, best_of_paths
 from raytrace.optimization.problem import Condition, NoProblem, Problem
 from raytrace.optimization.step import Linear, NoStep, Sides
 from raytrace.plot.optimize import optimize_report
 from raytrace.system.intent import Intent, Row, Vary
+from raytrace.system.pose import Pose
+from raytrace.system.surface import Surface
 
 FAR = np.inf
 NONE = np.zeros(0)
@@ -304,7 +307,7 @@ def test_the_document_has_the_fixed_keys_and_the_lens_comes_back(command_line):
     assert done.code == 0, done.err
     told = done.document
     assert [*told] == [
-        "merit_before", "merit_after", "cycles", "evaluations", "seconds", "stopped", "variables", "operands",
+        "merit_before", "merit_after", "cycles", "evaluations", "seconds", "stopped", "variables", "operands", "conditions",
     ]  # fmt: skip
     assert [*told["variables"][0]] == ["name", "before", "after"]
     assert [*told["operands"][0]] == ["row", "operand", "target", "weight", "before", "after"]
@@ -419,3 +422,43 @@ def test_lenses_and_spots_before_and_after_are_drawn_on_one_scale():
         spans = {tuple(round(float(np.diff(limit())[0]), 9) for limit in (a.get_xlim, a.get_ylim)) for a in panels}
         assert len(spans) == 1
     plt.close("all")
+
+
+def test_rays_along_the_image_behind_a_break_of_90_degrees_are_no_end_of_an_optimisation(triplet, capfd):
+    """They meet the image nowhere and miss it by no number that has a derivative."""
+    turned = Surface(torch.tensor(37.4, dtype=torch.float64), before=Pose(tilt_x=torch.tensor(90.0)), is_break=True)
+    lens = dataclasses.replace(triplet, surfaces=(*triplet.surfaces[:8], turned, triplet.surfaces[8]))
+    problem = problem_of(lens, "curvature")
+    state = problem.state(problem.model.start, True)
+    assert state.lost
+    assert np.isfinite(state.jacobian).all()
+    found = rt.optimize(lens, merit="spot", vary="curvature:1", rings=1, arms=2, cycles=1)
+    assert "nan" not in str(found)
+    assert "DLASCL" not in capfd.readouterr().out
+
+
+def test_a_row_without_a_derivative_is_refused_with_its_name(triplet):
+    """0 · ∞, where a root begins."""
+    bad = Row(rt.Measure("bad", lambda lens: 1 + (0 * lens.surfaces[1].curvature).abs().sqrt()), weight=1.0)
+    with pytest.raises(NoProblem, match="row 1 of the merit function, bad, has no derivative by curvature_1"):
+        rt.optimize(triplet, merit=[bad], vary="curvature:1", cycles=1)
+
+
+def test_operands_of_which_no_row_counts_are_not_evaluated_on_the_way(triplet):
+    """Rows without a weight are shown at both ends alone; those that a row of arithmetic takes are evaluated."""
+    called = []
+    idle = Row(rt.Measure("idle", lambda lens: called.append(1) or lens.surfaces[1].curvature))
+    rows = [*rows_of(triplet, "spot", rings=1, arms=2), idle]
+    found = rt.optimize(triplet, merit=rows, vary="curvature:1-3", cycles=6)
+    assert found.values_after[-1] == pytest.approx(float(found.lens.surfaces[1].curvature))
+    assert len(called) < 10 < found.evaluations
+    used = [*rows, Row("OPVA", (len(rows), 0), weight=1.0)]
+    called.clear()
+    assert rt.optimize(triplet, merit=used, vary="curvature:1-3", cycles=6).evaluations <= len(called)
+
+
+def test_a_descent_along_a_valley_without_end_ends():
+    """A merit that falls for ever, by a little every cycle."""
+    crawl = squares(lambda x: np.array([np.exp(-x[0])]), lambda x: np.array([[-np.exp(-x[0])]]))
+    found = best_of_paths(crawl, np.zeros(1), lower=np.full(1, -FAR), upper=np.full(1, FAR), typical=None)
+    assert found.cycles <= LIMIT

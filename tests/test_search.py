@@ -380,7 +380,7 @@ def test_the_command_writes_what_it_found_and_goes_on(command_line, tmp_path):
     words = ["search", "singlet", "--merit", "spot", "--vary", "curvature sensor", "--hold", "efl=50", "-o", "minima"]
     done = command_line(*words, "--starts", 2, "--json")
     assert done.code == 0, done.err
-    assert [*done.document] == ["starts", "seconds", "stopped", "results"]
+    assert [*done.document] == ["starts", "descents", "seconds", "stopped", "results"]
     assert (tmp_path / "minima" / "minimum_01.zmx").exists()
     again = command_line(*words, "--starts", 2, "--json")
     assert again.document["results"] == done.document["results"]

@@ -32,14 +32,20 @@ class Recovery:
         self._bundles: dict = {}
 
     def excess(self, x: np.ndarray, rows: Sequence[int], *, derivatives: bool) -> tuple[np.ndarray, ...]:
-        """How far the rays of rows (K,), from 0, miss: (K,), by variables (K, n), and how many surfaces are left."""
+        """How far the rays of rows (K,), from 0, miss: (K,), by variables (K, n), and how many surfaces are left.
+
+        0 of a ray that runs along the surface, as behind a break of 90°: there is no way back that derivatives know.
+        """
         variables = Dual(np.asarray(x, float), np.eye(len(x))) if derivatives else np.asarray(x, float)
         missed, slopes, behind = np.zeros(len(rows)), np.zeros((len(rows), len(x))), np.zeros(len(rows))
         for view, wanted in self._by_view(rows).items():
             moment = view.moment(variables)
-            for place, number, left in self._missed(view, moment, wanted):
-                missed[place], slopes[place] = float(value_of(number)), slope_of(number, len(x))
-                behind[place] = left
+            with np.errstate(all="ignore"):
+                found = [*self._missed(view, moment, wanted)]
+            for place, number, left in found:
+                behind[place], slope = left, slope_of(number, len(x))
+                if np.isfinite(value_of(number)) and np.isfinite(slope).all():  # else the ray runs along the surface
+                    missed[place], slopes[place] = float(value_of(number)), slope
         return missed, slopes, behind
 
     def _by_view(self, rows: Sequence[int]) -> dict:
@@ -55,12 +61,12 @@ class Recovery:
     def _missed(self, view, moment: Moment, wanted: list[tuple[int, Ray]]):
         """(place, how far it misses, surfaces left) of every ray that is lost on its way to the image."""
         rays = tuple(dict.fromkeys(ray for _, ray in wanted))
-        ended = self._ends(view, moment, rays)
+        ended, traced = self._ends(view, moment, rays), {}
         for place, ray in wanted:
             surface = ended.get(ray)
             if surface is None or is_posed(view.lens.surfaces[surface]):
                 continue
-            before = self._before(view, moment, rays, ray, surface)
+            before = self._before(view, moment, rays, ray, surface, traced)
             yield place, _miss(moment, surface, ray.wavelength, *before), len(view.lens.surfaces) - 1 - surface
 
     def _ends(self, view, moment: Moment, rays: tuple[Ray, ...]) -> dict[Ray, int]:
@@ -82,8 +88,8 @@ class Recovery:
             self._bundles[key] = bundle, np.array([bundle.ask(*ray) for ray in rays])
         return self._bundles[key]
 
-    def _before(self, view, moment: Moment, rays: tuple[Ray, ...], ray: Ray, surface: int):
-        """Position and direction of a ray before a surface, in the axes of its vertex."""
+    def _before(self, view, moment: Moment, rays: tuple[Ray, ...], ray: Ray, surface: int, traced: dict):
+        """Position and direction of a ray before a surface, in the axes of its vertex; traced: all rays by surface."""
         number = rays.index(ray)
         if surface == 1:
             bundle, numbers = self._bundle(view, 1, rays)
@@ -92,7 +98,9 @@ class Recovery:
             flat = [part.reshape(-1)[at] for part in (*position, *direction)]
             return flat[:3], flat[3:]
         bundle, numbers = self._bundle(view, surface - 1, rays)
-        hit = bundle.hits(moment).at(numbers[number : number + 1])
+        if surface not in traced:
+            traced[surface] = bundle.hits(moment)
+        hit = traced[surface].at(numbers[number : number + 1])
         x, y, z = (hit.position[k][0] for k in range(3))
         return (x, y, z - moment.thickness[surface - 1]), tuple(hit.direction[k][0] for k in range(3))
 

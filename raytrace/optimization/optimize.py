@@ -126,7 +126,7 @@ def optimize(
         start = opened(
             problem, start, lower=lower, upper=upper, typical=how["typical"], until=until, watch=opening.append
         )
-        begin, again = _timed(lambda: problem.evaluated(start))
+        begin, again = _timed(lambda: problem.evaluated(start, True))
         _refuse_undefined(problem, begin)
         seconds_of_end = min(seconds_of_end, again)  # the first evaluation takes longer
     until -= seconds_of_end  # the result is evaluated once more
@@ -241,13 +241,20 @@ def _bounds(free: Freedom, bounds: str | Sequence[str] | None, names: Sequence[s
 
 
 def _refuse_undefined(problem: Problem, found: Evaluated) -> None:
-    """Raise NoProblem where the merit is no number at the start, or of no ray."""
+    """Raise NoProblem where the merit, or a derivative of it, is no number at the start, or where it is of no ray."""
     bad = ~np.isfinite(found.residuals)
     if bad.any():
         k = int(found.of_row[np.argmax(bad)])
         row, number = problem.evaluation.rows[k], found.values[k]
         raise NoProblem(f"row {k + 1} of the merit function, {row.name}, is {number:g} at the start")
     counted = np.unique(found.of_row)
+    if not np.isfinite(found.jacobian).all():
+        k, variable = np.argwhere(~np.isfinite(found.jacobian))[0]
+        row, name = int(found.of_row[k]), name_of(problem.model.variables[variable])
+        raise NoProblem(
+            f"row {row + 1} of the merit function, {problem.evaluation.rows[row].name}, has no derivative by {name} at "
+            f"the start: {found.jacobian[k, variable]:g}"
+        )
     if found.lost[counted].all():
         raise NoProblem("no row of the merit function has a value: no ray of them gets through the lens as it is")
 

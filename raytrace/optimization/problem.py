@@ -83,7 +83,7 @@ class Problem:
             Sides(excess[soft], slopes[soft], rows[soft]),
             found.residuals[equal] / factors[equal],
             np.concatenate([signs[limit] * found.residuals[limit] / factors[limit], excess[hard] / own]),
-            None if jacobian is None else jacobian[squared],
+            None if jacobian is None else np.where(np.isfinite(jacobian[squared]), jacobian[squared], 0.0),
             None if jacobian is None else jacobian[equal] / factors[equal, None],
             None
             if jacobian is None

@@ -147,7 +147,8 @@ class Optimized(Result):
         lines.append(f"\n  {head}{'row':>5} {'operand':<8} {'target':>12} {'weight':>10} {ends} {'left':>7}")
         for i in left[:_SHOWN]:
             row, share = self.merit[i - 1], float(self.contributions[i - 1])
-            ends = f"{float(self.values_before[i - 1]):>14.6g} {float(self.values_after[i - 1]):>14.6g}"
+            both = (float(values[i - 1]) for values in (self.values_before, self.values_after))
+            ends = " ".join(f"{'lost':>14}" if np.isnan(one) else f"{one:>14.6g}" for one in both)
             of = f"{self.configurations[i - 1]:>5} " if self.has_configurations else ""
             lines.append(f"  {of}{i:>5} {row.name:<8} {row.target:>12.6g} {row.weight:>10.4g} {ends} {share:>7.1%}")
         if len(left) > _SHOWN:

@@ -108,13 +108,14 @@ def search(
     ends, conditions = bounds_of(free.lens, free.variables, bounds), _conditions(lens, hold, function.unit)
     how = {"unit": function.unit, "skip_unknown": skip_unknown, "readings": readings_of(readings)}
     asked = Asked(free, tuple(function.rows), conditions, ends, glass, air, how)
-    start = np.clip(asked.model.start, asked.space.lower, asked.space.upper)
-    refuse_contradictions(asked.whole, start, lower=asked.space.lower, upper=asked.space.upper)
     until = begun + (np.inf if seconds is None else seconds)
-    if insert is None or insert is False:
+    places = () if insert is None or insert is False else _places(free, insert, starts)
+    if conditions:
+        low, high = asked.space.lower, asked.space.upper
+        refuse_contradictions(asked.whole, np.clip(asked.model.start, low, high), lower=low, upper=high)
+    if not places:
         run = _Run(asked, Journal(folder, asked.about(seed), until), seed, STARTS if starts is None else starts)
     else:
-        places = _places(free, insert, starts)
         journal = Journal(folder, {**asked.about(seed), "insert": list(places)}, until)
         run = Insertion(asked, journal, places)
     stopped = _stopped(run, progress)
