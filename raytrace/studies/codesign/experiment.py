@@ -112,7 +112,7 @@ def lens_at_start(lens: Lens, settings: Settings) -> Lens:
 
 
 def _clipped(lens: Lens) -> Lens:
-    """The lens with an aperture at the semi-diameter of every refracting surface; the F/number sets that of the stop."""
+    """The lens with an aperture at the semi-diameter of every surface but the stop, which the F/number sizes."""
     surfaces = list(lens.surfaces)
     for number, surface in enumerate(surfaces):
         if surface.semi_diameter is not None and number != lens.stop:

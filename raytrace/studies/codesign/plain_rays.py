@@ -63,9 +63,8 @@ class PlainRays(Camera):
         light = scene(lens, fields, distances, lens.wavelengths, self._memo)
         window = _of_wavelengths(self._window(lens, fields, distances), len(lens.wavelengths))
         shares = lens.wavelength_weights / lens.wavelength_weights.sum()
-        kernel = (_KERNELS[self.model](light, window, self._points[self.model].to(fields)) * shares[:, None, None]).sum(
-            2
-        )[:, 0]
+        kernel = _KERNELS[self.model](light, window, self._points[self.model].to(fields))
+        kernel = (kernel * shares[:, None, None]).sum(2)[:, 0]
         return safe_divide(kernel, kernel.sum((-2, -1), keepdim=True)) if self.normalise == "window" else kernel
 
 
