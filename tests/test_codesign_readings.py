@@ -148,6 +148,42 @@ def test_plain_rays_are_of_the_first_step_alone(lens):
     assert torch.equal(paraxial.kernels(z), camera(lens, dataclasses.replace(SMALL, model="paraxial")).kernels(z))
 
 
+def test_plain_rays_of_drt_are_of_both_steps(lens):
+    """With --drt-rays the same rays make the PSFs of step 2, of every model: dozens for Gaussians, hundreds for DRT."""
+    z = torch.tensor([12e3, 40e3], dtype=torch.float64)
+    few = dataclasses.replace(SMALL, size=21, sampling="hexapolar", rays=61, drt_rays=271)
+    traced = camera(lens, dataclasses.replace(few, model="drt"))
+    plain = camera(lens, dataclasses.replace(SMALL, size=21, sampling="hexapolar", model="drt", rays=271))
+    assert torch.equal(traced.kernels(z), plain.kernels(z))
+    for model in ("paraxial", "gaussian", "drt"):
+        own = camera(lens, dataclasses.replace(few, model=model))
+        own.use("drt")
+        assert torch.equal(own.kernels(z), traced.kernels(z)), model
+
+
+def test_mirrored_rays_have_no_covariance_of_x_and_y(lens):
+    """Rings of an axial beam: the product of two error functions, where a rotated Gaussian needs a quadrature."""
+    z = torch.tensor([12e3, 40e3], dtype=torch.float64)
+    own = camera(lens, dataclasses.replace(SMALL, size=21, sampling="hexapolar", rays=61))
+    tilted = camera(lens, dataclasses.replace(SMALL, size=21, sampling="hexapolar", rays=61))
+    tilted._points["gaussian"] = tilted._points["gaussian"] + 1e-7  # no longer mirrored, the same to 1e-6
+    assert float((own.kernels(z) - tilted.kernels(z)).abs().max().detach()) < 1e-6
+
+
+def test_semi_diameters_vignette_where_asked(lens):
+    """Light beyond the rims of surfaces 5 and 7 is lost; the stop is as wide as the F/number says."""
+    settings = dataclasses.replace(SMALL, f_number=1.9, model="drt", normalise="energy", size=61)
+    z = torch.tensor([25e3], dtype=torch.float64)
+    whole, clipped = (
+        float(camera(lens, dataclasses.replace(settings, vignetting=word)).kernels(z).sum().detach())
+        for word in ("none", "semi-diameters")
+    )
+    assert whole == pytest.approx(1.0, abs=0.02)
+    assert clipped < 0.97 * whole
+    at_f4 = dataclasses.replace(settings, f_number=4.0, vignetting="semi-diameters")
+    assert float(camera(lens, at_f4).kernels(z).sum().detach()) == pytest.approx(1.0, abs=0.02)
+
+
 def test_where_plain_rays_cross_the_pupil():
     assert points("sobol", 12).shape == (2, 12)
     assert points("hexapolar", 12).shape[1] == 19  # two whole rings

@@ -40,7 +40,7 @@ EXAMPLES = """examples:
 _SCENE = (
     *("vary", "bounds", "hold", "glass_thickness", "air_thickness", "edge", "start", "focus_distance", "f_number"),
     *("wavelengths", "wavelength_weights", "near", "far", "spread", "fields", "pixel", "size"),
-    *("normalise", "rho", "noise", "tol", "rays", "sampling"),
+    *("normalise", "rho", "noise", "tol", "rays", "drt_rays", "sampling", "vignetting"),
 )
 _TRAINING = ("depth", "width", "epochs", "batch", "seed", "rate_network", "rate_optics", "decay", "precision")
 

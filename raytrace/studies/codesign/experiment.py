@@ -37,10 +37,11 @@ from raytrace.studies.codesign.closed_form import (
     out_of_focus,
     power_spectrum,
 )
-from raytrace.studies.codesign.plain_rays import PlainRays, points
+from raytrace.studies.codesign.plain_rays import PlainRays, points_of_models
 from raytrace.studies.codesign.settings import GAUSSIAN, Settings
 from raytrace.studies.descent import NoOptimum
 from raytrace.studies.pictures import Pictures, crop, draws
+from raytrace.system.aperture import Aperture
 from raytrace.system.lens import Lens, with_object_distance, with_sensor_distance, with_wavelengths
 
 _SAMPLE = 10  # last number of the key of what a sample draws
@@ -98,6 +99,8 @@ def lens_at_start(lens: Lens, settings: Settings) -> Lens:
     if weights.shape != wavelengths.shape or not bool((weights >= 0).all() and weights.sum() > 0):
         raise ValueError(f"{len(weights)} weights of {len(wavelengths)} wavelengths; expected one ≥ 0 for each")
     lens = with_wavelengths(lens, wavelengths, weights).at(f_number=settings.f_number)
+    if settings.vignetting == "semi-diameters":
+        lens = _clipped(lens)
     real_image_distance(lens, wavelengths.new_tensor([settings.near, settings.far]))  # refuses what has none
     if settings.start in ("paraxial", "rms", "spectral", GAUSSIAN):
         return focused(lens, settings.focus_distance, on="rms" if settings.start == "rms" else "paraxial")
@@ -107,6 +110,16 @@ def lens_at_start(lens: Lens, settings: Settings) -> Lens:
         raise ValueError(
             f"start {settings.start!r}: expected paraxial, rms, spectral, gaussian or a sensor distance in mm"
         ) from error
+
+
+def _clipped(lens: Lens) -> Lens:
+    """The lens with an aperture at the semi-diameter of every surface but the stop, which the F/number sizes."""
+    surfaces = list(lens.surfaces)
+    for number, surface in enumerate(surfaces):
+        if surface.semi_diameter is not None and number != lens.stop:
+            rim = Aperture("circular", (0.0, surface.semi_diameter))
+            surfaces[number] = dataclasses.replace(surface, apertures=(*surface.apertures, rim))
+    return dataclasses.replace(lens, surfaces=tuple(surfaces))
 
 
 def variables(lens: Lens, settings: Settings) -> Variables:
@@ -129,8 +142,9 @@ def camera(lens: Lens, settings: Settings) -> Camera:
     if settings.precision not in ("float32", "bfloat16"):
         raise ValueError(f"precision {settings.precision!r}: expected float32 or bfloat16")
     kind = Camera
-    if settings.rays is not None:
-        kind = partial(PlainRays, points=points(settings.sampling, settings.rays, seed=settings.seed))
+    sampled = points_of_models(settings)
+    if sampled:
+        kind = partial(PlainRays, points=sampled, kept=() if settings.drt_rays is None else ("drt",))
     return kind(
         variables(lens, settings),
         RedNet(RedNetShape(settings.depth, settings.width), seed=settings.seed).to(memory_format=torch.channels_last),

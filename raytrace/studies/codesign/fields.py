@@ -78,7 +78,7 @@ def fields(
 
 def _found(lens: Lens, settings: Settings, spectrum: Tensor) -> dict:
     found = closed_form(lens, settings, spectrum)
-    own = camera_at(lens, found.sensor_mm, dataclasses.replace(settings, model="drt", rays=None))
+    own = camera_at(lens, found.sensor_mm, dataclasses.replace(settings, model="drt", rays=None, drt_rays=None))
     by_field = error_by_field(own, spectrum, even_distances(own, spread=settings.spread))
     values = (*(getattr(found, name) for name in optima.COLUMNS), by_field.tolist())
     return dict(zip(FOUND, values, strict=True))

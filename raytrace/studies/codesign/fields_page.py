@@ -190,7 +190,7 @@ def fields(arguments: argparse.Namespace) -> None:
 
 def _energies(given: Experiment, rows: Sequence[Row]) -> list[dict[str, float]]:
     """In windows from the usual size to that of the settings, at DRT's optimum."""
-    settings = dataclasses.replace(given.settings, model="drt", rays=None, normalise="energy")
+    settings = dataclasses.replace(given.settings, model="drt", rays=None, drt_rays=None, normalise="energy")
     (drt,) = (row for row in rows if row.model == "drt" and _place(row) == (settings.size, settings.fields))
     sizes = [*range(min(21, settings.size), settings.size, 10), settings.size]
     return energies(camera_at(given.lens, drt.sensor_mm, settings), sizes, spread=settings.spread)

@@ -129,7 +129,10 @@ def _experiment(report: Report) -> str:
     }.get(s.start, f"{s.start} mm")
     where = "the axis" if s.fields == (0.0,) else f"the fields {_listed(s.fields)}"
     weights = f" weighted {_listed(s.wavelength_weights)}" if len(s.wavelengths) > 1 else ""
-    rays = "" if s.rays is None else f", those of traced rays in step 1 of {s.rays} ({s.sampling})"
+    counts = {"Gaussian DRT in step 1" if s.drt_rays else "step 1": s.rays, "DRT in both steps": s.drt_rays}
+    traced = [f"{count} rays ({s.sampling}) for {where}" for where, count in counts.items() if count is not None]
+    rays = f", traced with {' and '.join(traced)}" if traced else ""
+    rays += "; rays beyond the semi-diameters are vignetted" if s.vignetting == "semi-diameters" else ""
     spread = "" if s.spread == "uniform" else " in 1/z"
     falling = "" if s.decay == "none" else ", falling to 0 along half a cosine"
     light = {"window": "the window", "energy": "the light through the pupil"}[s.normalise]

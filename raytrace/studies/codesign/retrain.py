@@ -91,7 +91,7 @@ def sensors_of(path: str | Path) -> dict[str, float]:
 
 def settings_of_lens(settings: Settings, sensor: float, seed: int) -> Settings:
     """Settings of one network: DRT PSFs of all light, the sensor held wherever it is, whatever chose the lens."""
-    whole = dataclasses.replace(settings, model="drt", rays=None, vary="sensor", bounds="", hold="")
+    whole = dataclasses.replace(settings, model="drt", rays=None, drt_rays=None, vary="sensor", bounds="", hold="")
     return dataclasses.replace(whole, start=repr(sensor), seed=seed)
 
 

@@ -96,7 +96,19 @@ class Settings(options.Settings):
         "plain rays of a traced PSF of step 1, the same ones always, instead of as many as --tol needs",
         type=count,
     )
-    sampling: str = option("sobol", "where --rays cross the pupil (default sobol)", choices=("sobol", "hexapolar"))
+    drt_rays: int | None = option(
+        None,
+        "plain rays of every DRT PSF, of step 1, step 2 and its tests, instead of as many as --tol needs",
+        type=count,
+    )
+    sampling: str = option(
+        "sobol", "where --rays and --drt-rays cross the pupil (default sobol)", choices=("sobol", "hexapolar")
+    )
+    vignetting: str = option(
+        "none",
+        "rays beyond the semi-diameters of the file: traced (none, default), or vignetted (semi-diameters)",
+        choices=("none", "semi-diameters"),
+    )
     decay: str = option(
         "none",
         "Adam's rates in the course of a step: constant (none, default), or falling to 0 along half a cosine",

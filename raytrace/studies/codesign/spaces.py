@@ -114,9 +114,9 @@ def _found(lens: Lens, settings: Settings, spectrum: Tensor) -> dict:
 
 def _refocused(found: Optimum, settings: Settings, spectrum: Tensor) -> Optimum:
     """The optimum of the sensor alone with DRT PSFs of all light, behind the thicknesses that were found."""
-    if found.model == "drt" and settings.vary == "sensor" and settings.rays is None:
+    if found.model == "drt" and settings.vary == "sensor" and settings.rays is None and settings.drt_rays is None:
         return found
-    alone = dataclasses.replace(_sensor_alone(settings), model="drt", rays=None, start="paraxial")
+    alone = dataclasses.replace(_sensor_alone(settings), model="drt", rays=None, drt_rays=None, start="paraxial")
     return closed_form(found.lens, alone, spectrum)
 
 

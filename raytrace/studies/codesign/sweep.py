@@ -139,6 +139,8 @@ def _together(settings: Settings, factors: Sequence[Factor], apertures: Sequence
 def _of_model(settings: Settings, model: str) -> Settings:
     """The settings for a model, those that do not reach it as they always are: the same optimum is then sought once."""
     names = [name for reached, names in _REACH.items() if model not in reached for name in names]
+    if settings.drt_rays is not None:
+        names = [name for name in names if name != "sampling"]  # DRT PSFs judge the lenses of all models
     usual = {field.name: field.default for field in dataclasses.fields(Settings) if field.name in names}
     return dataclasses.replace(settings, model=model, **usual)
 
