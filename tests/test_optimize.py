@@ -307,7 +307,8 @@ def test_the_document_has_the_fixed_keys_and_the_lens_comes_back(command_line):
     assert done.code == 0, done.err
     told = done.document
     assert [*told] == [
-        "merit_before", "merit_after", "cycles", "evaluations", "seconds", "stopped", "variables", "operands", "conditions",
+        "merit_before", "merit_after", "cycles", "evaluations", "seconds", "stopped", "variables", "operands",
+        "conditions",
     ]  # fmt: skip
     assert [*told["variables"][0]] == ["name", "before", "after"]
     assert [*told["operands"][0]] == ["row", "operand", "target", "weight", "before", "after"]
