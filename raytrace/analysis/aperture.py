@@ -197,11 +197,19 @@ def _cells(
     share = torch.where(radius < 0.5, 1.0, share)
     density = (by_l[0] * by_m[1] - by_l[1] * by_m[0]).abs()
     beyond = radius > 1  # cells whose middle lies beyond the rim have the wave of the rim
-    cells = slice(None) if waves is None else torch.nonzero((beyond & (share > 0)).flatten(0, -2).any(0))[:, 0]
-    traced = wavefront_of(scene, (pupil * ((1 - 1e-9) / radius.clamp_min(1.0)))[..., cells])
-    at_cells = traced.opd / (1e-3 * traced.wavelength)[:, None]
+    at_rim = torch.nonzero((beyond & (share > 0)).flatten(0, -2).any(0))[:, 0]
     if waves is None:
-        waves, share = at_cells, torch.where(traced.valid, share, 0.0)
+        waves, valid = _traced(scene, pupil, radius)
+        share = torch.where(valid, share, 0.0)
+    elif len(at_rim):
+        rim, _ = _traced(scene, pupil[..., at_rim], radius[..., at_rim])
+        waves = torch.where(beyond, torch.zeros_like(waves[0]).index_copy(-1, at_rim, rim), waves[0])
     else:
-        waves = torch.where(beyond, torch.zeros_like(waves[0]).index_copy(-1, cells, at_cells), waves[0])
+        waves = waves[0]
     return share * safe_sqrt(density) * phasor(waves), share * density
+
+
+def _traced(scene: Scene, pupil: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
+    """Waves (1, F, W, P) at points of the pupil, of those beyond the rim on it, and whether the rays are valid."""
+    traced = wavefront_of(scene, pupil * ((1 - 1e-9) / radius.clamp_min(1.0)))
+    return traced.opd / (1e-3 * traced.wavelength)[:, None], traced.valid
