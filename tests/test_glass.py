@@ -342,3 +342,9 @@ def test_sellmeier_refuses_what_does_not_pair():
 
 def test_lines_are_in_order_of_wavelength():
     assert list(LINES.values()) == sorted(LINES.values())
+
+
+def test_an_index_at_a_plain_number_is_that_of_a_tensor():
+    glass = Glass("", "schott", float64([2.27, -0.01, 0.01, 1e-4, 0.0, 0.0]))
+    assert float(refractive_index(glass, 0.5876)) == float(refractive_index(glass, float64(0.5876)))
+    assert refractive_index(glass, [0.4861, 0.6563]).shape == (2,)

@@ -5,6 +5,7 @@ import functools
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -211,3 +212,23 @@ def test_file_is_short(name):
     )
     lines = len(text.splitlines()) - imported_lines
     assert lines <= 400, f"{name}: {lines} lines; a file of more than 400 holds more than one noun or verb"
+
+
+#: Distributions by the module that they install, where the names differ.
+DISTRIBUTIONS = {"PIL": "pillow", "mpl_toolkits": "matplotlib"}
+
+
+def test_every_package_that_is_imported_is_declared():
+    """But for those of `bench`, which measures what is installed."""
+    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    declared = {re.match(r"[\w-]+", name)[0] for name in project["dependencies"]}
+    library = (path for name, path in MODULES.items() if room(name) != "bench")
+    roots = {name.split(".")[0] for path in library for name in imports(path)}
+    others = roots - set(sys.stdlib_module_names) - {room(name) for name in MODULES} - {"raytrace"}
+    assert {DISTRIBUTIONS.get(name, name) for name in others} <= declared
+
+
+def test_no_figure_is_left_at_the_top():
+    """What a command writes there is named in the manual, and ignored by git."""
+    listed = subprocess.run(["git", "ls-files", "*.*"], cwd=PACKAGE.parent, capture_output=True, text=True).stdout
+    assert not [name for name in listed.split() if name.endswith((".png", ".pdf", ".svg")) and "/" not in name]

@@ -9,10 +9,10 @@ from differences import slopes_by_differences
 from problems import values
 
 import raytrace as rt
+from raytrace.analysis.shear import Fit, layout_of, otf
 from raytrace.merit.merit import Evaluation
 from raytrace.merit.model import Model
 from raytrace.merit.moment import Moment
-from raytrace.merit.shear import Fit, layout_of, otf
 from raytrace.system.intent import Row, Vary
 
 

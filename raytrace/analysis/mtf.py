@@ -1,15 +1,17 @@
 """Modulation transfer: of diffraction, by autocorrelation of the traced wave; of rays, by quadrature."""
 
+import dataclasses
 import math
 
 import torch
 from torch import Tensor
 
-from raytrace.analysis.aperture import MARGIN, exit_pupil
+from raytrace.analysis.aperture import exit_pupil, points_needed
 from raytrace.analysis.result import Analysis, fine
 from raytrace.analysis.setting import (
     Numbers,
     Points,
+    field_words,
     like,
     primary_wavelength,
     refuse_dark,
@@ -17,8 +19,10 @@ from raytrace.analysis.setting import (
     setting,
     wavelength_shares,
 )
+from raytrace.analysis.shear import otf
+from raytrace.analysis.smooth_pupil import MARGIN, beam_of, polynomials_of
 from raytrace.budget import RAY_BYTES, piece
-from raytrace.kernels.dft import phasor, rings_and_arms
+from raytrace.kernels.dft import TooManyPoints, phasor, rings_and_arms
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.result import axis
@@ -31,6 +35,10 @@ from raytrace.system.lens import Lens, vector, with_sensor_distance
 
 _LEAST_RINGS, _MOST_RAYS = 24, 100_000
 _FREQUENCIES, _DISTANCES = 41, 21  # that are told where none are asked for
+_SECONDS = 1.5  # of the trace of a field, from where the transfer of rays is tried first
+_NO_MATTER = 1e-3  # of modulation: the change by diffraction up to which the transfer of rays is given
+_FINE_GRID = 512  # points across the pupil, from where a quadrature of the sheared pupil is tried
+_RULES = (16, 20, 28, 40, 56, 80, 112, 160, 224)  # its points along and across
 
 
 @value
@@ -39,7 +47,8 @@ class Mtf(Analysis):
 
     tangential, sagittal: (F, K), of patterns that vary along y and along x.
     limit: (K,) of a perfect lens of the paraxial working F/# on the axis, or None for rays alone.
-    frequencies: (K,) cycles/mm on the sensor; fields: (2, F); geometric: of rays, without diffraction.
+    frequencies: (K,) cycles/mm on the sensor; fields: (2, F); geometric: all fields by rays, without diffraction.
+    by_rays: (F,) bool, fields by rays, without diffraction.
     marked: whether the frequencies were asked for, and are marked on the curves.
     """
 
@@ -50,6 +59,7 @@ class Mtf(Analysis):
     sagittal: Tensor
     limit: Tensor | None
     geometric: bool
+    by_rays: Tensor
     marked: bool = False
 
     COMMAND = "mtf"
@@ -61,15 +71,21 @@ class Mtf(Analysis):
         table = {**heads, "tangential": self.tangential, "sagittal": self.sagittal}
         return table if self.limit is None else {**table, "diffraction_limit": axis(self.limit, 1, 2)}
 
+    def about(self) -> dict:
+        return {"transfer": transfer(self)}
+
     def drawn(self) -> "Mtf":
-        return _mtf(self.lens, self.fields, fine(self.frequencies), self.geometric)
+        return _mtf(self.lens, self.fields, fine(self.frequencies), self.by_rays)
+
+    def __str__(self) -> str:
+        return "\n".join([Analysis.__str__(self), *_remarks(self)])
 
 
 @value
 class ThroughFocusMtf(Analysis):
     """Modulation at one frequency over sensor distances: tangential, sagittal (S, F); sensor_distances: (S,) mm.
 
-    frequency: (1,) cycles/mm; fields: (2, F); geometric: of rays, without diffraction.
+    frequency: (1,) cycles/mm; fields: (2, F); geometric: all by rays, without diffraction; by_rays: (S, F) bool.
     """
 
     lens: Lens
@@ -79,9 +95,16 @@ class ThroughFocusMtf(Analysis):
     tangential: Tensor
     sagittal: Tensor
     geometric: bool
+    by_rays: Tensor
 
     COMMAND = "mtf"
     FIGURE = "plot.analysis.mtf_through_focus_curves"
+
+    def about(self) -> dict:
+        return {"transfer": transfer(self)}
+
+    def __str__(self) -> str:
+        return "\n".join([Analysis.__str__(self), *_remarks(self)])
 
     def columns(self) -> dict[str, Tensor]:
         return {
@@ -98,7 +121,7 @@ def mtf(
     lens: Lens,
     frequencies: Numbers = None,
     *,
-    geometric: bool = False,
+    geometric: bool | None = None,
     through_focus: float | None = None,
     fields: Points = None,
     wavelengths: Numbers = None,
@@ -108,33 +131,109 @@ def mtf(
         OTF(ν) = ∬ A(L, M + λν) A*(L, M) dL dM / ∬ |A|²              diffraction
         OTF(ν) = Σ_j w_j exp(-2πi ν y_j),  y_j where ray j lands      geometric
 
+    geometric: True or False; by default diffraction, except for a field that would need more than 1280 points across
+    the pupil or a trace of more than 1.5 s, and whose modulation diffraction is predicted to change by at most 1e-3
+    at every frequency: that field is geometric, as `by_rays` reports.
     The wavelengths' OTFs add by weight and transmitted light, each at its own place on the sensor: lateral colour
     counts. through_focus: mm by which the sensor moves to either side, of one frequency. fields: y or (x, y);
     wavelengths: µm. Raises ValueError where too few rays arrive or the blur is too large.
     """
     lens, fields = setting(lens, fields, wavelengths, every=True)
     asked = None if frequencies is None else vector(frequencies, like=lens)
+    choice = None if geometric is None else torch.full_like(fields[0], geometric, dtype=torch.bool)
     if through_focus is not None:
         if asked is None or len(asked) != 1:
             raise ValueError("`through_focus` needs one spatial frequency: give `frequencies`")
         distances = lens.surfaces[-2].thickness + through_focus * torch.linspace(-1, 1, _DISTANCES, **like(lens))
-        return _through_focus(lens, fields, asked, distances, geometric)
+        return _through_focus(lens, fields, asked, distances, choice)
     given = frequency_range(lens, fields, _FREQUENCIES) if asked is None else asked
-    return _mtf(lens, fields, given, geometric, marked=asked is not None)
+    return _mtf(lens, fields, given, choice, marked=asked is not None)
 
 
-def _mtf(lens: Lens, fields: Tensor, frequencies: Tensor, geometric: bool, *, marked: bool = False) -> Mtf:
-    tangential, sagittal = (_geometric if geometric else _diffraction)(lens, fields, frequencies)
+def _mtf(lens: Lens, fields: Tensor, frequencies: Tensor, choice: Tensor | None, *, marked: bool = False) -> Mtf:
+    """choice: (F,) bool, fields by rays; None: as `mtf` decides for each."""
+    if choice is not None and bool(choice.all()):
+        tangential, sagittal = _geometric(lens, fields, frequencies)
+        by_rays = choice
+    else:
+        wanted = [None] * fields.shape[1] if choice is None else choice.tolist()
+        rows = [_of_field(lens, *each, frequencies) for each in zip(fields.split(1, 1), wanted, strict=True)]
+        tangential, sagittal = (torch.cat(parts) for parts in list(zip(*rows, strict=True))[:2])
+        by_rays = torch.tensor([row[2] for row in rows], device=fields.device)
     perfect = clear_circle(frequencies[:, None] / cutoff(lens, lens.wavelengths)) @ wavelength_shares(lens)
-    return Mtf(lens, fields, frequencies, tangential, sagittal, None if geometric else perfect, geometric, marked)
+    whole = bool(by_rays.all())
+    limit = None if whole else perfect
+    return Mtf(lens, fields, frequencies, tangential, sagittal, limit, whole, by_rays, marked)
+
+
+def _of_field(lens: Lens, field: Tensor, geometric: bool | None, frequencies: Tensor) -> tuple[Tensor, Tensor, bool]:
+    """Tangential and sagittal MTF (1, K) of a field (2, 1), and whether of rays."""
+    if geometric:
+        return *_geometric(lens, field, frequencies), True
+    scene = scene_of(lens, field)
+    sheared = _sheared(scene, frequencies)
+    if sheared is not None:
+        return *sheared, False
+    try:
+        return *_gridded(scene, frequencies, None if geometric is False else _SECONDS), False
+    except TooManyPoints:
+        if geometric is False:
+            raise
+    both = _where_diffraction_is_no_matter(scene, frequencies)
+    return (*_gridded(scene, frequencies, None), False) if both is None else (*both, True)
+
+
+def _where_diffraction_is_no_matter(scene: Scene, frequencies: Tensor) -> tuple[Tensor, Tensor] | None:
+    """MTF (1, K) of rays where diffraction changes it by less than 1e-3, else None; see `_change_by_diffraction`."""
+    try:
+        both = _geometric(scene.lens, scene.fields, frequencies)
+        change = _change_by_diffraction(scene, frequencies, both)
+    except TooManyPoints:
+        return None
+    return both if change <= _NO_MATTER else None
+
+
+def _change_by_diffraction(scene: Scene, frequencies: Tensor, both: tuple[Tensor, Tensor]) -> float:
+    """Largest |G(ν) - C G(ν - k ν (1 - C))| for k = 1/2 and 1, of the MTF G (1, K) of rays along both sections.
+
+    Two pupils cover each other by a share C, that of a clear pupil, which a defocus sees as a blur narrower by about
+    1 - C along the shear.
+    """
+    changes = []
+    with torch.no_grad():
+        highest = beam_of(scene).cutoffs.amin(-1).flip(0)
+        for section, (geometric, top) in enumerate(zip(both, highest, strict=True)):
+            share = clear_circle(frequencies / top)
+            for k in (0.5, 1.0):
+                narrowed = _geometric(scene.lens, scene.fields, frequencies * (1 - k * (1 - share)))[section]
+                changes.append((geometric - share * narrowed).abs().max())
+    return float(torch.stack(changes).max())
 
 
 def _through_focus(
-    lens: Lens, fields: Tensor, frequency: Tensor, distances: Tensor, geometric: bool
+    lens: Lens, fields: Tensor, frequency: Tensor, distances: Tensor, choice: Tensor | None
 ) -> ThroughFocusMtf:
-    found = [_mtf(with_sensor_distance(lens, distance), fields, frequency, geometric) for distance in distances]
+    found = [_mtf(with_sensor_distance(lens, distance), fields, frequency, choice) for distance in distances]
     tangential, sagittal = (torch.stack([getattr(m, name)[:, 0] for m in found]) for name in ("tangential", "sagittal"))
-    return ThroughFocusMtf(lens, fields, frequency, distances, tangential, sagittal, geometric)
+    by_rays = torch.stack([m.by_rays for m in found])
+    whole = bool(by_rays.all())
+    return ThroughFocusMtf(lens, fields, frequency, distances, tangential, sagittal, whole, by_rays)
+
+
+def transfer(found: Mtf | ThroughFocusMtf) -> str:
+    """Which transfer a result has: "diffraction", "geometric", or both with the fields, as for a title."""
+    some = found.by_rays.any(0) if found.by_rays.dim() == 2 else found.by_rays
+    if found.geometric or not bool(some.any()):
+        return "geometric" if found.geometric else "diffraction"
+    names = " and ".join(field_words(found.lens, field) for field in found.fields.T[some])
+    return f"diffraction (geometric for {names})"
+
+
+def _remarks(found: Mtf | ThroughFocusMtf) -> list[str]:
+    """A line of text on fields that are geometric unasked."""
+    if not bool(found.by_rays.any()):
+        return []
+    return [f"transfer: {transfer(found)}"]
 
 
 def frequency_range(lens: Lens, fields: Tensor, size: int) -> Tensor:
@@ -155,16 +254,56 @@ def cutoff(lens: Lens, wavelength: Tensor) -> Tensor:
     return 1e3 / (wavelength * axial_f_number(lens))
 
 
-def _diffraction(lens: Lens, fields: Tensor, frequencies: Tensor) -> tuple[Tensor, Tensor]:
-    whole, rows = scene_of(lens, fields), []
-    for field in fields.split(1, 1):  # each on a grid as fine as its own blur asks for
-        pupil = exit_pupil(Scene(whole.lens, field, whole.wavelengths))
-        shift, weights = _from_primary(lens, pupil.centre), wavelength_shares(lens) * pupil.light
-        sections = zip((pupil.amplitude.mT, pupil.amplitude), pupil.step.flip(0), shift.flip(0), strict=True)
-        otfs = ((otf_along(lines, pupil.energy, frequencies, step), place) for lines, step, place in sections)
-        rows.append([modulation(otf, frequencies, place, weights) for otf, place in otfs])
-    tangential, sagittal = (torch.cat(parts) for parts in zip(*rows, strict=True))
+def _gridded(scene: Scene, frequencies: Tensor, seconds: float | None) -> tuple[Tensor, Tensor]:
+    """MTF (1, K) of a field, on a grid of the pupil as fine as its blur needs; seconds: see `exit_pupil`."""
+    pupil = exit_pupil(scene, seconds=seconds)
+    shift, weights = _from_primary(scene.lens, pupil.centre), wavelength_shares(scene.lens) * pupil.light
+    sections = zip((pupil.amplitude.mT, pupil.amplitude), pupil.step.flip(0), shift.flip(0), strict=True)
+    otfs = ((otf_along(lines, pupil.energy, frequencies, step), place) for lines, step, place in sections)
+    tangential, sagittal = (modulation(otf, frequencies, place, weights) for otf, place in otfs)
     return tangential, sagittal
+
+
+def _sheared(scene: Scene, frequencies: Tensor) -> tuple[Tensor, Tensor] | None:
+    """The same by the quadrature of `shear.py`, where a fine grid would take longer and polynomials give the wave.
+
+    The grid needs points for all that the blur could modulate, the quadrature for the frequencies that are listed.
+    """
+    beam = beam_of(scene)
+    beam = dataclasses.replace(beam, middle=beam.middle.detach(), half=beam.half.detach())  # choices of coordinates
+    usual = not points_needed(beam) > _FINE_GRID
+    if usual or frequencies.requires_grad or not bool(beam.wavefront.valid.all()):
+        return None
+    rules = [_rule(float((beam.blur.max() * frequency.abs()).detach())) for frequency in frequencies]
+    polynomials = None if None in rules else polynomials_of(scene, beam)
+    if polynomials is None:
+        return None
+    shift = _from_primary(scene.lens, beam.wavefront.centre[:2, 0])
+    weights = wavelength_shares(scene.lens) * beam.wavefront.energy.sum(-1)[0]
+    result = []
+    for section, along in ((1, polynomials), (0, polynomials.mT)):
+        shear = frequencies[:, None] / (beam.half[section, 0, 0] * beam.waves_per)
+        parts = _overlaps(along, shear, rules)
+        result.append(modulation(parts.mT[None], frequencies, shift[section], weights))
+    return tuple(result)
+
+
+def _rule(turns: float) -> int | None:
+    """Points along and across for a phase of 2π `turns` from the chief ray to the rim; None: more than there are."""
+    return next((n for n in _RULES if n >= 16 + 6 * turns), None)
+
+
+def _overlaps(polynomials: Tensor, shear: Tensor, rules: list[int]) -> Tensor:
+    """OTF (K, W) of polynomials (3, 1, W, N, N) at shears (K, W) by rules (K,), 1 without a shear."""
+    found = torch.ones_like(shear) + 0j
+    sheared = (shear != 0).any(-1).tolist()
+    for points in sorted(set(rules)):
+        chosen = torch.tensor([k for k, rule in enumerate(rules) if rule == points and sheared[k]], dtype=torch.int64)
+        together = piece(64 * points**2 * polynomials.shape[-1] * shear.shape[1])
+        for some in chosen.to(shear.device).split(together) if len(chosen) else []:
+            stacked = polynomials.expand(-1, len(some), -1, -1, -1)
+            found = found.index_copy(0, some, otf(stacked, shear[some].abs(), points))
+    return found
 
 
 def otf_along(lines: Tensor, energy: Tensor, frequencies: Tensor, step: Tensor) -> Tensor:
@@ -200,7 +339,7 @@ def _geometric(lens: Lens, fields: Tensor, frequencies: Tensor) -> tuple[Tensor,
         rings, arms = rings_and_arms(2 * math.pi * float(blur * frequencies.max()), 0)
     rings, arms = max(rings, _LEAST_RINGS), max(arms, 4 * _LEAST_RINGS)
     if rings * arms > _MOST_RAYS:
-        raise ValueError(
+        raise TooManyPoints(
             f"the blur needs {rings * arms} rays at {float(frequencies.max()):g} cycles/mm: focus the lens"
         )
     pupil = gauss_rings(rings, arms, **like(lens))

@@ -2,7 +2,7 @@
 
 import argparse
 
-from raytrace.cli.options import analysis, geometric, positive_finite
+from raytrace.cli.options import analysis, positive_finite
 
 SUMMARY = "modulation transfer function"
 DESCRIPTION = (
@@ -17,7 +17,12 @@ EXAMPLES = """examples:
 
 def options(parser: argparse.ArgumentParser) -> None:
     analysis(parser, "the curves")
-    geometric(parser)
+    parser.add_argument(
+        "--geometric",
+        action=argparse.BooleanOptionalAction,
+        help="of rays alone, without diffraction, or always of diffraction (default: of diffraction, but of rays for "
+        "fields whose blur is so large that diffraction takes long and changes the modulation by less than 0.001)",
+    )
     parser.add_argument(
         "--frequency",
         dest="frequencies",

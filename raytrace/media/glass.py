@@ -82,16 +82,18 @@ class Glass:
 # -- the index --------------------------------------------------------------------------------------------------------
 
 
-def refractive_index(glass: Glass, wavelength: Tensor) -> Tensor:
+def refractive_index(glass: Glass, wavelength: Tensor | float) -> Tensor:
     """n of a glass, evaluated in float64; 0 with gradient 0 where the formula has no real, positive index.
 
-    wavelength: (...) µm; a constant index takes any number. Returns (...), broadcast with the trailing axes of the
-    coefficients, in the dtype and on the device of `wavelength`. No check, no warning, no host synchronisation: see
-    the module's docstring.
+    wavelength: (...) µm, plain numbers in float64; a constant index takes any number. Returns (...), broadcast with the
+    trailing axes of the coefficients, in the dtype and on the device of `wavelength`. No check, no warning, no host
+    synchronisation: see the module's docstring.
     Raises InvalidIndex for MIRROR, which has no index: light stays in the medium before it.
     """
     if glass.formula == "mirror":
         raise InvalidIndex("a mirror has no refractive index: the light stays in the medium before it")
+    if not isinstance(wavelength, Tensor):
+        wavelength = torch.as_tensor(wavelength, dtype=torch.float64)
     exact = wavelength.to(torch.float64)
     coefficients = glass.coefficients.to(device=wavelength.device, dtype=torch.float64)
     count, *batch = coefficients.shape

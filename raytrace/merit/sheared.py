@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from raytrace.analysis.shear import Fit, layout_of, otf
 from raytrace.maths.dual import Dual, slope_of, value_of
 from raytrace.merit.path import directions_to, image_index, path_to, sphere_of
 from raytrace.merit.plan import Now, Planner
-from raytrace.merit.shear import Fit, layout_of, otf
 from raytrace.optics.axis import is_bent
 
 _MISSED = 0.02  # waves of RMS that the polynomials of a wave may leave

@@ -14,7 +14,7 @@ from raytrace.analysis.grid import GridDistortion
 from raytrace.analysis.illumination import RelativeIllumination
 from raytrace.analysis.incidence import Incidence
 from raytrace.analysis.longitudinal import LongitudinalAberration
-from raytrace.analysis.mtf import Mtf, ThroughFocusMtf, cutoff
+from raytrace.analysis.mtf import Mtf, ThroughFocusMtf, cutoff, transfer
 from raytrace.analysis.rms import RmsOverField
 from raytrace.analysis.seidel import Seidel
 from raytrace.analysis.setting import primary_wavelength
@@ -145,7 +145,7 @@ def mtf_curves(found: Mtf, *, asked: Mtf | None = None) -> Figure:
     if found.limit is not None:
         panel.plot(frequency, array(found.limit), color=GREY, linewidth=1.0, linestyle=":", label="diffraction limit")
     panel.set(xlim=(0, frequency.max()), ylim=(0, 1.0))
-    return finished(panel, found, f"{_light(found)} MTF", 6)
+    return finished(panel, found, f"{transfer(found)} MTF", 6)
 
 
 @styled
@@ -160,7 +160,7 @@ def mtf_through_focus_curves(found: ThroughFocusMtf) -> Figure:
     by_field(panel, found, fine, **smooth)
     panel.axvline(float(found.lens.surfaces[-2].thickness), color=GREY, linewidth=0.8)
     panel.set(xlim=(distance.min(), distance.max()), ylim=(0, 1.0))
-    return finished(panel, found, f"{_light(found)} MTF through focus", 6)
+    return finished(panel, found, f"{transfer(found)} MTF through focus", 6)
 
 
 @styled
@@ -173,11 +173,8 @@ def encircled_curves(found: EncircledEnergy, *, asked: EncircledEnergy | None = 
         mark_fields(panel, 1e3 * array(asked.radii), array(asked.share))
     panel.axhline(0.8, color=GREY, linewidth=0.7, linestyle=":")
     panel.set(xlim=(0, radii.max()), ylim=(0, 1.02))
-    return finished(panel, found, f"{_light(found)} encircled energy", 6)
-
-
-def _light(found) -> str:
-    return "geometric" if found.geometric else "diffraction"
+    light = "geometric" if found.geometric else "diffraction"
+    return finished(panel, found, f"{light} encircled energy", 6)
 
 
 @styled
