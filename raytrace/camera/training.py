@@ -185,7 +185,7 @@ def read_json(path: Path) -> dict:
 
 
 def _words(error: object) -> str:
-    return " ".join(str(error).split())[:120]
+    return " ".join(str(error).split())[:400]
 
 
 def _csv(rows: list[list]) -> str:
