@@ -138,11 +138,6 @@ def test_an_interrupt_keeps_the_best():
 # -- lenses ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def triplet():
-    return rt.read_lens("cooke_triplet")
-
-
 def problem_of(lens, vary, **options):
     free = freedom(lens, vary)
     return Problem(Model(free.lens, free.variables, free.solves), rows_of(lens, "spot"), **options)
@@ -307,7 +302,8 @@ def test_the_document_has_the_fixed_keys_and_the_lens_comes_back(command_line):
     assert done.code == 0, done.err
     told = done.document
     assert [*told] == [
-        "merit_before", "merit_after", "cycles", "evaluations", "seconds", "stopped", "variables", "operands", "conditions",
+        "merit_before", "merit_after", "cycles", "evaluations", "seconds", "stopped", "variables", "operands",
+        "conditions",
     ]  # fmt: skip
     assert [*told["variables"][0]] == ["name", "before", "after"]
     assert [*told["operands"][0]] == ["row", "operand", "target", "weight", "before", "after"]
