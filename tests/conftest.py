@@ -51,6 +51,12 @@ def lens():
     return read_lens("double_gauss")
 
 
+@pytest.fixture(scope="module")
+def triplet():
+    """The shipped Cooke triplet."""
+    return read_lens("cooke_triplet")
+
+
 @pytest.fixture
 def engine(request):
     """Traces by torch alone, or as `problems.both_engines` says."""

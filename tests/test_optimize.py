@@ -15,9 +15,9 @@ from raytrace.bench import optimise as bench
 from raytrace.merit.default import Boundaries, rows_of
 from raytrace.merit.model import Model
 from raytrace.merit.vary import freedom, name_of
+from raytrace.optimization import paths
 from raytrace.optimization.least_squares import Manner, State, least_squares
 from raytrace.optimization.lost import Recovery
-from raytrace.optimization.paths import LIMIT, best_of_paths
 from raytrace.optimization.problem import Condition, NoProblem, Problem
 from raytrace.optimization.step import Linear, NoStep, Sides
 from raytrace.plot.optimize import optimize_report
@@ -136,11 +136,6 @@ def test_an_interrupt_keeps_the_best():
 
 
 # -- lenses ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def triplet():
-    return rt.read_lens("cooke_triplet")
 
 
 def problem_of(lens, vary, **options):
@@ -458,8 +453,11 @@ def test_operands_of_which_no_row_counts_are_not_evaluated_on_the_way(triplet):
     assert rt.optimize(triplet, merit=used, vary="curvature:1-3", cycles=6).evaluations <= len(called)
 
 
-def test_a_descent_along_a_valley_without_end_ends():
-    """A merit that falls for ever, by a little every cycle."""
-    crawl = squares(lambda x: np.array([np.exp(-x[0])]), lambda x: np.array([[-np.exp(-x[0])]]))
-    found = best_of_paths(crawl, np.zeros(1), lower=np.full(1, -FAR), upper=np.full(1, FAR), typical=None)
-    assert found.cycles <= LIMIT
+def test_cycles_are_limited_where_neither_they_nor_the_time_are(monkeypatch):
+    """Along a narrow valley a merit may fall for ever; who gives a time has all of it."""
+    monkeypatch.setattr(paths, "LIMIT", 3)
+    state, start, ends = squares(rosenbrock, by_rosenbrock), np.array([-1.2, 1.0]), np.full(2, FAR)
+    found = paths.best_of_paths(state, start, lower=-ends, upper=ends)
+    assert (found.cycles, found.stopped) == (3, "cycles")
+    assert paths.best_of_paths(state, start, lower=-ends, upper=ends, seconds=60).cycles > 3
+    assert paths.best_of_paths(state, start, lower=-ends, upper=ends, cycles=5).cycles == 5

@@ -16,12 +16,6 @@ from raytrace.optimization.problem import NoProblem
 from raytrace.optimization.reached import NotReached
 from raytrace.system.intent import Intent, Row, Vary
 
-
-@pytest.fixture(scope="module")
-def triplet():
-    return rt.read_lens("cooke_triplet")
-
-
 REFUSED = {
     "two numbers for one": ("curvature", "", "efl=100 efl=50", "efl=100 (now 101.181), efl=50", "exclude one another"),
     "an interval of nothing": ("curvature", "", "efl<=40 efl>=50", "efl<=40", "exclude one another"),
