@@ -49,11 +49,20 @@ def _holds_numbers(annotation: object) -> bool:
     return annotation is torch.Tensor or annotation in _VALUE_TYPES
 
 
+def check_precision(dtype: torch.dtype) -> None:
+    """Refuse floating-point numbers of 16 bits and fewer: at a millimetre they are 0.5 µm or more apart."""
+    if dtype.is_floating_point and torch.finfo(dtype).bits < 32:
+        raise ValueError(f"dtype {dtype}: expected torch.float32 or torch.float64; fewer bits resolve no spot or path")
+
+
 def to(instance: Value, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Value:
     """The same value with every floating-point tensor in it converted to `dtype` and moved to `device`.
 
-    A tensor that stands in several places (the coefficients of air, say) stays one tensor.
+    A tensor that stands in several places (the coefficients of air, say) stays one tensor. Raises ValueError for a
+    dtype too coarse for optics (`check_precision`).
     """
+    if dtype is not None:
+        check_precision(dtype)
     converted: dict[int, torch.Tensor] = {}
 
     def convert(leaf):

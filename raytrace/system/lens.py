@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from raytrace.maths.result import lent
-from raytrace.maths.value import value
+from raytrace.maths.value import check_precision, value
 from raytrace.media.environment import (
     REFERENCE,
     Environment,
@@ -169,9 +169,11 @@ def changed(surface: Surface, numbers: Mapping[str, object], where: str, *, like
 def field_points(fields: Tensor | Sequence | float | None, *, like: "Lens | Tensor") -> Tensor:
     """(2, F) field points of a y, of several y or pairs (x, y), or of a tensor (2, F) as it is; None: the lens's own.
 
-    like: the lens whose kind of field it is, or a tensor that tells dtype and device. Raises ValueError.
+    like: the lens whose kind of field it is, or a tensor of their dtype and device. Raises ValueError, also where the
+    lens is in float16.
     """
     if isinstance(like, Lens):
+        check_precision(like.wavelengths.dtype)
         if fields is None:
             return torch.stack([like.fields.x, like.fields.y])
         found = field_points(fields, like=like.fields.y)
@@ -330,6 +332,7 @@ def _with_thickness(lens: Lens, number: int, thickness: Tensor | float) -> Lens:
 
 def check(lens: Lens) -> None:
     """Refuse a lens that cannot be traced as a whole. Raises ValueError saying what was found and what was expected."""
+    check_precision(lens.wavelengths.dtype)
     last = len(lens.surfaces) - 1
     if lens.ray_aiming not in RAY_AIMING:
         raise ValueError(f"ray aiming {lens.ray_aiming!r}: expected one of {', '.join(RAY_AIMING)}")
