@@ -1,6 +1,6 @@
-"""The verbs as `rt.NAME`: a path serves as a lens, one number as a list of one, `field` as `fields`; the rest is refused.
+"""The verbs as `rt.NAME`: a path serves as a lens, one number as a list of one, `field` as `fields`.
 
-Calls inside the package do not pass through here.
+Other values of the wrong kind are refused. Calls inside the package do not pass through here.
 """
 
 import functools
@@ -93,9 +93,8 @@ def _lens(verb: str, name: str, value: object) -> Lens:
     if isinstance(value, (str, os.PathLike)):
         return read_lens(value)
     hint = "; it has one, as its `lens`" if isinstance(getattr(value, "lens", None), Lens) else ""
-    raise TypeError(
-        f"{verb}: `{name}` is {_kind(value)}; expected a Lens, the path of a lens file or the name of a shipped lens{hint}"
-    )
+    expected = "a Lens, the path of a lens file or the name of a shipped lens"
+    raise TypeError(f"{verb}: `{name}` is {_kind(value)}; expected {expected}{hint}")
 
 
 def _several(verb: str, name: str, value: object) -> Tensor | tuple | list:

@@ -117,3 +117,12 @@ def test_the_verbs_are_those_of_the_modules():
         assert verb is getattr(rt, name)
         assert verb.__doc__ == verb.__wrapped__.__doc__
         assert pickle.loads(pickle.dumps(verb)) is verb
+
+
+@pytest.mark.parametrize("warned", ["spot", "read_lens"])
+def test_a_warning_names_the_line_that_calls_the_verb(warned, path, tmp_path):
+    unknown = tmp_path / "unknown.zmx"
+    unknown.write_text(path.read_text("utf-8-sig").replace("NAME", "FROB 1 2\nNAME", 1), "utf-8")
+    with pytest.warns((rt.LostRays, UserWarning)) as found:
+        rt.spot(path, field=80) if warned == "spot" else rt.read_lens(unknown)
+    assert {one.filename for one in found} == {__file__}
