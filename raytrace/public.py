@@ -1,4 +1,4 @@
-"""The verbs as `rt.NAME`: a path serves as a lens, one number as a list of one, `field` as `fields`.
+"""The verbs as the package exports them: a path serves as a lens, one number as a list of one, `field` as `fields`.
 
 Other values of the wrong kind are refused. Calls inside the package do not pass through here.
 """
