@@ -6,10 +6,12 @@
     99.5145515665...
 
 The nouns and verbs stand here, each in the room that PUBLIC names, and are imported when first used: `import raytrace`
-alone loads neither torch nor matplotlib nor pandas.
+alone loads neither torch nor matplotlib nor pandas. A verb that takes a lens takes the path of its file, too, or the
+name of a shipped lens (`raytrace.public`).
 """
 
 import importlib
+from types import FunctionType
 
 #: Public names, and where each is defined: "room.file", or "room.file:name" if it has another name there.
 PUBLIC = {
@@ -150,7 +152,10 @@ def __getattr__(name: str):
     if name not in PUBLIC:
         raise AttributeError(f"module 'raytrace' has no attribute {name!r}")
     place, _, own = PUBLIC[name].partition(":")
-    return getattr(importlib.import_module(f"raytrace.{place}"), own or name)
+    found = getattr(importlib.import_module(f"raytrace.{place}"), own or name)
+    if not isinstance(found, FunctionType):
+        return found
+    return importlib.import_module("raytrace.public").public(found, name)
 
 
 def __dir__() -> list[str]:

@@ -13,6 +13,8 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
+from raytrace.words import calling_level
+
 _SMALL = 2**24  # bytes that nobody is asked about
 _LONG = 30.0  # s
 _PIECE = 2**27  # bytes that a piece of what is cut into pieces takes
@@ -62,7 +64,7 @@ def forewarn(seconds: float, what: str, *, helps: str) -> None:
     """Warn TakesLong where something is predicted to take long, to a factor of three; arguments as for `afford`."""
     if seconds > _LONG:
         length = f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:,.0f} minutes"
-        warnings.warn(f"{what}: about {length}; for less, {helps}", TakesLong, stacklevel=3)
+        warnings.warn(f"{what}: about {length}; for less, {helps}", TakesLong, stacklevel=calling_level())
 
 
 def allowed_bytes() -> float:

@@ -16,6 +16,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from raytrace.files import append_text, read_bytes, write_text
+from raytrace.words import calling_level
 
 #: A value as JSON has it -> the value that is stored. Raises Unfit.
 Check = Callable[[object], object]
@@ -255,9 +256,9 @@ class Lines:
 
     def _report(self, damaged: list[str]) -> None:
         for words in damaged[:_REPORTED]:
-            warnings.warn(f"{self.path}, {words}; the line is ignored", DamagedLine, stacklevel=4)
+            warnings.warn(f"{self.path}, {words}; the line is ignored", DamagedLine, stacklevel=calling_level())
         if len(damaged) > _REPORTED:
-            warnings.warn(f"{self.path}: {len(damaged)} damaged lines in all", DamagedLine, stacklevel=4)
+            warnings.warn(f"{self.path}: {len(damaged)} damaged lines in all", DamagedLine, stacklevel=calling_level())
 
     def begin(self, head: object) -> None:
         """Begin the file with its first line, as a whole or not at all; the folder is made."""

@@ -1,8 +1,12 @@
-"""Words: what may have been meant by one that is not known, and what the kind of a value is called."""
+"""Words: the nearest known to an unknown one, what the kind of a value is called, and the line that a warning names."""
 
 import difflib
 import re
+import sys
 from collections.abc import Iterable
+from pathlib import Path
+
+_PACKAGE = str(Path(__file__).parent)
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
@@ -20,3 +24,11 @@ def named(part: object) -> str:
 def with_article(noun: str) -> str:
     """A noun with "a" or "an" before it."""
     return ("an " if noun[0] in "aeiou" else "a ") + noun
+
+
+def calling_level() -> int:
+    """The `stacklevel` of a warning, so that it names the line that called the package, however deep it arises."""
+    frame, level = sys._getframe(1), 1
+    while frame.f_back and frame.f_code.co_filename.startswith(_PACKAGE):
+        frame, level = frame.f_back, level + 1
+    return level

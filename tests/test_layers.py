@@ -14,11 +14,11 @@ PACKAGE = Path(__file__).parents[1] / "raytrace"
 
 #: Floor of every room, a folder or a file directly under raytrace/; inside a room imports only have to run one way.
 FLOORS = {
-    # knows no optics: files that travel with the package, processes that share one computation
+    # knows no optics: words of messages; files that travel with the package, processes that share one computation
+    "words": -1,
     "files": 0,
     "budget": 0,
     "shards": 0,
-    "words": 0,
     "maths": 1,
     "pages": 1,
     "stores": 1,
@@ -42,6 +42,8 @@ FLOORS = {
     # experiments and measurements: nothing imports them
     "studies": 12,
     "bench": 12,
+    # the package's door
+    "public": 13,
     "__init__": 13,
     "__main__": 13,
 }

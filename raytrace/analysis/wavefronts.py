@@ -17,6 +17,7 @@ from raytrace.maths.value import value
 from raytrace.optics.scene import Scene
 from raytrace.optics.wavefront import peak_to_valley, rms, wavefront_of, zernike_coefficients
 from raytrace.system.lens import Lens
+from raytrace.words import calling_level
 
 _RINGS = 14, 56
 _GRID = 127
@@ -112,7 +113,7 @@ def wavefront(
     for f in torch.nonzero(unknown.any(1))[:, 0].tolist():
         field = f"field {field_words(lens, fields[:, f])}"
         words = f"{field}: the light fills too little of the entrance pupil for Zernike coefficients"
-        warnings.warn(words, Incomplete, stacklevel=2)
+        warnings.warn(words, Incomplete, stacklevel=calling_level())
     return found
 
 

@@ -26,6 +26,7 @@ from raytrace.files import append_text, write_atomically
 from raytrace.fused import prepare
 from raytrace.shards import Share, share, total
 from raytrace.stores import DamagedLine, anything, mapped, read_document
+from raytrace.words import calling_level
 
 #: What a step reports: numbers by name, a column of the log each.
 Record = dict[str, float]
@@ -136,7 +137,7 @@ class Run:
         for line, row in enumerate(rows[:-1], 2):  # the last one may be torn
             if not whole[line - 2]:
                 words = f"found {_words(','.join(row))!r}, expected {len(header)} numbers; the line is dropped"
-                warnings.warn(f"{self.log}, line {line}: {words}", DamagedLine, stacklevel=2)
+                warnings.warn(f"{self.log}, line {line}: {words}", DamagedLine, stacklevel=calling_level())
         kept = [row for row, is_whole in zip(rows, whole, strict=True) if is_whole and int(row[0]) < step]
         write_atomically(self.log, lambda file: file.write(_csv([header, *kept]).encode()))
 

@@ -37,6 +37,7 @@ from raytrace.system.configurations import count
 from raytrace.system.intent import Intent
 from raytrace.system.lens import Lens, check_media
 from raytrace.system.lens import check as check_lens
+from raytrace.words import calling_level
 
 #: Other glasses for those of a file: {"SSK4": "SSK4A"}, words like "SSK4=SSK4A", "nearest" for every unknown one.
 Substitute = Mapping[str, str] | str | Sequence[str] | None
@@ -95,7 +96,7 @@ def read_lens(
     how = {"catalogs": catalogs, "strict": strict, "configuration": configuration, "substitute": substitute}
     lens, report = read_lens_with_report(path, **how)
     if report.warnings:
-        warnings.warn("; ".join(report.warnings), LensFileWarning, stacklevel=2)
+        warnings.warn("; ".join(report.warnings), LensFileWarning, stacklevel=calling_level())
     return lens
 
 
@@ -199,7 +200,7 @@ def convert(
     how = {"catalogs": catalogs, "strict": strict, "configuration": configuration, "substitute": substitute}
     lens, report = read_lens_with_report(source, **how)
     for warning in report.warnings:
-        warnings.warn(warning, LensFileWarning, stacklevel=2)
+        warnings.warn(warning, LensFileWarning, stacklevel=calling_level())
     write_lens(lens, target, catalogs=catalogs)
     return Conversion(report.file, str(target), len(lens.surfaces))
 
@@ -227,7 +228,7 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
     changed = _changed_texts(lens, content, form, path, tuple(catalogs))
     if changed:
         message = f"{path}: {', '.join(changed)}: not brought back as it is by a {path.suffix} file"
-        warnings.warn(message, LensFileWarning, stacklevel=2)
+        warnings.warn(message, LensFileWarning, stacklevel=calling_level())
     try:
         write_atomically(path, lambda file: file.write(content))
     except OSError as error:

@@ -18,6 +18,7 @@ from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.pupil import gauss_rings
 from raytrace.optics.f_number import axial_f_number
 from raytrace.optics.scene import Scene
+from raytrace.words import calling_level
 
 
 class TooManyPoints(ValueError):
@@ -71,7 +72,8 @@ def fft_psf(amplitude: Tensor, waves: Tensor, *, pad: int) -> Tensor:
         lit = (amplitude != 0).narrow(axis, 1, step.shape[axis]) & (amplitude != 0).narrow(axis, 0, step.shape[axis])
         if bool((lit & (step > 0.5)).any()):
             largest = float(torch.where(lit, step, 0.0).max())
-            warnings.warn(f"OPD steps by up to {largest:.3g} waves between pupil samples", Aliased, stacklevel=2)
+            message = f"OPD steps by up to {largest:.3g} waves between pupil samples"
+            warnings.warn(message, Aliased, stacklevel=calling_level())
             break
     size = pad * amplitude.shape[-1]
     field = torch.fft.fft2(amplitude * phasor(waves), s=(size, size))

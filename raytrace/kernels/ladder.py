@@ -18,6 +18,7 @@ from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.optics.f_number import axial_f_number
 from raytrace.optics.paraxial import first_order
 from raytrace.optics.scene import Scene, varies
+from raytrace.words import calling_level
 
 
 class NotConverged(UserWarning):
@@ -58,7 +59,7 @@ def by_tolerance(batch: Scene, pixels: Grid, weights: Tensor | None, model: Mode
     reason = ""
     if not bool((error <= tol).all()):
         reason = f"{model.name}: the estimated error {float(error.max()):.1e} stays above the tolerance {tol:g}"
-        warnings.warn(reason, NotConverged, stacklevel=4)
+        warnings.warn(reason, NotConverged, stacklevel=calling_level())
     residual, order = found.residual, found.order
     # Derivatives by any number of the scene, the pixels or the model's own options.
     numbers = pytree.tree_leaves((batch, pixels, weights, getattr(model.kernels, "keywords", {})))
@@ -116,7 +117,7 @@ def climb(batch: Scene, pixels: Grid, weights: Tensor | None, rungs: Sequence[Mo
 def _unproven(found: Psf, why: str) -> Psf:
     """The kernels of a rung that the one above cannot be compared with. Warns NotConverged."""
     reason = f"{found.model}: not compared with waves: {why}"
-    warnings.warn(reason, NotConverged, stacklevel=5)
+    warnings.warn(reason, NotConverged, stacklevel=calling_level())
     return dataclasses.replace(found, reason=reason)
 
 

@@ -27,7 +27,7 @@ class Model:
     is_rung: whether `model="auto"` tries it, which climbs from the model that knows least.
     row, compared: its place in `compare`, and how it is driven there.
 
-    The error of an order, where not `proof`, is extrapolated from its changes (`ladder.estimate`):
+    The error of an order, where not `proof`, is extrapolated from its changes (`ladder.by_tolerance`):
     by_width: True if the error is that of σ, False if it is that of the kernel.
     proof: the error of an order is so many times its difference from the next, which is computed to prove it.
     first: ratio of successive changes that is taken for granted while only one change is known; None: two are needed.

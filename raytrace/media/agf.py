@@ -13,6 +13,7 @@ import torch
 from raytrace.files import encoding, read_bytes, write_text
 from raytrace.media.formulas import BY_NUMBER, FORMULAS
 from raytrace.media.glass import Glass
+from raytrace.words import calling_level
 
 _STATUSES = {0: "standard", 1: "preferred", 2: "obsolete", 3: "special", 4: "melt"}
 #: Records of numbers, by rank in the order in which a glass is written.
@@ -151,12 +152,12 @@ def parse_agf(text: str, path: str | Path) -> Catalog:
         first = glasses.setdefault(glass.listed_name, glass)
         if first is not glass:
             message = f"{path}:{block[0][0]}: {glass.listed_name} is defined again; the first definition holds"
-            warnings.warn(message, CatalogWarning, stacklevel=3)
+            warnings.warn(message, CatalogWarning, stacklevel=calling_level())
     if not glasses:
         raise _fault(path, 1, "no glass", "an AGF catalog, with one NM record for each glass")
     if unknown:
         listed = ", ".join(f"{word!r} (line {line})" for word, line in list(unknown.items())[:5])
-        warnings.warn(f"{path}: left aside lines that begin with {listed}", CatalogWarning, stacklevel=3)
+        warnings.warn(f"{path}: left aside lines that begin with {listed}", CatalogWarning, stacklevel=calling_level())
     return Catalog(name, MappingProxyType(glasses), tuple(comments))
 
 

@@ -34,6 +34,7 @@ from raytrace.media.agf import read_agf as read_agf
 from raytrace.media.agf import read_text
 from raytrace.media.agf import write_agf as write_agf
 from raytrace.media.glass import LINES, Glass, refractive_index
+from raytrace.words import calling_level
 
 #: Shipped catalogs in the order they are searched: the makers by how often lens files name them, then collections,
 #: then the makers of few glasses; BIREFRINGENT last, for its names stand for one ray of a crystal.
@@ -282,7 +283,7 @@ def _warn_if_ambiguous(candidates: Sequence[Glass], where: str) -> None:
             f"{_at(where)}{glass.listed_name} is taken from {glass.catalog}, but another glass has this name in other "
             f"catalogs (index differs in {', '.join(rivals)}); name the catalog in the file, or give it (--catalog)"
         )
-        warnings.warn(message, AmbiguousGlass, stacklevel=3)
+        warnings.warn(message, AmbiguousGlass, stacklevel=calling_level())
 
 
 def _difference(one: Glass, other: Glass) -> float:

@@ -31,6 +31,7 @@ from raytrace.media.glass import (
     nd,
     refractive_index,
 )
+from raytrace.words import calling_level
 
 
 @value
@@ -129,5 +130,5 @@ def glass(
     if wrong := objection(air):
         raise ValueError(f"{name}: {wrong}")
     if unknown := unknown_change(found, air):
-        warnings.warn(unknown, NoThermalCoefficients, stacklevel=2)
+        warnings.warn(unknown, NoThermalCoefficients, stacklevel=calling_level())
     return GlassFigures(found, asked, index_in(found, asked, air), air, *dn_dt(found, asked, air))

@@ -22,6 +22,7 @@ from torch import Tensor
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.value import value
 from raytrace.media.formulas import FORMULAS
+from raytrace.words import calling_level
 
 #: Spectral lines, µm (ISO 7944 and the neighbours that catalogs list).
 LINES = {"i": 0.3650146, "h": 0.4046561, "g": 0.4358343, "F'": 0.4799914, "F": 0.4861327, "e": 0.5460740}
@@ -134,7 +135,7 @@ def check_wavelengths(glass: Glass, wavelengths: Tensor | Sequence[float] | floa
         outside = wavelengths[(wavelengths < shortest) | (wavelengths > longest)]
         if outside.numel():
             message = f"{place}{name} is extrapolated to {_spell(outside)} µm; {fitted}"
-            warnings.warn(message, OutOfRange, stacklevel=2)
+            warnings.warn(message, OutOfRange, stacklevel=calling_level())
 
 
 def check_unit(

@@ -34,7 +34,7 @@ from raytrace.system.intent import Solve, Vary
 from raytrace.system.lens import Lens
 from raytrace.system.naming import BadVariables, counted, joined, parse_bounds, sensor
 from raytrace.system.places import modelled, places
-from raytrace.words import did_you_mean
+from raytrace.words import calling_level, did_you_mean
 
 #: Words for several numbers at once.
 GROUPS = {"tilt": ("tilt_x", "tilt_y"), "decentre": ("x", "y")}
@@ -191,7 +191,7 @@ def _model_of(glass: Glass, surface: int, lens: Lens) -> Glass:
     warnings.warn(
         f"surface {surface}: {glass.name} varies as a model glass, whose index is off by {float(off.abs().max()):.1g}",
         VariedGlass,
-        stacklevel=4,
+        stacklevel=calling_level(),
     )
     return found
 

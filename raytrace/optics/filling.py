@@ -17,6 +17,7 @@ from raytrace.optics.axis import aiming_of
 from raytrace.optics.launch import points_of_stop, rays_of_field, with_ray_aiming
 from raytrace.optics.vignetting import vignette
 from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
+from raytrace.words import calling_level
 
 #: What the beam may miss the stop by without a warning, of the stop's semi-diameter.
 TOLERANCE = 0.02
@@ -80,7 +81,7 @@ def warn_of_filling(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None
         f"{_words(found.chief[at], 'centre')}, marginal rays {_words(found.marginal[at], 'rim')}"
         f"{many if len(worst) > 1 else ''}; `ray_aiming=real` aims them, in Python lens.at(ray_aiming='real')",
         UnfilledStop,
-        stacklevel=3,
+        stacklevel=calling_level(),
     )
 
 

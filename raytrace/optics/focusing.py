@@ -32,6 +32,7 @@ from raytrace.system.lens import (
     with_object_distance,
     with_sensor_distance,
 )
+from raytrace.words import calling_level
 
 
 class NoFocus(ValueError):
@@ -199,7 +200,7 @@ def focus(
     if not found.is_real:
         place = f"{float(best):g} mm, on the side of the last surface that the light comes from"
         told = f"the image is virtual, at {place}: no sensor can stand there; take the object further away"
-        warnings.warn(told, VirtualImage, stacklevel=2)
+        warnings.warn(told, VirtualImage, stacklevel=calling_level())
     return found
 
 
@@ -226,7 +227,8 @@ def _tell_losses(lens: Lens, points: Tensor, distances: Tensor, fields: Tensor, 
     if lost == 1:
         raise NoFocus("no ray reaches the image")
     if lost > 0:
-        warnings.warn(f"{lost:.2%} of the rays are lost; the focus is of the rest", LostRays, stacklevel=3)
+        message = f"{lost:.2%} of the rays are lost; the focus is of the rest"
+        warnings.warn(message, LostRays, stacklevel=calling_level())
 
 
 def _rule(found: Focus) -> dict:

@@ -17,6 +17,7 @@ from raytrace.optics.trace import lens_steps, media
 from raytrace.system.lens import Lens
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface, is_freeform, sag_at
+from raytrace.words import calling_level
 
 #: Points of the pupil whose rays are highest on a surface.
 _ENDS = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0))
@@ -60,7 +61,7 @@ def warn_of_defects(lens: Lens) -> tuple[Defect, ...]:
     """`defects`, each with a warning Unbuildable."""
     found = defects(lens)
     for one in found:
-        warnings.warn(one.words, Unbuildable, stacklevel=3)
+        warnings.warn(one.words, Unbuildable, stacklevel=calling_level())
     return found
 
 

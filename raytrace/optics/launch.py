@@ -22,6 +22,7 @@ from raytrace.optics.vignetting import vignette
 from raytrace.system.lens import RAY_AIMING, Lens, field_points, index_behind, wavelengths_of
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import sag
+from raytrace.words import calling_level
 
 
 class MarginalRayLost(UserWarning):
@@ -235,7 +236,7 @@ def _aimed_radius(lens: Lens, paraxial: FirstOrder, entrance: Entrance | None) -
     radius, arrives = _stop_radius(lens, paraxial, entrance)
     if arrives is not None and not bool(arrives.all()):
         message = "the real marginal ray does not reach the stop; rays are aimed over the radius of the paraxial one"
-        warnings.warn(message, MarginalRayLost, stacklevel=4)
+        warnings.warn(message, MarginalRayLost, stacklevel=calling_level())
     return _signed(radius, paraxial, entrance)
 
 

@@ -14,6 +14,7 @@ from raytrace.optics.paraxial import first_order
 from raytrace.optics.trace import Crossing, lens_steps
 from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
 from raytrace.system.rays import Rays
+from raytrace.words import calling_level
 
 #: What becomes of a ray, by its number, and how that is said of a surface.
 FATES = {
@@ -184,4 +185,4 @@ def _named(lens: Lens, field: Tensor) -> str:
 
 
 def _warn(words: str) -> None:
-    warnings.warn(words, LostRays, stacklevel=4)
+    warnings.warn(words, LostRays, stacklevel=calling_level())

@@ -16,6 +16,7 @@ from raytrace.optics.losses import STATUS, LostRays, warn_of_losses
 from raytrace.optics.spot import Spot, spot_of, spot_of_points
 from raytrace.optics.streaming import MAX_BYTES, StreamedSpot, stream_spots
 from raytrace.system.lens import FIELD_UNITS, Lens, field_points, name_of_field, with_wavelengths
+from raytrace.words import calling_level
 
 _TRIED = 4096  # rays that tell where all are lost
 _RIM = 72  # rays on the rim of the pupil, for the largest radius, as the spot of few rays has them
@@ -169,7 +170,7 @@ def spot(
     found = arrivals(lens, at, shares, fields=fields, ray_aiming=ray_aiming, progress=each)
     if unaimed := int((found.status == STATUS.index("unaimed")).sum()):
         told = f"{unaimed} of {found.status.numel()} rays found no way to their point of the stop"
-        warnings.warn(told, LostRays, stacklevel=2)
+        warnings.warn(told, LostRays, stacklevel=calling_level())
     about = None if reference == "centroid" else chief_reference(with_ray_aiming(lens, ray_aiming), fields)
     spots = spot_of(found.rays, shares, about=about)
     warn_of_losses(lens, at, spots.rms_radius.isnan(), fields=fields, ray_aiming=ray_aiming)

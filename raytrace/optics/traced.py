@@ -24,6 +24,7 @@ from raytrace.optics.sequence import sequence_of
 from raytrace.optics.trace import axial_path, media, steps, trace_lens
 from raytrace.system.lens import Lens, field_points, vector, wavelengths_of
 from raytrace.system.rays import COLUMNS, Rays
+from raytrace.words import calling_level
 
 _OK, _VIGNETTED, _MISS, _TIR = (STATUS.index(name) for name in ("ok", "vignetted", "miss", "tir"))
 _LOST = {_MISS: "missed", _TIR: "were totally reflected at", _VIGNETTED: "were vignetted at"}
@@ -156,7 +157,7 @@ def trace(
     else:
         if object_distances is not None or fields is not None:
             told = "`object_distances` and `fields` change nothing: the rays of a table begin where it says"
-            warnings.warn(told, ChangesNothing, stacklevel=2)
+            warnings.warn(told, ChangesNothing, stacklevel=calling_level())
         begun = rays if isinstance(rays, Rays) else called("formats.ray_table.read_rays")(rays, lens)
     if begun.wavelength is None:
         begun = dataclasses.replace(begun, wavelength=_chosen(lens, wavelengths).squeeze())
@@ -184,7 +185,7 @@ def _chief_and_marginal(lens: Lens, object_distances, fields, wavelengths, ray_a
         found = Rays(*parts, wavelength=wavelengths[:, None])
     if unaimed := int((~found.valid).sum()):
         told = f"{unaimed} rays found no way to their point of the stop and are left out"
-        warnings.warn(told, LostRays, stacklevel=3)
+        warnings.warn(told, LostRays, stacklevel=calling_level())
     labels = (distance, *fields[:, :, None, None], wavelengths[:, None], *pupil)
     return found, torch.stack([label.detach().expand(found.shape) for label in labels])
 

@@ -15,6 +15,7 @@ from raytrace.optimization.least_squares import Cycle, Standing
 from raytrace.optimization.paths import MANNERS, Course
 from raytrace.stores import Unfit, anything, either, exactly, listed, mapped, number, read_document, record, text, whole
 from raytrace.system.identity import unlike
+from raytrace.words import calling_level
 
 EVERY = 2.0  # s between two checkpoints
 _COLUMNS = ("cycle", "merit", "missed", "step", "damping", "evaluations", "seconds", "limits")
@@ -87,7 +88,7 @@ class Checkpoint:
             write_json(self.path, document)
         except OSError as error:
             words = f"{self.path}: {error.strerror}; the optimisation goes on, but cannot resume from here"
-            warnings.warn(words, NotWritten, stacklevel=2)
+            warnings.warn(words, NotWritten, stacklevel=calling_level())
             self.path = None
         self.last = time.monotonic()
 
@@ -215,7 +216,7 @@ class Log:
         try:
             append_text(self.path, _line(_words(cycle)), sync=False)
         except OSError as error:
-            warnings.warn(f"{self.path}: {error.strerror}; the log ends here", NotWritten, stacklevel=2)
+            warnings.warn(f"{self.path}: {error.strerror}; the log ends here", NotWritten, stacklevel=calling_level())
             self.path = None
 
 

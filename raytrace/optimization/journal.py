@@ -18,6 +18,7 @@ from raytrace.files import NotWritten
 from raytrace.shards import agreeing, share, total
 from raytrace.stores import DamagedLine, Lines, anything, listed, mapped, number, record, text
 from raytrace.system.identity import unlike
+from raytrace.words import calling_level
 
 FILE = "search.jsonl"
 _ADVICE = "it keeps no search: name a new folder"
@@ -115,7 +116,7 @@ class Journal:
         if key in self.known and len(self.known[key].x) != count:
             found = f"x: found a list of {len(self.known.pop(key).x)}, expected {count} of them"
             place = f"{self.path}, line {self.lines[key]}"
-            warnings.warn(f"{place}: {found}; the line is ignored", DamagedLine, stacklevel=3)
+            warnings.warn(f"{place}: {found}; the line is ignored", DamagedLine, stacklevel=calling_level())
 
     def _keep(self, key: str, ended: Ended) -> None:
         self.known[key] = ended
@@ -127,4 +128,4 @@ class Journal:
         except OSError as error:
             self.store = None
             words = f"{self.path}: {error.strerror}; the search goes on, but cannot resume from here"
-            warnings.warn(words, NotWritten, stacklevel=3)
+            warnings.warn(words, NotWritten, stacklevel=calling_level())

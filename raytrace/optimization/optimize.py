@@ -35,6 +35,7 @@ from raytrace.optimization.result import Optimized
 from raytrace.system.identity import digest, identity
 from raytrace.system.intent import Row, Vary
 from raytrace.system.lens import Lens, field_points
+from raytrace.words import calling_level
 
 #: Suffixes of the files that an optimisation writes beside its lens.
 LOGS, CHECKPOINTS = (".csv", ".txt", ".log"), (".json",)
@@ -322,7 +323,7 @@ def _warned(found: Optimized) -> Optimized:
     """The result, with a warning for every condition that is not met, and for what of the lens cannot be made."""
     for one in found.conditions:
         if not one.met:
-            warnings.warn(str(one), NotReached, stacklevel=3)
+            warnings.warn(str(one), NotReached, stacklevel=calling_level())
     for lens in found.lens.configurations:
         warn_of_defects(lens)
     return found

@@ -39,6 +39,7 @@ from raytrace.shards import Share
 from raytrace.system.intent import Row
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.naming import parse_range
+from raytrace.words import calling_level
 
 STARTS = 64
 _BATCH = 16  # starts; what is done in a batch is shared by processes
@@ -126,7 +127,7 @@ def search(
         try:
             found.save(folder)
         except (OSError, LensFileError) as error:
-            warnings.warn(f"{folder}: not all minima are written: {error}", NotWritten, stacklevel=2)
+            warnings.warn(f"{folder}: not all minima are written: {error}", NotWritten, stacklevel=calling_level())
     return found
 
 

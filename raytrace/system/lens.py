@@ -27,7 +27,7 @@ from raytrace.system.configurations import Operand
 from raytrace.system.intent import Intent
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface
-from raytrace.words import did_you_mean
+from raytrace.words import calling_level, did_you_mean
 
 
 @value
@@ -269,7 +269,7 @@ def with_environment(lens: Lens, temperature: Tensor | float | None, pressure: T
     found = dataclasses.replace(lens, environment=Environment(temperature, pressure))
     _check_environments(found)
     for number, message in unknown_changes(found).items():
-        warnings.warn(f"surface {number}: {message}", NoThermalCoefficients, stacklevel=3)
+        warnings.warn(f"surface {number}: {message}", NoThermalCoefficients, stacklevel=calling_level())
     return found
 
 

@@ -168,7 +168,7 @@ def hybrid_psf(
 def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: int = 0) -> Kernels:
     """Wave PSFs of a scene whose lens carries elements in contact at its stop.
 
-    Differentiable in the numbers of the elements and of the lens. order: as for the wave model (`psf.diffraction`);
+    Differentiable in the numbers of the elements and of the lens. order: as for the wave model (`kernels.diffraction`);
     the rays follow the phase of the lens and of the elements together. Kernels of flat pixels, rings and wrapped
     heights converge slowly in it, by the rays across a step. Moments are left out.
     Raises ValueError for a stop between other media than air, a beam wider than an element at the stop (beyond a margin
@@ -184,7 +184,7 @@ def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: i
 
 
 def _field_kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, order: int) -> tuple[int, Tensor]:
-    """Rays and kernel (D, 1, W, rows, columns) of one field; without elements those of `psf.diffraction`."""
+    """Rays and kernel (D, 1, W, rows, columns) of one field; without elements those of `kernels.diffraction`."""
     like = {"dtype": scene.wavelengths.dtype, "device": scene.wavelengths.device}
     probe = wavefront_of(scene, *gauss_rings(*_PROBE, **like))
     centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))) - probe.centre[:2]

@@ -76,7 +76,7 @@ class Coarse:
         )
 
     def psf(self, scene: WaveScene) -> ElementPsf:
-        """As `psf.psf` of a scene that differs in its heights alone; differentiable in them."""
+        """As `wave_psf` of a scene that differs in its heights alone; differentiable in them."""
         cells, nodes = self.colours[0].band_x.cells, len(self.colours[0].pixel)
         return ElementPsf(self.kernels(scene), scene, Plan("coarse", cells, nodes, self.error, 0.0, 0.0))
 

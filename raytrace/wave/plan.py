@@ -39,6 +39,7 @@ from raytrace.wave.sampling import (
 )
 from raytrace.wave.scene import WaveScene, aperture, check, is_round, millimetres
 from raytrace.wave.spread import blur
+from raytrace.words import calling_level
 
 _FINEST = 4096  # cells across the aperture
 
@@ -90,7 +91,7 @@ def plan(
     nodes: to be used as they are (`Plan`). pad, band_limit: of the transfer functions; pad 1.5 without a band limit is
     that of Sitzmann et al. (2018).
     Raises AliasedSampling where copies of the image would lie in the window, ValueError where an engine cannot hold
-    the scene; warns `psf.dft.Aliased` where the converging field is undersampled, and `NotConverged` where the finest
+    the scene; warns `kernels.dft.Aliased` where the converging field is undersampled, and `NotConverged` where the finest
     sampling there is does not meet tol.
     """
     check(scene)
@@ -107,7 +108,8 @@ def plan(
     )
     if not ENGINES[engine].is_reference and samples is None and nodes is None and found.error > tol:
         message = f"predicted error {found.error:.2g} above the tolerance {tol:.2g} with {found.samples} samples"
-        warnings.warn(f"{message}; the worst light lies within ±{setting.width:.3g} mm", NotConverged, stacklevel=2)
+        message += f"; the worst light lies within ±{setting.width:.3g} mm"
+        warnings.warn(message, NotConverged, stacklevel=calling_level())
     return found
 
 
@@ -201,7 +203,7 @@ def _transfer(scene: WaveScene, s: Setting, *, engine, samples, nodes, tol, pad,
             f"is {1e3 * s.diameter / least:.3g} µm at {1e3 * s.shortest:.3g} µm; light of the rim is lost or "
             f"misplaced. Take at least {math.ceil(least)} samples or the pupil engine",
             Aliased,
-            stacklevel=3,
+            stacklevel=calling_level(),
         )
     size = propagate.padded(samples, pad)
     error = node_error(s, nodes) + min(1.0, transfer_error(s, samples, pad, band_limit))

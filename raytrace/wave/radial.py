@@ -4,7 +4,7 @@
 
 The integral is a Gauss rule in r² between the radii where a height steps or jumps (ring edges, zones of a wrapped
 lens), so that only smooth phases are ever sampled. |U|² is band-limited: its values at a few radii give the light of
-every pixel (`psf.radial`). J₀ depends on neither heights nor depths: while those alone vary, a step costs one real
+every pixel (`kernels.radial`). J₀ depends on neither heights nor depths: while those alone vary, a step costs one real
 product.
 """
 

@@ -1,0 +1,156 @@
+"""The verbs as the package exports them: a path serves as a lens, one number as a list of one, `field` as `fields`.
+
+Other values of the wrong kind are refused. Calls inside the package do not pass through here.
+"""
+
+import functools
+import inspect
+import math
+import os
+from collections.abc import Callable, Iterable, Mapping
+from numbers import Real
+
+from torch import Tensor
+
+from raytrace.formats import read_lens
+from raytrace.system.lens import Lens
+from raytrace.words import did_you_mean, with_article
+
+#: Options with two spellings: one value on the command line, several in Python.
+SPELLINGS = (
+    ("catalog", "catalogs"),
+    ("depth", "depths"),
+    ("field", "fields"),
+    ("frequency", "frequencies"),
+    ("object_distance", "object_distances"),
+    ("radius", "radii"),
+    ("wavelength", "wavelengths"),
+)
+_OTHER = {one: other for pair in SPELLINGS for one, other in (pair, pair[::-1])}
+
+#: Options of several numbers, and which of them may be infinite; those of `fields` may be pairs.
+_FINITE = ("fields", "frequencies", "radii", "wavelengths")
+_SEVERAL = (*_FINITE, "depths", "object_distances", "distance_weights", "field_weights", "wavelength_weights")
+
+
+@functools.cache
+def public(function: Callable, name: str) -> Callable:
+    """A verb as `raytrace` exports it under a name, with the signature and the text of the function.
+
+    It reads a lens given as a path or as the name of a shipped one, takes the other spelling of an option (SPELLINGS)
+    and single numbers where several are expected. Raises TypeError and ValueError, which name verb and argument, for
+    no lens, for unknown options, and for numbers that are none, nan or of the wrong kind.
+    """
+    parameters = inspect.signature(function).parameters
+    names = tuple(parameters)
+    every = any(one.kind is one.VAR_KEYWORD for one in parameters.values())
+    readers = {key: reader for key, one in parameters.items() if (reader := _reader(one))}
+
+    @functools.wraps(function)
+    def verb(*given, **options):
+        options = {_known(name, word, names, options, every): value for word, value in options.items()}
+        taken = [_read(name, readers, *one) for one in zip(names, given, strict=False)]
+        taken += given[len(names) :]
+        return function(*taken, **{word: _read(name, readers, word, value) for word, value in options.items()})
+
+    verb.__module__, verb.__qualname__ = "raytrace", name  # where pickle finds it
+    return verb
+
+
+def _known(verb: str, word: str, names: tuple[str, ...], options: Mapping, every: bool) -> str:
+    """An option as the verb spells it. Raises TypeError for one that it does not have, or that is given twice."""
+    if word in names:
+        return word
+    other = _OTHER.get(word)
+    if other in names:
+        if other in options:
+            raise TypeError(f"{verb}: `{word}` and `{other}` are one option: leave one out")
+        return other
+    if not every:
+        raise TypeError(f"{verb} has no option `{word}`{did_you_mean(word, names)} (it has {', '.join(names)})")
+    return word
+
+
+def _reader(parameter: inspect.Parameter) -> Callable | None:
+    """What reads the values of a parameter, (verb, name, value) -> value; None if they pass as they are."""
+    if parameter.name == "lens":
+        return _lens
+    if parameter.name in _SEVERAL:
+        return _several
+    if parameter.annotation in (int, int | None):
+        return _count
+    return _number if parameter.annotation in (float, float | None) else None
+
+
+def _read(verb: str, readers: Mapping[str, Callable], name: str, value: object) -> object:
+    reader = readers.get(name)
+    return value if reader is None or (value is None and reader is not _lens) else reader(verb, name, value)
+
+
+def _lens(verb: str, name: str, value: object) -> Lens:
+    if isinstance(value, Lens):
+        return value
+    if isinstance(value, (str, os.PathLike)):
+        return read_lens(value)
+    hint = "; it has one, as its `lens`" if isinstance(getattr(value, "lens", None), Lens) else ""
+    expected = "a Lens, the path of a lens file or the name of a shipped lens"
+    raise TypeError(f"{verb}: `{name}` is {_kind(value)}; expected {expected}{hint}")
+
+
+def _several(verb: str, name: str, value: object) -> Tensor | tuple | list:
+    """Numbers, of one or several; tensors as they are, their values unread."""
+    if isinstance(value, Tensor):
+        found = value.reshape(1) if value.dim() == 0 else value
+        if found.numel() == 0:
+            raise ValueError(f"{verb}: `{name}` is empty; expected {_numbers(name)}")
+        return found
+    value = value.tolist() if hasattr(value, "tolist") else value  # of numpy and pandas
+    if isinstance(value, Real):
+        value = [value]
+    if not isinstance(value, Iterable) or isinstance(value, (str, bytes, Mapping)):
+        raise TypeError(f"{verb}: `{name}` is {_kind(value)}; expected {_numbers(name)}")
+    value = value if isinstance(value, (tuple, list)) else [*value]
+    if not value:
+        raise ValueError(f"{verb}: `{name}` is empty; expected {_numbers(name)}")
+    return type(value)([_entry(verb, name, entry) for entry in value]) if type(value) in (tuple, list) else value
+
+
+def _entry(verb: str, name: str, entry: object) -> object:
+    if isinstance(entry, Tensor):
+        return entry
+    if isinstance(entry, Real):
+        if math.isnan(entry) or (math.isinf(entry) and name in _FINITE):
+            raise ValueError(f"{verb}: `{name}` holds {entry}; expected {_numbers(name)}")
+        return entry if isinstance(entry, (int, float)) else float(entry)
+    if name == "fields" and isinstance(entry, Iterable) and not isinstance(entry, (str, bytes, Mapping)):
+        return tuple(_entry(verb, "field", part) for part in entry)
+    raise TypeError(f"{verb}: `{name}` holds {_kind(entry)}; expected {_numbers(name)}")
+
+
+def _numbers(name: str) -> str:
+    pairs = ", y or pairs (x, y)" if name in ("fields", "field") else ""
+    return f"a number or several{pairs}"
+
+
+def _number(verb: str, name: str, value: object) -> object:
+    if isinstance(value, Tensor):
+        return value
+    if not isinstance(value, Real):
+        raise TypeError(f"{verb}: `{name}` is {_kind(value)}; expected a number")
+    if math.isnan(value):
+        raise ValueError(f"{verb}: `{name}` is nan; expected a number")
+    return value
+
+
+def _count(verb: str, name: str, value: object) -> object:
+    if isinstance(value, Tensor) or (isinstance(value, Real) and value == value // 1):
+        return int(value) if isinstance(value, float) else value
+    kind = TypeError if not isinstance(value, Real) else ValueError
+    raise kind(f"{verb}: `{name}` is {_kind(value)}; expected a whole number")
+
+
+def _kind(value: object) -> str:
+    """A value as a message names it: itself if it is short and plain, else its class."""
+    if value is None or isinstance(value, (str, Real)):
+        return repr(value) if len(repr(value)) < 60 else f"{repr(value)[:57]}…"
+    return with_article(type(value).__name__)

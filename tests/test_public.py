@@ -1,0 +1,128 @@
+"""Verbs as `raytrace` exports them: a path for a lens, one number for several, both spellings, and misuse in words."""
+
+import inspect
+import pickle
+import re
+
+import numpy as np
+import pytest
+import torch
+
+import raytrace as rt
+from raytrace import public
+
+NAN = float("nan")
+VERBS = {name: getattr(rt, name) for name in rt.PUBLIC if inspect.isfunction(getattr(rt, name))}
+PARAMETERS = {name: inspect.signature(verb).parameters for name, verb in VERBS.items()}
+OF_A_LENS = [name for name, parameters in PARAMETERS.items() if "lens" in parameters]
+OF_SEVERAL = [(verb, name) for verb, names in PARAMETERS.items() for name in names if name in public._SEVERAL]
+#: A verb, keywords as a person may give them, and the same in full.
+ALIKE = [
+    ("first_order", {}, {}),
+    ("base_ray", {}, {}),
+    ("info", {}, {}),
+    ("evaluate", {"merit": "spot"}, {"merit": "spot"}),
+    ("layout", {"field": 3}, {"fields": [3.0]}),
+    ("rays", {"fields": 3, "wavelength": 0.55}, {"fields": [3.0], "wavelengths": [0.55]}),
+    ("trace", {"object_distance": 1e3, "field": 3}, {"object_distances": [1e3], "fields": [3.0]}),
+    ("spot", {"field": 3, "wavelength": 0.55}, {"fields": [3.0], "wavelengths": [0.55]}),
+    ("spot", {"fields": np.float32(3)}, {"fields": [3.0]}),
+    ("spot", {"fields": [(0, np.int64(3))]}, {"fields": [(0.0, 3.0)]}),
+    ("spot", {"fields": torch.tensor(3.0, dtype=torch.float64)}, {"fields": [3.0]}),
+    ("spot", {"rings": 4.0}, {"rings": 4}),
+    ("focus", {"object_distances": 1e3}, {"object_distances": [1e3]}),
+    ("ray_fan", {"field": 3}, {"fields": [3.0]}),
+    ("seidel", {"field": np.array([3])}, {"fields": [3.0]}),
+    ("distortion", {"wavelengths": 0.55, "samples": 3}, {"wavelengths": [0.55], "samples": 3}),
+    (
+        "mtf",
+        {"frequency": 10, "field": 3, "geometric": True},
+        {"frequencies": [10.0], "fields": [3.0], "geometric": True},
+    ),
+    ("encircled_energy", {"radius": 0.1, "geometric": True}, {"radii": [0.1], "geometric": True}),
+    ("psf", {"model": "gaussian", "field": 3, "object_distance": 1e4, "size": 5},
+     {"model": "gaussian", "fields": [3.0], "object_distances": [1e4], "size": 5}),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def singlet():
+    rows = [{"radius": 50.0, "thickness": 4.0, "glass": 1.5}, {"radius": -50.0, "thickness": 48.0}]
+    return rt.lens(rows, stop=1, f_number=8, fields=[0, 3])
+
+
+@pytest.fixture(scope="module")
+def path(singlet, tmp_path_factory):
+    found = tmp_path_factory.mktemp("lens") / "singlet.zmx"
+    rt.write_lens(singlet, found)
+    return found
+
+
+def fill(verb: str, **given) -> dict:
+    """The keywords given, and None for what else the verb requires."""
+    return {name: None for name, one in PARAMETERS[verb].items() if one.default is one.empty and one.kind < 4} | given
+
+
+def refused(kind, verb: str, said: str, **given) -> None:
+    with pytest.raises(kind, match=re.escape(said)) as found:
+        VERBS[verb](**fill(verb, **given))
+    assert str(found.value).startswith(verb)
+
+
+@pytest.mark.parametrize(("verb", "short", "full"), ALIKE, ids=lambda value: str(value)[:30])
+def test_a_path_and_a_lens_and_one_number_and_several_are_alike(verb, short, full, path):
+    found, expected = VERBS[verb](str(path), **short), VERBS[verb](rt.read_lens(path), **full)
+    assert str(found) == str(expected)
+
+
+@pytest.mark.parametrize("verb", OF_A_LENS)
+def test_what_is_no_lens_is_refused(verb, singlet):
+    for wrong, said in ((None, "None"), (5, "5"), ([singlet], "a list"), (rt.info(singlet), "as its `lens`")):
+        refused(TypeError, verb, said, lens=wrong)
+    with pytest.raises((OSError, ValueError), match="no_such_lens"):
+        VERBS[verb](**fill(verb, lens="no_such_lens"))
+
+
+@pytest.mark.parametrize(("verb", "name"), OF_SEVERAL, ids=lambda value: str(value))
+def test_what_are_no_numbers_is_refused(verb, name, singlet):
+    lens = {"lens": singlet} if "lens" in PARAMETERS[verb] else {}
+    refused(ValueError, verb, f"`{name}` holds nan; expected a number or several", **lens, **{name: NAN})
+    refused(ValueError, verb, f"`{name}` holds nan; expected a number or several", **lens, **{name: [1, NAN]})
+    refused(ValueError, verb, f"`{name}` is empty; expected a number or several", **lens, **{name: []})
+    refused(ValueError, verb, f"`{name}` is empty", **lens, **{name: torch.zeros(0)})
+    refused(TypeError, verb, f"`{name}` is 'five'; expected a number", **lens, **{name: "five"})
+    refused(TypeError, verb, f"`{name}` holds 'five'; expected a number", **lens, **{name: ["five"]})
+    refused(TypeError, verb, f"`{name}` is an object; expected a number", **lens, **{name: object()})
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_other_misuse_is_refused(verb, singlet):
+    lens = {"lens": singlet} if "lens" in PARAMETERS[verb] else {}
+    for name, one in PARAMETERS[verb].items():
+        reader = public._reader(one)
+        if reader in (public._number, public._count):
+            refused(TypeError, verb, f"`{name}` is 'five'; expected a", **lens, **{name: "five"})
+            refused(ValueError, verb, f"`{name}` is nan; expected a", **lens, **{name: NAN})
+    if all(one.kind is not one.VAR_KEYWORD for one in PARAMETERS[verb].values()):
+        refused(TypeError, verb, f"{verb} has no option `nothing_like_it` (it has ", **lens, nothing_like_it=1)
+
+
+def test_an_unknown_option_names_the_nearest(singlet):
+    refused(TypeError, "spot", "spot has no option `feilds`; did you mean fields?", lens=singlet, feilds=1)
+    refused(TypeError, "mtf", "`field` and `fields` are one option", lens=singlet, field=1, fields=[1])
+
+
+def test_the_verbs_are_those_of_the_modules():
+    for name, verb in VERBS.items():
+        assert verb is getattr(rt, name)
+        assert verb.__doc__ == verb.__wrapped__.__doc__
+        assert pickle.loads(pickle.dumps(verb)) is verb
+
+
+@pytest.mark.parametrize("warned", ["spot", "read_lens"])
+def test_a_warning_names_the_line_that_calls_the_verb(warned, path, tmp_path):
+    unknown = tmp_path / "unknown.zmx"
+    unknown.write_text(path.read_text("utf-8-sig").replace("NAME", "FROB 1 2\nNAME", 1), "utf-8")
+    with pytest.warns((rt.LostRays, UserWarning)) as found:
+        rt.spot(path, field=80) if warned == "spot" else rt.read_lens(unknown)
+    assert {one.filename for one in found} == {__file__}
