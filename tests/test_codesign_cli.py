@@ -342,7 +342,7 @@ def test_compare_writes_the_table_and_the_page(run, pictures):
     assert [row["model"] for row in optimum] == ["paraxial", after]
     assert [one["model"] for one in document["closed_form"]] == ["paraxial", after]
     assert f"| {float(optimum[0]['sensor_mm']):.4f} | {one['sensor_mm']:.4f} |" in page
-    assert "no finished run of gaussian" in page
+    assert "Gaussian DRT is not among the models of this study" in page
     again(run, command, page)
 
 

@@ -98,13 +98,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         warnings.simplefilter("always")
         spelled = arguments.spelled
         shown: set[type[Warning]] = set()
-        warnings.showwarning = _shower(spelled, shown)
+        of_result: list[str] = []
+        warnings.showwarning = _shower(spelled, shown, of_result)
         try:
             with (
                 importlib.import_module("raytrace.cli.progress").heartbeat(arguments.command),
                 importlib.import_module("raytrace.budget").within(getattr(arguments, "max_bytes", None)),
             ):
                 code = importlib.import_module("raytrace.cli.run").carry_out(arguments.run, arguments)
+            for words in of_result:
+                print(words, file=sys.stderr)
             return 1 if any(issubclass(category, NotWritten) for category in shown) else code
         except KeyboardInterrupt:
             return _fail("interrupted", 130)
@@ -147,9 +150,11 @@ def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
 
 
-def _shower(spelled: Mapping[str, str], shown: set[type[Warning]]) -> Callable[..., None]:
+def _shower(spelled: Mapping[str, str], shown: set[type[Warning]], of_result: list[str]) -> Callable[..., None]:
     """Shows warnings of this package, one line each and none twice, and adds their categories to `shown`; those of
-    libraries speak to programmers."""
+    libraries speak to programmers. of_result: collects those that qualify a result (`of_result` of their category),
+    which are not shown where there is none.
+    """
     said = set()
 
     def show(message, category, filename, lineno, file=None, line=None) -> None:
@@ -157,7 +162,11 @@ def _shower(spelled: Mapping[str, str], shown: set[type[Warning]]) -> Callable[.
         if category.__module__.startswith("raytrace") and words not in said:
             said.add(words)
             shown.add(category)
-            print(f"raytrace: warning: {words}", file=sys.stderr)
+            line = f"raytrace: warning: {words}"
+            if getattr(category, "of_result", False):
+                of_result.append(line)
+            else:
+                print(line, file=sys.stderr)
 
     return show
 

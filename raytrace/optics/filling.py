@@ -22,9 +22,13 @@ from raytrace.words import calling_level
 #: What the beam may miss the stop by without a warning, of the stop's semi-diameter.
 TOLERANCE = 0.02
 
+MOST_FIELDS = 64  # that are measured of one call: a map of a field asks for thousands
+
 
 class UnfilledStop(UserWarning):
     """The beam of a field misses the stop by more than TOLERANCE; the message has figures and a remedy."""
+
+    of_result = True  # said of a result: an error that ends the command stands alone
 
 
 @value
@@ -62,6 +66,7 @@ def filling(lens: Lens, fields: Tensor) -> Filling:
 def warn_of_filling(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None) -> None:
     """Warn UnfilledStop of the field of (2, F) that misses the stop most, if it does by more than TOLERANCE.
 
+    Of more than MOST_FIELDS so many are measured, evenly spread over them, and the largest one.
     A field that loses all its rays in front of the stop is left to LostRays. Nothing is traced where rays are aimed,
     where chief rays are parallel in object space, and in optimisation: where numbers of the lens or fields require a
     gradient or are inside a transform of torch.func.
@@ -69,6 +74,9 @@ def warn_of_filling(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None
     lens = with_ray_aiming(lens, ray_aiming)
     if _is_being_optimised((lens, fields)) or lens.fields.telecentric or aiming_of(lens) != "off":
         return
+    if fields.shape[1] > MOST_FIELDS:
+        spread = torch.linspace(0, fields.shape[1] - 1, MOST_FIELDS, dtype=torch.float64).long()
+        fields = fields[:, [*spread.tolist(), int(fields.norm(dim=0).argmax())]]
     found = filling(lens, fields)
     worst = torch.where(found.lost, 0.0, torch.maximum(found.chief, found.marginal))
     if not bool((worst > TOLERANCE).any() & (found.radius > 1e-9)):  # a point has no rim
