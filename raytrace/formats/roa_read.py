@@ -84,7 +84,7 @@ def read(
         fields=_fields(optics.part("field_of_view"), unit, report),
         wavelengths=double(wavelengths),
         wavelength_weights=double(weights),
-        primary_wavelength=primary,
+        primary_wavelength=primary + 1,
         name=system.text("title").strip(),
         catalogs=tuple(dict.fromkeys(one.glass.catalog for one in surfaces if one.glass.catalog)),
     )
