@@ -20,7 +20,7 @@ template <typename T, int terms>
 struct Toroid {
   T hx, hy, c, k, c_x;
   T z, x, y, xx, xy, yy;  // the sag and its derivatives
-  bool inside;
+  bool inside, reached;  // reached: whether the circle about the axis gets as far out as x
   T u, over_s, share_s, g, dS, dg, q, over_w, turn;  // over_s, share_s: 1/√ of the section along y, 1/(1 + √)
 
   template <int second>
@@ -36,8 +36,8 @@ struct Toroid {
     dg = T(2) * dS * hy;
     T p = c_x * hx;
     q = T(1) - c_x * g;
-    inside = open & (q > magnitude(p));
-    q = inside ? q : T(1), p = inside ? p : T(0);
+    reached = q > magnitude(p), inside = open & reached;
+    q = reached ? q : T(1), p = reached ? p : T(0);
     T w = root((q - p) * (q + p));
     T both = T(1) / (w * (q + w));
     over_w = (q + w) * both;

@@ -121,6 +121,11 @@ template <typename T>
 constexpr T kSmallStep = sizeof(T) == 4 ? T(2e-5) : T(1e-9);
 constexpr int kSteps = 8;
 
+// |F| of a hit over the size of its terms, above which it is left to `careful`: where a section closes its slope has no
+// bound, and steps vanish far from the surface.
+template <typename T>
+constexpr T kOff = sizeof(T) == 4 ? T(1e-4) : T(1e-10);
+
 template <typename T, int kind, int terms>
 void newton(const Rays<T>& from, Notes<T>& notes, int n, const Surface<T>& s) {
   const T gap = s.gap, c = s.c, shape = T(1) + s.k;
@@ -198,6 +203,7 @@ int cross_asphere(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, cons
     T x = from.x[i], y = from.y[i], z = from.z[i], L = from.L[i], M = from.M[i], N = from.N[i], t = notes.t[i];
     T hx = notes.px[i] + t * L, hy = notes.py[i] + t * M, hz = notes.pz[i] + t * N;
     T u = hx * hx + hy * hy, nx, ny, nz = 1, cosine, w;
+    T off, size;
     bool good;
     if constexpr (has_ring<T>(kind)) {
       const Ring<T, terms> ring(s, hy);
@@ -205,24 +211,30 @@ int cross_asphere(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, cons
       nx = -c_x * hx, ny = -q * ring.dg * over, nz = T(1) - c_x * hz;
       good = ring.open & (q > 0) & (nz > (T(1) - kEdge<T>) * q);
       cosine = nx * L + ny * M + nz * N, w = nx * nx + ny * ny + nz * nz;
+      T g = ring.g * over, bent = T(0.5) * c_x * (hx * hx + hz * hz - g * g);
+      off = hz - g - bent, size = magnitude(hz) + magnitude(g) + magnitude(bent);
     } else if constexpr (is_freeform(kind)) {
       const auto sheet = sheet_at<kind, terms, false>(s, hx, hy);
+      off = hz - sheet.z, size = magnitude(hz) + magnitude(sheet.z);
       good = sheet.inside, nx = -sheet.x, ny = -sheet.y;
       cosine = N + nx * L + ny * M, w = T(1) + nx * nx + ny * ny;
     } else {
       T S, dS, d2S;
       good = sag<kind, false>(s, terms, u, S, dS, d2S);
       T slope = T(2) * dS;
+      off = hz - S, size = magnitude(hz) + magnitude(S);
       nx = -slope * hx, ny = -slope * hy, cosine = N - slope * (hx * L + hy * M);
       w = T(1) + slope * slope * u;
     }
     if constexpr (is_departed(kind)) {
+      off -= notes.added.p[i], size += magnitude(notes.added.p[i]);
       nx -= notes.added.x[i], ny -= notes.added.y[i];
       cosine = N + nx * L + ny * M, w = T(1) + nx * nx + ny * ny;
     }
     // `active` is 1 where Newton's method has not arrived, and NaN compares as false.
     good &= (notes.active[i] < T(0.5)) & (u <= rim_squared) & (cosine * N > 0);
     good &= cosine * cosine > kGrazing<T> * T(0.1) * w;
+    good &= magnitude(off) <= kOff<T> * (size + root(u));
     T l = L, m = M, o = N;
     if (bend != kNone) good &= law(l, m, o, nx, ny, nz, cosine, w);
     if (path) to.path[i] = from.path[i] + s.n1 * reduced_path(hx, hy, hz, x, y, z, L, M, N, gap, has_gap, side);

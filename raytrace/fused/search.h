@@ -12,8 +12,10 @@ struct Residual { double F, dF, scale, u; bool inside; };
 struct Found { double t; bool small, forward; double radius; };
 struct Stretch { double first, last; bool possible; };
 
+inline double big() { return std::pow(std::numeric_limits<double>::max(), 0.48); }  // its square is a number
+
 // What searches share. Own has the members of `AsphereSearch`: the surface, a ray from its foot, `residual`, `start` and
-// `stretch`; inside_only: whether a crossing counts only where there is a surface.
+// `stretch`, which is the part of the ray within a rim where a crossing may lie.
 template <typename Own>
 struct Search {
   Found newton(double t) const {
@@ -25,8 +27,7 @@ struct Search {
       if (!(std::fabs(r.F) > rounding * r.scale)) break;
     }
     Residual r = own().residual(t);
-    bool small = std::fabs(r.F) <= 64 * rounding * r.scale && r.inside && std::isfinite(t);
-    return {t, small, r.dF * (own().N < 0 ? -1 : 1) > 0, std::sqrt(r.u)};
+    return {t, is_small(r) && std::isfinite(t), r.dF * (own().N < 0 ? -1 : 1) > 0, std::sqrt(r.u)};
   }
 
   // The start by the quadric A t² - 2 G t + F = 0.
@@ -55,50 +56,72 @@ struct Search {
     return 4 * (std::sqrt(ray.x * ray.x + ray.y * ray.y) + std::fabs(ray.z));
   }
 
-  bool bracketed(double& found_at) const {
-    const int samples = 96, bisections = 64;
-    const auto [first, last, possible] = own().stretch();
-    if (!possible || !(last >= first)) return false;
-    double sign = own().N < 0 ? -1 : 1, width = (last - first) / samples;
-    Residual before = own().residual(first);
-    bool found = false;
-    double left = first;
-    for (int i = 1; i <= samples && !found; i++) {
-      double t = first + i * width;
-      Residual after = own().residual(t);
-      bool there = !Own::inside_only || before.inside || after.inside;
-      if (sign * before.F <= 0 && sign * after.F > 0 && there) left = t - width, found = true;
+  // The first crossing in the direction of light on a stretch. A sign change counts only between points on the surface:
+  // an end outside the domain has no F, so that the bisection ends at a crossing or at the edge of the domain, and the
+  // residual tells them apart.
+  bool bracketed(const Stretch& on, double& found_at) const {
+    const int samples = 96, candidates = 4;
+    if (!on.possible || !(on.last >= on.first)) return false;
+    const double width = (on.last - on.first) / samples;
+    Side before = side(on.first);
+    for (int i = 1, tried = 0; i <= samples && tried < candidates; i++) {
+      const double right = on.first + i * width;
+      const Side after = side(right);
+      const bool leaves = before == Side::before && after != Side::before;
+      const bool enters = before == Side::outside && after == Side::behind;
       before = after;
+      if (!leaves && !enters) continue;
+      if (bisected(right - width, right, leaves, found_at)) return true;
+      tried++;
     }
-    if (!found) return false;
-    double right = left + width;
+    return false;
+  }
+
+  bool operator()(double& t) const {
+    const double rim = own().s.rim;
+    Found found = newton(own().start());
+    bool converged = found.small && found.forward;
+    t = found.t;
+    if (converged && found.radius <= rim) return true;
+    if (bracketed(own().stretch(rim), t) || converged) return true;
+    return rim < big() && bracketed(own().stretch(std::numeric_limits<double>::infinity()), t);
+  }
+
+ private:
+  // Where light is on its way at t: before the surface, behind it, or where there is none.
+  enum class Side { before, behind, outside };
+
+  Side side(double t) const {
+    const Residual r = own().residual(t);
+    if (!r.inside) return Side::outside;
+    return (own().N < 0 ? -r.F : r.F) <= 0 ? Side::before : Side::behind;
+  }
+
+  // Crossing between two points of which the left one is before the surface (leaves), or the right one behind it.
+  bool bisected(double left, double right, bool leaves, double& found_at) const {
+    const int bisections = 64;
+    const double width = right - left;
     for (int i = 0; i < bisections; i++) {
-      double middle = 0.5 * (left + right);
-      (sign * own().residual(middle).F <= 0 ? left : right) = middle;
+      const double middle = 0.5 * (left + right);
+      const Side at = side(middle);
+      ((leaves ? at == Side::before : at != Side::behind) ? left : right) = middle;
     }
-    double t = 0.5 * (left + right);
-    Found polished = newton(t);
-    bool stayed = polished.small && polished.forward && std::fabs(polished.t - t) <= std::fabs(width);
+    const double t = leaves ? left : right;  // the end on the surface
+    const Found polished = newton(t);
+    const bool stayed = polished.small && polished.forward && std::fabs(polished.t - t) <= std::fabs(width);
+    if (!stayed && !is_small(own().residual(t))) return false;
     found_at = stayed ? polished.t : t;
     return true;
   }
 
-  bool operator()(double& t) const {
-    Found found = newton(own().start());
-    bool converged = found.small && found.forward;
-    t = found.t;
-    if (!(converged && found.radius <= own().s.rim) && !bracketed(t) && !converged) return false;
-    return !Own::inside_only || own().residual(t).inside;
+  static bool is_small(const Residual& r) {
+    return std::fabs(r.F) <= 64 * std::numeric_limits<double>::epsilon() * r.scale && r.inside;
   }
 
- private:
   const Own& own() const { return static_cast<const Own&>(*this); }
 };
 
-inline double big() { return std::pow(std::numeric_limits<double>::max(), 0.48); }  // its square is a number
-
 struct AsphereSearch : Search<AsphereSearch> {
-  static constexpr bool inside_only = false;
   const Surface<double>& s;
   double x, y, z, L, M, N;
   AsphereSearch(const Surface<double>& s, double x, double y, double z, double L, double M, double N)
@@ -121,16 +144,16 @@ struct AsphereSearch : Search<AsphereSearch> {
     return quadric(A, G, F);
   }
 
-  Stretch stretch() const {
-    const double within = radius();
+  Stretch stretch(double rim) const {
+    const double within = radius(rim);
     auto [low, high] = heights(within);
     return between(low, high, 0.05, cylinder(within));
   }
 
   // How far out a crossing is looked for.
-  double radius() const {
+  double radius(double rim) const {
     double closed = (1 + s.k) * s.c * s.c, edge = closed > 0 ? 1 / std::sqrt(closed) : big();
-    double radius = edge < big() ? std::fmin(edge, s.rim) : s.rim;
+    double radius = edge < big() ? std::fmin(edge, rim) : rim;
     return radius < big() ? radius : reach();
   }
 
@@ -162,9 +185,9 @@ inline Height height_at(const Surface<double>& s, double x, double y) {
     if constexpr (is_freeform(kind())) {
       const auto sheet = sheet_at<kind(), terms(), false>(s, x, y);
       found = {sheet.z, sheet.x, sheet.y, std::fabs(s.c * y * y) + std::fabs(c_x * x * x), sheet.inside};
-      if (kind() == kToroidal) {
+      if constexpr (kind() == kToroidal) {
         for (int j = s.at->terms - 1; j >= 1; j--) found.size += std::fabs(s.a[j]) * std::pow(y * y, j);
-        if (!sheet.inside && c_x != 0) found.z = 1 / c_x, found.x = found.y = 0;
+        if (!sheet.reached && c_x != 0) found.z = 1 / c_x, found.x = found.y = 0;
       } else if (!sheet.inside) {  // as it would go on with w = 0
         found.x = 2 * c_x * x, found.y = 2 * s.c * y, found.z = 0.5 * (x * found.x + y * found.y);
       }
@@ -190,7 +213,12 @@ inline double edge_of(double c, double k, double limit) {
 
 inline Extent extent_of(const Surface<double>& s, double limit) {
   const double c_x = s.a[0], y = edge_of(s.c, s.k, limit);
-  if (s.at->kind == kBiconic) return {edge_of(c_x, s.a[1], limit), y};
+  if (s.at->kind == kBiconic) {  // a section that stays open along one axis moves the edge along the other one out
+    const double open_x = std::fmax(0.0, -(1 + s.a[1]) * (c_x * limit) * (c_x * limit));
+    const double open_y = std::fmax(0.0, -(1 + s.k) * (s.c * limit) * (s.c * limit));
+    const double x = edge_of(c_x, s.a[1], limit);
+    return {std::fmin(x * std::sqrt(1 + open_y), limit), std::fmin(y * std::sqrt(1 + open_x), limit)};
+  }
   if (c_x == 0) return {limit, y};
   double widest = 0;
   for (int i = 0; i <= 16; i++) {
@@ -202,7 +230,6 @@ inline Extent extent_of(const Surface<double>& s, double limit) {
 
 // A round sag with a departure: that of the sag alone, and what the departure adds.
 struct DepartedSearch : Search<DepartedSearch> {
-  static constexpr bool inside_only = false;
   const AsphereSearch round;
   const Surface<double>& s;
   double x, y, z, L, M, N;
@@ -221,15 +248,14 @@ struct DepartedSearch : Search<DepartedSearch> {
 
   double start() const { return round.start(); }
 
-  Stretch stretch() const {
-    double radius = round.radius(), beside = departure_size(s, radius);
+  Stretch stretch(double rim) const {
+    double radius = round.radius(rim), beside = departure_size(s, radius);
     auto [low, high] = round.heights(radius);
     return between(low - beside, high + beside, 0.05, round.cylinder(radius));
   }
 };
 
 struct FreeformSearch : Search<FreeformSearch> {
-  static constexpr bool inside_only = true;
   const Surface<double>& s;
   double x, y, z, L, M, N;
   FreeformSearch(const Surface<double>& s, double x, double y, double z, double L, double M, double N)
@@ -250,9 +276,9 @@ struct FreeformSearch : Search<FreeformSearch> {
                    c_x * x * x + c_y * y * y + c_z * z * z - 2 * z);
   }
 
-  Stretch stretch() const {
-    const double infinity = std::numeric_limits<double>::infinity(), limit = s.rim < big() ? s.rim : reach();
-    Extent side = extent_of(s, std::fmin(s.rim, big()));
+  Stretch stretch(double rim) const {
+    const double infinity = std::numeric_limits<double>::infinity(), limit = rim < big() ? rim : reach();
+    Extent side = extent_of(s, std::fmin(rim, big()));
     if (!(side.x < big())) side.x = limit;
     if (!(side.y < big())) side.y = limit;
     Stretch of{-big(), big(), true};

@@ -113,7 +113,11 @@ def _biconic_covers(c, k, a, x, y) -> Tensor:
 
 
 def _biconic_extent(c, k, a, limit) -> tuple[Tensor, Tensor]:
-    return _edge(a[0], a[1], limit), _edge(c, k, limit)
+    """A section that stays open along one axis moves the edge along the other one out."""
+    open_x, open_y = (
+        torch.sqrt(1 + (-(1 + conic) * (bend * limit) ** 2).clamp_min(0.0)) for bend, conic in ((a[0], a[1]), (c, k))
+    )
+    return (_edge(a[0], a[1], limit) * open_y).minimum(limit), (_edge(c, k, limit) * open_x).minimum(limit)
 
 
 def _size(c, a, x, y, terms: Tensor | float = 0.0) -> Tensor:

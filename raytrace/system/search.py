@@ -6,6 +6,7 @@ and sends the few rays that fail to a bracketed search. It is one opaque operato
 `torch.compile` accept the data-dependent search inside; derivatives are attached by the caller.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -19,6 +20,7 @@ from raytrace.system.shapes import EVEN, KINDS, Relief, sag_and_derivatives, siz
 _NEWTON_STEPS = 24
 _BISECTIONS = 64
 _SAMPLES = 96
+_CANDIDATES = 4  # sign changes and edges of the domain that are looked into, on one ray
 _ACCEPTED_RESIDUAL = 64.0  # units of the rounding error of the terms of F
 
 # An operator by the lower door of torch.library: `torch.library.custom_op` would load the compiler at its first call.
@@ -99,25 +101,29 @@ def search(
     t, residual_small, forward, radius = _newton(rays, _start(rays))
     converged = residual_small & forward
     good = converged & (radius <= rim)
-    if not _reads_are_free(t):
-        t_few, found = _bracketed(rays)
-        t = torch.where(good | ~found, t, t_few)
-        good = good | found | converged
-    elif not bool(good.all()):
-        few = ~good
-        t_few, found = _bracketed(rays.of(few))
-        t = t.clone()
-        t[few] = torch.where(found, t_few, t[few])
-        good[few] = found | converged[few]
-    if relief is not None:
-        good = good & relief.covers(p[0] + t * d[0], p[1] + t * d[1])
-    if rays.form is not None:
-        good = good & rays.form.covers(c, k, a, p[0] + t * d[0], p[1] + t * d[1])
+    t, good = _searched(rays, t, good)
+    good = good | converged
+    if rim < _big(t):
+        t, good = _searched(rays._replace(rim=math.inf), t, good)
     t = torch.where(good, t, 0.0)
     return t.reshape(batch).to(foot.dtype), good.reshape(batch).clone()
 
 
 torch.library.impl("raytrace::first_crossing", "CompositeExplicitAutograd")(search)
+
+
+def _searched(rays: "_Rays", t: Tensor, good: Tensor) -> tuple[Tensor, Tensor]:
+    """t and good, of rays that are not good by the bracketed search."""
+    if not _reads_are_free(t):
+        t_few, found = _bracketed(rays)
+        return torch.where(found & ~good, t_few, t), good | found
+    if bool(good.all()):
+        return t, good
+    few = ~good
+    t_few, found = _bracketed(rays.of(few))
+    t, good = t.clone(), good.clone()
+    t[few], good[few] = torch.where(found, t_few, t[few]), found
+    return t, good
 
 
 def _reads_are_free(tensor: Tensor) -> bool:
@@ -233,6 +239,7 @@ def _residual(rays: _Rays, t: Tensor):
     if relief is not None:
         D, D_x, D_y, *_ = relief.sag(x, y, highest=1)
         F, dF = F - D, dF - (D_x * d[0] + D_y * d[1])
+        inside_domain = inside_domain & relief.covers(x, y)
         scale = scale + relief.size(torch.sqrt(u)) + (D_x.abs() + D_y.abs()) * (x.abs() + y.abs() + t.abs())
     return F, dF, scale, u, inside_domain
 
@@ -250,47 +257,70 @@ def _newton(rays: _Rays, t: Tensor):
         if _reads_are_free(t) and not bool(active.any()):
             break
     F, dF, scale, u, inside_domain = _residual(rays, t)
-    small = (F.abs() <= _ACCEPTED_RESIDUAL * rounding * scale) & inside_domain & torch.isfinite(t)
+    small = _is_small(F, dF, scale, u, inside_domain) & torch.isfinite(t)
     forward = dF * torch.where(rays.d[2] < 0, -1.0, 1.0) > 0
     return t, small, forward, torch.sqrt(u)
 
 
 def _bracketed(rays: _Rays):
-    """First crossing in the direction of propagation on the stretch of ray inside rim and sag range (1-D batch)."""
+    """First crossing in the direction of propagation on the stretch of ray inside rim and sag range (1-D batch).
+
+    A sign change counts only between points on the surface: an end outside the domain has no F, so that the bisection
+    ends at a crossing or at the edge of the domain, and the residual tells them apart.
+    """
     first, last, possible = (_stretch_round if rays.form is None else _stretch_freeform)(rays)
-    N = rays.d[2]
-    s = torch.where(N < 0, -1.0, 1.0).to(N.dtype)
     width = (last - first) / _SAMPLES
-    before, was_inside = _side(rays, s, first)
-    left, found = first, torch.zeros_like(possible)
-    for i in range(1, _SAMPLES + 1):
-        t = first + i * width
-        after, is_inside = _side(rays, s, t)
-        crossing = (before <= 0) & (after > 0) & ~found & (was_inside | is_inside)
-        left = torch.where(crossing, t - width, left)
-        found = found | crossing
-        before, was_inside = after, is_inside
-    right = left + width
+    sides = [_side(rays, first + i * width) for i in range(_SAMPLES + 1)]
+    before, behind = (torch.stack(side) for side in zip(*sides, strict=True))
+    leaves = before[:-1] & ~before[1:]
+    steps = (leaves | ~(before[:-1] | behind[:-1]) & behind[1:]) & possible  # that may hold a crossing
+    found, t = torch.zeros_like(possible), first
+    for _ in range(_CANDIDATES):
+        few = (steps.any(0) & ~found).nonzero()[:, 0] if _reads_are_free(t) else torch.arange(len(t), device=t.device)
+        if _reads_are_free(t) and not len(few):
+            break
+        at = steps[:, few].to(torch.uint8).argmax(0)  # the first of them
+        right = first[few] + (at + 1) * width[few]
+        t_few, is_crossing = _bisected(rays.of(few), right - width[few], right, leaves[at, few])
+        is_crossing = is_crossing & steps[at, few] & ~found[few]
+        steps[at, few] = False
+        t, found = (
+            t.index_put((few,), torch.where(is_crossing, t_few, t[few])),
+            found.index_put((few,), found[few] | is_crossing),
+        )
+    return t, found
+
+
+def _bisected(rays: _Rays, left: Tensor, right: Tensor, leaves: Tensor) -> tuple[Tensor, Tensor]:
+    """Crossing between points, the left one before the surface (leaves) or the right one behind it; whether it is."""
+    width = right - left
     for _ in range(_BISECTIONS):
         middle = 0.5 * (left + right)
-        below = _side(rays, s, middle)[0] <= 0
-        left, right = torch.where(below, middle, left), torch.where(below, right, middle)
-    t = 0.5 * (left + right)
+        is_before, is_behind = _side(rays, middle)
+        low = torch.where(leaves, is_before, ~is_behind)
+        left, right = torch.where(low, middle, left), torch.where(low, right, middle)
+    t = torch.where(leaves, left, right)  # the end on the surface
     t_polished, small, forward, _ = _newton(rays, t)
     stayed = small & forward & ((t_polished - t).abs() <= width.abs())
-    return torch.where(stayed, t_polished, t), found & possible
+    return torch.where(stayed, t_polished, t), stayed | _is_small(*_residual(rays, t))
 
 
-def _side(rays: _Rays, s: Tensor, t: Tensor) -> tuple[Tensor, Tensor | bool]:
-    """F as light sees it, and whether there is a surface: a round one is looked for only where there is."""
+def _side(rays: _Rays, t: Tensor) -> tuple[Tensor, Tensor]:
+    """Whether light at t is before the surface, and whether it is behind it: neither where there is none."""
     F, _, _, _, inside = _residual(rays, t)
-    return s * F, True if rays.form is None else inside
+    below = torch.where(rays.d[2] < 0, -F, F) <= 0
+    return inside & below, inside & ~below
+
+
+def _is_small(F: Tensor, dF: Tensor, scale: Tensor, u: Tensor, inside: Tensor) -> Tensor:
+    """Whether a point is on the surface."""
+    return (F.abs() <= _ACCEPTED_RESIDUAL * torch.finfo(F.dtype).eps * scale) & inside
 
 
 def _stretch_round(rays: _Rays):
     """Where on the rays a crossing may lie, from … to …, and whether it may at all."""
     p, (L, M, _), c, k, a, rim, *_ = rays
-    big = torch.finfo(p.dtype).max ** 0.48  # its square is a number
+    big = _big(p)
     closed = (1 + k) * c * c
     edge = torch.where(closed > 0, torch.rsqrt(torch.where(closed > 0, closed, 1.0)), big)
     radius = torch.where(edge < big, edge.clamp_max(rim), torch.full_like(edge, rim))
@@ -317,7 +347,7 @@ def _stretch_round(rays: _Rays):
 def _stretch_freeform(rays: _Rays):
     """The same inside the box that the sheet of the vertex fills."""
     p, d, c, k, a, rim, *_ = rays
-    big = torch.finfo(p.dtype).max ** 0.48
+    big = _big(p)
     limit = torch.full_like(p[0], rim) if rim < big else _reach(rays)
     sides = rays.form.extent(c, k, a, torch.full_like(p[0], min(rim, big)))
     sides = [torch.where(side < big, side, limit) for side in sides]
@@ -333,6 +363,11 @@ def _stretch_freeform(rays: _Rays):
     x, y = (fraction[:, None, None] * sides[0]), fraction[None, :, None] * sides[1]
     heights = rays.form.sag(c, k, a[:, None, None], x, y, 0).z.flatten(0, 1)
     return _between(rays, heights, 0.25, torch.hypot(*sides), first, last, possible)
+
+
+def _big(of: Tensor) -> float:
+    """A length whose square is a number."""
+    return torch.finfo(of.dtype).max ** 0.48
 
 
 def _reach(rays: _Rays) -> Tensor:
