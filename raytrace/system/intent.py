@@ -92,8 +92,8 @@ def _where(one: Vary | Solve) -> str:
 class Row:
     """One line of a merit function: an operand, its arguments, and what it is meant to be.
 
-    operand: its name, as "TRAC", a key of `merit.operands.OPERANDS` where it is known, or a function from a lens to a tensor
-        () or (k,), which may be a `merit.measure.Measure`; `name` is a word for either.
+    operand: its name, as "TRAC", a key of `merit.operands.OPERANDS` where it is known, or a function from a lens to a
+        tensor () or (k,), which may be a `merit.measure.Measure`; `name` is a word for either.
     integers, numbers: its arguments as the field's programs write them: surfaces, a wavelength (from 1, 0 the primary
         one) or rows; Hx, Hy, Px, Py or data.
     target, weight: the merit is the weighted mean square of value - target; a weight of 0 shows the value alone.

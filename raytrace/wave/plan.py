@@ -91,8 +91,8 @@ def plan(
     nodes: to be used as they are (`Plan`). pad, band_limit: of the transfer functions; pad 1.5 without a band limit is
     that of Sitzmann et al. (2018).
     Raises AliasedSampling where copies of the image would lie in the window, ValueError where an engine cannot hold
-    the scene; warns `kernels.dft.Aliased` where the converging field is undersampled, and `NotConverged` where the finest
-    sampling there is does not meet tol.
+    the scene; warns `kernels.dft.Aliased` where the converging field is undersampled, and `NotConverged` where the
+    finest sampling there is does not meet tol.
     """
     check(scene)
     round_scene = is_round(scene) and is_centred(scene.grid)
