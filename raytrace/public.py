@@ -7,14 +7,19 @@ import functools
 import inspect
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping
-from numbers import Real
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from numbers import Integral, Real
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Union, get_args, get_origin
 
+import torch
 from torch import Tensor
 
-from raytrace.formats import read_lens
+from raytrace.formats import as_lens
 from raytrace.system.lens import Lens
-from raytrace.words import did_you_mean, with_article
+from raytrace.words import did_you_mean, named_value, with_article
 
 #: Options with two spellings: one value on the command line, several in Python.
 SPELLINGS = (
@@ -31,6 +36,16 @@ _OTHER = {one: other for pair in SPELLINGS for one, other in (pair, pair[::-1])}
 #: Options of several numbers, and which of them may be infinite; those of `fields` may be pairs.
 _FINITE = ("fields", "frequencies", "radii", "wavelengths")
 _SEVERAL = (*_FINITE, "depths", "object_distances", "distance_weights", "field_weights", "wavelength_weights")
+
+
+#: Modules whose classes are looked for; a module, an optimizer or a generator of torch may be anything alike.
+_CHECKED = r"builtins|collections\.abc|os|pathlib|raytrace\..*|torch"
+_ITERABLE = {Sequence, Iterable, list, tuple}
+#: Classes as a message names them.
+_KINDS = {
+    **{Tensor: "a tensor", str: "a text", os.PathLike: "a path", Path: "a path", int: "a whole number"},
+    **{float: "a number", Sequence: "a sequence", Iterable: "a sequence", tuple: "a pair", Callable: "a function"},
+}
 
 
 @functools.cache
@@ -75,26 +90,57 @@ def _reader(parameter: inspect.Parameter) -> Callable | None:
     """What reads the values of a parameter, (verb, name, value) -> value; None if they pass as they are."""
     if parameter.name == "lens":
         return _lens
+    reader = _reader_of_values(parameter)
+    optional = parameter.default is not parameter.empty or NoneType in get_args(parameter.annotation)
+    if reader is None or not optional:
+        return reader
+    return lambda verb, name, value: None if value is None else reader(verb, name, value)
+
+
+def _reader_of_values(parameter: inspect.Parameter) -> Callable | None:
     if parameter.name in _SEVERAL:
         return _several
     if parameter.annotation in (int, int | None):
         return _count
-    return _number if parameter.annotation in (float, float | None) else None
+    if parameter.annotation in (float, float | None):
+        return _number
+    kinds = _kinds(parameter.annotation)
+    if not kinds or (kinds == {str} and parameter.default is not parameter.empty):  # a choice, which the verb lists
+        return None
+    return functools.partial(_of_kinds, kinds)
+
+
+def _kinds(annotation: object) -> set[type]:
+    """The classes that an annotation names; none if one of them cannot be looked for."""
+    parts = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
+    found = {get_origin(part) or part for part in parts} - {NoneType}
+    checked = all(isinstance(kind, type) and re.fullmatch(_CHECKED, kind.__module__) for kind in found)
+    return found if checked and bool not in found else set()
 
 
 def _read(verb: str, readers: Mapping[str, Callable], name: str, value: object) -> object:
     reader = readers.get(name)
-    return value if reader is None or (value is None and reader is not _lens) else reader(verb, name, value)
+    return value if reader is None else reader(verb, name, value)
 
 
 def _lens(verb: str, name: str, value: object) -> Lens:
-    if isinstance(value, Lens):
+    return as_lens(value, verb)
+
+
+def _of_kinds(kinds: set[type], verb: str, name: str, value: object) -> object:
+    """A value of one of some classes; where tensors are expected alone, numbers become one, float64."""
+    words = isinstance(value, (str, bytes))
+    numeric = isinstance(value, (Real, list, tuple)) or hasattr(value, "tolist")
+    if kinds == {Tensor} and isinstance(value, Real):
+        return torch.tensor(_number(verb, name, value), dtype=torch.float64)
+    if isinstance(value, tuple(kinds)) and not (words and str not in kinds):
         return value
-    if isinstance(value, (str, os.PathLike)):
-        return read_lens(value)
-    hint = "; it has one, as its `lens`" if isinstance(getattr(value, "lens", None), Lens) else ""
-    expected = "a Lens, the path of a lens file or the name of a shipped lens"
-    raise TypeError(f"{verb}: `{name}` is {_kind(value)}; expected {expected}{hint}")
+    if (kinds & {Tensor, float} and numeric) or (kinds & {int} and isinstance(value, Integral)):
+        return value
+    if kinds & _ITERABLE and isinstance(value, Iterable) and not words:
+        return value
+    expected = " or ".join(sorted({_KINDS.get(kind) or with_article(kind.__name__) for kind in kinds}))
+    raise TypeError(f"{verb}: `{name}` is {named_value(value)}; expected {expected}")
 
 
 def _several(verb: str, name: str, value: object) -> Tensor | tuple | list:
@@ -108,7 +154,7 @@ def _several(verb: str, name: str, value: object) -> Tensor | tuple | list:
     if isinstance(value, Real):
         value = [value]
     if not isinstance(value, Iterable) or isinstance(value, (str, bytes, Mapping)):
-        raise TypeError(f"{verb}: `{name}` is {_kind(value)}; expected {_numbers(name)}")
+        raise TypeError(f"{verb}: `{name}` is {named_value(value)}; expected {_numbers(name)}")
     value = value if isinstance(value, (tuple, list)) else [*value]
     if not value:
         raise ValueError(f"{verb}: `{name}` is empty; expected {_numbers(name)}")
@@ -124,7 +170,7 @@ def _entry(verb: str, name: str, entry: object) -> object:
         return entry if isinstance(entry, (int, float)) else float(entry)
     if name == "fields" and isinstance(entry, Iterable) and not isinstance(entry, (str, bytes, Mapping)):
         return tuple(_entry(verb, "field", part) for part in entry)
-    raise TypeError(f"{verb}: `{name}` holds {_kind(entry)}; expected {_numbers(name)}")
+    raise TypeError(f"{verb}: `{name}` holds {named_value(entry)}; expected {_numbers(name)}")
 
 
 def _numbers(name: str) -> str:
@@ -136,7 +182,7 @@ def _number(verb: str, name: str, value: object) -> object:
     if isinstance(value, Tensor):
         return value
     if not isinstance(value, Real):
-        raise TypeError(f"{verb}: `{name}` is {_kind(value)}; expected a number")
+        raise TypeError(f"{verb}: `{name}` is {named_value(value)}; expected a number")
     if math.isnan(value):
         raise ValueError(f"{verb}: `{name}` is nan; expected a number")
     return value
@@ -146,11 +192,4 @@ def _count(verb: str, name: str, value: object) -> object:
     if isinstance(value, Tensor) or (isinstance(value, Real) and value == value // 1):
         return int(value) if isinstance(value, float) else value
     kind = TypeError if not isinstance(value, Real) else ValueError
-    raise kind(f"{verb}: `{name}` is {_kind(value)}; expected a whole number")
-
-
-def _kind(value: object) -> str:
-    """A value as a message names it: itself if it is short and plain, else its class."""
-    if value is None or isinstance(value, (str, Real)):
-        return repr(value) if len(repr(value)) < 60 else f"{repr(value)[:57]}…"
-    return with_article(type(value).__name__)
+    raise kind(f"{verb}: `{name}` is {named_value(value)}; expected a whole number")

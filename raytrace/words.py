@@ -4,6 +4,7 @@ import difflib
 import re
 import sys
 from collections.abc import Iterable
+from numbers import Real
 from pathlib import Path
 
 _PACKAGE = str(Path(__file__).parent)
@@ -21,9 +22,16 @@ def named(part: object) -> str:
     return with_article(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(part).__name__).lower())
 
 
+def named_value(value: object) -> str:
+    """A value as a message names it: itself if it is short and plain, else its class."""
+    if value is None or isinstance(value, (str, Real)):
+        return repr(value) if len(repr(value)) < 60 else f"{repr(value)[:57]}…"
+    return with_article(type(value).__name__)
+
+
 def with_article(noun: str) -> str:
     """A noun with "a" or "an" before it."""
-    return ("an " if noun[0] in "aeiou" else "a ") + noun
+    return ("an " if noun[0] in "aeiouAEIO" else "a ") + noun
 
 
 def calling_level() -> int:

@@ -1,5 +1,6 @@
 """Verbs as `raytrace` exports them: a path for a lens, one number for several, both spellings, and misuse in words."""
 
+import functools
 import inspect
 import pickle
 import re
@@ -19,7 +20,6 @@ OF_SEVERAL = [(verb, name) for verb, names in PARAMETERS.items() for name in nam
 #: A verb, keywords as a person may give them, and the same in full.
 ALIKE = [
     ("first_order", {}, {}),
-    ("base_ray", {}, {}),
     ("info", {}, {}),
     ("evaluate", {"merit": "spot"}, {"merit": "spot"}),
     ("layout", {"field": 3}, {"fields": [3.0]}),
@@ -59,8 +59,9 @@ def path(singlet, tmp_path_factory):
 
 
 def fill(verb: str, **given) -> dict:
-    """The keywords given, and None for what else the verb requires."""
-    return {name: None for name, one in PARAMETERS[verb].items() if one.default is one.empty and one.kind < 4} | given
+    """The keywords given, which are read first, and None for what else the verb requires."""
+    required = (name for name, one in PARAMETERS[verb].items() if one.default is one.empty and one.kind < 4)
+    return given | {name: None for name in required if name not in given}
 
 
 def refused(kind, verb: str, said: str, **given) -> None:
@@ -99,10 +100,12 @@ def test_what_are_no_numbers_is_refused(verb, name, singlet):
 def test_other_misuse_is_refused(verb, singlet):
     lens = {"lens": singlet} if "lens" in PARAMETERS[verb] else {}
     for name, one in PARAMETERS[verb].items():
-        reader = public._reader(one)
+        reader = public._reader_of_values(one) if name != "lens" else None
         if reader in (public._number, public._count):
             refused(TypeError, verb, f"`{name}` is 'five'; expected a", **lens, **{name: "five"})
             refused(ValueError, verb, f"`{name}` is nan; expected a", **lens, **{name: NAN})
+        if isinstance(reader, functools.partial):
+            refused(TypeError, verb, f"`{name}` is an object; expected a", **lens, **{name: object()})
     if all(one.kind is not one.VAR_KEYWORD for one in PARAMETERS[verb].values()):
         refused(TypeError, verb, f"{verb} has no option `nothing_like_it` (it has ", **lens, nothing_like_it=1)
 
@@ -110,6 +113,31 @@ def test_other_misuse_is_refused(verb, singlet):
 def test_an_unknown_option_names_the_nearest(singlet):
     refused(TypeError, "spot", "spot has no option `feilds`; did you mean fields?", lens=singlet, feilds=1)
     refused(TypeError, "mtf", "`field` and `fields` are one option", lens=singlet, field=1, fields=[1])
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda lens: rt.Variables(None), "Variables: `lens` is None; expected a Lens"),
+        (lambda lens: rt.Camera(lens, None), "Camera: `variables` is a Lens; expected the Variables of a lens"),
+        (lambda lens: lens.at(fields=NAN), "`fields` hold a number that is not finite"),
+        (lambda lens: lens.at(object_distance=NAN), "the object distance is nan"),
+        (lambda lens: rt.find_glass(None), "find_glass: `name` is None; expected a text"),
+        (lambda lens: rt.refractive_index("N-BK7", 0.55), "`glass` is 'N-BK7'; expected a Glass"),
+        (lambda lens: rt.psf(lens, size="a"), "psf: `size` is 'a'; expected a pair or a whole number"),
+        (lambda lens: rt.optimize(lens, merit="spot", vary=5), "`vary` is 5; expected a sequence or a text"),
+    ],
+)
+def test_classes_and_values_of_other_kinds_are_refused(call, said, singlet):
+    with pytest.raises((TypeError, ValueError), match=re.escape(said)):
+        call(singlet)
+
+
+def test_one_number_serves_as_a_wavelength(path):
+    lens = rt.read_lens(path)
+    expected = rt.first_order(lens, torch.tensor(0.55, dtype=torch.float64)).power
+    assert torch.equal(rt.first_order(path, wavelengths=0.55).power, expected)
+    assert rt.Variables(str(path)).lens.name == lens.name
 
 
 def test_the_verbs_are_those_of_the_modules():

@@ -29,6 +29,7 @@ from raytrace.optics.filling import warn_of_filling
 from raytrace.optics.reuse import Memo
 from raytrace.optics.scene import chief_landing, scene
 from raytrace.system.lens import Lens, field_points
+from raytrace.words import named_value
 
 _LARGEST = 2.0  # of a picture in [0, 1] whose resampling overshoots
 
@@ -63,6 +64,9 @@ class Camera(nn.Module):
         network_dtype: torch.dtype | None = None,
     ):
         super().__init__()
+        if not isinstance(getattr(variables, "lens", None), Lens):
+            found = named_value(variables)
+            raise TypeError(f"Camera: `variables` is {found}; expected the Variables of a lens: Variables(lens, …)")
         self.variables, self.network, self.model = variables, network, model
         self.range = object_distances
         like = variables.lens.wavelengths

@@ -6,6 +6,7 @@ changed = variables()          # the lens with its variables, differentiable
 
 import dataclasses
 import math
+import os
 from collections.abc import Mapping
 
 import torch
@@ -15,6 +16,7 @@ from raytrace.camera.held import held, solved
 from raytrace.camera.limits import limits_of, violation
 from raytrace.camera.owned import OtherLens as OtherLens
 from raytrace.camera.owned import Owned
+from raytrace.formats import as_lens
 from raytrace.optics.paraxial import first_order
 from raytrace.system.identity import identity, other_lens
 from raytrace.system.lens import Lens
@@ -62,7 +64,7 @@ class Variables(Owned):
 
     def __init__(
         self,
-        lens: Lens,
+        lens: Lens | str | os.PathLike,
         vary: str = "sensor",
         *,
         bounds: Mapping[str, tuple[float, float]] | None = None,
@@ -72,6 +74,7 @@ class Variables(Owned):
         edge: float | None = None,
     ):
         super().__init__()
+        lens = as_lens(lens, "Variables")
         self.lens = lens
         every = parse(lens, vary)
         self.held = held(hold, lens, every, _with_value)

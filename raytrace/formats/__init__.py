@@ -37,7 +37,7 @@ from raytrace.system.configurations import count
 from raytrace.system.intent import Intent
 from raytrace.system.lens import Lens, check_media
 from raytrace.system.lens import check as check_lens
-from raytrace.words import calling_level
+from raytrace.words import calling_level, named_value
 
 #: Other glasses for those of a file: {"SSK4": "SSK4A"}, words like "SSK4=SSK4A", "nearest" for every unknown one.
 Substitute = Mapping[str, str] | str | Sequence[str] | None
@@ -98,6 +98,17 @@ def read_lens(
     if report.warnings:
         warnings.warn("; ".join(report.warnings), LensFileWarning, stacklevel=calling_level())
     return lens
+
+
+def as_lens(given: Lens | str | os.PathLike, verb: str) -> Lens:
+    """A lens as it is, or that of a path or of a shipped name. Raises TypeError, which names the verb, for no lens."""
+    if isinstance(given, Lens):
+        return given
+    if isinstance(given, (str, os.PathLike)):
+        return read_lens(given)
+    hint = "; it has one, as its `lens`" if isinstance(getattr(given, "lens", None), Lens) else ""
+    expected = "a Lens, the path of a lens file or the name of a shipped lens"
+    raise TypeError(f"{verb}: `lens` is {named_value(given)}; expected {expected}{hint}")
 
 
 def read_lens_with_report(

@@ -349,6 +349,10 @@ def check(lens: Lens) -> None:
     for number, surface in enumerate(lens.surfaces[1:], 1):
         if not bool(torch.isfinite(surface.thickness)):
             raise ValueError(f"surface {number} has thickness {float(surface.thickness)}; only the object's may be inf")
+    if bool(torch.isnan(lens.surfaces[0].thickness)):
+        raise ValueError("the object distance is nan; expected mm, or inf")
+    if not bool((torch.isfinite(lens.fields.x) & torch.isfinite(lens.fields.y)).all()):
+        raise ValueError("`fields` hold a number that is not finite; expected numbers y, or pairs (x, y)")
     at_infinity = bool(torch.isinf(lens.surfaces[0].thickness))
     if at_infinity and lens.fields.kind == "object_height":
         raise ValueError("fields are object heights but the object is at infinity: give angles, or an object distance")
