@@ -92,7 +92,7 @@ def test_plain_texts_stay_plain():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"wavelengths": torch.tensor([1e9], dtype=torch.float64)}, r"1e\+09"),
+        ({"wavelengths": torch.tensor([-0.55], dtype=torch.float64)}, "-0.55"),
         ({"wavelength_weights": torch.tensor([-1.0], dtype=torch.float64)}, "weight"),
         ({"stop": 0}, "(?i)stop"),
     ],

@@ -176,8 +176,9 @@ _GLASS = {
     "design_wavelength": _ABOVE_0,
     "aperture": _ABOVE_0,
 }
-_OF_HEIGHTS = record(_GLASS | {"pitch": _ABOVE_0})
-_SMOOTH = record(_GLASS | {"profile": exactly(*_PROFILES), "coefficients_of_profile": listed(number(), 1)})
+_INFORMATION = {"height_range": listed(number(), 2, 2)}  # older labels have none
+_OF_HEIGHTS = record(_GLASS | {"pitch": _ABOVE_0}, _INFORMATION)
+_SMOOTH = record(_GLASS | {"profile": exactly(*_PROFILES), "coefficients_of_profile": listed(number(), 1)}, _INFORMATION)
 
 
 def _label(value: object) -> dict:
