@@ -6,7 +6,6 @@ and sends the few rays that fail to a bracketed search. It is one opaque operato
 `torch.compile` accept the data-dependent search inside; derivatives are attached by the caller.
 """
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -104,7 +103,7 @@ def search(
     t, good = _searched(rays, t, good)
     good = good | converged
     if rim < _big(t):
-        t, good = _searched(rays._replace(rim=math.inf), t, good)
+        t, good = _searched(rays._replace(rim=torch.inf), t, good)
     t = torch.where(good, t, 0.0)
     return t.reshape(batch).to(foot.dtype), good.reshape(batch).clone()
 
