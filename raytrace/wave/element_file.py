@@ -178,7 +178,8 @@ _GLASS = {
 }
 _INFORMATION = {"height_range": listed(number(), 2, 2)}  # older labels have none
 _OF_HEIGHTS = record(_GLASS | {"pitch": _ABOVE_0}, _INFORMATION)
-_SMOOTH = record(_GLASS | {"profile": exactly(*_PROFILES), "coefficients_of_profile": listed(number(), 1)}, _INFORMATION)
+_PROFILE = {"profile": exactly(*_PROFILES), "coefficients_of_profile": listed(number(), 1)}
+_SMOOTH = record(_GLASS | _PROFILE, _INFORMATION)
 
 
 def _label(value: object) -> dict:
