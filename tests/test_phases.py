@@ -9,7 +9,8 @@ from bends import real
 
 import raytrace as rt
 from raytrace.maths.bivariate import fringe, fringe_to_powers, polynomial_xy, powers
-from raytrace.optics.trace import axial_path, trace_surfaces
+from raytrace.optics.launch import launch
+from raytrace.optics.trace import axial_path, trace_lens, trace_surfaces
 from raytrace.system.phases import added_path, power_of
 from raytrace.system.rays import start
 from raytrace.system.surface import Surface
@@ -256,3 +257,22 @@ def test_derivatives_by_every_number_of_a_phase(name):
 
     assert torch.autograd.gradcheck(trace, leaves, atol=1e-5)
     assert torch.autograd.gradgradcheck(lambda *n: trace(*n)[0][:, 3], leaves, atol=1e-4, fast_mode=True)
+
+
+@pytest.mark.parametrize("engine", ["eager", "fused"])
+def test_the_path_of_an_ideal_lens_is_smooth_in_both_powers(engine):
+    """By one power alone, at equal ones, a derivative is that of differences: the path has no jump there."""
+
+    def total(power_x, power_y):
+        lens = lens_of(rt.IdealLens(power_x, power_y), object_distance=80.0, image=60.0, field=3.0)
+        rays = launch(lens, points.expand(2, -1))
+        with rt.tracing(engine):
+            return trace_lens(lens, rays, lens.wavelengths[:, None]).opl.sum()
+
+    points = rt.gauss_rings(4, dtype=torch.float64)[0].repeat(1, 100)  # as many as the compiled trace is worth
+    powers = [torch.tensor(0.02, dtype=torch.float64, requires_grad=True) for _ in range(2)]
+    found = torch.autograd.grad(total(*powers), powers)
+    step = 1e-6
+    for k, derivative in enumerate(found):
+        ends = [total(*(p.detach() + sign * step * (j == k) for j, p in enumerate(powers))) for sign in (1, -1)]
+        assert float(derivative) == pytest.approx(float(ends[0] - ends[1]) / (2 * step), rel=1e-6)

@@ -73,10 +73,10 @@ void pull_slopes(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes
 
     // The path.
     Longer<T> before(x, y, L, M, N, lens.vergence, T(-1)), behind(x, y, l, m, o, lens.onward, T(1));
-    T share = lens.round ? R : T(0), half = lens.round ? T(0) : T(-0.5) * R;
-    pull_longer(before, n1 * share, x, y, N, lens.vergence, T(-1), gx, gy, gL, gM, gN, gv);
-    pull_longer(behind, n2 * share, x, y, o, lens.onward, T(1), gx, gy, gl, gm, gn, gonward);
-    gx += T(2) * half * lens.power_x * x, gy += T(2) * half * lens.power_y * y;
+    T quarter = T(0.25) * R * (x * x - y * y);
+    pull_longer(before, n1 * R, x, y, N, lens.vergence, T(-1), gx, gy, gL, gM, gN, gv);
+    pull_longer(behind, n2 * R, x, y, o, lens.onward, T(1), gx, gy, gl, gm, gn, gonward);
+    gx += T(2) * R * lens.cylinder * x, gy -= T(2) * R * lens.cylinder * y;
 
     // The direction.
     T steep = magnitude(N), eL = n1 * L - lens.power_x * x * steep, eM = n1 * M - lens.power_y * y * steep, eN = n2 * N;
@@ -85,14 +85,14 @@ void pull_slopes(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes
     T bent = -(lens.power_x * x * kL + lens.power_y * y * kM);
     g.L[i] = gL + n1 * kL, g.M[i] = gM + n1 * kM, g.N[i] = gN + n2 * kN + signed_as(bent, N);
     g.x[i] += gx - lens.power_x * steep * kL, g.y[i] += gy - lens.power_y * steep * kM;
-    sum_x += half * x * x - x * steep * kL, sum_y += half * y * y - y * steep * kM;
-    sum_n1 += share * before.length + L * kL + M * kM, sum_n2 += share * behind.length + N * kN;
+    sum_x += quarter - x * steep * kL, sum_y -= quarter + y * steep * kM;
+    sum_n1 += R * before.length + L * kL + M * kM, sum_n2 += R * behind.length + N * kN;
     sum_v += gv, sum_onward += gonward;
     turn.x[i] = turn.y[i] = turn.z[i] = turn.w[i] = 0;
   }
-  const T each = sum_onward / n2;  // onward = (φx - n1 v)/n2
+  const T each = sum_onward / n2;  // onward = ((φx + φy)/2 - n1 v)/n2
   double* own = row + s.at->phase_numbers;
-  own[0] += sum_x + each, own[1] += sum_y, own[2] += sum_v - n1 * each;
+  own[0] += sum_x + T(0.5) * each, own[1] += sum_y + T(0.5) * each, own[2] += sum_v - n1 * each;
   row[s.at->before] += sum_n1 - lens.vergence * each, row[s.at->behind] += sum_n2 - lens.onward * each;
 }
 
@@ -155,7 +155,8 @@ void push_slopes(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, Notes<T>&, 
   const T n1 = s.n1, n2 = s.n2, dn1 = change.n1, dn2 = change.n2;
   const T power_x = lens.power_x, power_y = lens.power_y;
   const T dpower_x = change.phase[0], dpower_y = change.phase[1], dv = change.phase[2];
-  const T donward = (dpower_x - n1 * dv - dn1 * lens.vergence - lens.onward * dn2) / n2;
+  const T dcylinder = T(0.25) * (dpower_x - dpower_y);
+  const T donward = (T(0.5) * (dpower_x + dpower_y) - n1 * dv - dn1 * lens.vergence - lens.onward * dn2) / n2;
 #pragma omp simd
   for (int i = 0; i < n; i++) {
     T x = to.x[i], y = to.y[i], L = from.L[i], M = from.M[i], N = from.N[i], l = to.L[i], m = to.M[i], o = to.N[i];
@@ -172,8 +173,8 @@ void push_slopes(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, Notes<T>&, 
       T longer = dn1 * before.length + dn2 * behind.length;
       longer += n1 * push_longer(before, x, y, N, lens.vergence, T(-1), L, M, dx, dy, dL, dM, dN, dv);
       longer += n2 * push_longer(behind, x, y, o, lens.onward, T(1), l, m, dx, dy, dl, dm, dn, donward);
-      T unlike = T(-0.5) * (dpower_x * x * x + dpower_y * y * y) - (power_x * x * dx + power_y * y * dy);
-      d.path[i] += lens.round ? longer : unlike;
+      longer += dcylinder * (x * x - y * y) + T(2) * lens.cylinder * (x * dx - y * dy);
+      d.path[i] += longer;
     }
     d.L[i] = dl, d.M[i] = dm, d.N[i] = dn;
   }

@@ -73,12 +73,11 @@ struct Longer {
 // An ideal lens: its powers in x and y, the vergence of the point it images, and that behind it.
 template <typename T>
 struct IdealLens {
-  T n1, n2, power_x, power_y, vergence, onward;
-  bool round;
+  T n1, n2, power_x, power_y, vergence, onward, cylinder;
   template <typename C>
   IdealLens(T n1, T n2, const C* numbers)
       : n1(n1), n2(n2), power_x(T(numbers[0])), power_y(T(numbers[1])), vergence(T(numbers[2])),
-        onward((power_x - n1 * vergence) / n2), round(power_x == power_y) {}
+        onward((T(0.5) * (power_x + power_y) - n1 * vergence) / n2), cylinder(T(0.25) * (power_x - power_y)) {}
 
   // Turns (L, M, N).
   inline void bend(T x, T y, T& L, T& M, T& N) const {
@@ -89,9 +88,8 @@ struct IdealLens {
 
   // The path that it adds to a ray of direction d before it and e behind it.
   inline T path(T x, T y, T dL, T dM, T dN, T eL, T eM, T eN) const {
-    T unlike = T(-0.5) * (power_x * x * x + power_y * y * y);
     Longer<T> before(x, y, dL, dM, dN, vergence, T(-1)), behind(x, y, eL, eM, eN, onward, T(1));
-    return round ? n1 * before.length + n2 * behind.length : unlike;
+    return n1 * before.length + n2 * behind.length + cylinder * (x * x - y * y);
   }
 };
 

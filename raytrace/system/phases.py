@@ -278,17 +278,18 @@ def power_of(phase: Phase, wavelength: Tensor) -> tuple[Tensor, Tensor]:
 def ideal_path(lens: IdealLens, point, before, behind, n1: Tensor, n2: Tensor) -> Tensor:
     """The path (...) mm through an ideal lens that makes it alike along all rays of a point, O, to its image, I.
 
-        Δ = n1 (|O| - |OP|) + n2 (|I| - |PI|),  n1/s + n2/s′ = power
+        Δ = n1 (|O| - |OP|) + n2 (|I| - |PI|) + (φx - φy) (x² - y²)/4,  n1/s + n2/s′ = (φx + φy)/2
         |O| - |OP| = (v |P|² - 2 d·P)/(|v P - d| + 1),  v = |N|/s the inverse distance along the ray d, and so for I
 
     point: P = (x, y, ...) mm on the lens; before, behind: directions by components. A point at infinity is v = 0. Of
-    unequal powers no point has a sharp image, and Δ = -(φx x² + φy y²)/2.
+    unequal powers no point has a sharp image: the mean power has the path of a round lens along the bent rays, and the
+    last term makes Δ -(φx x² + φy y²)/2 near the axis. Δ is smooth in both powers.
     """
     x, y = point[0], point[1]
     vergence = torch.zeros_like(lens.power_x) if lens.vergence is None else lens.vergence
-    onward = (lens.power_x - n1 * vergence) / n2
-    found = n1 * _longer(x, y, before, vergence, -1.0) + n2 * _longer(x, y, behind, onward, 1.0)
-    return torch.where(lens.power_x == lens.power_y, found, -0.5 * (lens.power_x * x * x + lens.power_y * y * y))
+    onward = (0.5 * (lens.power_x + lens.power_y) - n1 * vergence) / n2
+    round_part = n1 * _longer(x, y, before, vergence, -1.0) + n2 * _longer(x, y, behind, onward, 1.0)
+    return round_part + 0.25 * (lens.power_x - lens.power_y) * (x * x - y * y)
 
 
 def _longer(x: Tensor, y: Tensor, direction, vergence: Tensor, sign: float) -> Tensor:
