@@ -80,7 +80,8 @@ def compare(kind: str, count: int, rays: int, seed: int) -> dict[str, int]:
 KINDS_TESTED = ["even asphere", "odd asphere", "toroidal", "biconic", "added sag"]
 
 #: Share of hits that one engine alone finds, 98 of 298,357 of the toroids below: rays behind a surface for less than
-#: 1/96 of their stretch are found or missed depending on the start of Newton's method, which differs in the compiled loops.
+#: 1/96 of their stretch are found or missed depending on the start of Newton's method, which differs in the compiled
+#: loops.
 GRAZING = 4e-4
 
 
