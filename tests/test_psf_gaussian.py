@@ -364,8 +364,8 @@ def test_derivatives_with_vignetted_rays(field):
     assert 0 < rays.valid.sum() < rays.valid.numel()
     assert torch.autograd.gradcheck(kernel, numbers, eps=1e-6, atol=1e-5, rtol=1e-4)
     if field[1] == 14.0:
-        torch.manual_seed(0)  # of the direction that the fast mode draws
-        assert torch.autograd.gradgradcheck(kernel, numbers, eps=1e-6, atol=1e-4, rtol=1e-3, fast_mode=True)
+        # Differences of 1e-6 err by up to 3e-3 here, of 1e-7 by 3e-5: they fall with the square of the step.
+        assert torch.autograd.gradgradcheck(kernel, numbers, eps=1e-7, atol=1e-4, rtol=1e-3, fast_mode=True)
 
 
 @pytest.mark.parametrize(
