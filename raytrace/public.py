@@ -19,19 +19,7 @@ from torch import Tensor
 
 from raytrace.formats import as_lens
 from raytrace.system.lens import Lens
-from raytrace.words import did_you_mean, named_value, with_article
-
-#: Options with two spellings: one value on the command line, several in Python.
-SPELLINGS = (
-    ("catalog", "catalogs"),
-    ("depth", "depths"),
-    ("field", "fields"),
-    ("frequency", "frequencies"),
-    ("object_distance", "object_distances"),
-    ("radius", "radii"),
-    ("wavelength", "wavelengths"),
-)
-_OTHER = {one: other for pair in SPELLINGS for one, other in (pair, pair[::-1])}
+from raytrace.words import known_option, named_value, nameless, with_article
 
 #: Options of several numbers, and which of them may be infinite; those of `fields` may be pairs.
 _FINITE = ("fields", "frequencies", "radii", "wavelengths")
@@ -54,7 +42,8 @@ def public(function: Callable, name: str) -> Callable:
 
     It reads a lens given as a path or as the name of a shipped one, takes the other spelling of an option (SPELLINGS)
     and single numbers where several are expected. Raises TypeError and ValueError, which name verb and argument, for
-    no lens, for unknown options, and for numbers that are none, nan or of the wrong kind.
+    no lens, for unknown or missing options, and for numbers that are none, nan or of the wrong kind; RuntimeError
+    where `torch.func.vmap` hides numbers that the verb reads.
     """
     parameters = inspect.signature(function).parameters
     names = tuple(parameters)
@@ -63,27 +52,49 @@ def public(function: Callable, name: str) -> Callable:
 
     @functools.wraps(function)
     def verb(*given, **options):
-        options = {_known(name, word, names, options, every): value for word, value in options.items()}
+        options = {known_option(name, word, names, options, every): value for word, value in options.items()}
+        _check_call(name, parameters, given, options)
         taken = [_read(name, readers, *one) for one in zip(names, given, strict=False)]
         taken += given[len(names) :]
-        return function(*taken, **{word: _read(name, readers, word, value) for word, value in options.items()})
+        options = {word: _read(name, readers, word, value) for word, value in options.items()}
+        try:
+            return function(*taken, **options)
+        except RuntimeError as error:
+            if (clear := _under_vmap(name, error)) is error:
+                raise
+            raise clear from error
 
     verb.__module__, verb.__qualname__ = "raytrace", name  # where pickle finds it
     return verb
 
 
-def _known(verb: str, word: str, names: tuple[str, ...], options: Mapping, every: bool) -> str:
-    """An option as the verb spells it. Raises TypeError for one that it does not have, or that is given twice."""
-    if word in names:
-        return word
-    other = _OTHER.get(word)
-    if other in names:
-        if other in options:
-            raise TypeError(f"{verb}: `{word}` and `{other}` are one option: leave one out")
-        return other
-    if not every:
-        raise TypeError(f"{verb} has no option `{word}`{did_you_mean(word, names)} (it has {', '.join(names)})")
-    return word
+def _check_call(verb: str, parameters: Mapping[str, inspect.Parameter], values: Sequence, words: Iterable[str]) -> None:
+    """Raises TypeError for values without a name beyond those that may come so, options given twice, or left out."""
+    kinds = inspect.Parameter
+    placed = [
+        name for name, one in parameters.items() if one.kind in (kinds.POSITIONAL_ONLY, kinds.POSITIONAL_OR_KEYWORD)
+    ]
+    several = any(one.kind is kinds.VAR_POSITIONAL for one in parameters.values())
+    if len(values) > len(placed) and not several:
+        options = [name for name, one in parameters.items() if one.kind is kinds.KEYWORD_ONLY]
+        raise TypeError(f"{verb}: {nameless(values[len(placed)], options)}")
+    read = {*placed[: len(values)]}
+    for name in sorted(read & {*words}):
+        raise TypeError(f"{verb}: `{name}` is given twice, with and without its name: leave one out")
+    for name, one in parameters.items():
+        open_ended = one.kind in (kinds.VAR_POSITIONAL, kinds.VAR_KEYWORD)
+        if one.default is one.empty and not open_ended and name not in read and name not in words:
+            raise TypeError(f"{verb}: `{name}` is missing and has no default; add {name}=…")
+
+
+def _under_vmap(verb: str, error: RuntimeError) -> RuntimeError:
+    """The error of a verb under `torch.func.vmap`, which reads numbers of the lens; other errors as they are."""
+    if not re.match(r"vmap:|Cannot access data pointer", str(error)):
+        return error
+    return RuntimeError(
+        f"{verb} does not work under torch.func.vmap: it reads numbers that vmap hides. Call it for each lens in a "
+        "loop; under vmap work first_order, rays, base_ray, and launch, trace_lens and spot_of of raytrace.optics"
+    )
 
 
 def _reader(parameter: inspect.Parameter) -> Callable | None:
@@ -91,7 +102,7 @@ def _reader(parameter: inspect.Parameter) -> Callable | None:
     if parameter.name == "lens":
         return _lens
     reader = _reader_of_values(parameter)
-    optional = parameter.default is not parameter.empty or NoneType in get_args(parameter.annotation)
+    optional = parameter.default is None or NoneType in get_args(parameter.annotation)
     if reader is None or not optional:
         return reader
     return lambda verb, name, value: None if value is None else reader(verb, name, value)

@@ -1,13 +1,60 @@
 """Words: the nearest known to an unknown one, what the kind of a value is called, and the line that a warning names."""
 
 import difflib
+import functools
+import inspect
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from numbers import Real
 from pathlib import Path
 
 _PACKAGE = str(Path(__file__).parent)
+
+#: Options with two spellings: one value on the command line, several in Python.
+SPELLINGS = (
+    ("catalog", "catalogs"),
+    ("depth", "depths"),
+    ("field", "fields"),
+    ("frequency", "frequencies"),
+    ("object_distance", "object_distances"),
+    ("radius", "radii"),
+    ("wavelength", "wavelengths"),
+)
+_OTHER = {one: other for pair in SPELLINGS for one, other in (pair, pair[::-1])}
+
+
+def both_spellings(method: Callable) -> Callable:
+    """A method of keywords alone that takes both spellings of an option, and refuses unknown ones in words."""
+    names = tuple(inspect.signature(method).parameters)[1:]
+
+    @functools.wraps(method)
+    def read(self, *values, **options):
+        if values:
+            raise TypeError(f"{method.__qualname__}: {nameless(values[0], names)}")
+        known = {known_option(method.__qualname__, word, names, options): value for word, value in options.items()}
+        return method(self, **known)
+
+    return read
+
+
+def known_option(verb: str, word: str, names: tuple[str, ...], options: Mapping, every: bool = False) -> str:
+    """An option as the verb spells it. Raises TypeError for one that it does not have, or that is given twice."""
+    if word in names:
+        return word
+    other = _OTHER.get(word)
+    if other in names:
+        if other in options:
+            raise TypeError(f"{verb}: `{word}` and `{other}` are one option: leave one out")
+        return other
+    if not every:
+        raise TypeError(f"{verb} has no option `{word}`{did_you_mean(word, names)} (it has {', '.join(names)})")
+    return word
+
+
+def nameless(value: object, names: Iterable[str]) -> str:
+    """The message for a value without the name of its option; names: options that take a name."""
+    return f"{named_value(value)} is given without a name; write name=value (options: {', '.join(names)})"
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

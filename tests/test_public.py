@@ -1,5 +1,6 @@
 """Verbs as `raytrace` exports them: a path for a lens, one number for several, both spellings, and misuse in words."""
 
+import dataclasses
 import functools
 import inspect
 import pickle
@@ -11,6 +12,9 @@ import torch
 
 import raytrace as rt
 from raytrace import public
+from raytrace.optics.launch import launch
+from raytrace.optics.spot import spot_of
+from raytrace.optics.trace import trace_lens
 
 NAN = float("nan")
 VERBS = {name: getattr(rt, name) for name in rt.PUBLIC if inspect.isfunction(getattr(rt, name))}
@@ -126,11 +130,68 @@ def test_an_unknown_option_names_the_nearest(singlet):
         (lambda lens: rt.refractive_index("N-BK7", 0.55), "`glass` is 'N-BK7'; expected a Glass"),
         (lambda lens: rt.psf(lens, size="a"), "psf: `size` is 'a'; expected a pair or a whole number"),
         (lambda lens: rt.optimize(lens, merit="spot", vary=5), "`vary` is 5; expected a sequence or a text"),
+        (lambda lens: lens.at(feilds=5), "Lens.at has no option `feilds`; did you mean fields?"),
+        (lambda lens: lens.at(field=5, fields=[5]), "Lens.at: `field` and `fields` are one option"),
+        (lambda lens: lens.at([5]), "Lens.at: a list is given without a name; write name=value (options: object_dist"),
+        (lambda lens: rt.lens([5]), "lens: `stop` is missing and has no default; add stop=…"),
+        (lambda lens: rt.lens([5], stop=1, f_number=8), "surface 1: 5; expected a mapping, as dict(radius=50"),
+        (lambda lens: rt.rays(lens, pupil=5), "rays: `pupil` is 5; expected points (2, P) of the unit disc, or a rule"),
+        (lambda lens: rt.rays(lens, pupil=torch.zeros(3)), "rays: `pupil` has the shape (3,); expected points (2, P)"),
+        (lambda lens: rt.wave_psf(None), "wave_psf: `element` is None; expected "),
+        (lambda lens: rt.hexapolar(-1), "hexapolar: `rings` is -1; expected 1 or more"),
+        (lambda lens: rt.gauss_rings(0), "gauss_rings: `rings` is 0; expected 1 or more"),
+        (lambda lens: rt.sobol(0), "sobol: `count` is 0; expected 1 or more"),
+        (lambda lens: rt.spot(lens, [0, 5]), "spot: a list is given without a name; write name=value (options: fields"),
+        (lambda lens: rt.spot(lens, lens=lens), "spot: `lens` is given twice, with and without its name"),
     ],
 )
 def test_classes_and_values_of_other_kinds_are_refused(call, said, singlet):
     with pytest.raises((TypeError, ValueError), match=re.escape(said)):
         call(singlet)
+
+
+VMAPPED = {
+    **{"spot": {}, "mtf": {"frequencies": [10.0]}, "wavefront": {}, "focus": {}, "trace": {}},
+    **{"psf": {"model": "gaussian", "size": 5}, "optimize": {"merit": "spot", "vary": "curvature"}},
+}
+
+
+def varied(lens, curvature):
+    first, changed, *rest = lens.surfaces
+    changed = dataclasses.replace(changed, curvature=curvature)
+    return dataclasses.replace(lens, surfaces=(first, changed, *rest))
+
+
+@pytest.mark.parametrize("verb", VMAPPED)
+def test_a_verb_that_reads_numbers_names_itself_under_vmap(verb, singlet):
+    curvatures = torch.tensor([0.02, 0.021], dtype=torch.float64)
+    with pytest.raises(
+        RuntimeError, match=f"^{verb} does not work under torch.func.vmap.* first_order, rays, base_ray"
+    ):
+        torch.func.vmap(lambda c: VERBS[verb](varied(singlet, c), **VMAPPED[verb]))(curvatures)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda lens: rt.first_order(lens).power,
+        lambda lens: rt.rays(lens).position,
+        lambda lens: rt.base_ray(lens).position,
+        lambda lens: (
+            spot_of(
+                trace_lens(lens, launch(lens, rt.gauss_rings(3)[0]), lens.wavelengths[:, None]), rt.gauss_rings(3)[1]
+            ).mean_square_radius
+        ),
+    ],
+)
+def test_the_functions_that_the_message_names_work_under_vmap(call, singlet):
+    curvatures = torch.tensor([0.02, 0.021], dtype=torch.float64)
+    found = torch.func.vmap(lambda c: call(varied(singlet, c)))(curvatures)
+    assert torch.allclose(found[1], call(varied(singlet, curvatures[1])), rtol=1e-12)
+
+
+def test_a_lens_takes_both_spellings_of_its_conditions(singlet):
+    assert str(singlet.at(field=5, wavelength=[0.55])) == str(singlet.at(fields=5, wavelengths=[0.55]))
 
 
 def test_one_number_serves_as_a_wavelength(path):

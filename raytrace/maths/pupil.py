@@ -16,6 +16,13 @@ _BY_EIGENVALUES = 256  # points of a Gaussian rule at most
 _POINT_BYTES = 64  # of a point and its weight, with what it takes to make them
 
 
+def _at_least_one(rule: str, **sizes: float) -> None:
+    """Raise ValueError for a rule without points."""
+    for name, size in sizes.items():
+        if not size >= 1:
+            raise ValueError(f"{rule}: `{name}` is {size}; expected 1 or more")
+
+
 def _afford(count: float, what: str) -> None:
     """Raise OverBudget for a rule of so many points that they do not fit into memory, before one is made."""
     afford(_POINT_BYTES * count, f"{what}: {count:.3g} points of the pupil", helps="ask for fewer")
@@ -30,6 +37,7 @@ def gauss_rings(
     the x axis, so that the pattern is symmetric in x and in y.
     """
     arms = 4 * rings if arms is None else arms
+    _at_least_one("gauss_rings", rings=rings, arms=arms)
     _afford(rings * arms, f"{rings} rings of {arms} arms")
     nodes, weights = gauss_legendre(rings)
     radius = np.sqrt(0.5 * (nodes + 1))
@@ -69,6 +77,7 @@ def hexapolar(
     rings: 1 or more; between whole numbers the outermost ring lies inside the edge (what a density of rays, rings²,
     leads to: OpticStudio traces a wavelength of weight w with √w times the rings).
     """
+    _at_least_one("hexapolar", rings=rings)
     _afford(3.0 * rings * (rings + 1) + 1, f"{rings} hexapolar rings")
     points, weights = [np.zeros((2, 1))], [np.array([0.25])]
     for ring in range(1, int(rings) + 1):
@@ -83,6 +92,7 @@ def square(
     across: int = 16, *, dtype: torch.dtype = torch.float64, device: torch.device | None = None
 ) -> tuple[Tensor, Tensor]:
     """Cell centres of an across × across grid over [-1, 1]² that lie inside the disc, equal weights."""
+    _at_least_one("square", across=across)
     _afford(float(across) ** 2, f"a square grid of {across} points across")
     axis = (2 * np.arange(across) + 1 - across) / across
     x, y = (grid.ravel() for grid in np.meshgrid(axis, axis))
@@ -94,6 +104,7 @@ def sobol(
     count: int = 256, *, seed: int = 0, dtype: torch.dtype = torch.float64, device: torch.device | None = None
 ) -> tuple[Tensor, Tensor]:
     """Scrambled Sobol points mapped to the disc by r = √u, equal weights; the same points for the same seed."""
+    _at_least_one("sobol", count=count)
     _afford(count, f"{count} Sobol points")
     engine = torch.quasirandom.SobolEngine(2, scramble=True, seed=seed)
     return _disc(engine.draw(count, dtype=torch.float64), dtype, device)
@@ -108,6 +119,7 @@ def random(
     device: torch.device | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Independent uniform points of the disc, equal weights; drawn from `generator`, or from a new one of `seed`."""
+    _at_least_one("random", count=count)
     _afford(count, f"{count} random points")
     generator = torch.Generator().manual_seed(seed) if generator is None else generator
     return _disc(torch.rand(count, 2, generator=generator, dtype=torch.float64), dtype, device)
@@ -117,6 +129,7 @@ def fan(
     count: int = 21, axis: str = "y", *, dtype: torch.dtype = torch.float64, device: torch.device | None = None
 ) -> tuple[Tensor, Tensor]:
     """`count` points from -1 to 1 along x or y, equal weights: for drawing, not for integrating."""
+    _at_least_one("fan", count=count)
     _afford(count, f"a fan of {count} rays")
     line = np.linspace(-1, 1, count) if count > 1 else np.zeros(1)
     zero = np.zeros_like(line)

@@ -22,7 +22,7 @@ from raytrace.optics.vignetting import vignette
 from raytrace.system.lens import RAY_AIMING, Lens, field_points, index_behind, wavelengths_of
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import sag
-from raytrace.words import calling_level
+from raytrace.words import calling_level, named_value
 
 
 class MarginalRayLost(UserWarning):
@@ -46,11 +46,22 @@ def rays(
     pupil = (
         gauss_rings(dtype=lens.surfaces[-2].thickness.dtype, device=lens.wavelengths.device) if pupil is None else pupil
     )
-    points = pupil if isinstance(pupil, Tensor) else pupil[0]
+    points = _points(pupil)
     wavelengths = wavelengths_of(lens, wavelengths)
     fields = field_points(fields, like=lens)
     found = launch(lens, points, fields=fields, wavelengths=wavelengths, ray_aiming=ray_aiming)
     return dataclasses.replace(found, wavelength=wavelengths[:, None])
+
+
+def _points(pupil: Tensor | tuple[Tensor, Tensor]) -> Tensor:
+    """Points (2, P) of a rule (points, weights), or as they are. Raises TypeError, ValueError for others."""
+    points = pupil[0] if isinstance(pupil, (tuple, list)) and pupil else pupil
+    expected = "expected points (2, P) of the unit disc, or a rule (points, weights) as rt.gauss_rings(6)"
+    if not isinstance(points, Tensor):
+        raise TypeError(f"rays: `pupil` is {named_value(pupil)}; {expected}")
+    if points.dim() != 2 or len(points) != 2:
+        raise ValueError(f"rays: `pupil` has the shape {tuple(points.shape)}; {expected}")
+    return points
 
 
 def launch(

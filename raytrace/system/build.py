@@ -13,6 +13,7 @@ from raytrace.media.catalog import find_glass
 from raytrace.media.glass import AIR, MIRROR, Glass, check_unit, constant, model_glass
 from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, Fields, Lens, SystemAperture, changed, check, field_points
 from raytrace.system.surface import Surface
+from raytrace.words import named_value
 
 
 class BadPrescription(ValueError):
@@ -81,6 +82,10 @@ def lens(
 def surface(row: Mapping, number: int = 0, catalogs: Sequence[str] = ()) -> Surface:
     """A surface of a row of plain numbers; number: its number, for errors. Raises BadPrescription, UnknownGlass."""
     where = f"surface {number}"
+    if not isinstance(row, Mapping):
+        raise BadPrescription(
+            f"{where}: {named_value(row)}; expected a mapping, as dict(radius=50, thickness=5, glass='N-BK7')"
+        )
     given = {key: value for key, value in row.items() if not _is_empty(value)}
     if "thickness" not in given:
         raise BadPrescription(f"{where}: no thickness; give mm to the next vertex, 0 where they touch")

@@ -27,7 +27,7 @@ from raytrace.system.configurations import Operand
 from raytrace.system.intent import Intent
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface
-from raytrace.words import calling_level, did_you_mean
+from raytrace.words import both_spellings, calling_level, did_you_mean
 
 
 @value
@@ -77,6 +77,7 @@ class Lens:
     __str__ = lent("optics.views.text")
     _repr_html_ = lent("plot.notebook.page")
 
+    @both_spellings
     def at(
         self,
         *,
