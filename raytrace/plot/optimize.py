@@ -152,7 +152,7 @@ def _draw_left(axes: Axes, found: Optimized) -> None:
     axes.invert_yaxis()
     axes.set_xlabel("part of the square of the merit, %")
     axes.set_title("What is left", fontweight="bold")
-    axes.legend(loc="lower right")
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)
 
 
 def _groups(found: Optimized) -> list[tuple[int, str]]:
