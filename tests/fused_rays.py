@@ -6,9 +6,9 @@ import torch
 from torch.testing import assert_close
 from torch.utils import _pytree as pytree
 
-from raytrace.fused import tracing
 from raytrace.maths.value import to
 from raytrace.system.rays import Rays, start
+from raytrace.tracing.compiled import trace_engine
 
 #: What both traces may differ by, in direction cosines and as a share of the size of a system.
 CLOSE = {torch.float64: 1e-14, torch.float32: 2e-6}
@@ -28,7 +28,7 @@ def some_rays(count: int = 700, dtype=torch.float64, seed: int = 4) -> Rays:
 def both(call):
     found = []
     for name in ("fused", "eager"):
-        with tracing(name):
+        with trace_engine(name):
             found.append(call())
     return found
 

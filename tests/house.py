@@ -18,7 +18,7 @@ import torch
 from test_layers import FLOORS
 
 import raytrace as rt
-from raytrace.optics.trace import cross, media
+from raytrace.tracing.trace import cross, media
 
 PACKAGE = Path(__file__).parents[1] / "raytrace"
 #: Rooms that nothing imports: experiments and measurements, no part of the library.

@@ -15,20 +15,20 @@ from pathlib import Path
 import torch
 
 import raytrace as rt
-from raytrace.formats.zemax_keywords import AIMINGS
-from raytrace.kernels import diffraction
+from raytrace.io.zemax.keywords import AIMINGS
+from raytrace.materials import glass
+from raytrace.materials.catalogs import find_glass
+from raytrace.materials.environment import Environment
 from raytrace.maths import pupil, zernike
-from raytrace.media import glass
-from raytrace.media.catalog import find_glass
-from raytrace.media.environment import Environment
-from raytrace.optics.launch import launch, stop_radius
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.scene import Scene, scene
-from raytrace.optics.trace import media, steps, trace_lens
-from raytrace.optics.wavefront import peak_to_valley, rms, wavefront_of
+from raytrace.psf_models import diffraction
 from raytrace.system.lens import FIELD_UNITS, Fields, Lens, SystemAperture
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Aperture, Surface
+from raytrace.tracing.launch import launch, stop_radius
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.scene import Scene, scene
+from raytrace.tracing.trace import media, steps, trace_lens
+from raytrace.tracing.wavefront import peak_to_valley, rms, wavefront_of
 
 ORACLE = Path(__file__).parent / "oracles" / "opticstudio.json.gz"
 

@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from raytrace.merit.merit import Evaluation
-from raytrace.merit.model import Model
-from raytrace.optics.paraxial import first_order
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit_rows import Evaluation
+from raytrace.tracing.paraxial import first_order
 
 peers = pytest.importorskip("raytrace.bench.peers_optimise", reason="needs the extra [bench]", exc_type=ImportError)
 

@@ -19,10 +19,11 @@ from raytrace.bench.psf_cases import Case, Method, cases, random_histogram
 from raytrace.bench.psf_report import judged, lines, targets
 from raytrace.bench.report import Measured
 from raytrace.cli import main
-from raytrace.formats import read_lens
-from raytrace.kernels import MODELS, diffraction, raymap
-from raytrace.kernels.gaussian import kernels as gaussian_kernels
+from raytrace.io import read_lens
 from raytrace.maths.grid import grid
+from raytrace.psf_models import MODELS, diffraction
+from raytrace.psf_models import drt as raymap
+from raytrace.psf_models.gaussian import kernels as gaussian_kernels
 from raytrace.system.surface import Aperture
 
 pytestmark = pytest.mark.usefixtures("threads")

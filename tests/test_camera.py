@@ -11,17 +11,15 @@ import pytest
 import torch
 from problems import number
 
-from raytrace.camera.camera import Camera
-from raytrace.camera.image import blur
-from raytrace.camera.network import RedNet, RedNetShape
-from raytrace.camera.training import Run, Share
-from raytrace.camera.variables import BadVariables, Variables
 from raytrace.files import shipped
-from raytrace.formats import read_lens
-from raytrace.kernels import psf
+from raytrace.imaging.camera import Camera
+from raytrace.imaging.image import blur
+from raytrace.imaging.network import RedNet, RedNetShape
+from raytrace.imaging.training import Run, Share
+from raytrace.imaging.variables import BadVariables, Variables
+from raytrace.io import read_lens
 from raytrace.maths.grid import grid
-from raytrace.optics.focus import NoImage, best_focus
-from raytrace.optics.paraxial import first_order, paraxial_image_distance
+from raytrace.psf_models import psf
 from raytrace.studies.codesign.closed_form import (
     camera_error,
     even_distances,
@@ -45,6 +43,8 @@ from raytrace.studies.codesign.experiment import (
 from raytrace.studies.codesign.settings import Settings
 from raytrace.studies.pictures import dead_leaves, split
 from raytrace.system.lens import with_object_distance
+from raytrace.tracing.focus import NoImage, best_focus
+from raytrace.tracing.paraxial import first_order, paraxial_image_distance
 
 LENS = Path(__file__).parents[1] / "lenses" / "double_gauss.zmx"
 SMALL = Settings(depth=4, width=4, patch=16, size=7, epochs=1, crops=2, batch=4)

@@ -232,7 +232,7 @@ def test_reader_that_leaves_early_is_no_error(tmp_path):
 
 
 def test_interrupt_is_one_line(run, monkeypatch):
-    from raytrace.optics import views
+    from raytrace.tracing import lens_report as views
 
     def interrupted(lens):
         raise KeyboardInterrupt

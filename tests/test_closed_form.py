@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from raytrace.camera.deconvolve import blind_filter, errors, errors_knowing
-from raytrace.camera.image import transfer_functions
+from raytrace.imaging.image import transfer_functions
+from raytrace.imaging.restoration import blind_filter, errors, errors_knowing
 from raytrace.studies.codesign.closed_form import power_spectrum
 from raytrace.studies.pictures import dead_leaves
 

@@ -14,13 +14,13 @@ import torch
 from PIL import Image
 
 import raytrace
-from raytrace.formats import read_lens
-from raytrace.optics.paraxial import paraxial_image_distance
+from raytrace.io import read_lens
 from raytrace.studies.codesign import setup as codesign_setup
 from raytrace.studies.codesign.experiment import lens_at_start
 from raytrace.studies.codesign.settings import AFTER_PARAXIAL, Settings
 from raytrace.studies.codesign.study import COLUMNS
 from raytrace.studies.pictures import dead_leaves
+from raytrace.tracing.paraxial import paraxial_image_distance
 
 _LITTLE = "--depth 4 --width 4 --patch 16 --size 7 --epochs 1 --crops 4 --batch 4 --precision float32"
 SMALL = tuple(_LITTLE.split(" "))

@@ -8,14 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from raytrace.camera.camera import Camera
-from raytrace.camera.training import OtherSettings, Run
-from raytrace.kernels import psf
-from raytrace.studies.codesign.closed_form import (
-    even_distances,
-    scan,
-    spectrum_rows,
-)
+from raytrace.imaging.camera import Camera
+from raytrace.imaging.training import OtherSettings, Run
+from raytrace.psf_models import psf
+from raytrace.studies.codesign.closed_form import even_distances, scan, spectrum_rows
 from raytrace.studies.codesign.conjugates import vignetted
 from raytrace.studies.codesign.experiment import batch, camera, lens_at_start, optimise, usual
 from raytrace.studies.codesign.optima import closed_form

@@ -9,15 +9,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from raytrace.camera.training import DamagedRun
+from raytrace.imaging.training import DamagedRun
 from raytrace.studies.codesign import retrain_page
-from raytrace.studies.codesign.retrain import (
-    Retrained,
-    effects,
-    last_epochs,
-    sensors_of,
-    settings_of_lens,
-)
+from raytrace.studies.codesign.retrain import Retrained, effects, last_epochs, sensors_of, settings_of_lens
 from raytrace.studies.codesign.settings import Settings
 from raytrace.studies.pictures import dead_leaves
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 import raytrace as rt
-from raytrace.optics.trace import trace_surfaces
 from raytrace.system.rays import start
 from raytrace.system.surface import Surface
+from raytrace.tracing.trace import trace_surfaces
 
 STEP = 1e-30
 RAYS = 12
@@ -84,7 +84,7 @@ def by_torch(of, position, direction, weights, engine):
     ]
     rays = start(torch.tensor(position), torch.tensor(direction), zero)
     indices = [*leaves["index"].unbind(), leaves["index"][-1]]
-    with rt.tracing(engine):
+    with rt.trace_engine(engine):
         end = trace_surfaces([*surfaces, Surface(thickness=zero)], rays, indices=indices)
     assert end.valid.all()
     total = (torch.tensor(weights) * end.position[:2]).sum()

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import raytrace as rt
-from raytrace.formats import write_lens
-from raytrace.system.intent import Intent, Row, Vary
+from raytrace.io import write_lens
+from raytrace.system.optimization_data import Intent, Row, Vary
 
 
 def ellipse(cone: float) -> rt.Lens:

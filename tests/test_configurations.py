@@ -12,8 +12,8 @@ from test_zemax import file, read
 
 import raytrace as rt
 from raytrace.cli import main
-from raytrace.formats import LensFileError, LensFileWarning, read_lens, write_lens
-from raytrace.plot.layout import layout as layout_figure
+from raytrace.io import LensFileError, LensFileWarning, read_lens, write_lens
+from raytrace.plotting.layout import layout as layout_figure
 from raytrace.system.configurations import differences, part
 
 SHARED = Path(__file__).parents[2] / "shared"

@@ -4,12 +4,12 @@ import pytest
 import torch
 from problems import both_engines, scalar, vector
 
-from raytrace.fused.choice import tracing
-from raytrace.optics.trace import trace_surfaces
 from raytrace.system.polynomials import PolynomialSag
 from raytrace.system.rays import Rays, start
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface, normal, sag_at
+from raytrace.tracing.compiled.engine_choice import trace_engine
+from raytrace.tracing.trace import trace_surfaces
 
 ROUNDING = 1e-12  # mm, of the coordinates of a hit; on a slope it moves the sag by slope × rounding
 ON_SURFACE = 1e-9  # mm along the axis, above rounding on a slope
@@ -51,7 +51,7 @@ def wide_rays(count: int, random: torch.Generator) -> Rays:
 
 
 def hits(surface: Surface, rays: Rays, engine: str) -> Rays:
-    with tracing(engine):
+    with trace_engine(engine):
         return trace_surfaces([surface], rays, indices=[scalar(1.0)] * 2)
 
 

@@ -7,7 +7,8 @@ import pytest
 import torch
 from problems import covariance, draws
 
-from raytrace.camera.deconvolve import (
+from raytrace.imaging.image import blur, transfer_functions
+from raytrace.imaging.restoration import (
     blind_error,
     blind_filter,
     errors,
@@ -23,7 +24,6 @@ from raytrace.camera.deconvolve import (
     wiener,
     within,
 )
-from raytrace.camera.image import blur, transfer_functions
 from raytrace.studies.pictures import dead_leaves
 
 

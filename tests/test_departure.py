@@ -8,20 +8,20 @@ import torch
 from problems import lens, points, surface, vector
 from torch.autograd import gradcheck, gradgradcheck
 
-from raytrace.formats import write_lens
-from raytrace.formats.source import LensFileError
-from raytrace.kernels import psf
+from raytrace.io import write_lens
+from raytrace.io.source import LensFileError
 from raytrace.maths import zernike
 from raytrace.maths.grid import grid
 from raytrace.maths.value import to
-from raytrace.optics.launch import launch
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.scene import scene, symmetry
-from raytrace.optics.trace import media, steps, trace_lens
-from raytrace.system.departure import GridSag, ZernikeSag, spline
+from raytrace.psf_models import psf
 from raytrace.system.rays import start
+from raytrace.system.sag_terms import GridSag, ZernikeSag, spline
 from raytrace.system.shapes import Relief, relief
 from raytrace.system.surface import intersect, normal, sag, sag_at
+from raytrace.tracing.launch import launch
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.scene import scene, symmetry
+from raytrace.tracing.trace import media, steps, trace_lens
 
 RADIUS = vector(4.0)[0]
 

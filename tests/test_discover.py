@@ -5,9 +5,9 @@ import json
 import pytest
 import torch
 
-from raytrace.camera.deconvolve import psnr
-from raytrace.camera.training import OtherSettings
 from raytrace.cli import main
+from raytrace.imaging.restoration import psnr
+from raytrace.imaging.training import OtherSettings
 from raytrace.studies.edof.world import periodic, spectrum
 from raytrace.studies.pictures import dead_leaves, split
 from raytrace.studies.superres import discover_report

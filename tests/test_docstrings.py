@@ -76,5 +76,5 @@ def test_dotted_names_in_docstrings_are_there(name):
 
 
 def test_a_name_of_the_past_is_not_there():
-    assert not is_there("psf.dft.Aliased", "wave.plan")
-    assert is_there("kernels.dft.Aliased", "wave.plan")
+    assert not is_there("psf.dft.Aliased", "wave_optics.plan")
+    assert is_there("psf_models.dft.Aliased", "wave_optics.plan")

@@ -6,17 +6,17 @@ import math
 import pytest
 import torch
 
-from raytrace.camera.network import RedNet, RedNetShape
-from raytrace.camera.training import Run
 from raytrace.cli import main
+from raytrace.imaging.network import RedNet, RedNetShape
+from raytrace.imaging.training import Run
 from raytrace.studies.edof import network_report, report
 from raytrace.studies.edof.network import Filtered, errors_behind, learn_network, patches
 from raytrace.studies.edof.table import Content
 from raytrace.studies.edof.world import World, periodic, spectrum, transfer
 from raytrace.studies.edof.world import scene as scene_of
 from raytrace.studies.pictures import dead_leaves
-from raytrace.wave.designs import aim, baseline
-from raytrace.wave.psf import psf
+from raytrace.wave_optics.designs import aim, baseline
+from raytrace.wave_optics.psf import psf
 
 SMALL = World(depths=(500.0, 1000.0, math.inf), wavelengths=(0.55,), size=63, pixel=0.00738)
 PICTURES = periodic(dead_leaves(8, size=96, seed=5, smallest=2.5), 192)

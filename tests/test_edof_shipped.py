@@ -11,7 +11,7 @@ from raytrace.studies.edof.noise_report import Kept
 from raytrace.studies.edof.report import LEAVES
 from raytrace.studies.edof.world import World, periodic
 from raytrace.studies.pictures import dead_leaves, split
-from raytrace.wave.element_file import read_element, read_label
+from raytrace.wave_optics.element_files import read_element, read_label
 
 DOCS = Path(__file__).parents[1] / "docs/wave"
 FILES = sorted((DOCS / "elements").glob("*.npy"))

@@ -10,16 +10,16 @@ import torch
 from torch.autograd import gradcheck, gradgradcheck
 
 import raytrace as rt
-from raytrace.formats import read_lens_with_report
-from raytrace.media.agf import parse_agf
-from raytrace.media.catalog import SHIPPED, find_glass, shipped_catalog
-from raytrace.media.environment import Environment, NoThermalCoefficients, air_index, dn_dt, index_in, thermal
-from raytrace.media.glass import AIR, constant, from_table, model_glass, refractive_index
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.sequence import media
-from raytrace.optics.spot import spot_of
-from raytrace.optics.trace import trace_lens
+from raytrace.io import read_lens_with_report
+from raytrace.materials.agf import parse_agf
+from raytrace.materials.catalogs import SHIPPED, find_glass, shipped_catalog
+from raytrace.materials.environment import Environment, NoThermalCoefficients, air_index, dn_dt, index_in, thermal
+from raytrace.materials.glass import AIR, constant, from_table, model_glass, refractive_index
 from raytrace.system.lens import index_behind
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.sequence import media
+from raytrace.tracing.spot import spot_of
+from raytrace.tracing.trace import trace_lens
 
 float64 = partial(torch.tensor, dtype=torch.float64)
 
@@ -203,7 +203,7 @@ def test_without_an_environment_nothing_is_computed_for_it(monkeypatch):
     lens = rt.read_lens("double_gauss")
     before = media(lens, lens.wavelengths)
     monkeypatch.setattr("raytrace.system.lens.index_in", None)
-    monkeypatch.setattr("raytrace.optics.sequence._media_in_environment", None)
+    monkeypatch.setattr("raytrace.tracing.sequence._media_in_environment", None)
     assert all(torch.equal(a, b) for a, b in zip(before, media(lens, lens.wavelengths), strict=True))
     assert lens.environment is None
     assert lens.at(f_number=4).environment is None
@@ -242,12 +242,12 @@ def test_derivatives_of_a_spot_by_temperature_and_pressure(engine):
         traced = trace_lens(found, rays, found.wavelengths[:, None])
         return spot_of(traced, rt.gauss_rings(4)[1]).mean_square_radius
 
-    with rt.tracing(engine):
+    with rt.trace_engine(engine):
         given = (float64(35.0, requires_grad=True), float64(0.6, requires_grad=True))
         # 1e-6 a degree: steps of a hundredth of a degree and of an atmosphere are far above rounding.
         assert gradcheck(spread, given, eps=1e-2, atol=1e-9, rtol=1e-4)
         found = torch.autograd.grad(spread(*given).sum(), given)
-    with rt.tracing("eager"):
+    with rt.trace_engine("eager"):
         expected = torch.autograd.grad(spread(*given).sum(), given)
     assert torch.allclose(torch.stack(found), torch.stack(expected), rtol=1e-9)
 

@@ -6,17 +6,17 @@ import math
 import pytest
 import torch
 
-from raytrace.camera.training import OtherSettings
 from raytrace.cli import main
-from raytrace.media.catalog import find_glass
+from raytrace.imaging.training import OtherSettings
+from raytrace.materials.catalogs import find_glass
 from raytrace.studies.edof import report
 from raytrace.studies.edof.world import ClosedForm, World, periodic, spectrum
 from raytrace.studies.pictures import dead_leaves
 from raytrace.studies.quantise import process_report
 from raytrace.studies.quantise.process import Case, cases, etch_rings, move_levels, under_errors
 from raytrace.studies.quantise.process_command import Settings
-from raytrace.wave.element import Element, EvenPowers, Rings, period
-from raytrace.wave.etching import Process, matched, relief
+from raytrace.wave_optics.element import Element, EvenPowers, Rings, period
+from raytrace.wave_optics.etching import Process, matched, relief
 
 #: Small, and quick: 1 mm, f/20, two colours, three depths.
 WORLD = World(radius=0.5, sensor_distance=20.0, depths=(200.0, 400.0, math.inf), design=400.0, wavelengths=(0.5, 0.6),

@@ -7,9 +7,11 @@ import pytest
 import torch
 from problems import double_gauss, lens, scalar, surface, vector
 
+from raytrace.materials.glass import MIRROR
 from raytrace.maths import pupil
-from raytrace.media.glass import MIRROR
-from raytrace.optics.focus import (
+from raytrace.system.lens import with_object_distance, with_sensor_distance
+from raytrace.system.surface import Aperture
+from raytrace.tracing.focus import (
     focus_moments,
     focus_of_mean_radius,
     focus_of_rms,
@@ -18,10 +20,8 @@ from raytrace.optics.focus import (
     spot_parabola,
     through_focus,
 )
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.spot import EmptySpot, spot_of
-from raytrace.system.lens import with_object_distance, with_sensor_distance
-from raytrace.system.surface import Aperture
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.spot import EmptySpot, spot_of
 
 POINTS, WEIGHTS = pupil.gauss_rings(6)
 AXIS = torch.zeros(2, 1, dtype=torch.float64)

@@ -16,19 +16,11 @@ from problems import number
 
 import raytrace as rt
 from raytrace.files import shipped
-from raytrace.formats import (
-    FORMATS,
-    WRITTEN,
-    LensFileError,
-    LensFileWarning,
-    read_lens,
-    read_lens_with_report,
-    write_lens,
-)
-from raytrace.formats.frame import lens_from_frame, to_frame
-from raytrace.formats.source import MAX_BYTES, Place, decode
-from raytrace.media.catalog import UnknownGlass
-from raytrace.media.glass import constant, model_glass
+from raytrace.io import FORMATS, WRITTEN, LensFileError, LensFileWarning, read_lens, read_lens_with_report, write_lens
+from raytrace.io.frames import lens_from_frame, to_frame
+from raytrace.io.source import MAX_BYTES, Place, decode
+from raytrace.materials.catalogs import UnknownGlass
+from raytrace.materials.glass import constant, model_glass
 from raytrace.system.lens import Lens, SystemAperture
 from raytrace.system.surface import Aperture, is_freeform, is_posed
 

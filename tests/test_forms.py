@@ -17,11 +17,11 @@ from raytrace import distortion, opd_fan, ray_fan
 from raytrace.cli import build_parser
 from raytrace.cli.door import find_lens
 from raytrace.cli.paths import PICTURES, picture_file
-from raytrace.formats import read_lens
+from raytrace.io import read_lens
 from raytrace.maths.pupil import hexapolar
-from raytrace.optics.arrivals import arrivals
-from raytrace.optics.losses import LOST, STATUS, losses
-from raytrace.plot.analysis import distortion_curves
+from raytrace.plotting.analysis import distortion_curves
+from raytrace.tracing.ray_failures import LOST, STATUS, losses
+from raytrace.tracing.ray_hits import arrivals
 from raytrace.words import did_you_mean
 
 #: Options whose form differs between commands, and why.

@@ -12,12 +12,12 @@ from torch.testing import assert_close
 from raytrace.maths import zernike
 from raytrace.maths.bivariate import powers
 from raytrace.maths.value import to
-from raytrace.optics.trace import trace_surfaces
-from raytrace.system.departure import FringeSag
 from raytrace.system.polynomials import IrregularSag, PolynomialSag, TiltSag, as_polynomial
 from raytrace.system.rays import start
+from raytrace.system.sag_terms import FringeSag
 from raytrace.system.shapes import KINDS, relief
 from raytrace.system.surface import Surface, intersect, normal, sag_at, vertex_curvature, vertex_curvatures
+from raytrace.tracing.trace import trace_surfaces
 
 
 def close(found, true, *, rtol: float = 0.0, atol: float = 0.0):

@@ -14,20 +14,20 @@ from torch.autograd import gradcheck, gradgradcheck
 from torch.testing import assert_close
 
 from raytrace.files import shipped
-from raytrace.formats import read_lens
-from raytrace.fused import engine, prepare, tracing
-from raytrace.fused.choice import is_fused
-from raytrace.fused.run import task_of, trace_compiled
-from raytrace.fused.structure import with_numbers
+from raytrace.io import read_lens
+from raytrace.materials.glass import MIRROR
 from raytrace.maths.pupil import sobol
 from raytrace.maths.value import to
-from raytrace.media.glass import MIRROR
-from raytrace.optics.jacobian import hit_jacobian, pushed
-from raytrace.optics.launch import launch
-from raytrace.optics.trace import media, trace_lens, trace_surfaces
-from raytrace.system.departure import ZernikeSag
 from raytrace.system.rays import Rays, start
+from raytrace.system.sag_terms import ZernikeSag
 from raytrace.system.surface import Aperture
+from raytrace.tracing.compiled import engine, prepare, trace_engine
+from raytrace.tracing.compiled.engine_choice import is_fused
+from raytrace.tracing.compiled.run import task_of, trace_compiled
+from raytrace.tracing.compiled.structure import with_numbers
+from raytrace.tracing.jacobian import hit_jacobian, pushed
+from raytrace.tracing.launch import launch
+from raytrace.tracing.trace import media, trace_lens, trace_surfaces
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -55,7 +55,7 @@ EVERYTHING = lens(
 @pytest.mark.parametrize("path", LENSES, ids=lambda path: path.stem)
 def test_shipped_lenses_are_traced_as_by_torch(path, dtype):
     system = to(read_lens(path), dtype=dtype)
-    with torch.no_grad(), tracing("eager"):
+    with torch.no_grad(), trace_engine("eager"):
         rays = launch(system, sobol(301)[0].to(dtype))
     fused, eager = both(lambda: trace_lens(system, rays, system.wavelengths[:, None]))
     size = max(float(s.thickness.abs()) for s in system.surfaces[1:])
@@ -154,7 +154,7 @@ def test_gradients_of_gradients_pass_through_the_eager_trace():
         return trace_lens(changed, rays, system.wavelengths[0]).position[:2]
 
     arguments = system.surfaces[1].curvature.clone().requires_grad_(), scalar(0.5).requires_grad_()
-    with tracing("fused"):
+    with trace_engine("fused"):
         assert gradcheck(spread, arguments, atol=1e-5, rtol=1e-4)
         assert gradgradcheck(spread, arguments, atol=1e-3, rtol=1e-3)
 
@@ -173,7 +173,7 @@ def test_a_ray_does_not_depend_on_its_neighbours_nor_gradients_on_threads():
         finally:
             torch.set_num_threads(before)
 
-    with tracing("fused"):
+    with trace_engine("fused"):
         together = trace_lens(EVERYTHING, rays, wavelength)
         chosen = torch.tensor([0, 1, 15, 16, 17, 50, 255, 256, 300, 39_999])
         alone = trace_lens(EVERYTHING, Rays(*(x[..., chosen] for x in leaves_of_rays(rays))), wavelength)
@@ -222,7 +222,7 @@ def test_surfaces_with_a_departure_are_traced_between_compiled_ones():
 
 def test_transforms_other_dtypes_and_the_switch_leave_it_to_torch():
     rays, number = some_rays(4), scalar(1.0)
-    with tracing("fused"):
+    with trace_engine("fused"):
         assert is_fused(rays, number, 1)
         assert not is_fused(Rays(*(x.to("meta") for x in leaves_of_rays(rays))), number, 1)
         assert not is_fused(dataclasses.replace(rays, position=rays.position.float()), number, 1)
@@ -231,19 +231,19 @@ def test_transforms_other_dtypes_and_the_switch_leave_it_to_torch():
             rays.position[None]
         )
         assert seen == [False]
-    with tracing("eager"):
+    with trace_engine("eager"):
         assert engine() == "eager"
         assert not is_fused(rays, number, 10**9)
         assert prepare() == "eager"
-    with pytest.raises(ValueError, match="'quick': expected one of auto, eager, fused"), tracing("quick"):
+    with pytest.raises(ValueError, match="'quick': expected one of auto, eager, fused"), trace_engine("quick"):
         pass
 
 
 PROBE = """
 import raytrace, torch
-from raytrace.optics.trace import trace_lens
-from raytrace.fused import library
-from raytrace.fused.choice import is_fused
+from raytrace.tracing.trace import trace_lens
+from raytrace.tracing.compiled import library
+from raytrace.tracing.compiled.engine_choice import is_fused
 from raytrace.system.rays import Rays, start
 library.FLAGS = tuple(flag for flag in library.FLAGS if flag != "-O3")  # compiled in 2 s instead of 14 s
 lens = raytrace.read_lens({lens!r})

@@ -11,19 +11,19 @@ from torch.autograd import gradcheck, gradgradcheck
 from torch.testing import assert_close
 
 import raytrace as rt
-from raytrace.fused import tracing
-from raytrace.fused.run import push, push_everywhere, task_of, trace_compiled
-from raytrace.fused.structure import rows_of
+from raytrace.materials.glass import MIRROR
 from raytrace.maths.value import to
-from raytrace.media.glass import MIRROR
-from raytrace.optics.jacobian import hit_jacobian
-from raytrace.optics.trace import media, trace_surfaces
-from raytrace.system.departure import FringeSag
 from raytrace.system.polynomials import PolynomialSag, TiltSag
-from raytrace.system.pose import Gap, Pose, direction_in, passage, point_in
+from raytrace.system.poses import Gap, Pose, direction_in, passage, point_in
 from raytrace.system.rays import Rays, start
+from raytrace.system.sag_terms import FringeSag
 from raytrace.system.shapes import EVEN
 from raytrace.system.surface import Aperture, Surface, gap_behind
+from raytrace.tracing.compiled import trace_engine
+from raytrace.tracing.compiled.run import push, push_everywhere, task_of, trace_compiled
+from raytrace.tracing.compiled.structure import rows_of
+from raytrace.tracing.jacobian import hit_jacobian
+from raytrace.tracing.trace import media, trace_surfaces
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -177,7 +177,7 @@ def test_forward_derivatives_are_the_gradients_of_torch(name):
     surfaces, rays, how = given(name, count=40)
     weights = drawn(7, 3, 40, seed=8)
     own, indices, leaves = with_leaves(surfaces, how["indices"])
-    with tracing("fused"):
+    with trace_engine("fused"):
         hits = hit_jacobian(own, rays, leaves, indices=indices, wavelength=WAVELENGTHS)
         task = task_of(own, rays, indices=indices, wavelength=WAVELENGTHS)
         table = task.given[3]
@@ -186,7 +186,7 @@ def test_forward_derivatives_are_the_gradients_of_torch(name):
         steps = [drawn(*leaf.shape, size=0.1, seed=seed) for seed, leaf in enumerate(leaves)]
         moved = sum((t * step).sum() for t, step in zip(towards, steps, strict=True) if t is not None)
         pushed = push(task, torch.autograd.grad(moved, change)[0][None])
-    with tracing("eager"):
+    with trace_engine("eager"):
         end = trace_surfaces(own, rays, indices=indices, wavelength=WAVELENGTHS)
         by_hit, by_rest = (
             torch.autograd.grad(merit, leaves, allow_unused=True, retain_graph=True)
@@ -210,7 +210,7 @@ def test_rays_behind_all_surfaces_at_once_are_those_behind_each(name):
     indices, wavelength = how["indices"], WAVELENGTHS
     task = task_of(surfaces, rays, indices=indices, wavelength=wavelength)
     change = drawn(2, *task.given[3].shape, size=0.01, seed=3) * task.given[3].abs()
-    with tracing("fused"):
+    with trace_engine("fused"):
         found = push_everywhere(task, change)
         bare = push_everywhere(task, change[:0])
         for number, row in enumerate(rows_of(task.structure, surfaces), 1):
@@ -350,7 +350,7 @@ def test_gradients_are_differences_and_have_gradients_of_their_own():
 
     start = (mean * 0.2, scalar(8.0), vector(-3.0, 2.0), scalar(0.01), *(scalar(0.5 * a) for a in ANGLES.values()))
     start = [x.clone().requires_grad_() for x in start]
-    with tracing("fused"):
+    with trace_engine("fused"):
         assert gradcheck(trace, start, rtol=1e-5, atol=1e-6)
         assert gradgradcheck(lambda *x: trace(*x)[0][..., 1:3], start, rtol=1e-4, atol=1e-5)
         assert gradgradcheck(lambda *x: trace(*x)[2][..., 1:3], start, rtol=1e-4, atol=1e-5)
@@ -369,7 +369,7 @@ def test_neither_neighbours_nor_threads_change_anything():
         finally:
             torch.set_num_threads(before)
 
-    with tracing("fused"):
+    with trace_engine("fused"):
         for one, two in zip(outcome(1), outcome(2), strict=True):
             assert one is two is None or torch.equal(one, two)
         chosen = torch.tensor([1, 15, 16, 17, 255, 256, 300, 19_999])

@@ -9,17 +9,17 @@ from problems import scalar, vector
 from torch.autograd import gradcheck, gradgradcheck
 from torch.utils._pytree import tree_flatten, tree_leaves, tree_unflatten
 
-from raytrace.fused import tracing
-from raytrace.fused.structure import is_expressible
+from raytrace.materials.glass import MIRROR
 from raytrace.maths.value import to
-from raytrace.media.glass import MIRROR
-from raytrace.optics.jacobian import hit_jacobian
-from raytrace.optics.trace import trace_surfaces
-from raytrace.system.departure import FringeSag, GridSag, ZernikeSag
 from raytrace.system.polynomials import IrregularSag, PolynomialSag, PowerSag, TiltSag
 from raytrace.system.rays import Rays
+from raytrace.system.sag_terms import FringeSag, GridSag, ZernikeSag
 from raytrace.system.shapes import DEPARTURES
 from raytrace.system.surface import Surface
+from raytrace.tracing.compiled import trace_engine
+from raytrace.tracing.compiled.structure import is_expressible
+from raytrace.tracing.jacobian import hit_jacobian
+from raytrace.tracing.trace import trace_surfaces
 
 
 def freeform(kind: str, curvature, conic, *coefficients: float, thickness: float = 4.0, **others) -> Surface:
@@ -142,7 +142,7 @@ def test_gradients_by_differences_and_their_gradients_with_lost_rays(name):
         more["coefficients"] = more["coefficients"] / share
     others, kinds = tree_flatten(more)
     numbers = tuple(number.clone().requires_grad_() for number in (*numbers, *others))
-    with tracing("fused"):
+    with trace_engine("fused"):
         assert gradcheck(hits, numbers, atol=1e-6)
         assert gradgradcheck(hits, numbers, atol=1e-5, fast_mode=True)
 
@@ -161,7 +161,7 @@ def test_rays_do_not_depend_on_their_neighbours_nor_gradients_on_threads(name):
         finally:
             torch.set_num_threads(before)
 
-    with tracing("fused"):
+    with trace_engine("fused"):
         for a, b in zip(gradient(1), gradient(2), strict=True):
             assert a is b is None or torch.equal(a, b)
         some = slice(1237, 1300)

@@ -8,11 +8,11 @@ from problems import fields, lens, scalar, surface
 
 import raytrace as rt
 from raytrace.cli import main
-from raytrace.media.glass import MIRROR, model_glass
-from raytrace.optics.geometry import Unbuildable, defects
-from raytrace.system.intent import Intent
-from raytrace.system.pose import Pose
+from raytrace.materials.glass import MIRROR, model_glass
+from raytrace.system.optimization_data import Intent
+from raytrace.system.poses import Pose
 from raytrace.system.surface import Surface
+from raytrace.tracing.geometry import Unbuildable, defects
 
 GLASS = model_glass(1.6, 50.0)
 

@@ -18,8 +18,8 @@ import torch
 from hardcases_scene import CASES, OUTPUTS, Scene
 from problems import both_engines
 
-from raytrace.media.glass import InvalidIndex, OutOfRange, check_wavelengths, refractive_index, sellmeier
-from raytrace.optics.wavefront import path_to_reference_sphere
+from raytrace.materials.glass import InvalidIndex, OutOfRange, check_wavelengths, refractive_index, sellmeier
+from raytrace.tracing.wavefront import path_to_reference_sphere
 
 getcontext().prec = 60
 

@@ -6,15 +6,15 @@ import pytest
 import torch
 from problems import focal_length
 
-from raytrace.camera.training import Run
-from raytrace.camera.variables import BadVariables, Variables, parse_bounds
-from raytrace.formats import read_lens
-from raytrace.optics.sequence import media
+from raytrace.imaging.training import Run
+from raytrace.imaging.variables import BadVariables, Variables, parse_bounds
+from raytrace.io import read_lens
 from raytrace.studies.codesign.closed_form import camera_error, even_distances, optimise_closed_form, power_spectrum
 from raytrace.studies.codesign.experiment import camera, optimise
 from raytrace.studies.codesign.optima import closed_form
 from raytrace.studies.codesign.settings import Settings
 from raytrace.studies.pictures import dead_leaves
+from raytrace.tracing.sequence import media
 
 MICROMETRE = 1e-3
 SPACES = "sensor thickness:2,9,5,6"

@@ -9,13 +9,14 @@ from test_zemax import file, read
 
 import raytrace as rt
 from raytrace.cli import main
-from raytrace.formats import LensFileError, LensFileWarning, read_lens, seq_read, write_lens
-from raytrace.formats.seq_glass import _fictitious_error
-from raytrace.formats.substitutes import substitutes_of
-from raytrace.media.catalog import UnknownGlass, find_glass, shipped_catalog
-from raytrace.media.glass import ImplausibleWavelength, OutOfRange, abbe_number, index, model_glass, nd
-from raytrace.system.intent import Intent, Row
+from raytrace.io import LensFileError, LensFileWarning, read_lens, write_lens
+from raytrace.io.codev import read as seq_read
+from raytrace.io.codev.glass import _fictitious_error
+from raytrace.io.substitutes import substitutes_of
+from raytrace.materials.catalogs import UnknownGlass, find_glass, shipped_catalog
+from raytrace.materials.glass import ImplausibleWavelength, OutOfRange, abbe_number, index, model_glass, nd
 from raytrace.system.lens import check_media
+from raytrace.system.optimization_data import Intent, Row
 
 #: A pickup of a medium with figures that are left from before.
 PICKUP = "GLAS {name} 2 0 1.5 40 0 0 0 0 0 0"

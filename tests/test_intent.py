@@ -12,15 +12,15 @@ from test_zemax import file, lens
 from test_zemax import read as read_text
 
 import raytrace as rt
-from raytrace.formats import read_lens_with_report, write_lens
-from raytrace.formats.source import LensFileError, LensFileWarning
-from raytrace.formats.zemax_merit import read_merit
-from raytrace.formats.zemax_units import in_file
-from raytrace.media.catalog import UnknownGlass
+from raytrace.io import read_lens_with_report, write_lens
+from raytrace.io.source import LensFileError, LensFileWarning
+from raytrace.io.zemax.merit import read_merit
+from raytrace.io.zemax.optimization_write import in_file
+from raytrace.materials.catalogs import UnknownGlass
 from raytrace.system.dimensions import DIMENSION
-from raytrace.system.intent import Intent, Row, Solve, Vary
 from raytrace.system.lens import index_behind
-from raytrace.system.places import number_at, places
+from raytrace.system.optimization_data import Intent, Row, Solve, Vary
+from raytrace.system.parameter_paths import number_at, places
 from raytrace.system.surface import sag
 
 SHARED = Path(__file__).parents[2] / "shared"

@@ -11,13 +11,13 @@ from problems import fields
 
 import raytrace as rt
 from raytrace.files import shipped
-from raytrace.merit.aberrations import OF_WAVEFRONT
-from raytrace.merit.merit import Evaluation
-from raytrace.merit.model import Model
-from raytrace.merit.plan import BadRow
-from raytrace.merit.readings import Readings
-from raytrace.optics.paraxial import first_order
-from raytrace.system.intent import Row
+from raytrace.optimization.context import BadRow
+from raytrace.optimization.conventions import Readings
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit_rows import Evaluation
+from raytrace.optimization.operands.aberrations import OF_WAVEFRONT
+from raytrace.system.optimization_data import Row
+from raytrace.tracing.paraxial import first_order
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

@@ -15,23 +15,22 @@ import torch
 from problems import both_engines, fields, lens, scalar, surface, vector
 
 import raytrace as rt
-from raytrace.media.catalog import UnknownGlass
-from raytrace.media.glass import MIRROR, abbe_number, model_glass, nd
-from raytrace.merit.boundaries import BOUNDARIES
-from raytrace.merit.bundle import Bundle
-from raytrace.merit.merit import LOST, Evaluation
-from raytrace.merit.model import Model
-from raytrace.merit.plan import Now, planner_of
-from raytrace.merit.readings import Readings
-from raytrace.merit.semi_diameters import ENDS, SemiDiameters
-from raytrace.optics.launch import rays_of_field
-from raytrace.optics.sequence import media
-from raytrace.optics.trace import trace_surfaces
-from raytrace.optics.vignetting import vignette
-from raytrace.system.departure import ZernikeSag
-from raytrace.system.intent import Intent, Row, Vary
-from raytrace.system.pose import Pose
+from raytrace.materials.catalogs import UnknownGlass
+from raytrace.materials.glass import MIRROR, abbe_number, model_glass, nd
+from raytrace.optimization.context import Now, planner_of
+from raytrace.optimization.conventions import Readings
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit_rows import LOST, Evaluation
+from raytrace.optimization.operands.boundaries import BOUNDARIES, ENDS, SemiDiameters
+from raytrace.optimization.ray_bundle import Bundle
+from raytrace.system.optimization_data import Intent, Row, Vary
+from raytrace.system.poses import Pose
+from raytrace.system.sag_terms import ZernikeSag
 from raytrace.system.surface import Surface, sag_at
+from raytrace.tracing.launch import rays_of_field
+from raytrace.tracing.sequence import media
+from raytrace.tracing.trace import trace_surfaces
+from raytrace.tracing.vignetting import vignette
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

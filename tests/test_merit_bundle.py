@@ -1,4 +1,4 @@
-"""Bundles: the rays of `optics.launch`, traced with the derivatives that finite differences have."""
+"""Bundles: the rays of `tracing.launch`, traced with the derivatives that finite differences have."""
 
 import dataclasses
 
@@ -8,14 +8,14 @@ import torch
 
 import raytrace as rt
 from raytrace.files import shipped
+from raytrace.materials.glass import model_glass
 from raytrace.maths.dual import Dual
-from raytrace.media.glass import model_glass
-from raytrace.merit.bundle import Bundle
-from raytrace.merit.model import Model
-from raytrace.optics.launch import launch
-from raytrace.optics.trace import trace_lens
-from raytrace.system.intent import Solve, Vary
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.ray_bundle import Bundle
 from raytrace.system.lens import with_field_kind
+from raytrace.system.optimization_data import Solve, Vary
+from raytrace.tracing.launch import launch
+from raytrace.tracing.trace import trace_lens
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -124,7 +124,7 @@ def test_rays_are_those_of_launch(cases, name):
 def test_derivatives_are_those_of_finite_differences(cases, name, engine):
     model, bundle = bundle_of(cases[name], name)
     x, count = model.start, len(model.start)
-    with rt.tracing(engine):
+    with rt.trace_engine(engine):
         hits = bundle.hits(model.views[0].moment(Dual(x, np.eye(count))))
         for k in range(count):
             step = 1e-6 * max(abs(x[k]), 1e-3)

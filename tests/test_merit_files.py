@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from raytrace.formats import read_lens
-from raytrace.merit.merit import Evaluation
-from raytrace.merit.model import Model
+from raytrace.io import read_lens
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit_rows import Evaluation
 
 FOLDER = Path(__file__).parents[2] / "shared" / "merit" / "dev"
 

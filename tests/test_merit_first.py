@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from merit_cases import LENSES, check_derivatives, is_near, lens_of, values_of
 
-from raytrace.merit.readings import Readings
-from raytrace.optics.f_number import working_f_number
-from raytrace.optics.paraxial import first_order
-from raytrace.system.intent import Row
+from raytrace.optimization.conventions import Readings
+from raytrace.system.optimization_data import Row
+from raytrace.tracing.f_number import working_f_number
+from raytrace.tracing.paraxial import first_order
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

@@ -13,18 +13,18 @@ from problems import lens as lens_of
 from problems import surface, values, vector
 
 import raytrace as rt
-from raytrace.merit.merit import Evaluation
-from raytrace.merit.model import Model
-from raytrace.merit.path import Fit
-from raytrace.merit.plan import BadRow
-from raytrace.merit.readings import Readings
-from raytrace.optics.launch import rays_of_field
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.scene import scene
-from raytrace.optics.trace import lens_steps, media, trace_lens
-from raytrace.optics.vignetting import vignette
-from raytrace.optics.wavefront import path_to_reference_sphere, wavefront_of
-from raytrace.system.intent import Row, Vary
+from raytrace.optimization.context import BadRow
+from raytrace.optimization.conventions import Readings
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit_rows import Evaluation
+from raytrace.optimization.operands.wavefront import Fit
+from raytrace.system.optimization_data import Row, Vary
+from raytrace.tracing.launch import rays_of_field
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.scene import scene
+from raytrace.tracing.trace import lens_steps, media, trace_lens
+from raytrace.tracing.vignetting import vignette
+from raytrace.tracing.wavefront import path_to_reference_sphere, wavefront_of
 
 DEVELOPMENT = Path(__file__).parents[2] / "shared" / "merit" / "dev"
 WAVES = 1e-7  # what the oracle is held to

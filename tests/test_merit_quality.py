@@ -9,17 +9,17 @@ from differences import slopes_by_differences
 from problems import values, vector, vignetting_aperture
 
 import raytrace as rt
-from raytrace.formats import LensFileWarning
+from raytrace.io import LensFileWarning
 from raytrace.maths.pupil import gauss_rings, square
-from raytrace.merit.measure import Measure
-from raytrace.merit.merit import Evaluation
-from raytrace.merit.model import Model
-from raytrace.merit.plan import BadRow
-from raytrace.optics.focus import image_rays
-from raytrace.optics.scene import scene
-from raytrace.optics.spot import spot_of, spot_of_points
-from raytrace.optics.wavefront import rms, wavefront_of, without
-from raytrace.system.intent import Row, Solve, Vary
+from raytrace.optimization.context import BadRow
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.merit_rows import Evaluation
+from raytrace.optimization.operands.custom import Measure
+from raytrace.system.optimization_data import Row, Solve, Vary
+from raytrace.tracing.focus import image_rays
+from raytrace.tracing.scene import scene
+from raytrace.tracing.spot import spot_of, spot_of_points
+from raytrace.tracing.wavefront import rms, wavefront_of, without
 
 FIELD = (0.0, 0.7)
 

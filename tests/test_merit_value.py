@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import raytrace as rt
-from raytrace.merit.merit import UnknownOperand
-from raytrace.merit.value import merit_for
-from raytrace.system.intent import Intent, Row
+from raytrace.optimization.merit import merit_for
+from raytrace.optimization.merit_rows import UnknownOperand
+from raytrace.system.optimization_data import Intent, Row
 
 DEVELOPMENT = Path(__file__).parents[2] / "shared" / "merit" / "dev"
 

@@ -11,20 +11,27 @@ from scipy.stats import spearmanr
 
 import raytrace as rt
 from raytrace.cli import main
-from raytrace.fused import prepare
-from raytrace.media.catalog import shipped_catalog
-from raytrace.media.glass import abbe_number, nd, refractive_index
-from raytrace.merit.hold import conditions_of
-from raytrace.merit.value import merit_for
-from raytrace.merit.vary import freedom
+from raytrace.materials.catalogs import shipped_catalog
+from raytrace.materials.glass import abbe_number, nd, refractive_index
 from raytrace.optimization.checkpoint import BadCheckpoint
-from raytrace.optimization.glass import Choice, Design, expansion
-from raytrace.optimization.glass_freedom import without_glass
-from raytrace.optimization.glass_pool import STATUSES, Pool, catalogs_of, hull, pool_of
-from raytrace.optimization.least_squares import State, least_squares
+from raytrace.optimization.constraints import conditions_of
+from raytrace.optimization.glass_choice import (
+    STATUSES,
+    Choice,
+    Design,
+    Pool,
+    catalogs_of,
+    expansion,
+    hull,
+    pool_of,
+    without_glass,
+)
+from raytrace.optimization.least_squares import Sides, State, least_squares
+from raytrace.optimization.merit import merit_for
 from raytrace.optimization.problem import NoProblem
-from raytrace.optimization.step import Sides
-from raytrace.system.intent import Intent, Solve, Vary
+from raytrace.optimization.variables import freedom
+from raytrace.system.optimization_data import Intent, Solve, Vary
+from raytrace.tracing.compiled import prepare
 
 NONE = np.zeros(0)
 BOUNDS = {"glass_thickness": (2.0, 20.0), "air_thickness": (0.3, 100.0), "edge": 1.0}

@@ -17,13 +17,14 @@ from problems import rotation
 import raytrace as rt
 from raytrace.analysis.seidel import seidel
 from raytrace.cli import main
-from raytrace.formats import LensFileError, UnsupportedSurface, convert, oslo_read, read_lens
-from raytrace.media.catalog import UnknownGlass, find_glass
-from raytrace.media.glass import refractive_index
-from raytrace.optics.frames import frames
-from raytrace.optics.scene import scene
-from raytrace.optics.wavefront import wavefront_of
+from raytrace.io import LensFileError, UnsupportedSurface, convert, read_lens
+from raytrace.io.oslo import read as oslo_read
+from raytrace.materials.catalogs import UnknownGlass, find_glass
+from raytrace.materials.glass import refractive_index
 from raytrace.system.lens import check
+from raytrace.tracing.frames import frames
+from raytrace.tracing.scene import scene
+from raytrace.tracing.wavefront import wavefront_of
 
 FAR = "TH 1e20"
 

@@ -80,8 +80,8 @@ def test_a_result_that_cannot_be_saved_is_printed(lens, command_line, monkeypatc
     def full(path, write):
         raise OSError(28, "cannot be written: No space left on device", str(path))
 
-    monkeypatch.setattr("raytrace.formats.write_atomically", full)
-    monkeypatch.setattr("raytrace.plot.style.write_atomically", full)
+    monkeypatch.setattr("raytrace.io.write_atomically", full)
+    monkeypatch.setattr("raytrace.plotting.style.write_atomically", full)
     for words in (f"{OPTIMIZE} -o x.zmx", "focus lens.zmx -o x.zmx", "spot lens.zmx --plot x.png"):
         text, document = command_line(*words.split()), command_line(*words.split(), "--json")
         assert (text.code, document.code) == (1, 1)
@@ -95,7 +95,7 @@ def test_what_a_search_cannot_write_is_told_and_its_minima_are_printed(lens, com
     def full(*arguments):
         raise OSError(28, "No space left on device", "minimum_01.zmx")
 
-    monkeypatch.setattr("raytrace.optimization.searched.write_lens", full)
+    monkeypatch.setattr("raytrace.optimization.search_result.write_lens", full)
     words = "search lens.zmx --merit spot --vary sensor --starts 1 --rings 2 -o minima --bounds sensor:80..120"
     done = command_line(*words.split())
     assert done.code == 1

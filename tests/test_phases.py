@@ -9,11 +9,11 @@ from bends import real
 
 import raytrace as rt
 from raytrace.maths.bivariate import fringe, fringe_to_powers, polynomial_xy, powers
-from raytrace.optics.launch import launch
-from raytrace.optics.trace import axial_path, trace_lens, trace_surfaces
 from raytrace.system.phases import added_path, power_of
 from raytrace.system.rays import start
 from raytrace.system.surface import Surface
+from raytrace.tracing.launch import launch
+from raytrace.tracing.trace import axial_path, trace_lens, trace_surfaces
 
 WAVELENGTH = torch.tensor(0.55, dtype=torch.float64)
 
@@ -59,7 +59,7 @@ def test_a_wave_of_piston_is_a_wave_of_path_with_its_derivative(engine):
         surfaces = [Surface(real(5.0), phase=phase), Surface(real(0.0))]
         x = torch.linspace(-3, 3, 4096, dtype=torch.float64)
         rays = start(torch.stack([x, 0.1 * x, 0 * x]), torch.stack([0 * x, 0 * x, 1 + 0 * x]), 0 * x)
-        with rt.tracing(engine):
+        with rt.trace_engine(engine):
             return trace_surfaces(surfaces, rays, indices=[real(1.0)] * 3, wavelength=WAVELENGTH).opl
 
     piston = real(1.0).requires_grad_()
@@ -266,7 +266,7 @@ def test_the_path_of_an_ideal_lens_is_smooth_in_both_powers(engine):
     def total(power_x, power_y):
         lens = lens_of(rt.IdealLens(power_x, power_y), object_distance=80.0, image=60.0, field=3.0)
         rays = launch(lens, points.expand(2, -1))
-        with rt.tracing(engine):
+        with rt.trace_engine(engine):
             return trace_lens(lens, rays, lens.wavelengths[:, None]).opl.sum()
 
     points = rt.gauss_rings(4, dtype=torch.float64)[0].repeat(1, 100)  # as many as the compiled trace is worth

@@ -7,11 +7,12 @@ import pytest
 import torch
 from problems import focal_length
 
-from raytrace.formats import LensFileError, table_read
-from raytrace.formats.source import Place, decode
-from raytrace.formats.table_columns import meaning
-from raytrace.media.glass import LINES, abbe_number, nd, refractive_index
-from raytrace.optics.paraxial import first_order
+from raytrace.io import LensFileError
+from raytrace.io.source import Place, decode
+from raytrace.io.table import read as table_read
+from raytrace.io.table.columns import meaning
+from raytrace.materials.glass import LINES, abbe_number, nd, refractive_index
+from raytrace.tracing.paraxial import first_order
 
 SYSTEM = "# wavelengths: 0.5876\n# fields: angle 0\n# aperture: F/4\n"
 

@@ -7,14 +7,15 @@ import pytest
 import torch
 from problems import double_gauss, scalar, vector
 
-from raytrace.kernels import gaussian, raymap
-from raytrace.kernels.models import MODELS
-from raytrace.kernels.rays import energy_of_fans
+from raytrace.materials.glass import model_glass
 from raytrace.maths.grid import Grid
-from raytrace.media.glass import model_glass
-from raytrace.optics.scene import Scene, scene, trace_scene
+from raytrace.psf_models import drt as raymap
+from raytrace.psf_models import gaussian
+from raytrace.psf_models.models import MODELS
+from raytrace.psf_models.rays import energy_of_fans
 from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
 from raytrace.system.surface import Aperture
+from raytrace.tracing.scene import Scene, scene, trace_scene
 
 #: Kind of parameter -> what one unit of it is; a millionth of that moves light by nanometres.
 KINDS = {

@@ -8,13 +8,13 @@ import pytest
 import torch
 from problems import scene_of, vector
 
-from raytrace.kernels import diffraction
-from raytrace.kernels.dft import Aliased, EmptyPupil, fft_psf, huygens, phasor, to_grid, to_grid_mirrored
 from raytrace.maths.grid import grid
 from raytrace.maths.pupil import gauss_rings
-from raytrace.optics.wavefront import rms, wavefront_of, without
+from raytrace.psf_models import diffraction
+from raytrace.psf_models.dft import Aliased, EmptyPupil, fft_psf, huygens, phasor, to_grid, to_grid_mirrored
 from raytrace.system.lens import with_sensor_distance
 from raytrace.system.surface import Aperture
+from raytrace.tracing.wavefront import rms, wavefront_of, without
 
 
 def stigmatic(diameter=0.5, focus=50.0, **others):

@@ -13,17 +13,18 @@ import pytest
 import torch
 from problems import number
 
-from raytrace.formats import read_lens
-from raytrace.kernels import NotConverged, diffraction, fourier, psf, raymap
-from raytrace.kernels.clear import between, clear_arms
-from raytrace.kernels.pixels import gaussian_pixels
-from raytrace.kernels.result import Kernels, polychromatic
+from raytrace.io import read_lens
 from raytrace.maths.grid import grid
 from raytrace.maths.value import to
-from raytrace.optics.launch import stop_radius
-from raytrace.optics.scene import Scene, beam_share, scene, trace_scene
+from raytrace.psf_models import NotConverged, diffraction, fourier, psf
+from raytrace.psf_models import drt as raymap
+from raytrace.psf_models.pixels import gaussian_pixels
+from raytrace.psf_models.pupil_clearance import between, clear_arms
+from raytrace.psf_models.result import Kernels, polychromatic
 from raytrace.system.lens import Lens, SystemAperture
 from raytrace.system.surface import Aperture
+from raytrace.tracing.launch import stop_radius
+from raytrace.tracing.scene import Scene, beam_share, scene, trace_scene
 
 LENSES = Path(__file__).parents[1] / "lenses"
 INF = math.inf

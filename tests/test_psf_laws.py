@@ -10,12 +10,12 @@ import pytest
 import torch
 from problems import number, vector
 
-from raytrace.formats import read_lens
-from raytrace.kernels import Memo, diffraction, psf
+from raytrace.io import read_lens
 from raytrace.maths.grid import grid
-from raytrace.optics.scene import scene
+from raytrace.psf_models import Memo, diffraction, psf
 from raytrace.system.lens import SystemAperture, with_sensor_distance
 from raytrace.system.surface import Aperture
+from raytrace.tracing.scene import scene
 
 LENSES = Path(__file__).parents[1] / "lenses"
 WAVELENGTH, FOCUS, DIAMETER = 0.55e-3, 50.0, 0.5  # mm

@@ -7,12 +7,13 @@ import pytest
 import torch
 from problems import number, relative_l1, sharp_double_gauss
 
-from raytrace.formats import read_lens
-from raytrace.kernels import raymap, rays
-from raytrace.kernels.raymap import fit, kernels, kernels_and_reason, reference
+from raytrace.io import read_lens
 from raytrace.maths.grid import Grid, grid
-from raytrace.optics.scene import scene
+from raytrace.psf_models import drt as raymap
+from raytrace.psf_models import rays
+from raytrace.psf_models.drt import fit, kernels, kernels_and_reason, reference
 from raytrace.system.lens import Lens
+from raytrace.tracing.scene import scene
 
 LENSES = Path(__file__).parents[1] / "lenses"
 NANOMETRE = 1e-6

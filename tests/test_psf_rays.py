@@ -7,14 +7,14 @@ import pytest
 import torch
 from problems import number, relative_l1, sharp_double_gauss
 
-from raytrace.formats import read_lens
-from raytrace.kernels.rays import kernels, trace_fans
-from raytrace.kernels.splat import below_edge, histogram, splat, splat_cells, splat_smooth
+from raytrace.io import read_lens
 from raytrace.maths import pupil
 from raytrace.maths.grid import Grid, grid
-from raytrace.optics.scene import beam_share, scene
+from raytrace.psf_models.rays import kernels, trace_fans
+from raytrace.psf_models.splat import below_edge, histogram, splat, splat_cells, splat_smooth
 from raytrace.system.lens import Lens, with_sensor_distance
 from raytrace.system.surface import Aperture
+from raytrace.tracing.scene import beam_share, scene
 
 LENSES = Path(__file__).parents[1] / "lenses"
 

@@ -8,17 +8,17 @@ import pytest
 import torch
 from problems import field, number, scene_of, vector
 
-from raytrace.kernels import NotConverged, diffraction, fourier, psf
-from raytrace.kernels.dft import huygens
+from raytrace.materials.glass import constant
 from raytrace.maths.grid import Grid, grid
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to
-from raytrace.media.glass import constant
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.scene import Scene, scene
-from raytrace.optics.wavefront import wavefront_of
+from raytrace.psf_models import NotConverged, diffraction, fourier, psf
+from raytrace.psf_models.dft import huygens
 from raytrace.system.lens import Lens
 from raytrace.system.surface import Aperture
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.scene import Scene, scene
+from raytrace.tracing.wavefront import wavefront_of
 
 WAVES = ("fourier", "wave")
 MODULES = {"fourier": fourier, "wave": diffraction}

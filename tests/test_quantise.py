@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from raytrace.cli import main
-from raytrace.media.catalog import find_glass
+from raytrace.materials.catalogs import find_glass
 from raytrace.studies.edof.report import learn
 from raytrace.studies.edof.settings import Settings
 from raytrace.studies.edof.world import World, expected_error, periodic, quality, scene, spectrum, transfer
@@ -25,11 +25,11 @@ from raytrace.studies.quantise.experiment import (
     tolerances_of,
     whole,
 )
-from raytrace.wave.designs import aim, baseline
-from raytrace.wave.element import Element, EvenPowers, Rings, as_pixels, as_rings, period
-from raytrace.wave.element_file import read_element, write_element
-from raytrace.wave.exchange import write_heights
-from raytrace.wave.psf import psf
+from raytrace.wave_optics.designs import aim, baseline
+from raytrace.wave_optics.element import Element, EvenPowers, Rings, as_pixels, as_rings, period
+from raytrace.wave_optics.element_files import read_element, write_element
+from raytrace.wave_optics.exchange import write_heights
+from raytrace.wave_optics.psf import psf
 
 #: Small, and quick: 1 mm, f/20, one colour, three depths.
 WORLD = World(radius=0.5, sensor_distance=20.0, depths=(200.0, 400.0, math.inf), design=400.0, wavelengths=(0.5, 0.6),

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import raytrace as rt
-from raytrace.formats import LensFileError, UnsupportedSurface, read_lens, read_lens_with_report
-from raytrace.media.glass import refractive_index
+from raytrace.io import LensFileError, UnsupportedSurface, read_lens, read_lens_with_report
+from raytrace.materials.glass import refractive_index
 
 
 def part(kind: str, module: str = "rayoptics.x", **attributes) -> dict:

@@ -8,13 +8,13 @@ import torch
 from problems import aspheric_singlet, double_gauss, fields, lens, scalar, surface, vector
 
 from raytrace import seidel
-from raytrace.formats import read_lens
-from raytrace.media.glass import MIRROR, model_glass
-from raytrace.optics.focus import image_rays
-from raytrace.optics.paraxial import first_order, marginal_ray, signed, system_matrix
-from raytrace.optics.trace import media
-from raytrace.system.departure import ZernikeSag
+from raytrace.io import read_lens
+from raytrace.materials.glass import MIRROR, model_glass
 from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance, with_wavelengths
+from raytrace.system.sag_terms import ZernikeSag
+from raytrace.tracing.focus import image_rays
+from raytrace.tracing.paraxial import first_order, marginal_ray, signed, system_matrix
+from raytrace.tracing.trace import media
 
 INF = math.inf
 FIELD = fields("angle", (8.0,))

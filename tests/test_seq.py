@@ -13,17 +13,17 @@ from problems import NANOMETRE, number
 from test_formats import damaged, leaves, read_damaged
 
 import raytrace as rt
-from raytrace.formats import FORMATS, LensFileError, LensFileWarning, read_lens, read_lens_with_report, write_lens
-from raytrace.formats.seq_keywords import FIELD_KINDS, POSE_WORDS, SURFACE_READ, SYSTEM_READ
-from raytrace.formats.source import Place, UnsupportedSurface, decode
-from raytrace.media.catalog import UnknownGlass
-from raytrace.media.glass import constant, index, model_glass
-from raytrace.optics.trace import trace_lens
-from raytrace.system.aperture import Aperture
+from raytrace.io import FORMATS, LensFileError, LensFileWarning, read_lens, read_lens_with_report, write_lens
+from raytrace.io.codev.keywords import FIELD_KINDS, POSE_WORDS, SURFACE_READ, SYSTEM_READ
+from raytrace.io.source import Place, UnsupportedSurface, decode
+from raytrace.materials.catalogs import UnknownGlass
+from raytrace.materials.glass import constant, index, model_glass
+from raytrace.system.apertures import Aperture
 from raytrace.system.lens import Lens, SystemAperture
 from raytrace.system.phases import RadialPhase
-from raytrace.system.pose import Pose, undone
+from raytrace.system.poses import Pose, undone
 from raytrace.system.rays import Rays
+from raytrace.tracing.trace import trace_lens
 
 MICROMETRE = 1e-3
 

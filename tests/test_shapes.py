@@ -14,30 +14,30 @@ from torch.autograd import gradcheck, gradgradcheck
 from torch.testing import assert_close
 
 import raytrace as rt
-from raytrace.camera.variables import Variables
-from raytrace.formats import read_lens, write_lens
-from raytrace.formats.source import LensFileError
-from raytrace.fused import tracing
-from raytrace.fused.structure import is_expressible
-from raytrace.kernels import psf
+from raytrace.imaging.variables import Variables
+from raytrace.io import read_lens, write_lens
+from raytrace.io.source import LensFileError
 from raytrace.maths.grid import grid
 from raytrace.maths.pupil import gauss_rings, sobol
 from raytrace.maths.value import value
-from raytrace.optics.launch import launch
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.reuse import Memo, trace_bundle
-from raytrace.optics.scene import symmetry
-from raytrace.optics.spot import spot_of
-from raytrace.optics.streaming import stream_spot
-from raytrace.optics.trace import trace_lens, trace_surfaces
-from raytrace.plot.outline import depth
+from raytrace.plotting.outline import depth
+from raytrace.psf_models import psf
 from raytrace.system import shapes
-from raytrace.system.aperture import SHAPES, Aperture, Edge, Shape, clearance, inside, reach, stands_inside
-from raytrace.system.build import lens as lens_of_rows
-from raytrace.system.departure import Sag
-from raytrace.system.places import number_at, places, with_number
+from raytrace.system.apertures import SHAPES, Aperture, Edge, Shape, clearance, inside, reach, stands_inside
+from raytrace.system.parameter_paths import number_at, places, with_number
+from raytrace.system.prescription import lens as lens_of_rows
 from raytrace.system.rays import start
+from raytrace.system.sag_terms import Sag
 from raytrace.system.surface import intersect, normal, sag, sag_at
+from raytrace.tracing.compiled import trace_engine
+from raytrace.tracing.compiled.structure import is_expressible
+from raytrace.tracing.launch import launch
+from raytrace.tracing.memo import Memo, trace_bundle
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.scene import symmetry
+from raytrace.tracing.spot import spot_of
+from raytrace.tracing.streaming import stream_spot
+from raytrace.tracing.trace import trace_lens, trace_surfaces
 
 SHARED = Path(__file__).parents[2] / "shared"
 TIER2, CORPUS = SHARED / "tier2", SHARED / "corpus"
@@ -371,7 +371,7 @@ class TestWhatHasToKnow:
         system = system_of(name)
         rays = start(*bundle(300))
         found = trace_lens(system, rays, system.wavelengths[0])
-        with tracing("eager"):
+        with trace_engine("eager"):
             expected = trace_lens(system, rays, system.wavelengths[0])
         assert is_expressible(system.surfaces[1]) == (name == "odd")
         assert_close(found.position, expected.position, rtol=0, atol=1e-12)
@@ -480,7 +480,7 @@ def test_a_shape_of_aperture_added_at_run_time_is_found_by_everything(monkeypatc
     axis = torch.zeros_like(position)
     axis[2] = 1
     for engine in ("eager", "fused"):
-        with tracing(engine):
+        with trace_engine(engine):
             valid = trace_lens(system, start(position, axis), system.wavelengths[0]).valid
         assert valid.tolist() == [True, True, True, False, False]
     assert symmetry(scene_of(system)) == "mirror"

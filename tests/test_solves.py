@@ -9,17 +9,17 @@ from test_corpus import CORPUS
 from test_merit_bounds import semi_diameters
 
 import raytrace as rt
+from raytrace.materials.glass import model_glass, refractive_index
 from raytrace.maths.dual import Dual, slope_of, value_of
-from raytrace.media.glass import model_glass, refractive_index
-from raytrace.merit.model import Model
-from raytrace.merit.solves import SOLVES
-from raytrace.merit.vary import freedom
-from raytrace.optics.launch import rays_of_field
-from raytrace.optics.trace import trace_lens
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.lens_state import SOLVES
+from raytrace.optimization.variables import freedom
 from raytrace.system import configurations
 from raytrace.system.configurations import Place
-from raytrace.system.intent import Intent, Solve, Vary
+from raytrace.system.optimization_data import Intent, Solve, Vary
 from raytrace.system.surface import sag
+from raytrace.tracing.launch import rays_of_field
+from raytrace.tracing.trace import trace_lens
 
 VARY = Vary(1, "curvature"), Vary(3, "thickness"), Vary(5, "curvature")
 

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from raytrace.camera.variables import parse_bounds
 from raytrace.files import shipped
-from raytrace.formats import read_lens
-from raytrace.optics.paraxial import first_order
+from raytrace.imaging.variables import parse_bounds
+from raytrace.io import read_lens
 from raytrace.pages import kept_of, markdown
 from raytrace.studies.codesign import spaces as module
 from raytrace.studies.codesign.experiment import variables
@@ -20,6 +19,7 @@ from raytrace.studies.codesign.setup import Experiment
 from raytrace.studies.codesign.spaces import Row, best, cases, gains
 from raytrace.studies.codesign.spaces_page import Spaces
 from raytrace.studies.pictures import dead_leaves
+from raytrace.tracing.paraxial import first_order
 
 DOCS = Path(__file__).parents[1] / "docs"
 SETTINGS = Settings(vary="sensor thickness:2,9,5,6", hold="efl", bounds="sensor:50,60")

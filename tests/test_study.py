@@ -10,9 +10,7 @@ import torch
 
 from raytrace.cli import build_parser
 from raytrace.files import shipped, write_table
-from raytrace.formats import read_lens
-from raytrace.optics.focus import best_focus
-from raytrace.optics.paraxial import first_order
+from raytrace.io import read_lens
 from raytrace.pages import kept_of, markdown
 from raytrace.studies.codesign import optima
 from raytrace.studies.codesign.claims import CLAIMS, Seen, claims, is_of_paper
@@ -39,6 +37,8 @@ from raytrace.studies.codesign.study import (
 )
 from raytrace.studies.pictures import dead_leaves
 from raytrace.system.lens import with_object_distance, with_sensor_distance
+from raytrace.tracing.focus import best_focus
+from raytrace.tracing.paraxial import first_order
 
 SMALL = Settings(depth=2, width=2, patch=16, size=7, epochs=1, batch=4, crops=2)
 MICROMETRE = 1e-3

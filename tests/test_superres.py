@@ -6,8 +6,8 @@ import dataclasses
 import pytest
 import torch
 
-from raytrace.camera.deconvolve import errors, mean_square_error, psnr
 from raytrace.cli.studies import command
+from raytrace.imaging.restoration import errors, mean_square_error, psnr
 from raytrace.studies.edof.world import periodic, scene, spectrum, transfer
 from raytrace.studies.pictures import dead_leaves
 from raytrace.studies.superres.experiment import (
@@ -36,7 +36,7 @@ from raytrace.studies.superres.experiment import (
     world_of,
 )
 from raytrace.studies.superres.inversion import coarse_image, least_error
-from raytrace.wave.psf import psf
+from raytrace.wave_optics.psf import psf
 
 LEAVES = dead_leaves(6, size=64)
 WORLD = world_of([0.55], noise=0.001, size=33)

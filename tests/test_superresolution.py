@@ -6,8 +6,8 @@ import pytest
 import torch
 from problems import covariance, draws, gaussian
 
-from raytrace.camera.deconvolve import blind_filter, errors, mean_square_error, power_law, psnr, restore, within
-from raytrace.camera.image import blur, transfer_functions, visible
+from raytrace.imaging.image import blur, transfer_functions, visible
+from raytrace.imaging.restoration import blind_filter, errors, mean_square_error, power_law, psnr, restore, within
 from raytrace.studies.pictures import dead_leaves
 from raytrace.studies.superres.inversion import (
     bicubic,

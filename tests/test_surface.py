@@ -7,7 +7,7 @@ import torch
 from problems import FEMTOMETRE, surface, turned, vector
 from torch.autograd import gradcheck, gradgradcheck
 
-from raytrace.system.aperture import Aperture, inside
+from raytrace.system.apertures import Aperture, inside
 from raytrace.system.surface import intersect, normal, sag
 
 KINDS = {

@@ -13,7 +13,7 @@ from PIL import Image
 
 from raytrace.cli import main
 from raytrace.files import shipped, write_table
-from raytrace.formats import read_lens
+from raytrace.io import read_lens
 from raytrace.pages import KEPT, kept_of, markdown
 from raytrace.stores import DamagedLine
 from raytrace.studies.codesign import sweep as module
@@ -22,17 +22,7 @@ from raytrace.studies.codesign.figures import sweep_figure
 from raytrace.studies.codesign.optima import Optimum, closed_form
 from raytrace.studies.codesign.settings import Settings
 from raytrace.studies.codesign.setup import Experiment
-from raytrace.studies.codesign.sweep import (
-    COLUMNS,
-    COMBINED,
-    DEFAULT,
-    Kept,
-    Row,
-    cases,
-    distinct,
-    readings,
-    sweep,
-)
+from raytrace.studies.codesign.sweep import COLUMNS, COMBINED, DEFAULT, Kept, Row, cases, distinct, readings, sweep
 from raytrace.studies.codesign.sweep_page import Sweep
 from raytrace.studies.codesign.sweep_parts import answers, beam
 from raytrace.studies.pictures import dead_leaves

@@ -7,10 +7,11 @@ import sys
 import pandas as pd
 import pytest
 
-from raytrace.formats import LensFileError, UnsupportedSurface, table_read
-from raytrace.formats.frame import lens_from_frame, to_frame
-from raytrace.media.catalog import UnknownGlass
-from raytrace.media.glass import MIRROR, mil_glass
+from raytrace.io import LensFileError, UnsupportedSurface
+from raytrace.io.frames import lens_from_frame, to_frame
+from raytrace.io.table import read as table_read
+from raytrace.materials.catalogs import UnknownGlass
+from raytrace.materials.glass import MIRROR, mil_glass
 
 #: Table 3 of "On the use of differentiable optical models for lens and neural network co-design", as pasted from it.
 TABLE_3 = """\
@@ -345,5 +346,5 @@ def test_frame_of_a_designer():
 
 
 def test_reading_a_table_loads_no_pandas():
-    code = "import sys, raytrace.formats; sys.exit('pandas' in sys.modules)"
+    code = "import sys, raytrace.io; sys.exit('pandas' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -9,8 +9,8 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from raytrace.formats import LensFileError, LensFileWarning, read_lens, spelling, write_lens
-from raytrace.formats.frame import lens_from_frame, to_frame
+from raytrace.io import LensFileError, LensFileWarning, read_lens, spelling, write_lens
+from raytrace.io.frames import lens_from_frame, to_frame
 
 LENSES = Path(__file__).parents[1] / "lenses"
 TABLES = (".csv", ".tsv", ".txt")

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from raytrace.fused import library, trust
-from raytrace.fused.library import NoCompiler, compiler
-from raytrace.fused.trust import Untrusted, check_file, objection, open_folder, private_folder
+from raytrace.tracing.compiled import library, trust
+from raytrace.tracing.compiled.library import NoCompiler, compiler
+from raytrace.tracing.compiled.trust import Untrusted, check_file, objection, open_folder, private_folder
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="owners and modes are POSIX's")
 
@@ -135,7 +135,7 @@ __attribute__((constructor)) static void run(void) { fclose(fopen("%s", "w")); }
 
 PROBE = """
 import os, sys, torch
-from raytrace.fused import choice, library
+from raytrace.tracing.compiled import choice, library
 from raytrace.system.rays import Rays
 one = torch.ones(3, 1, dtype=torch.float64)
 for word in sys.argv[1:]:

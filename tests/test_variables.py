@@ -10,18 +10,18 @@ import torch
 from problems import scalar
 from torch.utils import _pytree as pytree
 
-from raytrace.camera.camera import Camera
-from raytrace.camera.limits import BadLimits, Limits, edge_thickness, limits_of, parse_range, violation
-from raytrace.camera.phase import PhaseVariables
-from raytrace.camera.variables import BadVariables, OtherLens, Variables, parse_bounds
-from raytrace.formats import read_lens
-from raytrace.media.catalog import find_glass
-from raytrace.media.glass import AIR, MIRROR, constant, is_air, model_glass, nd
-from raytrace.system.departure import ZernikeSag
+from raytrace.imaging.camera import Camera
+from raytrace.imaging.limits import BadLimits, Limits, edge_thickness, limits_of, parse_range, violation
+from raytrace.imaging.phase_variables import PhaseVariables
+from raytrace.imaging.variables import BadVariables, OtherLens, Variables, parse_bounds
+from raytrace.io import read_lens
+from raytrace.materials.catalogs import find_glass
+from raytrace.materials.glass import AIR, MIRROR, constant, is_air, model_glass, nd
 from raytrace.system.lens import with_sensor_distance
-from raytrace.system.places import places
+from raytrace.system.parameter_paths import places
+from raytrace.system.sag_terms import ZernikeSag
 from raytrace.system.surface import Surface, sag
-from raytrace.wave.element import Element, Rings
+from raytrace.wave_optics.element import Element, Rings
 
 LENSES = Path(__file__).parents[1] / "lenses"
 NANOMETRE = 1e-6

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import raytrace as rt
-from raytrace.media.glass import abbe_number, nd
-from raytrace.merit.model import Model
-from raytrace.merit.vary import VariedGlass, bounds_of, freedom, name_of
-from raytrace.system.intent import Intent, Solve, Vary
-from raytrace.system.naming import BadVariables
+from raytrace.materials.glass import abbe_number, nd
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.variables import VariedGlass, bounds_of, freedom, name_of
+from raytrace.system.optimization_data import Intent, Solve, Vary
+from raytrace.system.parameter_paths import BadVariables
 
 
 @pytest.fixture(scope="module")

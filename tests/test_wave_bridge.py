@@ -8,21 +8,21 @@ import torch
 from problems import double_gauss, lens, scalar, surface, vector
 from torch.autograd import gradcheck
 
-from raytrace.kernels import diffraction, psf
+from raytrace.materials.glass import constant
 from raytrace.maths.grid import centres, grid
 from raytrace.maths.pupil import gauss_rings
-from raytrace.media.glass import constant
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.scene import cross_scene, scene
-from raytrace.optics.trace import media, trace_surfaces
-from raytrace.optics.wavefront import wavefront_of
-from raytrace.system import departure
+from raytrace.psf_models import diffraction, psf
+from raytrace.system import sag_terms as departure
 from raytrace.system.lens import Lens, with_sensor_distance
 from raytrace.system.surface import sag_at
-from raytrace.wave import bridge
-from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike, height, period
-from raytrace.wave.psf import psf as wave_psf
-from raytrace.wave.scene import WaveScene, excess, residual
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.scene import cross_scene, scene
+from raytrace.tracing.trace import media, trace_surfaces
+from raytrace.tracing.wavefront import wavefront_of
+from raytrace.wave_optics import hybrid as bridge
+from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Rings, Zernike, height, period
+from raytrace.wave_optics.psf import psf as wave_psf
+from raytrace.wave_optics.scene import WaveScene, excess, residual
 
 PMMA, WAVE = 1.493, 0.55e-3  # index and wavelength in mm
 INDEX = 1.5

@@ -29,7 +29,7 @@ from raytrace.studies.superres.command import Settings as Superres
 from raytrace.studies.superres.discover_command import Settings as Discover
 from raytrace.studies.superres.experiment import Row
 from raytrace.studies.superres.report import Block, Scene
-from raytrace.wave.designs import aim, baseline
+from raytrace.wave_optics.designs import aim, baseline
 
 #: Settings of every command with all of them changed, as its parser would give them.
 CHANGED = {

@@ -10,14 +10,14 @@ import torch
 from problems import scalar
 from test_wave_propagation import PLASTIC, R, lens, relative, scene
 
-from raytrace.kernels.dft import integrate, phasor, sub_pixels
-from raytrace.wave import mixed, radial
-from raytrace.wave.designs import aim, baseline
-from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike, as_pixels, wrapped
-from raytrace.wave.plan import plan
-from raytrace.wave.psf import psf
-from raytrace.wave.scene import aperture, millimetres, residual
-from raytrace.wave.spread import spread
+from raytrace.psf_models.dft import integrate, phasor, sub_pixels
+from raytrace.wave_optics import mixed
+from raytrace.wave_optics import propagation as radial
+from raytrace.wave_optics.designs import aim, baseline
+from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Rings, Zernike, as_pixels, wrapped
+from raytrace.wave_optics.plan import plan, spread
+from raytrace.wave_optics.psf import psf
+from raytrace.wave_optics.scene import aperture, millimetres, residual
 
 GREEN, BLUE = (0.55,), (0.46,)
 #: Padding and band limit that bring light back round.

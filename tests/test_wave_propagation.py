@@ -9,14 +9,16 @@ import rayleigh
 import torch
 from problems import scalar, vector
 
-from raytrace.kernels.dft import bessel_j1, integrate
+from raytrace.materials.catalogs import find_glass
+from raytrace.materials.glass import constant, index
 from raytrace.maths.grid import grid
-from raytrace.media.catalog import find_glass
-from raytrace.media.glass import constant, index
-from raytrace.wave import propagate, pupil, radial
-from raytrace.wave.element import Element, EvenPowers, Pixels, Rings, Zernike
-from raytrace.wave.psf import psf
-from raytrace.wave.scene import WaveScene, excess
+from raytrace.psf_models.dft import bessel_j1, integrate
+from raytrace.wave_optics import propagation as propagate
+from raytrace.wave_optics import propagation as radial
+from raytrace.wave_optics import pupil
+from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Rings, Zernike
+from raytrace.wave_optics.psf import psf
+from raytrace.wave_optics.scene import WaveScene, excess
 
 R, Z = 2.5, 35.5  # mm
 WAVELENGTHS = (0.46, 0.55, 0.64)

@@ -8,12 +8,12 @@ import torch
 from problems import scalar, vector
 from test_wave_propagation import PLASTIC, R, Z, lens, relative, scene
 
-from raytrace.kernels.dft import bessel_j0, bessel_j1
-from raytrace.optics.reuse import Memo
-from raytrace.wave import radial
-from raytrace.wave.element import Element, EvenPowers, Rings
-from raytrace.wave.plan import plan
-from raytrace.wave.psf import psf
+from raytrace.psf_models.dft import bessel_j0, bessel_j1
+from raytrace.tracing.memo import Memo
+from raytrace.wave_optics import propagation as radial
+from raytrace.wave_optics.element import Element, EvenPowers, Rings
+from raytrace.wave_optics.plan import plan
+from raytrace.wave_optics.psf import psf
 
 
 def rings(count=40, pitch=None, radius=R):

@@ -6,10 +6,11 @@ import re
 
 import pytest
 
-from raytrace.formats import LensFileError, UnsupportedSurface, read_lens, read_lens_with_report, write_lens, zemax_read
-from raytrace.formats.source import Place, decode
-from raytrace.media.catalog import UnknownGlass, find_glass
-from raytrace.media.glass import MIRROR, mil_glass
+from raytrace.io import LensFileError, UnsupportedSurface, read_lens, read_lens_with_report, write_lens
+from raytrace.io.source import Place, decode
+from raytrace.io.zemax import read as zemax_read
+from raytrace.materials.catalogs import UnknownGlass, find_glass
+from raytrace.materials.glass import MIRROR, mil_glass
 
 HEAD = {
     "MODE": "MODE SEQ",

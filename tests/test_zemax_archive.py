@@ -9,12 +9,13 @@ from test_catalog import SMALL
 from test_zemax import file as singlet
 
 from raytrace.cli import main
-from raytrace.formats import LensFileError, check, convert, read_lens, read_lens_with_report, zemax_archive
-from raytrace.formats.source import MAX_BYTES, Place
-from raytrace.formats.zemax_archive import Member, members, unpacked
-from raytrace.media.agf import MOST_GLASSES, CatalogError, format_agf, listed, parse_agf
-from raytrace.media.catalog import ENVIRONMENT, UnknownGlass, find_glass, shipped_catalog
-from raytrace.media.glass import index
+from raytrace.io import LensFileError, check, convert, read_lens, read_lens_with_report
+from raytrace.io.source import MAX_BYTES, Place
+from raytrace.io.zemax import archive as zemax_archive
+from raytrace.io.zemax.archive import Member, members, unpacked
+from raytrace.materials.agf import MOST_GLASSES, CatalogError, format_agf, listed, parse_agf
+from raytrace.materials.catalogs import ENVIRONMENT, UnknownGlass, find_glass, shipped_catalog
+from raytrace.materials.glass import index
 
 PLACE = Place("lens.zar")
 #: A catalog of one glass, N-BK7 by name, with other figures: those of SF6.

@@ -20,12 +20,12 @@ from raytrace.analysis.result import Analysis
 from raytrace.analysis.setting import Points, field_words, primary_wavelength
 from raytrace.maths.result import cell
 from raytrace.maths.value import value
-from raytrace.optics.axis import need_axis
-from raytrace.optics.launch import paraxial_field
-from raytrace.optics.paraxial import FirstOrder, first_order, largest_field, marginal_ray, signed
-from raytrace.optics.trace import media
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.surface import Surface, is_even, vertex_curvature
+from raytrace.tracing.axis import need_axis
+from raytrace.tracing.launch import paraxial_field
+from raytrace.tracing.paraxial import FirstOrder, first_order, largest_field, marginal_ray, signed
+from raytrace.tracing.trace import media
 from raytrace.words import named, with_article
 
 
@@ -53,7 +53,7 @@ class Seidel(Analysis):
     unit: str
 
     COMMAND = "seidel"
-    FIGURE = "plot.analysis.seidel_bars"
+    FIGURE = "plotting.analysis.seidel_bars"
 
     def columns(self) -> dict[str, Tensor]:
         surfaces = torch.arange(1, self.contributions.shape[-1] + 1, device=self.fields.device)

@@ -32,14 +32,14 @@ from optiland.samples.objectives import CookeTriplet, DoubleGauss
 from torch import Tensor
 
 from raytrace.bench.report import table
+from raytrace.materials.glass import AIR, Glass, from_table
 from raytrace.maths.pupil import gauss_legendre
-from raytrace.media.glass import AIR, Glass, from_table
-from raytrace.optics.launch import launch
-from raytrace.optics.paraxial import first_order
-from raytrace.optics.trace import trace_lens
-from raytrace.system.intent import Intent, Row, Vary
 from raytrace.system.lens import Fields, Lens, SystemAperture
+from raytrace.system.optimization_data import Intent, Row, Vary
 from raytrace.system.surface import Surface
+from raytrace.tracing.launch import launch
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.trace import trace_lens
 
 RINGS, ARMS = 3, 6
 AGREE = 1e-9  # of the merits of both programs, relative

@@ -22,16 +22,17 @@ from raytrace.bench.measure import clock, name_of, nothing, with_leaves
 from raytrace.bench.psf_cases import DIRECT, RANDOM, USUAL, Case, Method, cases, doors, methods, random_histogram
 from raytrace.bench.report import Asked, Measured
 from raytrace.cli.progress import progress
-from raytrace.kernels import MODELS, NotConverged, Psf, diffraction, paraxial, raymap
-from raytrace.kernels.dft import nodes_per_pixel, rings_and_arms
-from raytrace.kernels.pixels import gaussian_pixels
-from raytrace.kernels.result import Kernels
 from raytrace.maths.grid import Grid
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to
-from raytrace.optics.scene import Scene
-from raytrace.optics.wavefront import wavefront_of
+from raytrace.psf_models import MODELS, NotConverged, Psf, diffraction, paraxial
+from raytrace.psf_models import drt as raymap
+from raytrace.psf_models.dft import nodes_per_pixel, rings_and_arms
+from raytrace.psf_models.pixels import gaussian_pixels
+from raytrace.psf_models.result import Kernels
 from raytrace.system.lens import Lens
+from raytrace.tracing.scene import Scene
+from raytrace.tracing.wavefront import wavefront_of
 
 _PIECE = 2**16  # random rays at a time
 _PILOT = 2**17  # random rays that find how many are needed

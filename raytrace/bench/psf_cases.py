@@ -8,14 +8,14 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.kernels import MODELS, Psf, paraxial, psf, rays
-from raytrace.kernels.gaussian import kernels as gaussian_kernels
-from raytrace.kernels.result import Kernels
 from raytrace.maths import pupil
 from raytrace.maths.grid import Grid, grid
-from raytrace.optics.paraxial import first_order, largest_field
-from raytrace.optics.scene import Scene, scene
+from raytrace.psf_models import MODELS, Psf, paraxial, psf, rays
+from raytrace.psf_models.gaussian import kernels as gaussian_kernels
+from raytrace.psf_models.result import Kernels
 from raytrace.system.lens import Lens, with_object_distance
+from raytrace.tracing.paraxial import first_order, largest_field
+from raytrace.tracing.scene import Scene, scene
 
 PIXELS = 21  # across every window
 RANDOM, DIRECT = "random rays", "direct sum"

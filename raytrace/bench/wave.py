@@ -17,20 +17,20 @@ from torch import Tensor
 from raytrace.bench.measure import clock, name_of, nothing
 from raytrace.bench.report import Asked, Measured, digits, table, yes
 from raytrace.cli.progress import progress
-from raytrace.kernels.dft import Aliased, phasor
+from raytrace.materials.glass import index
 from raytrace.maths.grid import grid
 from raytrace.maths.result import number
 from raytrace.maths.value import to
-from raytrace.media.glass import index
-from raytrace.optics.reuse import Memo
 from raytrace.pages import measured
+from raytrace.psf_models.dft import Aliased, phasor
 from raytrace.shards import torch_threads
-from raytrace.wave import radial
-from raytrace.wave.designs import aim, singlet
-from raytrace.wave.plan import AliasedSampling
-from raytrace.wave.plan import plan as plan_of
-from raytrace.wave.psf import psf
-from raytrace.wave.scene import WaveScene
+from raytrace.tracing.memo import Memo
+from raytrace.wave_optics import propagation as radial
+from raytrace.wave_optics.designs import aim, singlet
+from raytrace.wave_optics.plan import AliasedSampling
+from raytrace.wave_optics.plan import plan as plan_of
+from raytrace.wave_optics.psf import psf
+from raytrace.wave_optics.scene import WaveScene
 
 WAVELENGTH, DEPTH, PIXEL, SIZE = 0.46, 500.0, 0.00369, 128
 #: Samples across and padding of Sitzmann's method: 2 µm over 5 mm, half as wide again.

@@ -13,7 +13,7 @@ import raytrace
 from raytrace.cli.door import CONDITIONS, CommandError, open_lens, print_json, say
 from raytrace.cli.outputs import check_outputs
 from raytrace.cli.progress import progress
-from raytrace.formats import LensFileError
+from raytrace.io import LensFileError
 from raytrace.maths.result import Result, called
 from raytrace.shards import processes, share
 

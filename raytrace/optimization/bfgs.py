@@ -13,8 +13,8 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from raytrace.maths.dual import Dual, slope_of, value_of
-from raytrace.merit.model import Model
 from raytrace.optimization.least_squares import Cycle
+from raytrace.optimization.lens_model import Model
 from raytrace.system.lens import Lens
 
 _FAR = 1e3  # of the merit at the start: what a lens costs of which it is no number

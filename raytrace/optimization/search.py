@@ -15,30 +15,27 @@ from typing import ClassVar
 import numpy as np
 
 from raytrace.files import NotWritten, check_output_folder
-from raytrace.formats import LensFileError
-from raytrace.fused import prepare
-from raytrace.merit.default import KINDS
-from raytrace.merit.hold import Condition, conditions_of
-from raytrace.merit.readings import Readings, readings_of
-from raytrace.merit.value import Merit, in_unit, merit_for
-from raytrace.merit.vary import Freedom, bounds_of, freedom
-from raytrace.optics.filling import warn_of_filling
-from raytrace.optimization.asked import Asked
-from raytrace.optimization.insertion import Insertion
+from raytrace.io import LensFileError
+from raytrace.optimization.attained import refuse_contradictions
+from raytrace.optimization.constraints import Condition, conditions_of
+from raytrace.optimization.conventions import Readings, readings_of
+from raytrace.optimization.default_merit import KINDS
 from raytrace.optimization.journal import Ended, Journal, Stopped
 from raytrace.optimization.least_squares import Manner
-from raytrace.optimization.meniscus import places_of
-from raytrace.optimization.minima import Minima, Minimum
-from raytrace.optimization.opening import opened
+from raytrace.optimization.merit import Merit, in_unit, merit_for
+from raytrace.optimization.optimize import opened
 from raytrace.optimization.problem import NoProblem, Problem
-from raytrace.optimization.reached import refuse_contradictions
-from raytrace.optimization.searched import Searched, searched
-from raytrace.optimization.stages import FOLLOW, LONG, Stage, descended
+from raytrace.optimization.saddle_points import Insertion, places_of
+from raytrace.optimization.search_result import Minima, Minimum, Searched, searched
+from raytrace.optimization.search_settings import FOLLOW, LONG, Asked, Stage, descended
 from raytrace.optimization.starts import Space
+from raytrace.optimization.variables import Freedom, bounds_of, freedom
 from raytrace.shards import Share
-from raytrace.system.intent import Row
 from raytrace.system.lens import Lens, field_points
-from raytrace.system.naming import parse_range
+from raytrace.system.optimization_data import Row
+from raytrace.system.parameter_paths import parse_range
+from raytrace.tracing.compiled import prepare
+from raytrace.tracing.stop_filling import warn_of_filling
 from raytrace.words import calling_level
 
 STARTS = 64

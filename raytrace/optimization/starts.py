@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import qmc
 
-from raytrace.merit.hold import Condition
-from raytrace.merit.model import Model
-from raytrace.merit.moment import Moment
+from raytrace.optimization.constraints import Condition
+from raytrace.optimization.lens_model import Model
+from raytrace.optimization.lens_state import Moment
 from raytrace.optimization.problem import NoProblem
-from raytrace.system.intent import Row, Vary
-from raytrace.system.naming import sensor
+from raytrace.system.optimization_data import Row, Vary
+from raytrace.system.parameter_paths import sensor
 
 STEEPEST = 3.0  # curvature of a start in units of 1/f
 _FACTORS = np.concatenate([np.geomspace(0.15, 4, 24), -np.geomspace(0.15, 4, 24)])  # of all curvatures

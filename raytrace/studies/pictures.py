@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from raytrace.cli.progress import progress
-from raytrace.formats.pictures import SUFFIXES, PictureError, read_grey
+from raytrace.io.pictures import SUFFIXES, PictureError, read_grey
 
 _SPLIT, _ORDER, _CROP, _LEAVES = range(4)  # what a draw is for: the last number of its key
 

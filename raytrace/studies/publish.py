@@ -6,7 +6,7 @@ from pathlib import Path
 from raytrace.cli.door import say
 from raytrace.files import write_text
 from raytrace.pages import write_page
-from raytrace.plot.style import save
+from raytrace.plotting.style import save
 
 
 def published(file: str | Path, docs: str | Path) -> str:

@@ -11,8 +11,8 @@ from typing import NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
+from raytrace.materials.glass import Glass, label
 from raytrace.maths.value import value
-from raytrace.media.glass import Glass, label
 
 Whole = TypeVar("Whole")
 

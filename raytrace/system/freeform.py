@@ -14,7 +14,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from raytrace.system.departure import Sag
+from raytrace.system.sag_terms import Sag
 from raytrace.system.terms import conic_terms, even_terms
 
 

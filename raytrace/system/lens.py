@@ -7,9 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.maths.result import lent
-from raytrace.maths.value import check_precision, value
-from raytrace.media.environment import (
+from raytrace.materials.environment import (
     REFERENCE,
     Environment,
     NoThermalCoefficients,
@@ -17,14 +15,16 @@ from raytrace.media.environment import (
     objection,
     unknown_change,
 )
-from raytrace.media.glass import check_unit, check_wavelengths, refractive_index
+from raytrace.materials.glass import check_unit, check_wavelengths, refractive_index
+from raytrace.maths.result import lent
+from raytrace.maths.value import check_precision, value
 from raytrace.system import configurations as multiple
-from raytrace.system.aperture import SHAPES
+from raytrace.system.apertures import SHAPES
 from raytrace.system.conditions import APERTURE_KINDS as APERTURE_KINDS
 from raytrace.system.conditions import FIELD_UNITS as FIELD_UNITS
 from raytrace.system.conditions import RAY_AIMING, Fields, SystemAperture
 from raytrace.system.configurations import Operand
-from raytrace.system.intent import Intent
+from raytrace.system.optimization_data import Intent
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface
 from raytrace.words import calling_level, did_you_mean
@@ -74,8 +74,8 @@ class Lens:
         """The primary wavelength, () µm."""
         return self.wavelengths[self.primary_wavelength - 1]
 
-    __str__ = lent("optics.views.text")
-    _repr_html_ = lent("plot.notebook.page")
+    __str__ = lent("tracing.lens_report.text")
+    _repr_html_ = lent("plotting.notebook.page")
 
     def at(
         self,

@@ -19,8 +19,8 @@ from raytrace.maths.bivariate import polynomial_xy, powers, zernike_to_powers
 from raytrace.maths.numerics import polynomial
 from raytrace.maths.value import value
 from raytrace.maths.zernike import Order, fringe, noll, norm
-from raytrace.system.departure import FringeSag, Sag, ZernikeSag
-from raytrace.system.pose import cos_sin
+from raytrace.system.poses import cos_sin
+from raytrace.system.sag_terms import FringeSag, Sag, ZernikeSag
 
 
 @value

@@ -4,7 +4,7 @@
 
 KINDS tells the b_j, by `Surface.kind`, or the form that a kind has in place of them and the conic; DEPARTURES tells D,
 by the class of `Surface.departure`. A new kind is a new row: rays, derivatives, first order, variables, figures, files
-and, with its terms in fused/sags.h, the compiled trace read it.
+and, with its terms in tracing/cpp/sags.h, the compiled trace read it.
 """
 
 import dataclasses
@@ -14,9 +14,8 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
-from raytrace.system import departure as own
 from raytrace.system import freeform
-from raytrace.system.departure import FringeSag, GridSag, Sag, SplineSag, ZernikeSag
+from raytrace.system import sag_terms as own
 from raytrace.system.polynomials import (
     IrregularSag,
     PolynomialSag,
@@ -31,6 +30,7 @@ from raytrace.system.polynomials import (
     powers_of_polynomial,
     powers_of_zernike,
 )
+from raytrace.system.sag_terms import FringeSag, GridSag, Sag, SplineSag, ZernikeSag
 from raytrace.system.terms import Terms, conic_terms, even_terms, odd_terms
 
 EVEN = "even asphere"
@@ -47,7 +47,7 @@ class Kind:
     step: b_j is r^(step j), so that a_j is named for it and in mm^(1 - step j).
     zemax: TYPE of a .zmx file, where PARM j is a_j up to `parameters`; None: no such file holds it.
     words: what the column "type" of a table may say for it; where that says nothing the powers of the terms tell.
-    code: the kind in fused/sags.h, which traces up to `compiled` terms; None: traced by torch alone.
+    code: the kind in tracing/cpp/sags.h, which traces up to `compiled` terms; None: traced by torch alone.
     """
 
     name: str

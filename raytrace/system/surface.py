@@ -17,16 +17,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from raytrace.materials.environment import Environment
+from raytrace.materials.glass import AIR, Glass
 from raytrace.maths.numerics import differentiating, dot
 from raytrace.maths.value import to, value
-from raytrace.media.environment import Environment
-from raytrace.media.glass import AIR, Glass
-from raytrace.system.aperture import Aperture
-from raytrace.system.departure import Sag
+from raytrace.system.apertures import Aperture
+from raytrace.system.intersection import conic_root, double, doubles, first_crossing, foot_of, way_of
 from raytrace.system.phases import Phase, kind_of
-from raytrace.system.pose import Gap, Pose, Turn
-from raytrace.system.roots import conic_root, double, doubles, foot_of, way_of
-from raytrace.system.search import first_crossing
+from raytrace.system.poses import Gap, Pose, Turn
+from raytrace.system.sag_terms import Sag
 from raytrace.system.shapes import DEPARTURES, EVEN, KINDS, Departure, Relief, relief, sag_and_derivatives
 
 

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from raytrace.camera.camera import Camera
-from raytrace.camera.deconvolve import kernel_error
-from raytrace.camera.deconvolve import power_spectrum as periodogram
+from raytrace.imaging.camera import Camera
+from raytrace.imaging.restoration import kernel_error
+from raytrace.imaging.restoration import power_spectrum as periodogram
 from raytrace.studies.codesign.conjugates import sensor_range
 from raytrace.studies.descent import Descent, minimise
 from raytrace.studies.pictures import Pictures, crop

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from raytrace.camera.training import Run, share
 from raytrace.cli.door import CommandError, say
 from raytrace.cli.run import present
 from raytrace.files import table
+from raytrace.imaging.training import Run, share
 from raytrace.pages import machine
 from raytrace.studies.codesign import figures, optima
 from raytrace.studies.codesign import study as runs

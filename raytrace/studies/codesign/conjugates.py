@@ -10,11 +10,11 @@ from torch import Tensor
 
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
-from raytrace.optics.focus import best_focus, focus_moments, image_rays, real_image_distance
-from raytrace.optics.launch import launch
-from raytrace.optics.paraxial import paraxial_image_distance
-from raytrace.optics.trace import lens_steps
 from raytrace.system.lens import Lens, with_object_distance
+from raytrace.tracing.focus import best_focus, focus_moments, image_rays, real_image_distance
+from raytrace.tracing.launch import launch
+from raytrace.tracing.paraxial import paraxial_image_distance
+from raytrace.tracing.trace import lens_steps
 
 _RINGS = 12  # of the pupil, where focus is found
 

@@ -18,16 +18,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.camera.camera import Camera
-from raytrace.camera.limits import parse_range
-from raytrace.camera.network import RedNet, RedNetShape
-from raytrace.camera.training import DamagedRun, Record, Run, Share, train
-from raytrace.camera.variables import Variables, parse_bounds
 from raytrace.files import write_json
-from raytrace.formats import write_lens
+from raytrace.imaging.camera import Camera
+from raytrace.imaging.limits import parse_range
+from raytrace.imaging.network import RedNet, RedNetShape
+from raytrace.imaging.training import DamagedRun, Record, Run, Share, train
+from raytrace.imaging.variables import Variables, parse_bounds
+from raytrace.io import write_lens
 from raytrace.maths.grid import grid
 from raytrace.maths.result import plain
-from raytrace.optics.focus import focused, real_image_distance
 from raytrace.stores import fields_of, read_document
 from raytrace.studies.codesign import conjugates
 from raytrace.studies.codesign.closed_form import (
@@ -41,8 +40,9 @@ from raytrace.studies.codesign.plain_rays import PlainRays, points_of_models
 from raytrace.studies.codesign.settings import GAUSSIAN, Settings
 from raytrace.studies.descent import NoOptimum
 from raytrace.studies.pictures import Pictures, crop, draws
-from raytrace.system.aperture import Aperture
+from raytrace.system.apertures import Aperture
 from raytrace.system.lens import Lens, with_object_distance, with_sensor_distance, with_wavelengths
+from raytrace.tracing.focus import focused, real_image_distance
 
 _SAMPLE = 10  # last number of the key of what a sample draws
 _TEST_EPOCH = 2**20  # test samples are those of an epoch that no training reaches

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable, Sequence
 import torch
 from torch import Tensor
 
-from raytrace.camera.camera import Camera
-from raytrace.camera.deconvolve import errors
-from raytrace.camera.image import transfer_functions
+from raytrace.imaging.camera import Camera
+from raytrace.imaging.image import transfer_functions
+from raytrace.imaging.restoration import errors
 from raytrace.studies.codesign import optima
 from raytrace.studies.codesign.closed_form import even_distances
 from raytrace.studies.codesign.experiment import camera

@@ -5,11 +5,11 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from raytrace.camera.training import Run, share
 from raytrace.cli.door import CommandError, say
 from raytrace.cli.progress import progress
 from raytrace.cli.run import present
 from raytrace.files import table
+from raytrace.imaging.training import Run, share
 from raytrace.maths.result import Result, plain
 from raytrace.pages import grid, machine, measured, shown
 from raytrace.shards import torch_threads

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from raytrace.plot.style import GREY, LOOKS, new_figure, styled
+from raytrace.plotting.style import GREY, LOOKS, new_figure, styled
 from raytrace.studies.codesign.settings import NAMES
 from raytrace.studies.codesign.study import PAPER
 from raytrace.studies.codesign.sweep import FACTORS, Factor, Reading

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-from raytrace.camera.training import DamagedRun
+from raytrace.imaging.training import DamagedRun
 from raytrace.maths.result import plain
 from raytrace.stores import Lines, Unfit, anything, either, exactly, listed, mapped, number, record, text
 from raytrace.studies.codesign.settings import Settings

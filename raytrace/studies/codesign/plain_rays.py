@@ -11,14 +11,14 @@ from collections.abc import Collection, Mapping
 import torch
 from torch import Tensor
 
-from raytrace.camera.camera import Camera
-from raytrace.kernels import gaussian, rays
-from raytrace.kernels.pixels import gaussian_pixels
+from raytrace.imaging.camera import Camera
 from raytrace.maths import pupil
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide
-from raytrace.optics.scene import Scene, beam_share, scene, symmetry, trace_scene
+from raytrace.psf_models import gaussian, rays
+from raytrace.psf_models.pixels import gaussian_pixels
 from raytrace.studies.codesign.settings import Settings
+from raytrace.tracing.scene import Scene, beam_share, scene, symmetry, trace_scene
 
 _BLUR = 0.25  # of a ray of `drt`, half width in pixels: what makes it differentiable
 

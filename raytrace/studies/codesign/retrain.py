@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import scipy.stats
 
-from raytrace.camera.training import DamagedRun, Record, Run
 from raytrace.files import write_json
+from raytrace.imaging.training import DamagedRun, Record, Run
 from raytrace.stores import fields_of, read_document
 from raytrace.studies.codesign.experiment import Progress, camera, held_out_error, optimise, usual
 from raytrace.studies.codesign.settings import NAMES, Settings

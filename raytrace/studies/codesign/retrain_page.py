@@ -5,10 +5,10 @@ import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from raytrace.camera.training import Run, share
 from raytrace.cli.door import CommandError
 from raytrace.cli.run import present
 from raytrace.files import table
+from raytrace.imaging.training import Run, share
 from raytrace.maths.result import Result, plain
 from raytrace.pages import grid
 from raytrace.studies.codesign.experiment import usual

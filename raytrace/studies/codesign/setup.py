@@ -14,14 +14,12 @@ import torch
 from torch import Tensor, distributed
 from tqdm import tqdm
 
-from raytrace.camera.limits import Limits
-from raytrace.camera.network import PRESETS, RedNet, RedNetShape
-from raytrace.camera.training import NotFinite, Record, read_json
 from raytrace.cli.door import CommandError, catalogs, find_lens, open_lens, say
 from raytrace.cli.progress import progress
-from raytrace.formats import FORMATS
-from raytrace.optics.focus import NoImage
-from raytrace.optics.paraxial import paraxial_image_distance
+from raytrace.imaging.limits import Limits
+from raytrace.imaging.network import PRESETS, RedNet, RedNetShape
+from raytrace.imaging.training import NotFinite, Record, read_json
+from raytrace.io import FORMATS
 from raytrace.shards import share
 from raytrace.studies.codesign.closed_form import power_spectrum
 from raytrace.studies.codesign.experiment import STEPS, Outcome, camera, lens_at_start, outcome, run_model, variables
@@ -29,6 +27,8 @@ from raytrace.studies.codesign.settings import Settings
 from raytrace.studies.options import read
 from raytrace.studies.pictures import Pictures, dead_leaves, digest, pictures, resized, split
 from raytrace.system.lens import Lens, check, field_points
+from raytrace.tracing.focus import NoImage
+from raytrace.tracing.paraxial import paraxial_image_distance
 
 _LEAVES = 100  # pictures, where none are given
 _DISTANCES = 9  # at which a finished run is tested

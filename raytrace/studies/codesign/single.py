@@ -6,11 +6,11 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 
-from raytrace.camera.limits import Limits
 from raytrace.cli.door import CommandError, say
 from raytrace.cli.run import present
 from raytrace.files import write_json
-from raytrace.formats import FORMATS, read_lens, write_lens
+from raytrace.imaging.limits import Limits
+from raytrace.io import FORMATS, read_lens, write_lens
 from raytrace.maths.result import Result, plain
 from raytrace.shards import share
 from raytrace.studies.codesign.experiment import LENS, STEPS, Outcome

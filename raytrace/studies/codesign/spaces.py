@@ -9,12 +9,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from torch import Tensor
 
-from raytrace.optics.paraxial import first_order
 from raytrace.studies.codesign import optima
 from raytrace.studies.codesign.kept import Kept, found_once
 from raytrace.studies.codesign.optima import Optimum, closed_form
 from raytrace.studies.codesign.settings import GAUSSIAN, MODELS, Settings
 from raytrace.system.lens import Lens
+from raytrace.tracing.paraxial import first_order
 
 ALONE = "sensor only"
 

@@ -5,14 +5,13 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from raytrace.camera.training import Run, share
-from raytrace.camera.variables import parse_bounds
 from raytrace.cli.door import CommandError, say
 from raytrace.cli.progress import progress
 from raytrace.cli.run import present
 from raytrace.files import table
+from raytrace.imaging.training import Run, share
+from raytrace.imaging.variables import parse_bounds
 from raytrace.maths.result import Result, plain
-from raytrace.optics.paraxial import first_order
 from raytrace.pages import grid, shown
 from raytrace.studies.codesign.claims import percent
 from raytrace.studies.codesign.experiment import lens_at_start, variables
@@ -22,6 +21,7 @@ from raytrace.studies.codesign.setup import Experiment, experiment, lens_of_file
 from raytrace.studies.codesign.spaces import ALONE, FOUND, Row, best, columns, gains
 from raytrace.studies.codesign.spaces import spaces as spaces_all
 from raytrace.studies.publish import publish
+from raytrace.tracing.paraxial import first_order
 
 _PAGE = "codesign_air_spaces"
 #: Pages of the other forms, which have the tables of these names in codesign/.

@@ -15,18 +15,18 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from raytrace.camera.camera import Camera
-from raytrace.camera.image import blur
-from raytrace.camera.training import load_state, read_log, read_state
+from raytrace.imaging.camera import Camera
+from raytrace.imaging.image import blur
+from raytrace.imaging.training import load_state, read_log, read_state
 from raytrace.maths.pupil import gauss_rings
-from raytrace.optics.launch import launch
-from raytrace.optics.spot import spot_of
-from raytrace.optics.trace import trace_lens
 from raytrace.studies.codesign.experiment import STEPS, Batch, Outcome, batch, outcome
 from raytrace.studies.codesign.experiment import camera as camera_at_start
 from raytrace.studies.codesign.settings import AFTER_PARAXIAL, NAMES, Settings
 from raytrace.studies.pictures import Pictures
 from raytrace.system.lens import Lens, with_object_distance
+from raytrace.tracing.launch import launch
+from raytrace.tracing.spot import spot_of
+from raytrace.tracing.trace import trace_lens
 
 #: The paper's table: L1 after step 1, L1 with DRT PSFs after step 2, focus distance in m.
 PAPER = {"paraxial": (0.0415, 0.0504, 33.9), "fourier": (0.0408, 0.0509, 35.7), "gaussian": (0.0429, 0.0430, 27.3)}

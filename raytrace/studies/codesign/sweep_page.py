@@ -10,11 +10,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
-from raytrace.camera.training import Run, share
 from raytrace.cli.door import CommandError, say
 from raytrace.cli.progress import progress
 from raytrace.cli.run import present
 from raytrace.files import table
+from raytrace.imaging.training import Run, share
 from raytrace.maths.result import Result, plain
 from raytrace.pages import picture
 from raytrace.studies.codesign import optima

@@ -7,13 +7,13 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from raytrace.plot.style import FIELD_COLOURS, GREY, INK, array, new_figure, styled, wavelength_colours
+from raytrace.plotting.style import FIELD_COLOURS, GREY, INK, array, new_figure, styled, wavelength_colours
 from raytrace.studies.edof.scene import Deep
 from raytrace.studies.edof.table import ROWS, title_of
 from raytrace.studies.edof.world import Judged, Quality, World, depth_text
 from raytrace.studies.figures import picture as show
-from raytrace.wave.element import Element, height
-from raytrace.wave.psf import ElementPsf
+from raytrace.wave_optics.element import Element, height
+from raytrace.wave_optics.psf import ElementPsf
 
 _LEARNED = ("learned", "learned-16", "learned-smooth")
 #: Panels of the figure over noise, by filter.

@@ -13,17 +13,17 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from raytrace.camera.phase import PhaseVariables
-from raytrace.camera.training import Record, Run, Share, load_state, read_state, train
 from raytrace.files import write_atomically
+from raytrace.imaging.phase_variables import PhaseVariables
+from raytrace.imaging.training import Record, Run, Share, load_state, read_state, train
 from raytrace.maths.value import detached
 from raytrace.studies.edof.noise import best_strengths, mark_of_elements
 from raytrace.studies.edof.training import scheduled
 from raytrace.studies.edof.world import ClosedForm, World, expected_error, scene, transfer
 from raytrace.studies.pictures import draws
-from raytrace.wave.coarse import Coarse
-from raytrace.wave.designs import Aim, aim, baseline
-from raytrace.wave.element import Element, Pixels, Zernike, as_pixels, excess_index, features, path
+from raytrace.wave_optics.coarse import Coarse
+from raytrace.wave_optics.designs import Aim, aim, baseline
+from raytrace.wave_optics.element import Element, Pixels, Zernike, as_pixels, excess_index, features, path
 
 _CHANGE, _SMOOTH = 33, 34  # last numbers of the keys of random starts
 TERMS, SPREAD = 36, 0.5  # Noll's polynomials, piston and tilts left out, of a random start; µm RMS of each

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.camera.deconvolve import psnr
-from raytrace.camera.training import NotFinite, OtherSettings
 from raytrace.cli.door import CommandError
 from raytrace.cli.progress import progress
 from raytrace.files import table
+from raytrace.imaging.restoration import psnr
+from raytrace.imaging.training import NotFinite, OtherSettings
 from raytrace.maths.result import Result
 from raytrace.pages import grid, picture
 from raytrace.studies.edof.command import LIMIT
@@ -26,8 +26,8 @@ from raytrace.studies.edof.report import contents_of
 from raytrace.studies.edof.world import FILTERS, WAVELENGTH, ClosedForm, World, depth_text, periodic, spectrum
 from raytrace.studies.options import picture_words
 from raytrace.studies.publish import publish, published
-from raytrace.wave.element import Element, Rings, as_pixels
-from raytrace.wave.element_file import read_element
+from raytrace.wave_optics.element import Element, Rings, as_pixels
+from raytrace.wave_optics.element_files import read_element
 
 _SHOWN = 500  # pixels of a drawn map along each side
 _LENS = 4  # even powers of r, from a constant on, that are taken out of drawn heights

@@ -11,9 +11,9 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from raytrace.camera.deconvolve import blind_filter
-from raytrace.camera.network import RedNet, RedNetShape
-from raytrace.camera.training import Record, Run, Share, train
+from raytrace.imaging.network import RedNet, RedNetShape
+from raytrace.imaging.restoration import blind_filter
+from raytrace.imaging.training import Record, Run, Share, train
 from raytrace.studies.edof.training import scheduled
 from raytrace.studies.edof.world import restored
 from raytrace.studies.pictures import draws

@@ -8,10 +8,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from raytrace.camera.training import read_json
 from raytrace.cli.door import CommandError
 from raytrace.cli.progress import progress
 from raytrace.files import table, write_json
+from raytrace.imaging.training import read_json
 from raytrace.maths.result import Result
 from raytrace.pages import grid
 from raytrace.studies.edof.command import LIMIT
@@ -25,7 +25,7 @@ from raytrace.studies.edof.world import World, kernels, spectrum, transfer
 from raytrace.studies.options import picture_words
 from raytrace.studies.pictures import digest, pictures_of
 from raytrace.studies.publish import publish
-from raytrace.wave.element import Element
+from raytrace.wave_optics.element import Element
 
 _TRAINED, _RESTORED = 100, 24  # pictures
 

@@ -20,13 +20,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.camera.deconvolve import blind_error, blind_filter, psnr, wiener
+from raytrace.imaging.restoration import blind_error, blind_filter, psnr, wiener
 from raytrace.studies.edof.settings import Settings
 from raytrace.studies.edof.table import ROWS, STRENGTHS
 from raytrace.studies.edof.world import World, best_gamma, errors_of_pictures, kernels, power, transfer
 from raytrace.studies.pictures import draws
-from raytrace.wave.designs import aim, baseline
-from raytrace.wave.element import Element
+from raytrace.wave_optics.designs import aim, baseline
+from raytrace.wave_optics.element import Element
 
 _STEPS_OF_SMOOTH = 60
 _DRAWS = 2000  # of the pictures

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.camera.training import DamagedRun, Run
 from raytrace.cli.door import CommandError
 from raytrace.cli.progress import progress
 from raytrace.files import table, write_atomically, write_json
+from raytrace.imaging.training import DamagedRun, Run
 from raytrace.maths.result import Result
 from raytrace.maths.value import detached
 from raytrace.pages import grid, picture
@@ -43,8 +43,8 @@ from raytrace.studies.edof.world import FILTERS, WAVELENGTH, ClosedForm, World, 
 from raytrace.studies.options import picture_words
 from raytrace.studies.pictures import Pictures
 from raytrace.studies.publish import publish, published
-from raytrace.wave.element import Element, Rings, fabricated, is_flat
-from raytrace.wave.element_file import SMOOTH, read_element, write_element
+from raytrace.wave_optics.element import Element, Rings, fabricated, is_flat
+from raytrace.wave_optics.element_files import SMOOTH, read_element, write_element
 from raytrace.words import did_you_mean
 
 #: What intervals of all pages of these studies are.

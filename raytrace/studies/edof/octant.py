@@ -13,13 +13,13 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace.camera.deconvolve import blind_density
-from raytrace.camera.image import transfer_functions
-from raytrace.kernels.radial import radii_of_waves, reach, unfold
+from raytrace.imaging.image import transfer_functions
+from raytrace.imaging.restoration import blind_density
 from raytrace.maths.grid import grid
-from raytrace.wave import radial
-from raytrace.wave.plan import Plan
-from raytrace.wave.scene import WaveScene, spheres
+from raytrace.psf_models.radial import radii_of_waves, reach, unfold
+from raytrace.wave_optics import propagation as radial
+from raytrace.wave_optics.plan import Plan
+from raytrace.wave_optics.scene import WaveScene, spheres
 
 _CHUNK = 32  # radii whose pixels are held at once
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import torch
 
-from raytrace.camera.training import NotFinite, OtherSettings
 from raytrace.cli.door import CommandError, say
 from raytrace.cli.progress import progress
 from raytrace.files import table as csv
 from raytrace.files import write_json
+from raytrace.imaging.training import NotFinite, OtherSettings
 from raytrace.maths.result import Result, called, plain
 from raytrace.pages import grid, picture
 from raytrace.studies.edof.command import LIMIT
@@ -34,8 +34,8 @@ from raytrace.studies.edof.world import (
 from raytrace.studies.options import picture_words
 from raytrace.studies.pictures import Pictures, dead_leaves, digest, pictures, pictures_of, split
 from raytrace.studies.publish import publish
-from raytrace.wave.element import Element, as_pixels, fabricated, height_range
-from raytrace.wave.element_file import write_element
+from raytrace.wave_optics.element import Element, as_pixels, fabricated, height_range
+from raytrace.wave_optics.element_files import write_element
 from raytrace.words import did_you_mean
 
 _WIDE = 512  # pixels of a period that is restored

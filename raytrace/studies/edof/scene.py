@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.camera.deconvolve import blind_filter, psnr, restore
-from raytrace.camera.image import blur_layers, depth_masks
+from raytrace.imaging.image import blur_layers, depth_masks
+from raytrace.imaging.restoration import blind_filter, psnr, restore
 from raytrace.studies.edof.world import World, depth_text, kernels, mirrored, spectrum, transfer
 from raytrace.studies.pictures import dead_leaves, draws
-from raytrace.wave.element import Element
+from raytrace.wave_optics.element import Element
 
 _KEY = 99  # of what is drawn
 _LAYERS = 9  # of a deep scene, even in dioptres

@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from torch import Tensor
 
 from raytrace.studies.edof.world import Quality, World, expected_error, kernels, quality, transfer
-from raytrace.wave.designs import Aim, aim, baseline
-from raytrace.wave.element import Element
+from raytrace.wave_optics.designs import Aim, aim, baseline
+from raytrace.wave_optics.element import Element
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,21 +16,21 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from raytrace.camera.deconvolve import blind_filter, towards_measurement
-from raytrace.camera.network import RedNet, RedNetShape
-from raytrace.camera.phase import PhaseVariables
-from raytrace.camera.training import DamagedRun, Record, Run, Share, read_state, train
 from raytrace.files import write_atomically
+from raytrace.imaging.network import RedNet, RedNetShape
+from raytrace.imaging.phase_variables import PhaseVariables
+from raytrace.imaging.restoration import blind_filter, towards_measurement
+from raytrace.imaging.training import DamagedRun, Record, Run, Share, read_state, train
+from raytrace.materials.catalogs import find_glass
+from raytrace.materials.glass import index
 from raytrace.maths.value import detached
-from raytrace.media.catalog import find_glass
-from raytrace.media.glass import index
 from raytrace.studies.edof.settings import Settings
 from raytrace.studies.edof.world import ClosedForm, World, best_of_starts, mirrored, restored, scene, transfer
 from raytrace.studies.pictures import Pictures, crop, draws
-from raytrace.wave.designs import aim, converging
-from raytrace.wave.element import Element, EvenPowers, Rings, Zernike, as_rings
-from raytrace.wave.etching import Process, matched
-from raytrace.wave.psf import psf
+from raytrace.wave_optics.designs import aim, converging
+from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike, as_rings
+from raytrace.wave_optics.etching import Process, matched
+from raytrace.wave_optics.psf import psf
 
 _NETWORK = RedNetShape(6, 16)  # behind the blind filter, the same for every colour
 _NETWORK_RATE = 1e-3

@@ -16,18 +16,18 @@ import scipy.optimize
 import torch
 from torch import Tensor, nn
 
-from raytrace.camera.deconvolve import blind_error, blind_filter, power_spectrum, psnr, wiener
-from raytrace.camera.image import transfer_functions
+from raytrace.imaging.image import transfer_functions
+from raytrace.imaging.restoration import blind_error, blind_filter, power_spectrum, psnr, wiener
 from raytrace.maths.grid import grid
 from raytrace.maths.result import Result
-from raytrace.optics.reuse import Memo
 from raytrace.studies.descent import NoOptimum, minimise
 from raytrace.studies.edof.octant import Octant, fits
 from raytrace.studies.pictures import Pictures, draws
-from raytrace.wave.element import Element, Rings
-from raytrace.wave.plan import plan
-from raytrace.wave.psf import ElementPsf, psf
-from raytrace.wave.scene import WaveScene, is_round
+from raytrace.tracing.memo import Memo
+from raytrace.wave_optics.element import Element, Rings
+from raytrace.wave_optics.plan import plan
+from raytrace.wave_optics.psf import ElementPsf, psf
+from raytrace.wave_optics.scene import WaveScene, is_round
 
 FILTERS = ("wiener", "blind")  # of restoration
 WAVELENGTH = 0.55  # µm: that elements are designed for, and wrapped at

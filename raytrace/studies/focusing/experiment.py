@@ -15,24 +15,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.camera.image import blur, visible
-from raytrace.camera.phase import PhaseVariables
-from raytrace.kernels.dft import phasor
+from raytrace.imaging.image import blur, visible
+from raytrace.imaging.phase_variables import PhaseVariables
+from raytrace.materials.catalogs import find_glass
+from raytrace.materials.glass import index
 from raytrace.maths.grid import grid
 from raytrace.maths.result import Result
-from raytrace.media.catalog import find_glass
-from raytrace.media.glass import index
-from raytrace.optics.reuse import Memo
+from raytrace.psf_models.dft import phasor
 from raytrace.studies.options import Settings
 from raytrace.studies.pictures import Pictures, crop, dead_leaves
-from raytrace.wave.designs import Aim, aim, ideal
-from raytrace.wave.element import Element, Pixels, height
-from raytrace.wave.element_file import write_element
-from raytrace.wave.plan import Plan
-from raytrace.wave.plan import plan as plan_of
-from raytrace.wave.psf import psf
-from raytrace.wave.pupil import disc_cells
-from raytrace.wave.scene import WaveScene, millimetres, residual
+from raytrace.tracing.memo import Memo
+from raytrace.wave_optics.designs import Aim, aim, ideal
+from raytrace.wave_optics.element import Element, Pixels, height
+from raytrace.wave_optics.element_files import write_element
+from raytrace.wave_optics.plan import Plan
+from raytrace.wave_optics.plan import plan as plan_of
+from raytrace.wave_optics.psf import psf
+from raytrace.wave_optics.pupil import disc_cells
+from raytrace.wave_optics.scene import WaveScene, millimetres, residual
 
 #: Rates of learning by method, on the phase in radians.
 RATES = {"sgd": 2e4, "adam": 0.3}

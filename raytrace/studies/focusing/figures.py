@@ -6,8 +6,8 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from raytrace.plot.style import GREY, array, field_colour, new_figure, number_text, styled
-from raytrace.plot.wave import framed
+from raytrace.plotting.style import GREY, array, field_colour, new_figure, number_text, styled
+from raytrace.plotting.wave import framed
 from raytrace.studies.focusing.experiment import Learned
 
 

@@ -17,9 +17,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from raytrace.camera.deconvolve import blind_filter, errors, psnr
-from raytrace.camera.phase import PhaseVariables
-from raytrace.camera.training import DamagedRun, load_state, read_json
+from raytrace.imaging.phase_variables import PhaseVariables
+from raytrace.imaging.restoration import blind_filter, errors, psnr
+from raytrace.imaging.training import DamagedRun, load_state, read_json
 from raytrace.maths.value import detached
 from raytrace.studies import options
 from raytrace.studies.edof.settings import Settings
@@ -27,8 +27,8 @@ from raytrace.studies.edof.training import adam, begin
 from raytrace.studies.edof.world import WAVELENGTH, ClosedForm, World, expected_error, scene, spectrum, transfer
 from raytrace.studies.edof.world import kernels as kernels_of
 from raytrace.studies.pictures import draws
-from raytrace.wave.element import Element, Pixels, Rings, period, with_tolerance, wrapped
-from raytrace.wave.scene import residual
+from raytrace.wave_optics.element import Element, Pixels, Rings, period, with_tolerance, wrapped
+from raytrace.wave_optics.scene import residual
 
 _POINTS = 400_000  # over the aperture, of equal area
 _DRAW = 24  # last number of the key of a draw of errors

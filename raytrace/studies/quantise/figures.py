@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator
 
-from raytrace.plot.style import FAINT, FIELD_COLOURS, GREY, INK, new_figure, styled
+from raytrace.plotting.style import FAINT, FIELD_COLOURS, GREY, INK, new_figure, styled
 from raytrace.studies.quantise.experiment import WAYS, Steps, Tolerance
 from raytrace.studies.quantise.report import Etched, Fabrication
 

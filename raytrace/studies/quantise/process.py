@@ -1,7 +1,8 @@
 """An element one can make: rings learned under the process that etches them, for extended depth of field.
 
 An element learned in whole heights is the model: the depths nearest to its phases in all colours are the start
-(`wave.etching`), and what the process does is in the loop: heights modulo its relief, errors of height drawn anew at
+(`wave_optics.etching`), and what the process does is in the loop: heights modulo its relief, errors of height drawn
+anew at
 every step. Steps of height are no gradient's matter: after the nearest level a few rings at a time move by one level
 where the gradient says that the error falls, and stay where it does.
 """
@@ -13,14 +14,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from raytrace.camera.phase import PhaseVariables
+from raytrace.imaging.phase_variables import PhaseVariables
 from raytrace.maths.value import detached
 from raytrace.studies.edof.noise import Unit
 from raytrace.studies.edof.training import adam
 from raytrace.studies.edof.world import ClosedForm
 from raytrace.studies.pictures import draws
-from raytrace.wave.element import Element, fabricated, with_tolerance
-from raytrace.wave.etching import Process, matched
+from raytrace.wave_optics.element import Element, fabricated, with_tolerance
+from raytrace.wave_optics.etching import Process, matched
 
 _DRAW, _MOVE = 26, 27  # last numbers of the keys of errors of height, of rings that may move
 _FIRST, _MOST = 0.05, 0.2  # of the rings: how many move at once

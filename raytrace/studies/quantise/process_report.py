@@ -7,10 +7,10 @@ from pathlib import Path
 
 import torch
 
-from raytrace.camera.deconvolve import psnr
-from raytrace.camera.training import Run
 from raytrace.cli.progress import progress
 from raytrace.files import table
+from raytrace.imaging.restoration import psnr
+from raytrace.imaging.training import Run
 from raytrace.maths.result import Result
 from raytrace.maths.value import detached
 from raytrace.pages import grid, picture
@@ -32,10 +32,10 @@ from raytrace.studies.pictures import Pictures, digest
 from raytrace.studies.publish import publish
 from raytrace.studies.quantise.process import Case, cases, etch_rings, under_errors
 from raytrace.studies.quantise.process_command import Settings
-from raytrace.wave.designs import aim, baseline
-from raytrace.wave.element import Element
-from raytrace.wave.element_file import read_element, write_element
-from raytrace.wave.etching import Process, relief
+from raytrace.wave_optics.designs import aim, baseline
+from raytrace.wave_optics.element import Element
+from raytrace.wave_optics.element_files import read_element, write_element
+from raytrace.wave_optics.etching import Process, relief
 
 BASES = {"fresnel": "Fresnel lens", "hybrid": "hybrid achromat"}
 

@@ -33,10 +33,10 @@ from raytrace.studies.quantise.experiment import (
     steps_of,
     tolerances_of,
 )
-from raytrace.wave.designs import aim, baseline, singlet
-from raytrace.wave.element import Element
-from raytrace.wave.element_file import read_element
-from raytrace.wave.exchange import FORMATS
+from raytrace.wave_optics.designs import aim, baseline, singlet
+from raytrace.wave_optics.element import Element
+from raytrace.wave_optics.element_files import read_element
+from raytrace.wave_optics.exchange import FORMATS
 from raytrace.words import did_you_mean
 
 _NAMED = ("fresnel", "learned")  # elements that are no files

@@ -9,9 +9,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from raytrace.camera.training import Run, read_state
 from raytrace.cli.progress import progress
 from raytrace.files import table, write_atomically
+from raytrace.imaging.training import Run, read_state
 from raytrace.maths.result import Result
 from raytrace.pages import grid, picture
 from raytrace.studies.edof.noise import Gains, drawn
@@ -19,16 +19,7 @@ from raytrace.studies.edof.world import World, periodic, spectrum
 from raytrace.studies.options import picture_words
 from raytrace.studies.pictures import Pictures, dead_leaves, digest, pictures, pictures_of, split
 from raytrace.studies.publish import publish
-from raytrace.studies.superres.discover import (
-    SIDE,
-    Error,
-    Found,
-    Place,
-    discover,
-    errors_of_scenes,
-    moments,
-    starts,
-)
+from raytrace.studies.superres.discover import SIDE, Error, Found, Place, discover, errors_of_scenes, moments, starts
 from raytrace.studies.superres.discover_command import LIMIT, Settings
 from raytrace.studies.superres.experiment import world_of
 

@@ -19,12 +19,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.camera.deconvolve import mean_square_error, psnr
-from raytrace.camera.phase import PhaseVariables
+from raytrace.imaging.phase_variables import PhaseVariables
+from raytrace.imaging.restoration import mean_square_error, psnr
+from raytrace.materials.catalogs import find_glass
+from raytrace.materials.glass import index
 from raytrace.maths.value import detached
-from raytrace.media.catalog import find_glass
-from raytrace.media.glass import index
-from raytrace.optics.reuse import Memo
 from raytrace.studies.descent import minimise
 from raytrace.studies.edof.world import WAVELENGTH, World, scene, spectrum
 from raytrace.studies.pictures import Pictures, draws
@@ -38,10 +37,11 @@ from raytrace.studies.superres.inversion import (
     joint_superresolve,
     superresolve,
 )
-from raytrace.wave.designs import aim, baseline
-from raytrace.wave.element import Element, Pixels, Zernike
-from raytrace.wave.plan import plan
-from raytrace.wave.psf import psf
+from raytrace.tracing.memo import Memo
+from raytrace.wave_optics.designs import aim, baseline
+from raytrace.wave_optics.element import Element, Pixels, Zernike
+from raytrace.wave_optics.plan import plan
+from raytrace.wave_optics.psf import psf
 
 #: Pixels of the picture along a small scene, of its dark border, and of the window of one place.
 FIELD, BORDER, TILE = 96, 16, 47

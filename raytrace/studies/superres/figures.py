@@ -5,7 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from raytrace.plot.style import array, new_figure, styled
+from raytrace.plotting.style import array, new_figure, styled
 from raytrace.studies.figures import picture
 from raytrace.studies.superres.discover_report import Discovered
 from raytrace.studies.superres.report import Superresolution

@@ -27,7 +27,7 @@ import math
 import torch
 from torch import Tensor
 
-from raytrace.camera.image import EXTENSIONS, blur, extend, transfer_functions
+from raytrace.imaging.image import EXTENSIONS, blur, extend, transfer_functions
 from raytrace.maths.numerics import safe_divide
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from torch import Tensor
 
-from raytrace.camera.deconvolve import psnr
 from raytrace.cli.progress import progress
 from raytrace.files import table
+from raytrace.imaging.restoration import psnr
 from raytrace.maths.result import Result
 from raytrace.pages import grid
 from raytrace.studies.edof.world import World, periodic, spectrum

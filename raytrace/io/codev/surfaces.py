@@ -1,0 +1,302 @@
+"""A surface of a CODE V sequence as a `Surface`: shape, medium and apertures.
+
+Diffractive surfaces of a CODE V sequence: round ones (DIF DOE, HCT R), read and written.
+
+    p = HOR λ/HWL Σ_j C_j r^2j
+
+HCO Cj tells C_j in units of length, HWL the wavelength of the construction in nm, HOR the order. A `RadialPhase` has
+coefficients in radians at a radius of its own, A_j = 2π C_j radius^2j/HWL, which are rounded once, and come back.
+"""
+
+import math
+from decimal import Decimal, localcontext
+from fractions import Fraction
+
+from torch import Tensor
+
+from raytrace.io.codev.glass import Shelf, medium
+from raytrace.io.codev.keywords import APERTURES, LEFT_HANDED, LETTERS, OWN, POSE_WORDS, RING, unquoted
+from raytrace.io.report import Draft
+from raytrace.io.source import LensFileError, Place, UnsupportedSurface, shown
+from raytrace.io.spelling import double, exact, exact_list, is_infinite, number
+from raytrace.io.zemax.keywords import Block, Record
+from raytrace.materials.glass import AIR, MIRROR, Glass
+from raytrace.system.apertures import SHAPES, Aperture
+from raytrace.system.phases import RadialPhase
+from raytrace.system.poses import Pose, undone
+from raytrace.system.surface import Surface
+
+#: More coefficients than any diffractive surface has.
+_MOST = 50
+
+#: Digits of a written coefficient, such that it comes back through two roundings.
+_DIGITS = 40
+
+_NANOMETRE = Fraction(1, 10**6)  # mm
+
+
+def phase(block: Block, radius: float, unit: float) -> RadialPhase | None:
+    """The phase of a surface, None if it is not diffractive; radius: mm, of its coefficients."""
+    record = block.last("DIF")
+    if record is None:
+        return None
+    kind, type_, wave = record.words[:1], block.last("HCT"), block.last("HWL")
+    if [word.upper() for word in kind] != ["DOE"]:
+        raise UnsupportedSurface(f"DIF {' '.join(kind)[:40]} (diffractive surface) is not modelled", record.place)
+    if not type_ or [word.upper() for word in type_.words] != ["R"]:
+        found = f"HCT {' '.join(type_.words)[:40]}" if type_ else "DIF DOE without HCT"
+        raise UnsupportedSurface(f"{found} is not modelled; modelled is HCT R, powers of r²", record.place)
+    if wave is None or wave.number(0, "wavelength") <= 0:
+        raise LensFileError("DIF DOE without the wavelength of its construction (HWL)", record.place)
+    length = _fraction(wave.words[0]) * _NANOMETRE
+    terms = _terms(block)
+    coefficients = [_radians(terms.get(j), j, length, radius, unit) for j in range(1, max(terms, default=0) + 1)]
+    order = block.last("HOR")
+    return RadialPhase(double(coefficients), double(radius), double(order.number(0, "order") if order else 1.0))
+
+
+def _fraction(word: str) -> Fraction:
+    return Fraction(word.upper().replace("D", "E"))
+
+
+def _terms(block: Block) -> dict[int, Record]:
+    terms = {}
+    for record in block.all("HCO"):
+        word = record.words[0].upper() if record.words else ""
+        j = int(word[1:]) if word[:1] == "C" and word[1:].isdigit() and len(word) < 6 else 0
+        if not 1 <= j <= _MOST:
+            raise LensFileError(f"HCO {word[:20]}, expected C1 to C{_MOST} and a number", record.place)
+        record.number(1, f"coefficient C{j}")
+        terms[j] = record
+    return terms
+
+
+def _radians(record: Record | None, j: int, length: Fraction, radius: float, unit: float) -> float:
+    if record is None:
+        return 0.0
+    written = _fraction(record.words[1]) / Fraction(unit) ** (2 * j - 1)
+    found = Fraction(2 * math.pi) * written * Fraction(radius) ** (2 * j) / length
+    try:
+        return float(found) + 0.0
+    except OverflowError as error:
+        raise LensFileError(f"HCO C{j} is too large", record.place) from error
+
+
+def lines(phase: RadialPhase, wavelength: float, place: Place) -> list[str]:
+    """The commands of a phase; wavelength: µm, that of its construction."""
+    length = Fraction(repr(wavelength)) * 1000 * _NANOMETRE
+    radius = exact(phase.radius, "radius of the phase", place)
+    if not float(radius) > 0:
+        raise LensFileError(f"the radius of the phase is {radius}, expected one above 0", place)
+    terms = exact_list(phase.coefficients, "coefficients of the phase", place)
+    if len(terms) > _MOST:
+        raise LensFileError(f"{len(terms)} coefficients of the phase, a .seq file has at most {_MOST}", place)
+    return [
+        "  DIF DOE",
+        f"  HOR {exact(phase.order, 'order', place)}",
+        f"  HWL {Decimal(repr(wavelength)).scaleb(3).normalize():f}; HCT R",
+        *(f"  HCO C{j} {_length(float(term), j, length, float(radius))}" for j, term in enumerate(terms, 1)),
+        f"  {OWN.lower()} radius {radius}" if float(radius) != 1 else "",
+    ]
+
+
+def _length(term: float, j: int, length: Fraction, radius: float) -> str:
+    """C_j with more digits than a number has, where it needs them."""
+    found = Fraction(term) * length / (Fraction(2 * math.pi) * Fraction(radius) ** (2 * j))
+    with localcontext(prec=_DIGITS):
+        return str(Decimal(found.numerator) / Decimal(found.denominator))
+
+
+#: An object at this distance or further away, in the unit of the file, is at infinity.
+INFINITY = 1e10
+
+#: What a command of an aperture may be of: the clear part, what is obscured, the edge of the part, a hole in it.
+_KINDS = ("CLR", "OBS", "EDG", "HOL")
+
+
+def build(block: Block, unit: float, before: Glass, *, own: dict[str, Record], shelf: Shelf, report: Draft) -> Surface:
+    """The surface of a block, its lengths in units of `unit` mm; before: the medium before it.
+
+    own: what our comments say of it: BREAK makes a coordinate break of a dummy surface, RADIUS tells that of its phase.
+    shelf: where its glass stands. Raises UnknownGlass as `find_glass` does.
+    """
+    apertures, semi_diameter = _apertures(block, unit, report)
+    label, (ahead, behind) = block.last("SLB"), _poses(block, unit)
+    glass, is_break = _medium(block, before, shelf, report), "BREAK" in own
+    radius = number((own["RADIUS"].text or "?").strip(), "radius", own["RADIUS"].place) if "RADIUS" in own else 1.0
+    if is_break and ahead is None and behind is not None:
+        ahead, behind = behind, None
+    return Surface(
+        thickness=_thickness(block, unit),
+        curvature=_curvature(block, unit),
+        conic=_conic(block),
+        coefficients=_coefficients(block, unit),
+        phase=phase(block, radius, unit),
+        before=ahead,
+        after=behind,
+        is_break=is_break,
+        glass=AIR if is_break else glass,
+        semi_diameter=semi_diameter,
+        apertures=apertures,
+        comment=unquoted(label.words[0]).strip() if label and label.words else "",
+    )
+
+
+def _thickness(block: Block, unit: float) -> Tensor:
+    record = block.last("THI")
+    if record is None:
+        raise LensFileError("surface without a thickness; S is followed by radius, thickness, glass", block.place)
+    word = record.words[0] if record.words else ""
+    is_object = block.place.surface == 0
+    found = float("inf") if is_object and is_infinite(word) else number(word, "thickness", record.place)
+    if is_object and found <= -INFINITY:
+        raise LensFileError(
+            f"thickness is {shown(word)}, expected a distance or {INFINITY:g} for infinity", record.place
+        )
+    return double(float("inf") if is_object and found >= INFINITY else found * unit)
+
+
+def _curvature(block: Block, unit: float) -> Tensor | None:
+    """Of RDY, a radius, or CUY; 0 is a plane in both."""
+    record = block.last("CUY")
+    found = record.number(0, "radius or curvature") if record else 0.0
+    if not found:
+        return None
+    curvature = found / unit if record.keyword == "CUY" else 1.0 / (found * unit)
+    return double(curvature) if curvature else None
+
+
+def _type(block: Block) -> str:
+    record = block.last("TYPE")
+    return record.keyword if record else "SPH"
+
+
+def _conic(block: Block) -> Tensor | None:
+    record, flat = block.last("K"), block.last("CUF")
+    if flat and flat.number(0, "CUF", 0.0):
+        raise UnsupportedSurface(f"CUF {flat.words[0][:40]} (fraction of a curvature) is not modelled", flat.place)
+    found = record.number(0, "conic constant") if record else 0.0
+    if found and _type(block) == "SPH":
+        raise LensFileError("K on a sphere; put CON or ASP before it", record.place)
+    return double(found) if found else None
+
+
+def _coefficients(block: Block, unit: float) -> Tensor | None:
+    """a_j of r^(2j): A is a_2; those up to the last letter that is there."""
+    given = [letter for letter in LETTERS if block.last(letter)]
+    records = [block.last(letter) for letter in LETTERS]
+    if _type(block) != "ASP":
+        for record in filter(None, records):
+            if record.number(0, "coefficient"):
+                message = f"{record.keyword} on a surface that is no asphere; put ASP before it"
+                raise LensFileError(message, record.place)
+        return None
+    count = LETTERS.index(given[-1]) + 1 if given else 0
+    found = [record.number(0, "coefficient") if record else 0.0 for record in records[:count]]
+    return double([0.0, *(value / unit ** (2 * j - 1) for j, value in enumerate(found, 2))])
+
+
+def _medium(block: Block, before: Glass, shelf: Shelf, report: Draft) -> Glass:
+    mode, glass = block.last("RMD"), block.last("GLA")
+    word = unquoted(mode.words[0]).upper() if mode and mode.words else "REFR"
+    if word not in ("REFL", "REFR"):
+        raise UnsupportedSurface(f"RMD {word[:40]} is not modelled; modelled are REFL and REFR", mode.place)
+    place = glass.place if glass else block.place
+    given = glass.words[0] if glass and glass.words else ""
+    found = medium(given, shelf, place=place, report=report)
+    if word == "REFR":
+        return found
+    if block.place.surface == 0:
+        raise LensFileError("the object is a mirror (REFL)", mode.place)
+    if given and found.name != before.name:
+        message = f"a mirror followed by {shown(given)}, while light stays in {before.name or 'air'}"
+        raise LensFileError(f"{message}; leave out the glass behind REFL", place)
+    return MIRROR
+
+
+# -- how it stands ----------------------------------------------------------------------------------------------------
+
+
+def _poses(block: Block, unit: float) -> tuple[Pose | None, Pose | None]:
+    """The pose of a surface and the one behind it, by the decentres, the tilts and what they are for."""
+    type_ = block.last("POSE")
+    what, pose = type_.keyword if type_ else "", _pose(block, unit)
+    if pose is None or not what:
+        return pose, None
+    if what == "DAR":
+        return pose, undone(pose)
+    if what == "REV":
+        return None, undone(pose)
+    tilts = {name: getattr(pose, name) for name in POSE_WORDS if name.startswith("tilt")}
+    if sum(tilt is not None for tilt in tilts.values()) > 1:
+        message = "BEN with tilts about several axes, to which CODE V adds one of its own, is not modelled"
+        raise UnsupportedSurface(f"{message}; put the mirror between two dummy surfaces", type_.place)
+    return pose, Pose(**tilts) if any(tilt is not None for tilt in tilts.values()) else None
+
+
+def _pose(block: Block, unit: float) -> Pose | None:
+    numbers = {}
+    for name, word in POSE_WORDS.items():
+        record = block.last(word)
+        found = record.number(0, "decentre or tilt") if record else 0.0
+        if found:
+            sign = -1.0 if word in LEFT_HANDED else 1.0
+            numbers[name] = double(sign * found * (1.0 if name.startswith("tilt") else unit))
+    return Pose(**numbers) if numbers else None
+
+
+# -- apertures --------------------------------------------------------------------------------------------------------
+
+
+def _apertures(block: Block, unit: float, report: Draft) -> tuple[tuple[Aperture, ...], float | None]:
+    """What clips, and the semi-diameter of the part, from CIR EDG."""
+    groups: dict[tuple[str, str], dict[str, Record]] = {}
+    for record in block.all("APERTURE"):
+        words, kind, label = list(record.words), "CLR", ""
+        while words and (words[0].upper() in _KINDS or words[0][:2] in ("L'", 'L"', "l'", 'l"')):
+            word = words.pop(0)
+            kind, label = (word.upper(), label) if word.upper() in _KINDS else (kind, word[1:].upper())
+        groups.setdefault((kind, label), {})[record.keyword] = record._replace(words=tuple(words))
+    found, semi_diameter = [], None
+    for (kind, label), sizes in groups.items():
+        if kind == "EDG":
+            semi_diameter = sizes["CIR"].number(0, "edge of the part") * unit if "CIR" in sizes else semi_diameter
+        elif kind == "HOL":
+            first = next(iter(sizes.values()))
+            report.warn("a hole in the part (HOL) is left out: no ray is clipped by it", first.place)
+        else:
+            found.append(_aperture(sizes, kind == "OBS", unit))
+            if label.strip("'\"") == RING and len(found) > 1:
+                found[-2:] = _ring(*found[-2:])
+    clear = [aperture for aperture in found if not aperture.obscures]
+    if len(clear) > 1:
+        message = f"{len(clear)} clear apertures on one surface; whether light passes any or all of them is not settled"
+        raise LensFileError(message, block.all("APERTURE")[0].place)
+    if semi_diameter is not None and semi_diameter < 0:
+        raise LensFileError("CIR EDG is negative, expected a semi-diameter of 0 or more", block.place)
+    return tuple(found), semi_diameter
+
+
+def _ring(outer: Aperture, inner: Aperture) -> list[Aperture]:
+    """A clear circle and what is obscured within it as one aperture, if they are about the same centre."""
+    if outer.shape != inner.shape or outer.shape != "circular" or outer.obscures or outer.centre != inner.centre:
+        return [outer, inner]
+    return [Aperture("circular", (inner.extent[1], outer.extent[1]), False, outer.centre)]
+
+
+def _aperture(sizes: dict[str, Record], obscures: bool, unit: float) -> Aperture:
+    place = next(iter(sizes.values())).place
+    shapes = [shape for shape, words in APERTURES.items() if any(word in sizes for word in words)]
+    if len(shapes) != 1:
+        raise LensFileError(f"an aperture of {len(shapes)} shapes ({', '.join(sizes)}), expected one", place)
+    words = APERTURES[shapes[0]]
+    if any(word not in sizes for word in words):
+        raise LensFileError(f"a {shapes[0]} aperture without {' and '.join(w for w in words if w not in sizes)}", place)
+    if "ARO" in sizes and sizes["ARO"].number(0, "rotation"):
+        raise LensFileError("a rotated aperture (ARO), which is not modelled", sizes["ARO"].place)
+    extent = tuple(sizes[word].number(0, "size of the aperture") * unit for word in words)
+    extent = (0.0, *extent) if shapes[0] == "circular" else extent
+    if SHAPES[shapes[0]].objection(extent):
+        raise LensFileError(f"{words[0]} {SHAPES[shapes[0]].objection(extent)}", place)
+    x, y = (sizes[word].number(0, "decentre") * unit if word in sizes else 0.0 for word in ("ADX", "ADY"))
+    return Aperture(shapes[0], extent, obscures, (x, y))

@@ -1,0 +1,473 @@
+"""One call for every PSF model, driven by a tolerance instead of a number of rays.
+
+Sharing: kernels of a scene computed by several processes, a block of object distances × fields × wavelengths each.
+
+Each model decides some things for its whole scene: how many rays, how fine a cell, whether anything is clipped. It asks
+`Scene.largest` for them, which holds for all blocks here, so that the kernels are those of one process to rounding.
+
+Streaming: kernels of any number of plain rays within a memory budget; see raytrace/tracing/streaming.py.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+import torch
+from torch import Tensor
+from torch.utils import _pytree as pytree
+
+from raytrace.budget import within
+from raytrace.maths import pupil
+from raytrace.maths.grid import Grid
+from raytrace.maths.grid import grid as make_grid
+from raytrace.maths.numerics import safe_divide
+from raytrace.maths.pupil import gauss_rings
+from raytrace.psf_models import gaussian
+from raytrace.psf_models.convergence import between, by_order, by_rays, by_tolerance, climb
+from raytrace.psf_models.models import MODELS, RUNGS, Model
+from raytrace.psf_models.paraxial import has_one_focus
+from raytrace.psf_models.rays import deposit
+from raytrace.psf_models.result import EmptyPsf, Kernels, Psf, combined, mixture, polychromatic, without_dark
+from raytrace.shards import Share, agreeing, gathered, total
+from raytrace.system.lens import Lens, field_points, with_object_distance
+from raytrace.tracing.memo import Memo
+from raytrace.tracing.ray_failures import beam_hint, losses, warn_of_losses
+from raytrace.tracing.scene import Scene, beam_share, chief_landing, scene, symmetry
+from raytrace.tracing.stop_filling import warn_of_filling
+from raytrace.tracing.streaming import (
+    MAX_BYTES,
+    Moments,
+    Progress,
+    chunk_size,
+    hits,
+    merge,
+    moments,
+    nothing,
+    pupil_chunks,
+    shots_of,
+    stacked,
+)
+
+
+def shared_model(model: Model, share: Share) -> Model:
+    """The model, computed together by processes that all call it alike and all get the kernels, without gradient.
+
+    Each process computes some of the kernels, and whole fields of a model that decides `by_field`; or some of the rays
+    where they are plain. A single kernel without plain rays is not cut: every process computes it.
+    """
+    deal = functools.partial(shared, share=share, by_field=model.by_field)
+    plain = model.plain and functools.partial(_plain_rays, model.plain, share)
+    return dataclasses.replace(model, kernels=deal(model.kernels), lean=model.lean and deal(model.lean), plain=plain)
+
+
+def check_shares(lens: Lens, options: Sequence) -> None:
+    """Raise ValueError for what processes cannot share: derivatives, and options that differ between kernels."""
+    leaves = [leaf for leaf in pytree.tree_leaves((lens, options)) if isinstance(leaf, Tensor)]
+    if torch.is_grad_enabled() and any(leaf.requires_grad for leaf in leaves):
+        raise ValueError("kernels that processes share have no gradient: leave share out, or use torch.no_grad()")
+    if any(isinstance(option, Tensor) and option.dim() > 1 for option in options):
+        raise ValueError("processes share kernels of one rho and one zernike only: leave share out")
+
+
+def shared(kernels: Callable[..., Kernels], share: Share, *, by_field: bool = False) -> Callable[..., Kernels]:
+    """The same kernels, each process computing a block of them; all of them get all, without gradient.
+
+    by_field: the model takes its decisions for each field by itself: then fields are dealt out whole, or each is cut.
+    """
+
+    def compute(scene: Scene, grid: Grid, **options) -> Kernels:
+        cut = _cuts(scene.shape, share.processes, by_field=by_field)
+        if math.prod(cut) == 1:
+            return kernels(scene, grid, **options)
+        # Processes beyond the number of blocks repeat one, so that all take part in all decisions.
+        block = _block(scene.shape, cut, share.rank % math.prod(cut))
+        own = _part(scene, block)
+        with agreeing() as largest:
+            if not (by_field and cut[1] > 1):
+                own = dataclasses.replace(own, largest=largest)
+            found = kernels(own, _window(grid, block), **options)
+            rays = int(largest(torch.tensor(found.rays)))
+        found = _joined(found, scene.shape, block if share.rank < math.prod(cut) else None)
+        return dataclasses.replace(found, grid=grid, rays=rays)
+
+    return compute
+
+
+def _plain_rays(plain: Callable[..., Kernels], share: Share, scene: Scene, grid: Grid, *, rays: int) -> Kernels:
+    """Kernels of so many Sobol rays, each process tracing some of them."""
+
+    def some(count: int, **like) -> tuple[Tensor, Tensor]:
+        points, weights = pupil.sobol(count, **like)
+        return points[:, share.part(count)], weights[share.part(count)]
+
+    found = plain(scene, grid, rays=rays, sampling=some)
+    arrived, *moments = (gathered(t).movedim(0, -1) for t in (found.arrived, found.centroid, found.covariance))
+    centroid, covariance = mixture(arrived, *moments)
+    return dataclasses.replace(
+        found, kernel=total(found.kernel), arrived=arrived.sum(-1), centroid=centroid, covariance=covariance
+    )
+
+
+def _cuts(shape: Sequence[int], processes: int, *, by_field: bool) -> tuple[int, int, int]:
+    """Into how many parts each axis is cut so that the largest block is smallest; of equal ones the fewest parts."""
+    choices = itertools.product(*(range(1, min(count, processes) + 1) for count in shape))
+    fitting = [cut for cut in choices if math.prod(cut) <= processes]
+    if by_field:
+        fitting = [cut for cut in fitting if cut[1] == 1 or cut[0] * cut[2] == 1]
+    return min(fitting, key=lambda cut: (math.prod(map(_ceil_divide, shape, cut)), math.prod(cut)))
+
+
+def _ceil_divide(count: int, parts: int) -> int:
+    return -(-count // parts)
+
+
+def _block(shape: Sequence[int], cut: Sequence[int], number: int) -> tuple[slice, ...]:
+    """Block `number` of those that axes of `shape` are cut into."""
+    places = []
+    for count, parts in zip(reversed(shape), reversed(cut), strict=True):
+        number, place = divmod(number, parts)
+        places.append(Share(place, parts).part(count))
+    return tuple(reversed(places))
+
+
+def _part(scene: Scene, block: tuple[slice, ...]) -> Scene:
+    distances, fields, wavelengths = block
+    return dataclasses.replace(
+        scene,
+        lens=with_object_distance(scene.lens, scene.lens.surfaces[0].thickness[distances]),
+        fields=scene.fields[:, fields],
+        wavelengths=scene.wavelengths[wavelengths],
+    )
+
+
+def _window(grid: Grid, block: tuple[slice, ...]) -> Grid:
+    """The windows of a block; axes of length 1 stand for all."""
+    centre = grid.centre
+    for axis, part in enumerate(block, 1):
+        if centre.dim() > 1 and centre.shape[axis] > 1:
+            centre = centre[(slice(None),) * axis + (part,)]
+    return dataclasses.replace(grid, centre=centre)
+
+
+def _joined(found: Kernels, shape: Sequence[int], block: tuple[slice, ...] | None) -> Kernels:
+    """All kernels from the blocks of all processes; block: where those of this one belong, None if another has it."""
+
+    def whole(parts: list[Tensor], before: int) -> Tensor:
+        (part,) = parts
+        joined = part.new_zeros(*part.shape[:before], *shape, *part.shape[before + 3 :])
+        if block is not None:
+            joined[(slice(None),) * before + block] = part.detach()
+        return total(joined)
+
+    return combined([found], whole)
+
+
+@torch.no_grad()
+def stream_kernels(
+    scene: Scene,
+    grid: Grid,
+    rays: int,
+    *,
+    sampling: str = "sobol",
+    seed: int = 0,
+    width: float = 0.25,
+    max_bytes: float = MAX_BYTES,
+    progress: Progress | None = None,
+) -> tuple[Kernels, Kernels]:
+    """Kernels of that many plain rays for each distance, field and wavelength, as `rays.kernels` has them, and of the
+    first half of them. No derivatives.
+
+    sampling, seed: as for `stream_spots`; width: half width in pixels of the kernel each ray is blurred by, 0 for none;
+    max_bytes: of memory beside what the process has; progress: called with the number of rays traced since the last
+    call. Sums are float64; two kernels of each are kept.
+    """
+    shape, lens = scene.shape, scene.lens
+    like = lens.surfaces[-2].thickness
+    at = (with_object_distance(lens, d) for d in lens.surfaces[0].thickness.flatten().unbind(0))
+    shots = [s for here in at for s in shots_of(here, rays, scene.fields, scene.wavelengths, None, None)[0]]
+    centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))).expand(2, *shape)
+    grids = [dataclasses.replace(grid, centre=c) for c in centre.flatten(1).unbind(1)]
+    size = chunk_size(shots[0], max_bytes, kept=3 * 8 * len(shots) * grid.rows * grid.columns)
+    references: list[Tensor] = []
+    sums, kernels = [nothing(like)] * len(shots), like.new_zeros(len(shots), *grid.shape, dtype=torch.float64)
+    done, half = 0, max(1, rays // 2)
+    for points in pupil_chunks(rays, size, sampling=sampling, seed=seed, like=like, cut=half):
+        for k, s in enumerate(shots):
+            found, valid = hits(s, points)
+            if not done:
+                references.append(moments(found, valid, like.new_zeros(2)).mean.to(like.dtype))
+            sums[k] = merge(sums[k], moments(found, valid, references[k]))
+            kernels[k] += deposit(grids[k], found, valid.double(), width)
+            if progress is not None:
+                progress(points.shape[1])
+        done += points.shape[1]
+        if done == half:
+            before = kernels.clone()
+    m = stacked([Moments(m.count, r + m.mean, m.scatter) for r, m in zip(references, sums, strict=True)], shape)
+    light = beam_share(scene).double()
+    about, arrived = (m.mean, safe_divide(m.scatter, m.count)), light * m.count / rays
+    whole, first = (
+        k.unflatten(0, shape) * (light / count)[..., None, None] for k, count in ((kernels, rays), (before, half))
+    )
+    return Kernels(whole, grid, *about, rays, arrived=arrived), Kernels(first, grid, *about, half, arrived=arrived)
+
+
+PIXEL, SIZE = 0.005, 21  # mm; a window of 105 µm
+
+
+def psf(
+    lens: Lens,
+    model: str = "auto",
+    *,
+    fields: Tensor | Sequence | None = None,
+    object_distances: Tensor | Sequence[float] | None = None,
+    wavelengths: Tensor | Sequence[float] | None = None,
+    wavelength_weights: Tensor | Sequence[float] | None = None,
+    pixel: float | None = None,
+    size: int | tuple[int, int] | None = None,
+    grid: Grid | None = None,
+    center: str | None = None,
+    window: str = "follows",
+    tol: float | None = None,
+    rays: int | None = None,
+    order: int | None = None,
+    normalise: str = "energy",
+    per_wavelength: bool = False,
+    rho: Tensor | float = 0.5,
+    zernike: Tensor | None = None,
+    memo: Memo | None = None,
+    share: Share | None = None,
+    max_bytes: float | None = None,
+    progress: Callable | None = None,
+    empty: str = "nan",
+) -> Psf:
+    """PSFs of a lens, differentiable in every number of the lens, its sensor distance and the grid.
+
+    Derivatives are those of the returned numbers, the place of the window included. Two edges have no derivative: the
+    rim of a beam where rays miss a surface or are totally reflected, in all models; and, of plain rays (`rays` of
+    `drt`), every aperture: a ray that is clipped drops out at once, and the light that a moving rim gains or loses is
+    missing from the derivative.
+
+    model: a name of MODELS, or "auto".
+    fields: y, pairs (x, y) or (2, F) in the lens's kind of field, its own by default; object_distances: (D,) mm, inf
+    allowed, the lens's by default; wavelengths: (W,) µm with wavelength_weights: (W,), the lens's own by default.
+    Kernels are summed over the wavelengths; per_wavelength: each has a kernel instead, (D, F, W, rows, columns) of
+    energy 1 for all its light.
+    pixel, size: pitch in mm, 0.005 by default, and number, one or (rows, columns), 21 by default; grid: instead, pixels
+    whose centre is (2,) or (2, D, F); center: what the grid's centre counts from: "axis", "chief" (the chief ray at the
+    primary wavelength) or "centroid" (of the rays). By default "axis" for fields that are given, and "chief" for the
+    lens's own, which may lie far from it.
+    window: "follows": a window about the chief ray or the centroid moves with it, in the derivatives too, so that a
+    shift of the image as a whole changes no kernel. "fixed": the derivatives hold the window where it is: they are
+    those of the light on the pixels of a sensor that does not move. The kernels are the same. On the axis, or with a
+    `grid` placed by its centre, both are the same.
+    tol: bound on the estimated error, 0.01 by default; the coarsest order that meets it is returned. rays: instead,
+    about that many rays per kernel (`drt`: plain Sobol rays), the error then estimated from half of them.
+    order: instead, an order of the model's ladder, as `Psf.order` of an earlier call tells it: for loops, it estimates
+    nothing.
+    normalise: "energy" (1 = all light through the entrance pupil) or "window".
+    rho: of `paraxial`, σ over the blur radius. zernike: of `fourier`, Noll coefficients from 1 on, mm RMS of path.
+    memo: rays of earlier calls, which are not traced again where nothing before them has changed.
+    share: of this process (`shards.share()`), if all processes call psf alike to compute the kernels together; each
+    gets all of them, equal to those of one process to rounding, without gradient.
+    max_bytes: memory that may be taken. Plain rays are then traced in pieces, any number of them, without gradient;
+    progress: (how many, unit) -> a bar of them, see `cli.progress`.
+    empty: what a PSF of a batch is that no ray reaches: "nan", its kernel 0 and its moments nan, all with gradient 0,
+    or "error". Raises ValueError for arguments that make no sense, EmptyPsf if no ray at all reaches the sensor. Warns
+    NotConverged and, outside of loops (without `order` and `memo`), UnfilledStop.
+    """
+    center = center or ("chief" if fields is None else "axis")
+    _check(model, center, window, normalise, tol=tol, rays=rays, order=order, grid=grid, pixel=pixel, size=size)
+    like = lens.wavelengths
+    framed = (grid, pixel, size) != (None, None, None)
+    base = make_grid(like.new_tensor(pixel or PIXEL), size or SIZE) if grid is None else grid
+    fields = fields if isinstance(fields, Tensor) else field_points(fields, like=lens)
+    distances = lens.surfaces[0].thickness if object_distances is None else object_distances
+    distances = distances.reshape(1) if object_distances is None else _row(distances, like)
+    weights = lens.wavelength_weights if wavelengths is None and wavelength_weights is None else wavelength_weights
+    wavelengths = like if wavelengths is None else _row(wavelengths, like)
+    weights = torch.ones_like(wavelengths) if weights is None else _row(weights, like)
+    _check_batch(fields, distances, wavelengths, weights)
+    if order is None and memo is None:
+        warn_of_filling(with_object_distance(lens, distances.min()), fields)
+    options = {"rho": rho, "zernike": zernike}
+    drive = _driver(lens, model, options, tol, rays, order, share, max_bytes, progress)
+    if share is not None and share.processes > 1:
+        check_shares(lens, (rho, zernike))
+    shares = weights / weights.sum()
+    kept = None if per_wavelength else shares
+
+    def compute(chosen: Tensor) -> Psf:
+        centre = base.centre[:, chosen] if base.centre.dim() > 1 else base.centre
+        batch = scene(lens, fields, distances[chosen], wavelengths, memo)
+        place = _centre(batch, lens, center, shares)
+        if place is not None and window == "fixed":
+            place = place.detach()
+        centre = _with_centre(centre, place, len(wavelengths))
+        return drive(batch, dataclasses.replace(base, centre=centre), kept)
+
+    infinite = torch.isinf(distances)
+    with within(max_bytes) if max_bytes is not None else contextlib.nullcontext():
+        if bool(infinite.any()) and not bool(infinite.all()):
+            found = _merged(compute(~infinite), compute(infinite), infinite)
+        else:
+            found = compute(torch.ones_like(infinite))
+    # Only traced light can be lost; light beside the window is not.
+    if found.rays and not bool((found.energy > 0).any()) and not bool((found.ray_covariance != 0).any()):
+        raise EmptyPsf(f"no ray reaches the sensor: {_lost(lens, fields, distances, wavelengths)}")
+    if normalise == "window":
+        found = dataclasses.replace(found, kernel=_of_its_window(found.kernel), normalised="window")
+    found = without_dark(found, empty)
+    _warn_of_dark(lens, fields, distances, wavelengths, found)
+    return dataclasses.replace(
+        found,
+        lens=lens,
+        fields=fields,
+        object_distances=distances,
+        wavelengths=wavelengths,
+        wavelength_weights=shares,
+        options=options,
+        framed=framed,
+    )
+
+
+def _driver(lens: Lens, model, options: Mapping, tol, rays, order, share: Share | None, max_bytes, progress):
+    """What computes a Psf of (scene, grid, weights), as the arguments of `psf` say."""
+    streams = rays is not None and max_bytes is not None and MODELS[model].plain is not None
+
+    def own(name: str) -> Model:
+        row = MODELS[name]
+        if row.options:
+            given = {option: options[option] for option in row.options}
+            row = dataclasses.replace(row, kernels=functools.partial(row.kernels, **given))
+        return shared_model(row, share) if share is not None and share.processes > 1 else row
+
+    def stream(batch: Scene, pixels: Grid, weights: Tensor | None) -> Psf:
+        with progress(rays * math.prod(batch.shape), "ray") if progress else contextlib.nullcontext() as bar:
+            found = stream_kernels(batch, pixels, rays, max_bytes=max_bytes, progress=bar and bar.update)
+        return between(*found, weights, MODELS[model])
+
+    if model == "auto":
+        rungs = [own(name) for name in RUNGS if MODELS[name].traces or has_one_focus(lens)]
+        return functools.partial(climb, rungs=rungs, tol=tol or 0.01)
+    if streams:
+        return stream
+    if order is not None:
+        return functools.partial(by_order, model=own(model), order=order)
+    if rays is not None:
+        return functools.partial(by_rays, model=own(model), count=rays)
+    return functools.partial(by_tolerance, model=own(model), tol=tol or 0.01)
+
+
+def _row(numbers: Tensor | Sequence[float], like: Tensor) -> Tensor:
+    return numbers if isinstance(numbers, Tensor) else like.new_tensor(numbers)
+
+
+def _lost(lens: Lens, fields: Tensor, distances: Tensor, wavelengths: Tensor) -> str:
+    """Where the rays of the first field and wavelength end, and what to do about a beam too wide."""
+    lens = with_object_distance(lens, distances[0].detach())
+    points = gauss_rings(6, dtype=fields.dtype, device=fields.device)[0]
+    found = losses(lens, points, fields=fields[:, :1].detach(), wavelengths=wavelengths[:1].detach())
+    return "; ".join(filter(None, (found.words(0, 0), beam_hint(lens))))
+
+
+def _warn_of_dark(lens: Lens, fields: Tensor, distances: Tensor, wavelengths: Tensor, found: Psf) -> None:
+    """Warn LostRays of every field that no ray of a wavelength brings to the sensor, and where they end."""
+    dark = found.ray_centroid[0].detach().isnan()
+    if not bool(dark.any()):
+        return
+    dark = dark if dark.dim() > 2 else dark[..., None].expand(*dark.shape, len(wavelengths))
+    points = gauss_rings(6, dtype=fields.dtype, device=fields.device)[0]
+    for distance, lost in zip(distances.detach(), dark, strict=True):
+        at = f"object at {float(distance):g} mm, " if len(distances) > 1 else ""
+        trial = with_object_distance(lens, distance)
+        warn_of_losses(trial, points, lost, fields=fields.detach(), wavelengths=wavelengths.detach(), at=at)
+
+
+def _of_its_window(kernel: Tensor) -> Tensor:
+    """Kernels (..., rows, columns) that sum to 1, or are 0; over their brightest pixel first: where a window holds next
+    to no light, the square of its sum, by which a derivative is divided, would be no number.
+    """
+    scaled = safe_divide(kernel, kernel.detach().amax((-2, -1), keepdim=True))
+    return safe_divide(scaled, scaled.sum((-2, -1), keepdim=True))
+
+
+def _check(model: str, center: str, window: str, normalise: str, *, tol, rays, order, grid, pixel, size) -> None:
+    known = {"model": (model, ("auto", *MODELS)), "center": (center, ("axis", "chief", "centroid"))}
+    known |= {"window": (window, ("follows", "fixed")), "normalise": (normalise, ("energy", "window"))}
+    for name, (word, words) in known.items():
+        if word not in words:
+            raise ValueError(f"{name} {word!r} is not known; expected {', '.join(words)}")
+    for refused, said in (
+        (
+            tol is not None and rays is not None,
+            "tol and rays exclude each other: a tolerance chooses the number of rays",
+        ),
+        (
+            order is not None and (tol is not None or rays is not None or model == "auto"),
+            "order belongs to one model and excludes tol and rays: an order says how much work is done",
+        ),
+        (tol is not None and not tol > 0, f"tol {tol}: expected a number above 0"),
+        (rays is not None and rays < 1, f"rays {rays}: expected a whole number above 0"),
+        (
+            rays is not None and model == "auto",
+            "auto chooses by a tolerance: give tol, or rays and a model that traces them",
+        ),
+        (rays is not None and model != "auto" and not MODELS[model].traces, f"{model} traces no rays: leave rays out"),
+        (grid is not None and (pixel, size) != (None, None), "grid says pixel and size: leave them out, or the grid"),
+        (pixel is not None and not pixel > 0, f"pixel {pixel}: expected a number above 0"),
+    ):
+        if refused:
+            raise ValueError(said)
+
+
+def _check_batch(fields: Tensor, distances: Tensor, wavelengths: Tensor, weights: Tensor) -> None:
+    if fields.dim() != 2 or len(fields) != 2 or not fields.numel():
+        raise ValueError(f"fields of shape {tuple(fields.shape)}; expected (2, F)")
+    for name, values in (("object_distances", distances), ("wavelengths", wavelengths)):
+        if values.dim() != 1 or not len(values):
+            raise ValueError(f"{name} of shape {tuple(values.shape)}; expected one axis")
+        if bool(values.isnan().any()) or bool((values == 0).any()):
+            raise ValueError(
+                f"{name} {values.tolist()}; expected numbers other than 0 and nan; give others by `{name}`"
+            )
+    if weights.shape != wavelengths.shape:
+        raise ValueError(f"{weights.numel()} wavelength_weights for {len(wavelengths)} wavelengths")
+    if bool((weights < 0).any()) or not bool(weights.sum() > 0):
+        raise ValueError(f"wavelength_weights {weights.tolist()} are below 0 or sum to 0")
+
+
+def _centre(batch: Scene, lens: Lens, center: str, weights: Tensor) -> Tensor | None:
+    """Point of the sensor that the grids count from, with its derivatives: None for the axis, else (2, D, F) mm."""
+    if center == "axis":
+        return None
+    if center == "centroid" and symmetry(batch) != "round":
+        pixel = make_grid(batch.wavelengths.new_tensor(1.0), 1)
+        return polychromatic(gaussian.kernels_alone(batch, pixel, order=6), weights, "").centroid
+    return chief_landing(dataclasses.replace(batch, wavelengths=lens.primary[None]))[..., 0]
+
+
+def _with_centre(base: Tensor, place: Tensor | None, wavelengths: int) -> Tensor:
+    """A base (2,) or (2, D, F), counted from a place, for all wavelengths; a base that is one point stays it."""
+    if place is None and base.dim() == 1:
+        return base
+    centre = base if base.dim() > 1 else base.reshape(2, 1, 1)
+    centre = centre if place is None else centre + place
+    return centre[..., None].expand(*centre.shape, wavelengths)
+
+
+def _merged(finite: Psf, infinite: Psf, mask: Tensor) -> Psf:
+    """The PSFs of finite and of infinite object distances, put back in their order."""
+    order = torch.argsort(torch.cat([torch.nonzero(~mask)[:, 0], torch.nonzero(mask)[:, 0]]))
+
+    def in_order(parts: Sequence[Tensor], axis: int) -> Tensor:
+        return torch.cat(parts, axis).index_select(axis, order)
+
+    found, centre = combined([finite, infinite], in_order), finite.grid.centre
+    if centre.dim() > 1:
+        centre = in_order([centre, infinite.grid.centre], 1)
+    reason = "; ".join(dict.fromkeys(filter(None, (finite.reason, infinite.reason))))
+    return dataclasses.replace(found, grid=dataclasses.replace(finite.grid, centre=centre), reason=reason)

@@ -1,0 +1,222 @@
+"""Ray aiming: the rays that pass given points of the stop, and the chief rays that meet given points of the image.
+
+Both are roots of what a trace tells, found by Newton's method from the paraxial rays; where it fails, they are followed
+from the axis to the full field. Every root is its own: it does not depend on those that are sought beside it.
+"""
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from raytrace.maths.numerics import broadcast_shape, safe_divide, with_batch_axes
+from raytrace.system.lens import Lens
+from raytrace.system.rays import Rays
+from raytrace.tracing.trace import media, steps
+
+_STAGES = 1, 20  # the field in one go, and for rays that fail in 20 parts, each started from those before it
+_STEPS = 8  # Newton steps at each stage
+_TOLERANCE = 1e-7  # of the radius of the stop and of the height of the image, in float64
+_FEW = 1000  # rays that cost less to trace in copies than to trace back more than once
+_LOST = 1e-2  # a root missed by more at one stage is not sought at those that follow
+_CLOSE = 1e-3  # of the tolerance: one more step, the attached one, ends at rounding
+
+#: Residuals (n, ...) of unknowns (n, ...) at a fraction of the field, and where rays reach what is aimed at.
+Residual = Callable[[Tensor, float], tuple[Tensor, Tensor]]
+
+
+def at_stop(lens: Lens, rays: Rays, wavelength: Tensor) -> tuple[Tensor, Tensor]:
+    """Where rays in front of surface 1 meet the stop, (2, ...) mm, and whether they do: a vignetted ray does."""
+    (stop,), arrives = _crossings(lens, rays, wavelength, (lens.stop,))
+    return stop, arrives
+
+
+def aim_at_stop(
+    lens: Lens,
+    through: Callable[[Tensor, float], Rays],
+    pupil: Tensor,
+    target: Tensor,
+    wavelength: Tensor,
+    radius: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Entrance pupil points (2, ...) whose rays pass the stop at `target` times `radius`; and whether found (...).
+
+    pupil: (2, ...), where to begin: the points that the targets have the name of; radius: mm, negative where the
+    entrance pupil is an inverted image of the stop; through(pupil, fraction): rays of a fraction of the field.
+    """
+    # An axis of object distances, which pupil points may not have.
+    pupil, target = (with_batch_axes(points, radius.dim()) for points in (pupil, target))
+
+    def missed(aim: Tensor, fraction: float) -> tuple[Tensor, Tensor]:
+        position, arrives = at_stop(lens, through(aim, fraction), wavelength)
+        return torch.stack([at / radius - to for at, to in zip(position, target, strict=True)]), arrives
+
+    aim, found = _root(missed, pupil, origin=lambda start: start)
+    return torch.stack([torch.where(found, at, to) for at, to in zip(aim, pupil, strict=True)]), found
+
+
+def aim_at_middle(
+    lens: Lens, through: Callable[[Tensor], Rays], start: Tensor, wavelength: Tensor, size: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Points (2, ...) whose rays pass the middle of the stop, and whether found (...): where they are not, the start.
+
+    through(points): rays; size: () mm, by which it is judged how near that is. Second derivatives are exact too.
+    """
+
+    def missed(point: Tensor, fraction: float) -> tuple[Tensor, Tensor]:
+        position, arrives = at_stop(lens, through(point), wavelength)
+        return position / size, arrives
+
+    root, found = _root(missed, start, origin=lambda start: start)
+    root = root - _solve(_error_and_jacobian(missed, root.detach(), 1.0)[1], missed(root, 1.0)[0])
+    return torch.where(found, root, start), found
+
+
+def aim_at_image(
+    lens: Lens, through: Callable[[Tensor, Tensor], Rays], height: Tensor, estimate: Tensor, radius: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Fields (2, ...) whose chief rays, at the primary wavelength, meet the image at `height`; and whether found (...).
+
+    A field is 0 where not found. through(field, pupil): rays; height: (2, ...) mm; estimate: (2, ...), where to begin;
+    radius: of the stop, whose centre the chief ray passes, or None where it passes that of the paraxial entrance pupil.
+    """
+    wavelength = lens.primary
+    size = torch.linalg.vector_norm(height.detach(), dim=0)
+    size = torch.where(size > 0, size, 1.0)
+
+    def missed(unknown: Tensor, fraction: float) -> tuple[Tensor, Tensor]:
+        pupil = torch.zeros_like(unknown[:2]) if radius is None else unknown[2:]
+        rays = through(unknown[:2], pupil)
+        (stop, image), arrives = _crossings(lens, rays, wavelength, (lens.stop, len(lens.surfaces) - 1))
+        off = [(at - fraction * to) / size for at, to in zip(image, height, strict=True)]
+        return torch.stack(off if radius is None else [*off, *(at / radius for at in stop)]), arrives
+
+    start = estimate if radius is None else torch.cat([estimate, torch.zeros_like(estimate)])
+    unknown, found = _root(missed, start, origin=torch.zeros_like)
+    return torch.where(found, unknown[:2], 0.0), found
+
+
+def _crossings(lens: Lens, rays: Rays, wavelength: Tensor, numbers: tuple[int, ...]) -> tuple[list[Tensor], Tensor]:
+    """Where rays meet the surfaces of those rising numbers, (2, ...) mm each, and whether they reach the last."""
+    found, arrives, last = [], rays.valid, numbers[-1]
+    indices = media(lens, wavelength)[: last + 1]
+    surfaces = lens.surfaces[1 : last + 1]
+    for number, crossing in enumerate(steps(surfaces, rays, indices=indices, wavelength=wavelength), 1):
+        arrives = arrives & ~(crossing.missed | crossing.totally_reflected)
+        found += [crossing.rays.position[:2]] * numbers.count(number)
+    return found, arrives
+
+
+def _root(residual: Residual, start: Tensor, *, origin: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+    """Unknowns (n, ...) where the residuals (n, ...) of the full field vanish, and whether found (...).
+
+    The last step is attached, so first derivatives are exact. origin: from the start at a field to the root on axis.
+    """
+    with torch.no_grad():
+        batch = broadcast_shape(residual(start, 1.0)[0].shape[1:], start.shape[1:])
+    start = torch.stack([part.expand(batch) for part in start.detach()])
+    tolerance = _TOLERANCE if start.dtype == torch.float64 else 1e-4
+    # What is not found is evaluated on the axis, where every derivative is finite.
+    root, found = origin(start), torch.zeros(batch, dtype=torch.bool, device=start.device)
+    for stages in _STAGES:
+        followed = _followed(residual, start, origin(start), stages, _CLOSE * tolerance)
+        error, rows, arrives = _error_and_jacobian(residual, followed, 1.0)
+        close = (error.abs() <= tolerance).all(0) & arrives
+        root, found = torch.where(close & ~found, followed, root), found | close
+        if bool(found.all()):
+            break
+    if stages != _STAGES[0]:
+        rows = _error_and_jacobian(residual, root, 1.0)[1]
+    return root - _solve(rows, residual(root, 1.0)[0]), found
+
+
+def _followed(residual: Residual, start: Tensor, origin: Tensor, stages: int, close: float) -> Tensor:
+    """The roots at the full field, followed from the axis in so many stages.
+
+    Each stage starts where the two before it point to, or where the last one ended if that is nearer. A Newton step
+    that loses the ray or leads away is shortened, and not taken; a root within `close` moves no more.
+    """
+    before, root = origin, origin + (start - origin) / stages
+    sought = torch.ones_like(root[0], dtype=torch.bool)
+    for stage in range(1, stages + 1):
+        fraction = stage / stages
+        error, rows, arrives = _error_and_jacobian(residual, root, fraction)
+        size, step = torch.where(arrives, _length(error), torch.inf), _solve(rows, error)
+        if stage > 1:
+            ahead = 2 * root - before
+            error, rows, arrives = _error_and_jacobian(residual, ahead, fraction)
+            nearer = arrives & (_length(error) < size)
+            before, root = root, torch.where(nearer, ahead, root)
+            size = torch.where(nearer, _length(error), size)
+            step = torch.where(nearer, _solve(rows, error), step)
+        share = torch.ones_like(size)
+        for _ in range(_STEPS):
+            moving = sought & (size > close)
+            if not bool(moving.any()):
+                break
+            error, rows, arrives = _error_and_jacobian(residual, root - share * step, fraction)
+            better = moving & arrives & (_length(error) < size)
+            root = torch.where(better, root - share * step, root)
+            size, step = torch.where(better, _length(error), size), torch.where(better, _solve(rows, error), step)
+            share = torch.where(better, 1.0, share / 4)
+        sought = sought & (size <= _LOST)
+        if not bool(sought.any()):
+            break
+    return root
+
+
+def _error_and_jacobian(residual: Residual, point: Tensor, fraction: float) -> tuple[Tensor, list[Tensor], Tensor]:
+    """r(p) (n, ...), the rows ∂r_i/∂p, each (n, ...), of each entry's own Jacobian, and whether its ray arrives.
+
+    All outside the graph. A few rays are traced in n copies, one for every row: one way back costs less than n.
+    """
+    count = len(point)
+    if point[0].numel() <= _FEW:
+        copies = point[:, None].expand(count, count, *point.shape[1:])
+        value, pull, arrives = _pulled_back(lambda p: residual(p, fraction), copies)
+        one = torch.eye(count, dtype=value.dtype, device=value.device)
+        jacobian = pull(one.reshape(count, count, *(1,) * (point.dim() - 1)).expand_as(value).contiguous())
+        return value[:, 0], list(jacobian.unbind(1)), arrives[0]
+    value, pull, arrives = _pulled_back(lambda p: residual(p, fraction), point)
+    rows = []
+    for i in range(count):
+        unit = torch.zeros_like(value)
+        unit[i] = 1.0
+        rows.append(pull(unit))
+    return value, rows, arrives
+
+
+def _pulled_back(function: Callable, point: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor], Tensor]:
+    """f(p), the map from v to vᵀ ∂f/∂p, and what f says beside; outside the graph.
+
+    `torch.func` only where its transforms are under way: its first call loads a library of computer algebra, 1.4 s.
+    """
+    if torch._C._are_functorch_transforms_active():
+        value, pull, beside = torch.func.vjp(function, point, has_aux=True)
+        return value.detach(), lambda v: pull(v)[0].detach(), beside
+    with torch.enable_grad():
+        point = point.detach().requires_grad_()
+        value, beside = function(point)
+    return value.detach(), lambda v: torch.autograd.grad(value, point, v, retain_graph=True)[0], beside
+
+
+def _length(vector: Tensor) -> Tensor:
+    return torch.linalg.vector_norm(vector, dim=0)
+
+
+def _solve(rows: list[Tensor], error: Tensor) -> Tensor:
+    """Solve the n × n systems, by Cramer's rule if n is 2; 0 where singular."""
+    if len(rows) == 2:
+        of_x, of_y = rows
+        determinant = of_x[0] * of_y[1] - of_x[1] * of_y[0]
+        return torch.stack(
+            [
+                safe_divide(error[0] * of_y[1] - of_x[1] * error[1], determinant),
+                safe_divide(of_x[0] * error[1] - error[0] * of_y[0], determinant),
+            ]
+        )
+    matrix, error = torch.stack([row.movedim(0, -1) for row in rows], -2), error.movedim(0, -1)[..., None]
+    trial, singular = torch.linalg.solve_ex(matrix, error.detach())
+    usable = ((singular == 0) & torch.isfinite(trial).all(-1).all(-1))[..., None, None]
+    safe = torch.where(usable, matrix, torch.eye(len(rows), dtype=matrix.dtype, device=matrix.device))
+    return torch.linalg.solve_ex(safe, torch.where(usable, error, 0.0))[0][..., 0].movedim(-1, 0)

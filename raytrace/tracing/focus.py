@@ -1,0 +1,299 @@
+"""Focus: the sensor distance of least RMS spot, in closed form.
+
+Rays in image space are straight: moving the sensor by s along its normal moves a hit by s·m, m = (L, M)/N. The mean
+square radius about each spot's own centroid is a parabola in s, so nothing is retraced:
+
+    s = -Σ W cov(x, m) / Σ W var(m)
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+
+import scipy.optimize
+import torch
+from torch import Tensor
+
+from raytrace.budget import RAY_BYTES, afford
+from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.maths.pupil import gauss_rings
+from raytrace.system.lens import Lens, with_object_distance, with_sensor_distance
+from raytrace.system.poses import direction_in
+from raytrace.system.rays import Rays
+from raytrace.tracing.axis import is_bent
+from raytrace.tracing.base_ray import base_ray
+from raytrace.tracing.launch import launch
+from raytrace.tracing.paraxial import paraxial_image_distance
+from raytrace.tracing.sequence import sequence_of
+from raytrace.tracing.spot import EmptySpot, Spot, spot_of, spot_of_points, where_lit
+from raytrace.tracing.trace import media, trace_surfaces
+
+_RINGS = 12  # of the pupil, where focus on the axis is found
+
+
+class NoImage(ValueError):
+    """An object without a real image: there is no place for a sensor."""
+
+
+def image_rays(lens: Lens, pupil: Tensor, *, fields: Tensor | None = None, wavelengths: Tensor | None = None) -> Rays:
+    """Rays (3, F, W, P) on the sensor, with their direction before it; arguments as for `launch`.
+
+    The sensor may touch glass: what bends rays there does not tell where they came from. Raises budget.OverBudget for
+    more rays than memory holds.
+    """
+    wavelengths = lens.wavelengths if wavelengths is None else wavelengths
+    F, W, P = lens.fields.y.numel() if fields is None else fields.shape[1], len(wavelengths), pupil.shape[-1]
+    afford(
+        RAY_BYTES * F * W * P,
+        f"{F * W * P:,} rays ({F} fields × {W} wavelengths × {P:,} of the pupil)",
+        helps="ask for fewer fields, wavelengths or pupil points",
+    )
+    indices = media(lens, wavelengths[:, None])
+    rays = launch(lens, pupil, fields=fields, wavelengths=wavelengths)
+    indices = [*indices[:-1], indices[-2]]
+    return trace_surfaces(sequence_of(lens), rays, indices=indices, wavelength=wavelengths[:, None])
+
+
+def focus_moments(rays: Rays, weights: Tensor | None = None, *, empty: str = "nan") -> tuple[Tensor, Tensor]:
+    """cov(x, m) in mm and var(m), x the hits and m = (L, M)/N the slopes, over the last axis of rays (3, ..., P).
+
+    The mean square radius on a sensor moved by s is its value at 0 plus 2 s cov + s² var. weights: (P,) or (..., P);
+    empty: what those of a spot without rays are, see `spot_of`.
+    """
+    points, slopes = _points_and_slopes(rays)
+    weights = torch.ones_like(points[0]) if weights is None else weights.expand(points.shape[1:])
+    weights = torch.where(rays.valid, weights, 0.0)
+    total = weights.sum(-1, keepdim=True)
+    share = safe_divide(weights, total)
+    centred = points - (share * points).sum(-1, keepdim=True)
+    tilted = slopes - (share * slopes).sum(-1, keepdim=True)
+    moments = (share * (centred * tilted).sum(0)).sum(-1), (share * (tilted * tilted).sum(0)).sum(-1)
+    return where_lit(total[..., 0] != 0, *moments, empty=empty)
+
+
+def spot_parabola(rays: Rays, weights: Tensor | None = None, *, empty: str = "nan") -> tuple[Tensor, Tensor, Tensor]:
+    """Q0 mm², Q1 mm, Q2 of the mean square radius Q0 + 2 s Q1 + s² Q2 on a sensor moved by s mm; each (...).
+
+    rays: (3, ..., P) as `image_rays` gives them. Once they are traced, a step of an optimisation of the sensor distance
+    is this polynomial, whatever the number of rays. empty: as for `spot_of`.
+    """
+    here = spot_of(rays, weights, empty=empty)
+    return here.mean_square_radius, *focus_moments(rays, weights)
+
+
+def through_focus(rays: Rays, shifts: Tensor, weights: Tensor | None = None, *, empty: str = "nan") -> Spot:
+    """Spots (S, ...) on the sensor moved by each of the shifts (S,) mm along its own normal.
+
+    rays: (3, ..., P) on the sensor; empty: as for `spot_of`.
+    """
+    points, slopes = _points_and_slopes(rays)
+    shifts = shifts.reshape(-1, *(1,) * (points.dim() - 1))
+    moved = points[:, None] + shifts * slopes[:, None]
+    return spot_of_points(moved, rays.valid.expand(moved.shape[1:]), weights, empty=empty)
+
+
+def focus_of_rms(lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = "nan", **scene) -> Tensor:
+    """Sensor distance (scalar, mm) of least RMS spot over object distances × fields × wavelengths.
+
+    pupil, weights: (2, P), (P,) of a rule in `pupil`; scene: as for `bundles`. Differentiable in every number of the
+    lens.
+    empty: "nan" leaves spots without rays out, for they are nowhere in focus; where none is left, or all rays are
+    parallel, the distance is nan with gradient 0. "error" raises EmptySpot for either.
+    """
+    covariance = variance = torch.zeros_like(lens.surfaces[-2].thickness)
+    for rays, share in bundles(lens, pupil, **scene):
+        moments = focus_moments(rays, weights, empty=empty)
+        covariance, variance = (
+            total + torch.where(_lit(rays, weights), share * moment, 0.0).sum()
+            for total, moment in zip((covariance, variance), moments, strict=True)
+        )
+    if empty == "error" and not bool(variance > 0):
+        raise EmptySpot("no sensor distance is best: the rays are parallel, or there is only one")
+    shift = safe_divide(covariance, variance) / along_normal(lens)
+    return torch.where(variance > 0, lens.surfaces[-2].thickness - shift, torch.nan)
+
+
+def focus_of_mean_radius(lens: Lens, pupil: Tensor, weights: Tensor, **scene) -> Tensor:
+    """Sensor distance (scalar, mm) of least mean distance of the hits from the centroid of their spot.
+
+    Arguments as for `focus_of_rms`, from where the search begins. Rays in image space are straight: they are traced
+    once, on the sensor as it stands, and what its rim clips there stays clipped. Not differentiated.
+    Raises EmptySpot where there is no focus of the rays, ValueError as `focus_of_merit`.
+    """
+    with torch.no_grad():
+        start = focus_of_rms(lens, pupil, weights, **scene)
+        traced = list(bundles(lens, pupil, **scene))
+    if not bool(torch.isfinite(start)):
+        raise EmptySpot("no ray reaches the image, or all are parallel: there is no focus")
+
+    def merit(sensor: Tensor) -> Tensor:
+        total = torch.zeros_like(sensor)
+        for rays, share in traced:
+            shift = (sensor - lens.surfaces[-2].thickness) * along_normal(lens)
+            found = through_focus(rays, shift.reshape(1), weights)
+            x, y = torch.where(found.valid, found.points - found.centroid[..., None], 0.0)
+            light = torch.where(rays.valid, weights, 0.0)
+            radius = safe_divide((light * safe_sqrt(x * x + y * y)).sum(-1), light.sum(-1))
+            total = total + (share * radius).sum()
+        return total
+
+    return focus_of_merit(merit, start).detach()
+
+
+def mean_rms_radius(lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = "nan", **scene) -> Tensor:
+    """√ of the weighted mean of the mean square radii (scalar, mm) over object distances × fields × wavelengths.
+
+    Arguments as for `focus_of_rms`, which minimises it; spots without rays are left out, and it is nan if none is left,
+    or, with empty = "error", raises EmptySpot.
+    """
+    total = sum_of_shares = torch.zeros_like(lens.surfaces[-2].thickness)
+    for rays, share in bundles(lens, pupil, **scene):
+        lit = _lit(rays, weights)
+        square = spot_of(rays, weights, empty=empty).mean_square_radius
+        total = total + torch.where(lit, share * square, 0.0).sum()
+        sum_of_shares = sum_of_shares + torch.where(lit, share, 0.0).sum()
+    return where_lit(sum_of_shares > 0, safe_sqrt(safe_divide(total, sum_of_shares)), empty=empty)[0]
+
+
+def _lit(rays: Rays, weights: Tensor) -> Tensor:
+    """Whether a ray of any weight arrives, (...)."""
+    return (rays.valid & (weights != 0)).any(-1)
+
+
+def bundles(
+    lens: Lens,
+    pupil: Tensor,
+    *,
+    object_distances: Sequence[Tensor | float] | None = None,
+    distance_weights: Sequence[float] | None = None,
+    fields: Tensor | None = None,
+    wavelengths: Tensor | None = None,
+    field_weights: Tensor | None = None,
+    wavelength_weights: Tensor | None = None,
+) -> Iterator[tuple[Rays, Tensor]]:
+    """The rays (3, F, W, P) of every object distance (mm, the lens's by default) and what their spots (F, W) count.
+
+    fields, wavelengths: as for `launch`; weights: one for each, 1 by default.
+    """
+    distances = [lens.surfaces[0].thickness] if object_distances is None else object_distances
+    distance_weights = [1.0] * len(distances) if distance_weights is None else distance_weights
+    for distance, distance_weight in zip(distances, distance_weights, strict=True):
+        rays = image_rays(with_object_distance(lens, distance), pupil, fields=fields, wavelengths=wavelengths)
+        share = rays.position.new_full(rays.shape[:-1], distance_weight)
+        share = share if field_weights is None else share * field_weights[:, None]
+        yield rays, share if wavelength_weights is None else share * wavelength_weights
+
+
+def best_focus(lens: Lens) -> Tensor:
+    """Sensor distance (scalar, mm) of least RMS spot on the axis, over the lens's wavelengths by their weights.
+
+    Raises EmptySpot where no ray arrives.
+    """
+    axis, weights = lens.wavelengths.new_zeros(2, 1), lens.wavelength_weights
+    return focus_of_rms(lens, *gauss_rings(_RINGS), fields=axis, wavelength_weights=weights, empty="error")
+
+
+def along_normal(lens: Lens) -> Tensor | float:
+    """By how many mm the sensor moves along its own normal where its distance grows by 1 mm: less where it is tilted
+    in the axes that the distance is laid along."""
+    pose = lens.surfaces[-1].before
+    if pose is None:
+        return 1.0
+    zero = torch.zeros_like(lens.surfaces[-2].thickness)
+    return direction_in(pose, [zero, zero, torch.ones_like(zero)])[2]
+
+
+def paraxial_sensor(lens: Lens, object_distances: Tensor) -> Tensor:
+    """Sensor distances (D,) mm of the paraxial images of objects at distances (D,) mm, inf allowed.
+
+    Where the axis bends, that halfway between the images of both sections along the base ray; or that of one.
+    """
+    if not is_bent(lens):
+        return paraxial_image_distance(lens, object_distances)
+    base = base_ray(with_object_distance(lens, object_distances))
+    there = torch.isfinite(base.image_distance)
+    total, count = torch.where(there, base.image_distance, 0.0).sum(0), there.sum(0)
+    ahead = torch.where(count > 0, total / count.clamp_min(1), torch.inf) - base.way_to_image
+    return lens.surfaces[-2].thickness + ahead * base.direction[2] / along_normal(lens)
+
+
+def real_image_distance(lens: Lens, object_distances: Tensor) -> Tensor:
+    """Sensor distances (D,) mm of the paraxial images of objects at distances (D,) mm. Raises NoImage for one that is
+    not behind the lens."""
+    images = paraxial_sensor(lens, object_distances)
+    wrong = ~(_behind(lens, images) & torch.isfinite(images))
+    if bool(wrong.any()):
+        distance, image = (float(one[wrong][0]) for one in (object_distances.detach(), images.detach()))
+        raise NoImage(
+            f"no real image of an object at {distance:g} mm: it lies within the focal length, or the lens diverges "
+            f"(paraxial image at {image:g} mm)"
+        )
+    return images
+
+
+def is_behind(lens: Lens, distance: Tensor) -> bool:
+    """Whether a sensor distance (mm) is one: on the side of the last surface that the light goes to."""
+    return bool(_behind(lens, distance).all())
+
+
+def _behind(lens: Lens, distance: Tensor) -> Tensor:
+    if is_bent(lens):
+        base = base_ray(lens)
+        ahead = (distance - lens.surfaces[-2].thickness) * along_normal(lens) / base.direction[2]
+        return (base.way_to_image + ahead > 0).detach()
+    side = -1 if sum(surface.is_mirror for surface in lens.surfaces) % 2 else 1
+    return (side * distance > 0).detach()
+
+
+def focused(lens: Lens, object_distance: float, *, on: str = "paraxial") -> Lens:
+    """The lens with an object at a distance (mm, inf allowed) and the sensor at its image on the axis.
+
+    on: "paraxial", or "rms", the least RMS spot. Raises NoImage where the image is not real.
+    """
+    lens = with_object_distance(lens, object_distance)
+    sensor = real_image_distance(lens, lens.wavelengths.new_tensor([object_distance]))
+    lens = with_sensor_distance(lens, sensor[0].detach())
+    return with_sensor_distance(lens, best_focus(lens).detach()) if on == "rms" else lens
+
+
+def _points_and_slopes(rays: Rays) -> tuple[Tensor, Tensor]:
+    """Hits (2, ...) mm and slopes (L, M)/N (2, ...), zero for lost rays."""
+    slopes = safe_divide(rays.direction[:2], rays.direction[2].expand_as(rays.direction[:2]))
+    return torch.where(rays.valid, rays.position[:2], 0.0), torch.where(rays.valid, slopes, 0.0)
+
+
+def focus_of_merit(merit: Callable[[Tensor], Tensor], start: Tensor, *, step: float = 0.1, tolerance: float = 1e-10):
+    """Sensor distance (scalar, mm) that minimises any differentiable merit of it, found by its gradient.
+
+    merit: sensor distance (scalar, mm) -> scalar, smooth near its minimum; start: mm, where the search begins, within
+    the basin of the minimum; step: mm, the first step of the search for a bracket; tolerance: mm.
+    The slope is bracketed and its zero found by Brent's method (scipy); one Newton step then attaches the implicit
+    derivative ds/dp = -∂²M/∂s∂p / ∂²M/∂s², so the result is differentiable once in all that the merit depends on.
+    Raises ValueError if the merit has no minimum within 2²⁰ steps.
+    """
+
+    def slope(s: Tensor, *, create_graph: bool = False) -> Tensor:
+        s = s if s.requires_grad else s.detach().requires_grad_()
+        return torch.autograd.grad(merit(s), s, create_graph=create_graph)[0]
+
+    def slope_at(s: float) -> float:
+        return float(slope(start.new_tensor(s)))
+
+    first = float(start)
+    here = slope_at(first)
+    if here != 0:
+        direction = -step if here > 0 else step
+        for doubling in range(20):
+            last = first + direction * 2**doubling
+            if slope_at(last) * here <= 0:
+                break
+        else:
+            raise ValueError(f"the merit has no minimum within {abs(last - first):g} mm of sensor distance {first:g}")
+        low, high = sorted((first, last))
+        first = scipy.optimize.brentq(slope_at, low, high, xtol=tolerance, rtol=8.9e-16)
+    s = start.new_tensor(first).requires_grad_()
+    gradient = slope(s, create_graph=True)
+    if not gradient.requires_grad:
+        return s.detach()
+    (bend,) = torch.autograd.grad(gradient, s, retain_graph=True)
+    if float(bend) <= 0:
+        return s.detach()
+    return s.detach() - (gradient - gradient.detach()) / bend.detach()
