@@ -80,7 +80,7 @@ PUBLIC = {
     "Condition": "optimization.constraints",
     "Measure": "optimization.operands.custom",
     "Merit": "optimization.merit",
-    "Readings": "optimization.conventions",
+    "Conventions": "optimization.conventions",
     "NoProblem": "optimization.problem",
     "Optimized": "optimization.result",
     "Row": "system.optimization_data",

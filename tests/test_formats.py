@@ -94,7 +94,7 @@ def without_intent(lens):
         for surface in lens.surfaces
     ]
     surfaces = tuple(dataclasses.replace(surface, **none) for surface, none in zip(lens.surfaces, zero, strict=True))
-    return dataclasses.replace(lens, surfaces=surfaces, intent=None)
+    return dataclasses.replace(lens, surfaces=surfaces, optimization_data=None)
 
 
 @pytest.mark.skipif(not CORPUS, reason="the corpus of real files is not at hand")

@@ -1,7 +1,7 @@
 """Model: the numbers of a lens, in all its configurations, as functions of the variables of an optimisation.
 
 What a variable moves, what follows by a solve or a pickup, and where the tables of the compiled trace hold it, is found
-once; a `Moment` is the lens at given variables.
+once; a `LensState` is the lens at given variables.
 """
 
 import dataclasses
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from raytrace.materials.glass import is_air
-from raytrace.optimization.lens_state import Moment
+from raytrace.optimization.lens_state import LensState
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Solve, Vary
 from raytrace.system.parameter_paths import Place, number_at, places, with_number
@@ -65,8 +65,8 @@ def with_numbers_of(lens: Lens, numbers: dict[Address, Tensor], known: dict[Addr
 class Model:
     """A lens whose variables move.
 
-    lens: as it is at the start; variables, solves: of `Intent`; opening: the part of the pupil and of the field that
-    rays of a merit function go through. Raises UnknownNumber for numbers that it does not have.
+    lens: as it is at the start; variables, solves: of `OptimizationData`; opening: the fraction of pupil and field that
+    the rays of a merit function fill. Raises UnknownNumber for numbers that it does not have.
     """
 
     lens: Lens
@@ -118,7 +118,7 @@ class Model:
                 operands[k] = dataclasses.replace(operands[k], numbers=numbers)
         lens = dataclasses.replace(lens, operands=tuple(operands)) if operands else lens
         current = self.views[lens.current_configuration - 1]
-        numbers = current.moment(np.asarray(variables, dtype=float)).numbers
+        numbers = current.state(np.asarray(variables, dtype=float)).numbers
         there = {at: like.new_tensor(float(n), dtype=torch.float64) for at, n in numbers.items()}
         return with_numbers_of(lens, there)
 
@@ -286,8 +286,8 @@ class View:
         rows = [torch.broadcast_to(n[..., 0] if n.dim() else n, wavelength.shape[:1]) for n in table]
         return surfaces, structure, torch.stack(rows, -1)
 
-    def moment(self, variables) -> Moment:
-        return Moment(self, variables)
+    def state(self, variables) -> LensState:
+        return LensState(self, variables)
 
 
 def _of_operands(model: Model, configuration: int) -> dict[Address, tuple[int, float, float]]:
@@ -320,7 +320,9 @@ def followed(model: Model, configuration: int) -> dict[int, tuple[int, float, fl
             if source in moved and at not in moved:
                 number, scale, offset = moved[source]
                 added = (
-                    one.offset * model.lens.intent.unit ** _POWERS.get(one.quantity, 0) if model.lens.intent else 0.0
+                    one.offset * model.lens.optimization_data.unit ** _POWERS.get(one.quantity, 0)
+                    if model.lens.optimization_data
+                    else 0.0
                 )
                 moved[at] = number, one.scale * scale, one.scale * offset + added
     return {operand: linear for (operand, at), linear in moved.items() if at == configuration}

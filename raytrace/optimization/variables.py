@@ -76,11 +76,11 @@ def freedom(lens: Lens, vary: str | Sequence[str] | None = None) -> Freedom:
     Solves of the file hold where no word says otherwise: a number that is named varies, and one that belongs to no
     surface's name ("curvature") varies where no solve holds. Raises BadVariables.
     """
-    own = () if lens.intent is None else lens.intent.solves
+    own = () if lens.optimization_data is None else lens.optimization_data.solves
     if vary is None:
-        if lens.intent is None or not lens.intent.variables:
+        if lens.optimization_data is None or not lens.optimization_data.variables:
             raise BadVariables("the file tells no variables: `vary` names them, as 'curvature thickness'")
-        return Freedom(lens, lens.intent.variables, own)
+        return Freedom(lens, lens.optimization_data.variables, own)
     words = _words(joined(vary))
     told = tuple(solve for word in words if "=" in word for solve in _solves(lens, word))
     found: dict[str, Vary] = {}

@@ -12,7 +12,7 @@ from raytrace.system.lens import Lens
 
 #: Fields that change no ray.
 _WORDS = {
-    *("name", "notes", "comment", "catalogs", "intent", "catalog", "status", "nd_listed", "abbe_listed"),
+    *("name", "notes", "comment", "catalogs", "optimization_data", "catalog", "status", "nd_listed", "abbe_listed"),
     *("alternatives", "listed_name", "records", "wavelength_range"),
 }
 _SHOWN = ("curvature", "thickness")  # of a surface, in its identity

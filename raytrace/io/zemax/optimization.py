@@ -1,4 +1,4 @@
-"""What a .zmx file says about how its lens is to be optimised: an `Intent`.
+"""What a .zmx file says about how its lens is to be optimised: an `OptimizationData`.
 
 The rules of surfaces (`zemax_rules`), the merit function and the tolerances (`zemax_merit`), and the status of numbers
 of the configurations: 1 variable, 2 a pickup; there a surface's own rule is void.
@@ -41,7 +41,7 @@ from raytrace.io.zemax.surface_types import types
 from raytrace.io.zemax.surfaces import numbers
 from raytrace.system.configurations import Path, part, with_part
 from raytrace.system.lens import Lens
-from raytrace.system.optimization_data import Intent, Solve, Vary
+from raytrace.system.optimization_data import OptimizationData, Solve, Vary
 from raytrace.system.parameter_paths import number_at, places
 from raytrace.system.surface import Surface
 
@@ -378,7 +378,7 @@ def _glass(one: Told) -> Iterator[Vary | Solve]:
 
 
 def read(found: Sections, lens: Lens, millimetres: float, report: Draft) -> Lens:
-    """The lens with its intent, None where the file says no more than any does; what varies is modelled."""
+    """The lens with its optimisation data, None where the file says no more than any does; what varies is modelled."""
     told = [told_of(*pair, millimetres) for pair in zip(found.surfaces, lens.surfaces, strict=True)]
     rules = [rule for one in told for rule in rules_of(one, told, report)]
     configured, own = list(_of_configurations(found, lens)), _paths_of_configurations(lens)
@@ -392,7 +392,7 @@ def read(found: Sections, lens: Lens, millimetres: float, report: Draft) -> Lens
     tail = _before_configurations(found)
     merit, tolerances = zemax_merit.rows(tail, report), zemax_merit.tolerances(tail, report)
     given = [k for k, one in enumerate(told) if one.surface.semi_diameter and code_of(one.block, "DIAM") == GIVEN]
-    intent = Intent(
+    optimization_data = OptimizationData(
         variables,
         followed,
         merit,
@@ -402,8 +402,11 @@ def read(found: Sections, lens: Lens, millimetres: float, report: Draft) -> Lens
         semi_diameter_margin=_margin(found, millimetres),
         kept=kept,
     )
-    _refuse_infinite(intent, told)
-    return dataclasses.replace(_with_moving(lens, told, intent), intent=intent if _says_more(intent, lens) else None)
+    _refuse_infinite(optimization_data, told)
+    return dataclasses.replace(
+        _with_moving(lens, told, optimization_data),
+        optimization_data=optimization_data if _says_more(optimization_data, lens) else None,
+    )
 
 
 def _is_followed(one: Solve) -> bool:
@@ -418,14 +421,14 @@ def _is_linear(one: Solve) -> bool:
     return one.quantity in ("thickness", "curvature", "conic") or (not one.offset and one.quantity.islower())
 
 
-def _says_more(intent: Intent, lens: Lens) -> bool:
-    """Whether an intent is another than that of a lens without one, whose semi-diameters are all given."""
+def _says_more(optimization_data: OptimizationData, lens: Lens) -> bool:
+    """Whether optimisation data is another than that of a lens without one, whose semi-diameters are all given."""
     sized = tuple(k for k, surface in enumerate(lens.surfaces) if surface.semi_diameter)
-    return intent != Intent(semi_diameters=sized)
+    return optimization_data != OptimizationData(semi_diameters=sized)
 
 
-def _refuse_infinite(intent: Intent, told: list[Told]) -> None:
-    for one in (*intent.solves, *intent.kept):
+def _refuse_infinite(optimization_data: OptimizationData, told: list[Told]) -> None:
+    for one in (*optimization_data.solves, *optimization_data.kept):
         figures = *one.numbers, one.scale, one.offset
         if not all(map(math.isfinite, figures)):
             message = f"a rule of the {one.quantity}: a number is too large once converted to mm"
@@ -443,10 +446,10 @@ def _margin(found: Sections, millimetres: float) -> tuple[float, float]:
 # -- what moves is modelled -------------------------------------------------------------------------------------------
 
 
-def _with_moving(lens: Lens, told: list[Told], intent: Intent) -> Lens:
+def _with_moving(lens: Lens, told: list[Told], optimization_data: OptimizationData) -> Lens:
     """The lens with every number modelled that may change: variables, and what follows them."""
-    moving = {(one.surface, one.quantity) for one in intent.variables if one.operand is None}
-    for one in intent.solves:
+    moving = {(one.surface, one.quantity) for one in optimization_data.variables if one.operand is None}
+    for one in optimization_data.solves:
         if one.operand is not None or one.quantity == "glass":
             continue
         of = (one.source, one.quantity_of_source or one.quantity)
