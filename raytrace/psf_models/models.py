@@ -8,8 +8,7 @@ pupil: a pure function, which `ladder.py` drives to a tolerance, `sharing.py` sh
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 
-from raytrace.psf_models import diffraction, fourier, gaussian, paraxial, rays
-from raytrace.psf_models import drt as raymap
+from raytrace.psf_models import diffraction, drt, fourier, gaussian, paraxial, rays
 from raytrace.psf_models.result import Kernels
 
 
@@ -80,7 +79,7 @@ _ROWS = (
     # All traced rays: geometric optics. Cells halve their error with each order: no faster, whatever a lucky change
     # says. The table of rings that round light is read from (radial.py) is good to 1e-5.
     Model(
-        "drt", "DRT", raymap.kernels, range(11), plain=rays.kernels, is_rung=True, row=0, compared={"rays": 256},
+        "drt", "DRT", drt.kernels, range(11), plain=rays.kernels, is_rung=True, row=0, compared={"rays": 256},
         first=0.6, least=0.6, most=0.6, unseen=0.15, floor=1e-5,
     ),
     # The traced wavefront: diffraction with the true aberrations.

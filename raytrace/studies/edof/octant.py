@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from raytrace.imaging.image import transfer_functions
-from raytrace.imaging.restoration import blind_density
+from raytrace.imaging.restoration import depth_invariant_density
 from raytrace.maths.grid import grid
 from raytrace.psf_models.radial import radii_of_waves, reach, unfold
 from raytrace.wave_optics import propagation as radial
@@ -56,7 +56,7 @@ class Octant:
         """Mean square error behind the best blind filter, for pictures of S (size, size) that are their own mirror
         images; mean over colours."""
         both = torch.stack([spectrum[self._rows, self._columns], spectrum[self._columns, self._rows]])
-        density = blind_density(self.transfer(scene)[:, :, None], both, noise)
+        density = depth_invariant_density(self.transfer(scene)[:, :, None], both, noise)
         return (self._weight * density).sum((-2, -1)).mean()
 
 

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from raytrace.files import write_atomically
 from raytrace.imaging.network import RedNet, RedNetShape
 from raytrace.imaging.phase_variables import PhaseVariables
-from raytrace.imaging.restoration import blind_filter, towards_measurement
+from raytrace.imaging.restoration import depth_invariant_wiener, towards_measurement
 from raytrace.imaging.training import DamagedRun, Record, Run, Share, read_state, train
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import index
@@ -72,7 +72,7 @@ class EdofCamera(nn.Module):
     def filter(self, H: Tensor) -> Tensor:
         """G (W, n, n)."""
         if self.restoration != "towards":
-            return blind_filter(H, self.spectrum, self.world.noise)
+            return depth_invariant_wiener(H, self.spectrum, self.world.noise)
         at_target = dataclasses.replace(scene(self.variables(), self.world), depths=1e3 * self.t.square().reshape(1))
         found = psf(at_target, plan=self.expected.plan)
         return towards_measurement(transfer(found, self.spectrum.shape[-1])[0], self.v.square())

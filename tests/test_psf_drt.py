@@ -9,8 +9,7 @@ from problems import number, relative_l1, sharp_double_gauss
 
 from raytrace.io import read_lens
 from raytrace.maths.grid import Grid, grid
-from raytrace.psf_models import drt as raymap
-from raytrace.psf_models import rays
+from raytrace.psf_models import drt, rays
 from raytrace.psf_models.drt import fit, kernels, kernels_and_reason, reference
 from raytrace.system.lens import Lens
 from raytrace.tracing.scene import scene
@@ -140,7 +139,7 @@ def test_half_of_a_symmetric_fan_stands_for_all_of_it(monkeypatch):
         return found.kernel.detach(), found.centroid.detach(), found.covariance.detach(), gradient
 
     half = outcome()
-    monkeypatch.setattr(raymap, "_is_symmetric", lambda grid: False)
+    monkeypatch.setattr(drt, "_is_symmetric", lambda grid: False)
     whole = outcome()
     assert float(half[0].sum()) > 0.5
     assert not torch.equal(half[0], whole[0])
