@@ -20,7 +20,7 @@ from raytrace.materials.catalogs import UnknownGlass
 from raytrace.system.dimensions import DIMENSION
 from raytrace.system.lens import index_behind
 from raytrace.system.optimization_data import OptimizationData, Row, Solve, Vary
-from raytrace.system.parameter_paths import number_at, places
+from raytrace.system.parameter_paths import number_at, parameter_paths
 from raytrace.system.surface import sag
 
 SHARED = Path(__file__).parents[2] / "shared"
@@ -71,7 +71,7 @@ def test_variables_and_rows_are_those_of_an_independent_reader():
         in_mm = not any("converted to mm" in note for note in report.notes)
         for value, (surface, quantity) in zip(case.get("x_stored", ()) if in_mm else (), expected, strict=False):
             held = original.surfaces[surface]
-            number = held.thickness if quantity == "thickness" else number_at(held, places(held)[quantity])
+            number = held.thickness if quantity == "thickness" else number_at(held, parameter_paths(held)[quantity])
             assert float(number) == pytest.approx(value, rel=1e-15, abs=0)
         counts = Counter(row.operand for row in original.optimization_data.merit)
         assert all(counts[name] == count for name, count in case.get("operand_counts", {}).items())

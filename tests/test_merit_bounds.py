@@ -46,7 +46,7 @@ def automatic(found, given=(), margin=MARGIN):
 
 
 def unusual():
-    """A coordinate break, an odd asphere, a toroid, a Zernike departure, a mirror within glass, and the way back."""
+    """A coordinate break, an odd asphere, a toroid, a Zernike sag_terms, a mirror within glass, and the way back."""
     zernike = ZernikeSag(vector(0.0, 0.01, -0.02, 0.01, 0.02), scalar(20.0))
     tilt = Pose(*(scalar(x) for x in (0.0, 0.5, 0.0, 2.0, 0.0, 0.0)))
     return lens(
@@ -54,7 +54,7 @@ def unusual():
             surface(0.01, 4.0, model_glass(1.6, 40.0), coefficients=[0.001, 1e-5, 2e-7], kind="odd asphere"),
             surface(-0.01, 2.0, coefficients=[0.02], kind="toroidal"),
             Surface(scalar(3.0), before=tilt, is_break=True),
-            surface(0.005, 5.0, model_glass(1.5, 60.0), departure=zernike),
+            surface(0.005, 5.0, model_glass(1.5, 60.0), sag_terms=zernike),
             surface(-0.004, -6.0, MIRROR, conic=-0.5),
             surface(0.01, -9.0, conic=0.3, coefficients=[0.0, 1e-6]),
         ],
@@ -126,7 +126,7 @@ def closing(surface, size) -> float:
 def past_edge(surface, size) -> float:
     """What the root of a conic that closes within its semi-diameter adds to a sag whose root is held at 0."""
     left = 1 - closing(surface, size)
-    if surface.kind != "even asphere" or surface.departure is not None or not left < 1e-4:
+    if surface.kind != "even asphere" or surface.sag_terms is not None or not left < 1e-4:
         return 0.0
     t = 1 - left / 1e-4
     root = np.sqrt(1e-4 / (1 + t + t * t))

@@ -116,7 +116,7 @@ def test_rays_are_those_of_launch(cases, name):
 @pytest.mark.parametrize(
     ("name", "engine"),
     [
-        *(pytest.param(name, "fused", marks=pytest.mark.slow if name in SLOW else ()) for name in lenses()),
+        *(pytest.param(name, "compiled", marks=pytest.mark.slow if name in SLOW else ()) for name in lenses()),
         ("near", "eager"),
         ("aspheres", "eager"),
     ],

@@ -15,7 +15,7 @@ from raytrace.optimization.lens_model import Model
 from raytrace.optimization.lens_state import SOLVES
 from raytrace.optimization.variables import freedom
 from raytrace.system import configurations
-from raytrace.system.configurations import Place
+from raytrace.system.configurations import ScaledPath
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
 from raytrace.system.surface import sag
 from raytrace.tracing.launch import rays_of_field
@@ -198,7 +198,7 @@ def zoom():
     """Two configurations, in which the thickness of surface 3, and -½ of it and 9 mm of surface 8, differ."""
     lens = configurations.made(rt.read_lens("double_gauss"), thickness={3: [4.0, 6.0]}, curvature={1: [0.02, 0.01]})
     gap, bend = lens.operands
-    gap = dataclasses.replace(gap, places=(*gap.places, Place(("surfaces", 8, "thickness"), -0.5, 9.0)))
+    gap = dataclasses.replace(gap, paths=(*gap.paths, ScaledPath(("surfaces", 8, "thickness"), -0.5, 9.0)))
     return dataclasses.replace(lens, operands=(gap, bend), optimization_data=OptimizationData(unit=25.4)).configuration(
         1
     )

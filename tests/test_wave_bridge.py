@@ -12,7 +12,7 @@ from raytrace.materials.glass import constant
 from raytrace.maths.grid import centres, grid
 from raytrace.maths.pupil import gauss_rings
 from raytrace.psf_models import diffraction, psf
-from raytrace.system import sag_terms as departure
+from raytrace.system import sag_terms as sag_terms
 from raytrace.system.lens import Lens, with_sensor_distance
 from raytrace.system.surface import sag_at
 from raytrace.tracing.paraxial import first_order
@@ -212,8 +212,8 @@ def test_a_height_map_of_pixels_is_traced_as_the_powers_it_samples():
 def test_a_height_map_is_filtered_once_however_often_it_is_traced(monkeypatch):
     """Gradients to the heights are those of differences of 10 nm."""
     filtered = []
-    real = departure._spline_coefficients
-    monkeypatch.setattr(departure, "_spline_coefficients", lambda heights: filtered.append(0) or real(heights))
+    real = sag_terms._spline_coefficients
+    monkeypatch.setattr(sag_terms, "_spline_coefficients", lambda heights: filtered.append(0) or real(heights))
     line = 0.25 * (torch.arange(22, dtype=torch.float64) - 10.5)
     heights = 0.5 + sag_of_powers(singlet(), line**2 + line[:, None] ** 2)
     pupil, _ = gauss_rings(4)

@@ -28,7 +28,15 @@ from raytrace.imaging.limits import limits_of, violation
 from raytrace.io import as_lens
 from raytrace.system.identity import identity, other_lens
 from raytrace.system.lens import Lens
-from raytrace.system.parameter_paths import BadVariables, Place, counted, number_at, place_named, sensor, with_number
+from raytrace.system.parameter_paths import (
+    BadVariables,
+    ParameterPath,
+    counted,
+    number_at,
+    parameter_path,
+    sensor,
+    with_number,
+)
 from raytrace.system.parameter_paths import parse_bounds as parse_bounds
 from raytrace.system.surface import Surface, sag_at
 from raytrace.tracing.paraxial import first_order
@@ -164,7 +172,7 @@ class Variable:
     surface: int
     start: float
     unit: float
-    place: Place
+    place: ParameterPath
 
     @property
     def name(self) -> str:
@@ -175,7 +183,7 @@ class Variables(Owned):
     """The variables of a lens as parameters: 0 at the start, in units of `Variable.unit`.
 
     vary: "sensor", and lists like "thickness:5,6,10 curvature:1-4 a4:3", of the file's surface numbers; beside
-        thickness, curvature and conic every number that the surface has by its kind (`places.places`).
+        thickness, curvature and conic every number that the surface has by its kind (`parameter_paths`).
     bounds: by name ("sensor", "curvature_3"), smallest and largest number of the lens; `project` keeps them.
     hold: "efl" keeps the focal length of the lens, "efl=100" that one in mm: the last variable of `vary` that changes
         it is then no parameter but solved for (`held`), and its bounds count in `violation`.
@@ -334,14 +342,14 @@ def parse(lens: Lens, vary: str) -> tuple[Variable, ...]:
 
 
 def _variable(lens: Lens, kind: str, number: int, word: str) -> Variable:
-    place, surface = place_named(lens, kind, number, word), lens.surfaces[number]
+    place, surface = parameter_path(lens, kind, number, word), lens.surfaces[number]
     start = number_at(surface, place)
     start = torch.zeros_like(surface.thickness) if start is None else start.detach()
     unit = 1.0 if place.path == ("thickness",) else 1 / _sag_moved(lens, surface, kind, place, start, word)
     return Variable(kind, number, float(start), unit, place)
 
 
-def _sag_moved(lens: Lens, surface: Surface, kind: str, place: Place, start: Tensor, word: str) -> float:
+def _sag_moved(lens: Lens, surface: Surface, kind: str, place: ParameterPath, start: Tensor, word: str) -> float:
     """How far the surface moves at its semi-diameter with one unit of a number, by the first term of the series
 
     z ≈ c r²/2 + (1 + k) c³ r⁴/8 + …

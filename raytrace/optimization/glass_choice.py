@@ -199,7 +199,7 @@ def followers(lens: Lens) -> dict[int, int]:
 
 
 def _differs(lens: Lens, surface: int) -> bool:
-    return any(place.path[:3] == ("surfaces", surface, "glass") for one in lens.operands for place in one.places)
+    return any(place.path[:3] == ("surfaces", surface, "glass") for one in lens.operands for place in one.paths)
 
 
 def with_glasses(lens: Lens, glasses: dict[int, Glass]) -> Lens:

@@ -71,7 +71,7 @@ def _objection(free: Freedom, k: int) -> str:
     if not 1 <= k <= sensor(lens):
         return f"is none before the image: this lens has surfaces 1 to {sensor(lens)}"
     surface, before = lens.surfaces[k], lens.surfaces[k - 1]
-    shaped = (surface.conic, surface.coefficients, surface.departure, surface.phase)
+    shaped = (surface.conic, surface.coefficients, surface.sag_terms, surface.phase)
     if surface.is_mirror or before.is_mirror or any(part is not None for part in shaped) or is_posed(surface):
         return "is no centred sphere that refracts"
     if before.is_break or is_air(before.glass) == is_air(surface.glass):

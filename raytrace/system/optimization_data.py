@@ -14,7 +14,7 @@ from dataclasses import dataclass
 class Vary:
     """A number that an optimisation may change.
 
-    surface: of the file; quantity: "thickness", "curvature", or another name of `places.places`, as "conic", "a4",
+    surface: of the file; quantity: "thickness", "curvature", or another name of `parameter_paths`, as "conic", "a4",
     "tilt_x"; "index", "abbe_number", "partial_dispersion" of a model glass.
     configuration, operand: of a number that differs from one configuration to the next, which (from 1), and which of
     `lens.operands` (from 0) it belongs to; surface and quantity are those of the operand. 0 and None: the lens's own.

@@ -100,7 +100,7 @@ def surfaces_of(element: Element, *, substrate: Tensor | float = 0.0) -> tuple[S
     """The plane and the height of an element, beside air; errors as `element_lens` has them.
 
     The thickness between their vertices is the substrate plus the height at the axis; even powers become those of an
-    asphere, all other profiles a departure without a height at its vertex.
+    asphere, all other profiles sag terms without a height at its vertex.
     """
     profile, radius = element.profile, float(element.radius.detach())
     if element.period is not None or isinstance(profile, Rings):
@@ -112,17 +112,17 @@ def surfaces_of(element: Element, *, substrate: Tensor | float = 0.0) -> tuple[S
     if isinstance(profile, EvenPowers):
         back = dataclasses.replace(back, coefficients=profile.coefficients)
     elif isinstance(profile, Zernike):
-        departure = ZernikeSag(profile.coefficients, element.radius)
-        centre = relief(departure).sag(zero, zero, highest=0).z
+        sag_terms = ZernikeSag(profile.coefficients, element.radius)
+        centre = relief(sag_terms).sag(zero, zero, highest=0).z
         piston = torch.nn.functional.pad(centre[None], (0, len(profile.coefficients) - 1))
-        departure = ZernikeSag(profile.coefficients - piston, element.radius)
-        back = dataclasses.replace(back, departure=departure)
+        sag_terms = ZernikeSag(profile.coefficients - piston, element.radius)
+        back = dataclasses.replace(back, sag_terms=sag_terms)
     else:
-        departure = spline(GridSag(profile.heights, profile.pitch))
-        centre = relief(departure).sag(zero, zero, highest=0).z
+        sag_terms = spline(GridSag(profile.heights, profile.pitch))
+        centre = relief(sag_terms).sag(zero, zero, highest=0).z
         # The weights of a spline sum to 1: less everywhere as at the axis. Found once, however often it is traced.
-        departure = dataclasses.replace(departure, coefficients=departure.coefficients - centre)
-        back = dataclasses.replace(back, departure=departure)
+        sag_terms = dataclasses.replace(sag_terms, coefficients=sag_terms.coefficients - centre)
+        back = dataclasses.replace(back, sag_terms=sag_terms)
     thickness = centre + torch.as_tensor(substrate, dtype=zero.dtype)
     with torch.no_grad():
         lowest = float((thickness + sag_at(back, *_disc(element.radius))).min())

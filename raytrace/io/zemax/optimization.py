@@ -42,7 +42,7 @@ from raytrace.io.zemax.surfaces import numbers
 from raytrace.system.configurations import Path, part, with_part
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import OptimizationData, Solve, Vary
-from raytrace.system.parameter_paths import number_at, places
+from raytrace.system.parameter_paths import number_at, parameter_paths
 from raytrace.system.surface import Surface
 
 #: Values far from what lenses have, exact in binary.
@@ -53,7 +53,7 @@ FIRST_TERM = 3
 
 
 class Named(NamedTuple):
-    """A number of the lens: its name in `places.places`, and factor · (number of the file, in mm) + offset, it is."""
+    """A number of the lens: its name in `parameter_paths`, and factor · (number of the file, in mm) + offset, it is."""
 
     name: str
     factor: float
@@ -74,8 +74,8 @@ def names(surface: Surface, row: SurfaceType, told: Numbers, keyword: str, j: in
     except (KeyError, IndexError, ValueError):
         return (), surface
     found = []
-    for name, place in places(probed[0]).items():
-        one, other = (number_at(like, place) if name in places(like) else None for like in probed)
+    for name, place in parameter_paths(probed[0]).items():
+        one, other = (number_at(like, place) if name in parameter_paths(like) else None for like in probed)
         if isinstance(one, Tensor) and isinstance(other, Tensor) and float(one) != float(other):
             factor = (float(other) - float(one)) / (_PROBES[1] - _PROBES[0])
             found.append(Named(name, factor, float(one) - factor * _PROBES[0]))
@@ -103,7 +103,7 @@ def listed(row: SurfaceType, told: Numbers) -> list[tuple[str, int]]:
 
 def path_of(surface: Surface, name: str) -> Path | None:
     """Where a surface holds a number of a name; None of one that it has no room for."""
-    place = places(surface).get(name)
+    place = parameter_paths(surface).get(name)
     if place is None:
         return None
     entry = () if place.entry is None else ((place.entry,),)
@@ -494,7 +494,7 @@ def _of_configurations(found: Sections, lens: Lens) -> Iterator[Vary | Solve]:
         status = int(plain(one.rule[0])) if one.rule and is_number(one.rule[0]) else 0
         if operand is None or not status or not 1 <= one.configuration <= len(lens.operands[operand]):
             continue
-        place = lens.operands[operand].places[:1]
+        place = lens.operands[operand].paths[:1]
         name = _name_at(lens, place[0].path) if place else ""
         where = {"configuration": one.configuration, "operand": operand}
         if status == VARIABLE and name:
@@ -537,11 +537,11 @@ def _name_at(lens: Lens, path: tuple) -> str:
     if path[2:] == ("thickness",):
         return "thickness"
     surface = lens.surfaces[path[1]]
-    return next((name for name in places(surface) if path_of(surface, name) == path[2:]), "")
+    return next((name for name in parameter_paths(surface) if path_of(surface, name) == path[2:]), "")
 
 
 def _paths_of_configurations(lens: Lens) -> set:
-    return {operand.places[0].path for operand in lens.operands if operand.places}
+    return {operand.paths[0].path for operand in lens.operands if operand.paths}
 
 
 def _is_void(one: Vary, lens: Lens, own: set) -> bool:

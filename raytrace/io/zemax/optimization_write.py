@@ -177,8 +177,8 @@ def with_pickups(lines: list[str], lens: Lens, number: int, place: Place) -> lis
     Raises LensFileError for one that a .zmx file is not known to have.
     """
     for operand in lens.operands:
-        first = operand.places[0].path if operand.places else ()
-        for path, factor, offset in operand.places[1:]:
+        first = operand.paths[0].path if operand.paths else ()
+        for path, factor, offset in operand.paths[1:]:
             if path[:2] != ("surfaces", number) or number == operand.number or path[2] == "environment":
                 continue
             name = "PRAM" if operand.name.startswith("PAR") else operand.name
@@ -227,7 +227,7 @@ def _line(operand: Operand, configuration: int, text: Sections, rule: tuple[str,
 
 def _word(operand: Operand, configuration: int, text: Sections, place: Place) -> str:
     """The value of an operand: the word in the file of its configuration, or its own where it stands for none."""
-    if operand.places and operand.name in ROWS and not zemax_environment.is_of_surfaces(operand):
+    if operand.paths and operand.name in ROWS and not zemax_environment.is_of_surfaces(operand):
         found = word(text, _cell(operand, configuration, place))
         if found is not None:
             return repr(FAR) if is_infinite(found) else found.replace('"', "'")

@@ -170,7 +170,7 @@ _SHAPE = {
     "curvature": "curvature",
     "conic": "conic constant",
     "coefficients": "aspheric terms",
-    "departure": "departure from a conic",
+    "sag_terms": "added sag terms",
     "phase": "phase",
 }
 
@@ -197,12 +197,12 @@ def _own(surface: Surface) -> str:
     """What is special of a surface, as an error calls it."""
     if surface.is_break:
         return "a coordinate break"
-    return type(surface.phase or surface.departure).__name__ if surface.phase or surface.departure else surface.kind
+    return type(surface.phase or surface.sag_terms).__name__ if surface.phase or surface.sag_terms else surface.kind
 
 
 def _check_terms(surface: Surface, found: str, place: Place) -> None:
     kind, row, terms = KINDS[surface.kind], types()[found], surface.coefficients
-    if (surface.phase is not None or surface.departure is not None) and surface.kind != EVEN:
+    if (surface.phase is not None or surface.sag_terms is not None) and surface.kind != EVEN:
         message = f"{_own(surface)} on a surface that is {surface.kind}, expected one that is an {EVEN} at most"
         raise LensFileError(f"{message}; a .zmx file holds no such surface", place)
     most = row.most if found == "XASPHERE" else kind.most or kind.parameters
@@ -265,7 +265,7 @@ def _glass(glass: Glass, place: Place) -> list[str]:
 
 def _floats(lens: Lens, number: int) -> bool:
     """Whether the aperture of a surface follows its semi-diameter from one configuration to the next."""
-    followed = [place.path[:3] for operand in lens.operands if operand.name == "SDIA" for place in operand.places]
+    followed = [place.path[:3] for operand in lens.operands if operand.name == "SDIA" for place in operand.paths]
     return ("surfaces", number, "apertures") in followed
 
 

@@ -204,7 +204,7 @@ def _need_seidel(line: Line, planner: Planner) -> None:
         raise BadRow(line, "is of a straight axis: tilts and decentres bend this one")
     for k, surface in enumerate(planner.lens.surfaces):
         if not is_even(surface):
-            raise BadRow(line, f"is of even powers of r: surface {k} has other terms, a departure or a phase")
+            raise BadRow(line, f"is of even powers of r: surface {k} has other terms, added sag or a phase")
 
 
 def _distortion_sum(lines: Sequence[Line], planner: Planner) -> Evaluate:

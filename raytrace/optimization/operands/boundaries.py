@@ -233,7 +233,7 @@ class Gaps:
 
 def is_even(surface: Surface) -> bool:
     """Whether the sag is that of a conic with even terms at most, which is told here in numpy."""
-    return surface.departure is None and (surface.coefficients is None or surface.kind == EVEN)
+    return surface.sag_terms is None and (surface.coefficients is None or surface.kind == EVEN)
 
 
 def _even_terms(surface: Surface) -> list[float]:
