@@ -87,7 +87,7 @@ def depth_invariant_density(transfer: Tensor, spectrum: Tensor, sigma: Tensor | 
 
 
 def kernel_error(kernels: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
-    """`depth_invariant_error` (...) of kernels (Z, ..., h, w), at half the cost: by the half of the frequencies that tells all.
+    """`depth_invariant_error` (...) of kernels (Z, ..., h, w), from the non-redundant half of the frequencies.
 
     Pictures and kernels are real, so that S and |H| at f and -f are equal; and where the middle of the kernels lies
     does not matter, as long as it is the same for all Z.
