@@ -21,7 +21,7 @@ from raytrace.bench.report import Measured
 from raytrace.cli import main
 from raytrace.io import read_lens
 from raytrace.maths.grid import grid
-from raytrace.psf_models import MODELS, diffraction, drt
+from raytrace.psf_models import MODELS, drt, wave
 from raytrace.psf_models.gaussian import kernels as gaussian_kernels
 from raytrace.system.surface import Aperture
 
@@ -60,7 +60,7 @@ def test_direct_sum_is_the_wave_models_limit():
     lens = problems.double_gauss(aperture=("entrance_pupil_diameter", 8.0))
     s = scene_of(lens, 7.0, 25e3)
     window = grid(0.01, 3, moments(s, 16, 64).centroid)
-    found = diffraction.kernels(s, window, order=1)
+    found = wave.kernels(s, window, order=1)
     rings, arms, nodes = bench.wave_sampling(s, window)
     kernel, _ = direct_sum(s, window, Sampling(rings, arms, nodes + 1))
     assert kernel.sum() > 0.3
@@ -269,7 +269,7 @@ def test_peer_sees_the_same_kernels():
     window = case.window(moments(case.scene, 8, 32).centroid)
     kernels = {
         "rays": drt.reference(case.scene, window, lines=512)[0, 0, 0],
-        "wave": diffraction.kernels(case.scene, window).kernel[0, 0, 0].detach(),
+        "wave": wave.kernels(case.scene, window).kernel[0, 0, 0].detach(),
     }
     truth = bench.Truth(case, kernels, dict.fromkeys(kernels, window), window.centre, vector(0.02, 0.02))
     found = {}

@@ -45,11 +45,11 @@ from raytrace.studies.edof.world import (
 )
 from raytrace.studies.pictures import Pictures, dead_leaves
 from raytrace.studies.quantise import process_report
+from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import aim, baseline
 from raytrace.wave_optics.element import Element, Zernike, as_rings
 from raytrace.wave_optics.element_files import write_element
 from raytrace.wave_optics.plan import plan
-from raytrace.wave_optics.psf import psf
 
 SMALL = World(depths=(500.0, 1000.0, math.inf), wavelengths=(0.5, 0.6), size=63, pixel=0.00738)
 PICTURES = periodic(dead_leaves(8, size=64, seed=5, smallest=2.5), 128)

@@ -10,8 +10,8 @@ from problems import double_gauss, scalar, vector
 from raytrace.materials.glass import model_glass
 from raytrace.maths.grid import Grid
 from raytrace.psf_models import drt, gaussian
+from raytrace.psf_models.drt import energy_of_fans
 from raytrace.psf_models.models import MODELS
-from raytrace.psf_models.rays import energy_of_fans
 from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance
 from raytrace.system.surface import Aperture
 from raytrace.tracing.scene import Scene, scene, trace_scene

@@ -25,7 +25,7 @@ from raytrace.cli.progress import progress
 from raytrace.maths.grid import Grid
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to
-from raytrace.psf_models import MODELS, NotConverged, Psf, diffraction, drt, paraxial
+from raytrace.psf_models import MODELS, NotConverged, Psf, drt, paraxial, wave
 from raytrace.psf_models.dft import nodes_per_pixel, rings_and_arms
 from raytrace.psf_models.pixels import gaussian_pixels
 from raytrace.psf_models.result import Kernels
@@ -131,7 +131,7 @@ def wave_sampling(scene: Scene, grid: Grid) -> tuple[int, int, int]:
     spread = torch.hypot(L - L.mean(), M - M.mean()).max()
     cutoff = 2e3 * float(spread * front.index[0] / front.wavelength[0])
     return (
-        *rings_and_arms(diffraction.phase_along_radius(front, reach), 0),
+        *rings_and_arms(wave.phase_along_radius(front, reach), 0),
         nodes_per_pixel(float(grid.pitch), cutoff, 0),
     )
 

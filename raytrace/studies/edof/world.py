@@ -24,9 +24,9 @@ from raytrace.studies.descent import NoOptimum, minimise
 from raytrace.studies.edof.octant import Octant, fits
 from raytrace.studies.pictures import Pictures, draws
 from raytrace.tracing.memo import Memo
+from raytrace.wave_optics.compute import ElementPsf, psf
 from raytrace.wave_optics.element import Element, Rings
 from raytrace.wave_optics.plan import plan
-from raytrace.wave_optics.psf import ElementPsf, psf
 from raytrace.wave_optics.scene import WaveScene, is_round
 
 FILTERS = ("wiener", "blind")  # of restoration

@@ -17,9 +17,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from raytrace.imaging.phase_variables import PhaseVariables
 from raytrace.imaging.restoration import depth_invariant_wiener, errors, psnr
 from raytrace.imaging.training import DamagedRun, load_state, read_json
+from raytrace.imaging.variables import PhaseVariables
 from raytrace.maths.value import detached
 from raytrace.studies import options
 from raytrace.studies.edof.settings import Settings
