@@ -31,7 +31,7 @@ def test_seidel_sums_are_those_of_the_verb(name):
     lens = lens_of(name)
     found = rt.seidel(lens, kind="waves").contributions[:5, 0].numpy()
     last = len(lens.surfaces) - 2
-    for which, (operand, share) in enumerate(zip((*SUMS, "DIST"), OF_WAVEFRONT, strict=True)):
+    for which, (operand, share) in enumerate(zip((*SUMS, "DIST"), OF_WAVEFRONT[:5], strict=True)):
         told = values_of(name, [Row(operand, (k, 0)) for k in range(1, last + 1)])
         size = np.abs(found).max()
         assert told / share == pytest.approx(found[which], rel=1e-10, abs=1e-12 * size), operand
