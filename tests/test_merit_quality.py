@@ -16,9 +16,8 @@ from raytrace.optimization.lens_model import Model
 from raytrace.optimization.merit_rows import Evaluation
 from raytrace.optimization.operands.custom import Measure
 from raytrace.system.optimization_data import Row, Solve, Vary
-from raytrace.tracing.focus import image_rays
 from raytrace.tracing.scene import scene
-from raytrace.tracing.spot import spot_of, spot_of_points
+from raytrace.tracing.spot import image_rays, spot_of, spot_of_points
 from raytrace.tracing.wavefront import rms, wavefront_of, without
 
 FIELD = (0.0, 0.7)

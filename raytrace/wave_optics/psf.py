@@ -16,7 +16,7 @@ from raytrace.files import write_atomically
 from raytrace.maths.grid import Grid, centres
 from raytrace.maths.result import Result, number, object_text, rows
 from raytrace.maths.value import value
-from raytrace.tracing.memo import Memo
+from raytrace.tracing.scene import Memo
 from raytrace.wave_optics import plan as planning
 from raytrace.wave_optics.element import Element, EvenPowers, height_range
 from raytrace.wave_optics.plan import Plan

@@ -14,9 +14,8 @@ from torch import Tensor
 from raytrace.io.spelling import double
 from raytrace.io.zemax.numbers import INVERSE, Numbers, SurfaceType, numbers_of, order_is_known, pose_of
 from raytrace.system.phases import Facets, FringePhase, Grating, Hologram, IdealLens, PolynomialPhase, RadialPhase
-from raytrace.system.polynomials import IrregularSag, PolynomialSag, TiltSag
 from raytrace.system.poses import undone
-from raytrace.system.sag_terms import FringeSag
+from raytrace.system.sag_terms import FringeSag, IrregularSag, PolynomialSag, TiltSag
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface
 
