@@ -80,7 +80,7 @@ PUBLIC = {
     "Condition": "optimization.constraints",
     "Measure": "optimization.operands.custom",
     "Merit": "optimization.merit",
-    "Readings": "optimization.conventions",
+    "Conventions": "optimization.conventions",
     "NoProblem": "optimization.problem",
     "Optimized": "optimization.result",
     "Row": "system.optimization_data",
@@ -126,7 +126,7 @@ PUBLIC = {
     # pictures and learning
     "add_noise": "imaging.sensor",
     "add_shot_noise": "imaging.sensor",
-    "blind_filter": "imaging.restoration",
+    "depth_invariant_wiener": "imaging.restoration",
     "blur": "imaging.image",
     "blur_layers": "imaging.image",
     "count_electrons": "imaging.sensor",

@@ -47,7 +47,7 @@ def test_rows_say_what_was_compared(monkeypatch):
     rows = measure(TINY, repeats=1, progress=words.append)
     assert torch.get_num_threads() == before
     assert words == [row.what for row in rows] == [case.what for case in few]
-    assert {row.engine for row in rows} == {"eager"} | ({"fused"} if prepare() == "fused" else set())
+    assert {row.engine for row in rows} == {"eager"} | ({"compiled"} if prepare() == "compiled" else set())
     for row in rows:
         assert row.gain == row.seconds_without / row.seconds
         assert 0 <= row.error < ROUNDING

@@ -36,7 +36,7 @@ def random_surface(kind: str, random: torch.Generator) -> Surface:
     elif kind == "biconic":
         others["coefficients"] = vector(uniform(-0.05, 0.05), uniform(-3, 2))
     else:
-        others["departure"] = PolynomialSag(vector(*(uniform(-0.1, 0.1) for _ in range(9))), scalar(20.0))
+        others["sag_terms"] = PolynomialSag(vector(*(uniform(-0.1, 0.1) for _ in range(9))), scalar(20.0))
     return Surface(
         scalar(5.0), c, None if k is None else scalar(k), kind=kind if kind in KINDS else "even asphere", **others
     )
@@ -69,7 +69,7 @@ def compare(kind: str, count: int, rays: int, seed: int) -> dict[str, int]:
     sums = dict.fromkeys(("hits", "eager off", "compiled off", "by one engine"), 0)
     for _ in range(count):
         surface, bundle = random_surface(kind, random), wide_rays(rays, random)
-        eager, compiled = (hits(surface, bundle, engine) for engine in ("eager", "fused"))
+        eager, compiled = (hits(surface, bundle, engine) for engine in ("eager", "compiled"))
         sums["hits"] += int(eager.valid.sum())
         sums["eager off"] += int(is_off(surface, eager).sum())
         sums["compiled off"] += int(is_off(surface, compiled).sum())

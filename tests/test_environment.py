@@ -232,7 +232,7 @@ def test_mirrors_keep_the_medium_before_them():
     assert [n.item() for n in media(lens.at(temperature=-30, pressure=0.3), lens.wavelengths[0])] == [1.0] * 4
 
 
-@pytest.mark.parametrize("engine", ["eager", "fused"])
+@pytest.mark.parametrize("engine", ["eager", "compiled"])
 def test_derivatives_of_a_spot_by_temperature_and_pressure(engine):
     lens = rt.read_lens("double_gauss")
 

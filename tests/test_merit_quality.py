@@ -339,5 +339,5 @@ def test_an_optimisation_follows_a_function_of_the_lens(tmp_path):
     assert "sharpness" in str(found)
     with pytest.warns(LensFileWarning, match="what is to be optimised"):
         rt.write_lens(found.lens, tmp_path / "found.zmx")
-    row = rt.read_lens(tmp_path / "found.zmx").intent.merit[0]
+    row = rt.read_lens(tmp_path / "found.zmx").optimization_data.merit[0]
     assert (row.operand, row.text) == ("BLNK", "sharpness: a function of the lens, target 1, weight 1")

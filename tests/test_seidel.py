@@ -150,8 +150,8 @@ def test_what_does_not_exist_is_nan_and_what_is_no_seidel_theory_is_refused():
     assert bool((seidel(afocal).contributions == 0).all())
     with pytest.raises(ValueError, match="expected one of coefficients, waves"):
         seidel(afocal, kind="wave")
-    bumpy = surface(0.02, 5.0, 1.5, departure=ZernikeSag(vector(0.0, 0.0, 0.0, 1e-3), scalar(5.0)))
-    with pytest.raises(ValueError, match="surface 1 has a departure"):
+    bumpy = surface(0.02, 5.0, 1.5, sag_terms=ZernikeSag(vector(0.0, 0.0, 0.0, 1e-3), scalar(5.0)))
+    with pytest.raises(ValueError, match="surface 1 has added sag terms"):
         seidel(lens([bumpy, surface(None, 90.0)]))
 
 

@@ -143,7 +143,7 @@ for word in sys.argv[1:]:
     os.environ[name] = value
     library.cache_folder.cache_clear()
     library.is_built.cache_clear()
-    print(choice.is_fused(Rays(one, one, one[0] > 0), one, 1), flush=True)
+    print(choice.uses_compiled(Rays(one, one, one[0] > 0), one, 1), flush=True)
     del os.environ[name]
 """
 

@@ -34,7 +34,7 @@ from raytrace.maths.value import value
 from raytrace.system.configurations import count
 from raytrace.system.lens import Lens, check_media
 from raytrace.system.lens import check as check_lens
-from raytrace.system.optimization_data import Intent
+from raytrace.system.optimization_data import OptimizationData
 from raytrace.words import calling_level, named_value
 
 #: Other glasses for those of a file: {"SSK4": "SSK4A"}, words like "SSK4=SSK4A", "nearest" for every unknown one.
@@ -134,7 +134,7 @@ def read_lens_with_report(
         raise LensFileError(f"has no configuration {configuration}; {there}", Place(str(path)))
     _refuse_no_wavelengths(lens, path)
     varied = [Varied(str(operand), tuple(operand.values())) for operand in lens.operands if operand.name != "MOFF"]
-    intent = Intent() if lens.intent is None else lens.intent
+    optimization_data = OptimizationData() if lens.optimization_data is None else lens.optimization_data
     report = dataclasses.replace(
         report,
         surfaces=len(lens.surfaces),
@@ -143,9 +143,9 @@ def read_lens_with_report(
         wavelengths=tuple(lens.wavelengths.tolist()),
         ray_aiming=lens.ray_aiming,
         configurations=tuple(varied),
-        **{name: tuple(map(str, getattr(intent, name))) for name in ("variables", "solves", "kept")},
-        operands=operand_uses(intent.merit, evaluated),
-        tolerances=len(intent.tolerances),
+        **{name: tuple(map(str, getattr(optimization_data, name))) for name in ("variables", "solves", "kept")},
+        operands=operand_uses(optimization_data.merit, evaluated),
+        tolerances=len(optimization_data.tolerances),
     )
     return lens, report
 
@@ -271,17 +271,28 @@ def _changed_texts(lens: Lens, content: bytes, form: Format, path: Path, catalog
         pairs.append((f"the other configurations, {count(lens.operands)} in all", lens.current_configuration, 0))
     else:
         pairs += [(str(a), a.values(), b.values()) for a, b in zip(lens.operands, again.operands, strict=False)]
-    if unbound := _unbound(lens.intent, again.intent):
+    if unbound := _unbound(lens.optimization_data, again.optimization_data):
         pairs.append(("bounds of variables, of which it holds those of thicknesses alone", ", ".join(unbound), ""))
-        again = dataclasses.replace(again, intent=dataclasses.replace(again.intent, variables=lens.intent.variables))
-    if _asks(lens.intent) and again.intent != lens.intent:
-        pairs.append(("what is to be optimised", f"{len(lens.intent.merit)} rows of a merit function", ""))
+        again = dataclasses.replace(
+            again,
+            optimization_data=dataclasses.replace(again.optimization_data, variables=lens.optimization_data.variables),
+        )
+    if _asks(lens.optimization_data) and again.optimization_data != lens.optimization_data:
+        pairs.append(("what is to be optimised", f"{len(lens.optimization_data.merit)} rows of a merit function", ""))
     return [f"{what} ({shown(str(before))})" for what, before, after in pairs if before != after]
 
 
-def _asks(intent: Intent | None) -> bool:
-    """Whether an intent says more than which semi-diameters are given."""
-    return intent is not None and any((intent.variables, intent.solves, intent.merit, intent.tolerances, intent.kept))
+def _asks(optimization_data: OptimizationData | None) -> bool:
+    """Whether optimisation data says more than which semi-diameters are given."""
+    return optimization_data is not None and any(
+        (
+            optimization_data.variables,
+            optimization_data.solves,
+            optimization_data.merit,
+            optimization_data.tolerances,
+            optimization_data.kept,
+        )
+    )
 
 
 def _format(path: Path, known: Sequence[str] = tuple(FORMATS)) -> Format:
@@ -293,11 +304,11 @@ def _format(path: Path, known: Sequence[str] = tuple(FORMATS)) -> Format:
     return FORMATS[suffix]
 
 
-def _unbound(intent: Intent | None, again: Intent | None) -> list[str]:
+def _unbound(optimization_data: OptimizationData | None, again: OptimizationData | None) -> list[str]:
     """Variables whose bounds are not those that they were written with, where nothing else of them is another."""
-    if intent is None or again is None:
+    if optimization_data is None or again is None:
         return []
-    free = [[dataclasses.replace(one, bounds=()) for one in told.variables] for told in (intent, again)]
-    pairs = zip(intent.variables, again.variables, strict=False)
+    free = [[dataclasses.replace(one, bounds=()) for one in told.variables] for told in (optimization_data, again)]
+    pairs = zip(optimization_data.variables, again.variables, strict=False)
     bare = [f"{a.quantity} of surface {a.surface}" for a, b in pairs if a.bounds and not b.bounds]
     return bare if free[0] == free[1] else []

@@ -123,7 +123,7 @@ class ImportReport(Result):
     error when the file is read with `strict=True`. surfaces, stop_surface, primary_wavelength (its
     number, from 1), wavelengths (µm), ray_aiming: of the lens that was read.
     configurations: what differs between those of a multi-configuration file.
-    variables, solves, kept: of `Lens.intent`, in words; operands: those of its merit function; tolerances: its lines.
+    variables, solves, kept: of `Lens.optimization_data`, in words; operands: of the merit; tolerances: its lines.
     geometry: surfaces and gaps that cannot be made.
     """
 
@@ -170,7 +170,7 @@ class ImportReport(Result):
         if self.configurations:
             numbers = " ".join(f"{k:>14}" for k in range(1, len(self.configurations[0].values) + 1))
             lines += ["  configurations:", f"    {'':<12} {numbers}", *(f"    {one}" for one in self.configurations)]
-        lines += self._intent()
+        lines += self._optimization_data()
         lines += ["  glasses:", *(f"    {use}" for use in self.glasses)] if self.glasses else []
         return "\n".join(lines)
 
@@ -184,7 +184,7 @@ class ImportReport(Result):
             f"  ray aiming: {self.ray_aiming} ({RAY_AIMING[self.ray_aiming]})",
         ]
 
-    def _intent(self) -> list[str]:
+    def _optimization_data(self) -> list[str]:
         """What the lens is to become, and the operands of its merit function by what becomes of them."""
         titled = {f"{len(self.variables)} variables": self.variables, "solves and pickups": self.solves}
         titled["rules that are kept and not followed"] = self.kept

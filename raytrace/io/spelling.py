@@ -119,10 +119,10 @@ def thickness(number: Tensor, infinity: str, place: Place) -> str:
 _ELSEWHERE = "this format does not hold; a .zmx file holds most kinds"
 
 
-def refuse_departure(surface: Surface, place: Place) -> None:
-    """Raise LensFileError for a surface with a departure: the formats hold conics and terms of a kind."""
-    if surface.departure is not None:
-        kind = named(surface.departure)
+def refuse_sag_terms(surface: Surface, place: Place) -> None:
+    """Raise LensFileError for a surface with sag terms: the formats hold conics and terms of a kind."""
+    if surface.sag_terms is not None:
+        kind = named(surface.sag_terms)
         raise LensFileError(f"the surface departs from a conic and even terms ({kind}), which {_ELSEWHERE}", place)
     if is_freeform(surface):
         raise LensFileError(f"the surface is {surface.kind}, which {_ELSEWHERE}", place)

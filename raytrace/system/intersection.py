@@ -107,7 +107,7 @@ _ACCEPTED_RESIDUAL = 64.0  # units of the rounding error of the terms of F
 torch.library.define(
     "raytrace::first_crossing",
     "(Tensor foot, Tensor direction, Tensor curvature, Tensor conic, Tensor coefficients, str kind, Tensor[] numbers,"
-    " str departure, float rim) -> (Tensor, Tensor)",
+    " str sag_terms, float rim) -> (Tensor, Tensor)",
 )
 
 
@@ -128,30 +128,30 @@ def first_crossing(
     within which the first crossing is wanted (inf: the whole sag); a crossing outside the rim is taken only if there is
     none in it. Worked in float64 also for float32 rays; not differentiated: hand it detached tensors.
     """
-    numbers, departure = ([], "") if relief is None else ([number.detach() for number in relief.numbers], relief.kind)
+    numbers, sag_terms = ([], "") if relief is None else ([number.detach() for number in relief.numbers], relief.kind)
     find = torch.ops.raytrace.first_crossing
-    return find(foot, direction, curvature, conic, coefficients, kind, numbers, departure, rim)
+    return find(foot, direction, curvature, conic, coefficients, kind, numbers, sag_terms, rim)
 
 
 @torch.library.register_fake("raytrace::first_crossing")
-def _(foot, direction, curvature, conic, coefficients, kind, numbers, departure, rim):
+def _(foot, direction, curvature, conic, coefficients, kind, numbers, sag_terms, rim):
     batch = broadcast_shape(foot.shape[1:], direction.shape[1:], curvature.shape, conic.shape, coefficients.shape[1:])
     return foot.new_empty(batch), foot.new_empty(batch, dtype=torch.bool)
 
 
 @torch.library.register_vmap("raytrace::first_crossing")
-def _(info, in_dims, foot, direction, curvature, conic, coefficients, kind, numbers, departure, rim):
-    """Move the mapped axis in front of the batch axes; departures that differ are gone through one by one."""
+def _(info, in_dims, foot, direction, curvature, conic, coefficients, kind, numbers, sag_terms, rim):
+    """Move the mapped axis in front of the batch axes; sag terms that differ are taken one by one."""
     tensors, find = (foot, direction, curvature, conic, coefficients), torch.ops.raytrace.first_crossing
-    dims = in_dims[6] if departure else []
+    dims = in_dims[6] if sag_terms else []
     if all(dim is None for dim in dims):
-        return find(*_aligned(tensors, in_dims[:5]), kind, numbers, departure, rim), (0, 0)
+        return find(*_aligned(tensors, in_dims[:5]), kind, numbers, sag_terms, rim), (0, 0)
 
     def part(given, dims, i: int) -> list[Tensor]:
         return [x if dim is None else x.select(dim, i) for x, dim in zip(given, dims, strict=True)]
 
     each = [
-        find(*part(tensors, in_dims[:5], i), kind, part(numbers, dims, i), departure, rim)
+        find(*part(tensors, in_dims[:5], i), kind, part(numbers, dims, i), sag_terms, rim)
         for i in range(info.batch_size)
     ]
     return tuple(torch.stack(found) for found in zip(*each, strict=True)), (0, 0)
@@ -165,11 +165,11 @@ def search(
     coefficients: Tensor,
     kind: str,
     numbers: Sequence[Tensor],
-    departure: str,
+    sag_terms: str,
     rim: float,
 ) -> tuple[Tensor, Tensor]:
     """What the operator does, outside of transforms."""
-    relief = Relief(departure, numbers) if departure else None
+    relief = Relief(sag_terms, numbers) if sag_terms else None
     batch = broadcast_shape(foot.shape[1:], direction.shape[1:], curvature.shape, conic.shape, coefficients.shape[1:])
     p, d = _expand(foot.double(), batch).reshape(3, -1), _expand(direction.double(), batch).reshape(3, -1)
     c, k = curvature.double().expand(batch).reshape(-1), conic.double().expand(batch).reshape(-1)

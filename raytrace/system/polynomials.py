@@ -1,4 +1,4 @@
-"""Polynomials: departures that are sums of powers of x and y, linear in their coefficients.
+"""Polynomials: sag_terms that are sums of powers of x and y, linear in their coefficients.
 
     PolynomialSag   D = Σ_k c_k E_k(x/R, y/R),  E = x, y, x², xy, y², x³, x²y, …
     IrregularSag    D = Z_s ρ⁴ + Z_a v² + Z_c ρ² v,  ρ = r/R,  v = (y cos θ - x sin θ)/R
@@ -64,16 +64,16 @@ class PowerSag:
     coefficients: Tensor
 
 
-def as_polynomial(departure: IrregularSag | TiltSag) -> PolynomialSag:
+def as_polynomial(sag_terms: IrregularSag | TiltSag) -> PolynomialSag:
     """The same as a sum of powers."""
-    if isinstance(departure, TiltSag):
-        return PolynomialSag(torch.stack([departure.tan_x, departure.tan_y]), torch.ones_like(departure.tan_x))
-    cosine, sine = cos_sin(departure.angle)
-    zero, across = torch.zeros_like(departure.coma), -sine * departure.coma
-    along, s = cosine * departure.coma, departure.spherical
-    bent = [a * departure.astigmatism for a in (sine * sine, -2 * sine * cosine, cosine * cosine)]
+    if isinstance(sag_terms, TiltSag):
+        return PolynomialSag(torch.stack([sag_terms.tan_x, sag_terms.tan_y]), torch.ones_like(sag_terms.tan_x))
+    cosine, sine = cos_sin(sag_terms.angle)
+    zero, across = torch.zeros_like(sag_terms.coma), -sine * sag_terms.coma
+    along, s = cosine * sag_terms.coma, sag_terms.spherical
+    bent = [a * sag_terms.astigmatism for a in (sine * sine, -2 * sine * cosine, cosine * cosine)]
     return PolynomialSag(
-        torch.stack([zero, zero, *bent, across, along, across, along, s, zero, 2 * s, zero, s]), departure.radius
+        torch.stack([zero, zero, *bent, across, along, across, along, s, zero, 2 * s, zero, s]), sag_terms.radius
     )
 
 
@@ -94,27 +94,27 @@ def polynomial_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
     return polynomial(torch.stack(sums), radius / unit.abs())
 
 
-def powers_of_polynomial(departure: PolynomialSag | IrregularSag | TiltSag) -> PowerSag:
+def powers_of_polynomial(sag_terms: PolynomialSag | IrregularSag | TiltSag) -> PowerSag:
     """The same as powers about the vertex."""
-    given = departure if isinstance(departure, PolynomialSag) else as_polynomial(departure)
+    given = sag_terms if isinstance(sag_terms, PolynomialSag) else as_polynomial(sag_terms)
     zero = torch.zeros_like(given.radius)
     return PowerSag(zero, zero, given.radius, zero, given.coefficients)
 
 
-def powers_of_fringe(departure: FringeSag) -> PowerSag:
+def powers_of_fringe(sag_terms: FringeSag) -> PowerSag:
     """The same as powers about its centre."""
-    orders = [fringe(j) for j in range(1, len(departure.coefficients) + 1)]
-    height, powers_ = _powers_of(orders, departure.coefficients)
-    return PowerSag(departure.centre_x, departure.centre_y, departure.radius, height, powers_)
+    orders = [fringe(j) for j in range(1, len(sag_terms.coefficients) + 1)]
+    height, powers_ = _powers_of(orders, sag_terms.coefficients)
+    return PowerSag(sag_terms.centre_x, sag_terms.centre_y, sag_terms.radius, height, powers_)
 
 
-def powers_of_zernike(departure: ZernikeSag) -> PowerSag:
+def powers_of_zernike(sag_terms: ZernikeSag) -> PowerSag:
     """The same as powers about the vertex."""
-    orders = [noll(j) for j in range(1, len(departure.coefficients) + 1)]
-    norms = departure.coefficients.new_tensor([norm(*order) for order in orders])
-    height, powers_ = _powers_of(orders, norms * departure.coefficients)
-    zero = torch.zeros_like(departure.radius)
-    return PowerSag(zero, zero, departure.radius, height, powers_)
+    orders = [noll(j) for j in range(1, len(sag_terms.coefficients) + 1)]
+    norms = sag_terms.coefficients.new_tensor([norm(*order) for order in orders])
+    height, powers_ = _powers_of(orders, norms * sag_terms.coefficients)
+    zero = torch.zeros_like(sag_terms.radius)
+    return PowerSag(zero, zero, sag_terms.radius, height, powers_)
 
 
 def _powers_of(orders: Sequence[Order], coefficients: Tensor) -> tuple[Tensor, Tensor]:

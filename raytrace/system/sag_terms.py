@@ -1,4 +1,4 @@
-"""Departure: what the sag of a surface has beside its conic and even terms, z = S(r²) + D(x, y).
+"""Sag terms: what the sag of a surface has beside its conic and even terms, z = S(r²) + D(x, y).
 
     GridSag      D = Σ_ij c_ij B(x/p - i) B(y/p - j), the cubic spline through heights at points p apart
     SplineSag    the same by its coefficients c, found once
@@ -6,7 +6,7 @@
     FringeSag    the same by the fringe polynomials, which are 1 at the rim, about a centre of their own
 
 Slopes and second derivatives are written out, and autograd may differentiate them further. What rays need of a
-departure are its numbers, its tensors in float64: the functions of each kind are its row in `shapes`, where the
+sag_terms are its numbers, its tensors in float64: the functions of each kind are its row in `shapes`, where the
 polynomials in x and y of `polynomials` have theirs too.
 """
 

@@ -2,8 +2,8 @@
 
     z = c r²/(1 + √(1 - (1+k) c² r²)) + Σ_j a_j b_j(r²) + D(x, y)
 
-KINDS tells the b_j, by `Surface.kind`, or the form that a kind has in place of them and the conic; DEPARTURES tells D,
-by the class of `Surface.departure`. A new kind is a new row: rays, derivatives, first order, variables, figures, files
+KINDS tells the b_j, by `Surface.kind`, or the form that a kind has in place of them and the conic; SAG_TERMS tells D,
+by the class of `Surface.sag_terms`. A new kind is a new row: rays, derivatives, first order, variables, figures, files
 and, with its terms in tracing/cpp/sags.h, the compiled trace read it.
 """
 
@@ -109,12 +109,12 @@ KINDS = {
 
 
 @dataclasses.dataclass(frozen=True)
-class DepartureKind:
+class SagTermKind:
     """A kind of D(x, y), by functions of its `numbers`: float64 tensors, found once for every meeting with rays.
 
     sag: numbers, x, y (...) mm, highest derivative -> `Sag`; size: numbers, radius (...) mm -> bound on |D| mm within
     it, by which a crossing is bracketed and rounding is judged; covers: numbers, x, y -> where there is a surface;
-    prepare: to the departure whose tensors are the numbers; is_round: about the axis.
+    prepare: to the sag terms whose tensors are the numbers; is_round: about the axis.
     powers: to the same as powers about a centre, which the compiled trace takes, up to `compiled` coefficients; None:
     traced by torch alone.
     """
@@ -124,50 +124,50 @@ class DepartureKind:
     covers: Callable[[Sequence[Tensor], Tensor, Tensor], Tensor] = lambda numbers, x, y: torch.ones_like(
         x, dtype=torch.bool
     )
-    prepare: Callable = lambda departure: departure
+    prepare: Callable = lambda sag_terms: sag_terms
     is_round: bool = False
     powers: Callable | None = None
     compiled: int | None = None
 
 
-DEPARTURES = {
-    "GridSag": DepartureKind(own.spline_sag, own.spline_size, own.spline_covers, prepare=own.spline),
-    "SplineSag": DepartureKind(own.spline_sag, own.spline_size, own.spline_covers),
-    "ZernikeSag": DepartureKind(own.zernike_sag, own.zernike_size, powers=powers_of_zernike, compiled=91),
-    "FringeSag": DepartureKind(own.fringe_sag, own.fringe_size, powers=powers_of_fringe, compiled=37),
-    "PolynomialSag": DepartureKind(polynomial_sag, polynomial_size, powers=powers_of_polynomial),
-    "IrregularSag": DepartureKind(polynomial_sag, polynomial_size, prepare=as_polynomial, powers=powers_of_polynomial),
-    "TiltSag": DepartureKind(polynomial_sag, polynomial_size, prepare=as_polynomial, powers=powers_of_polynomial),
-    "PowerSag": DepartureKind(power_sag, power_size, powers=lambda departure: departure),
+SAG_TERMS = {
+    "GridSag": SagTermKind(own.spline_sag, own.spline_size, own.spline_covers, prepare=own.spline),
+    "SplineSag": SagTermKind(own.spline_sag, own.spline_size, own.spline_covers),
+    "ZernikeSag": SagTermKind(own.zernike_sag, own.zernike_size, powers=powers_of_zernike, compiled=91),
+    "FringeSag": SagTermKind(own.fringe_sag, own.fringe_size, powers=powers_of_fringe, compiled=37),
+    "PolynomialSag": SagTermKind(polynomial_sag, polynomial_size, powers=powers_of_polynomial),
+    "IrregularSag": SagTermKind(polynomial_sag, polynomial_size, prepare=as_polynomial, powers=powers_of_polynomial),
+    "TiltSag": SagTermKind(polynomial_sag, polynomial_size, prepare=as_polynomial, powers=powers_of_polynomial),
+    "PowerSag": SagTermKind(power_sag, power_size, powers=lambda sag_terms: sag_terms),
 }
 
-Departure = GridSag | SplineSag | ZernikeSag | FringeSag | PolynomialSag | IrregularSag | TiltSag | PowerSag
+SagTerms = GridSag | SplineSag | ZernikeSag | FringeSag | PolynomialSag | IrregularSag | TiltSag | PowerSag
 
 
 @dataclasses.dataclass(frozen=True)
 class Relief:
-    """A departure made ready for rays: its row, by the name of its class, and its numbers."""
+    """sag terms made ready for rays: its row, by the name of its class, and its numbers."""
 
     kind: str
     numbers: Sequence[Tensor]
 
     def sag(self, x: Tensor, y: Tensor, *, highest: int = 2) -> Sag:
         """D (...) mm and derivatives up to the `highest`; a grid's goes on beyond its edge with the height there."""
-        return DEPARTURES[self.kind].sag(self.numbers, x, y, highest)
+        return SAG_TERMS[self.kind].sag(self.numbers, x, y, highest)
 
     def covers(self, x: Tensor, y: Tensor) -> Tensor:
         """Whether there is a surface at points (...) mm."""
-        return DEPARTURES[self.kind].covers(self.numbers, x, y)
+        return SAG_TERMS[self.kind].covers(self.numbers, x, y)
 
     def size(self, radius: Tensor) -> Tensor:
         """A bound on |D| in mm up to a radius (...) mm; of grids and Zernike polynomials over all that they cover."""
-        return DEPARTURES[self.kind].size(self.numbers, radius)
+        return SAG_TERMS[self.kind].size(self.numbers, radius)
 
 
-def relief(departure: Departure) -> Relief:
-    """A departure made ready. Raises ValueError for a grid of fewer than 4 × 4 heights."""
-    name = type(departure).__name__
-    return Relief(name, [number.double() for number in tree_leaves(DEPARTURES[name].prepare(departure))])
+def relief(sag_terms: SagTerms) -> Relief:
+    """sag terms made ready. Raises ValueError for a grid of fewer than 4 × 4 heights."""
+    name = type(sag_terms).__name__
+    return Relief(name, [number.double() for number in tree_leaves(SAG_TERMS[name].prepare(sag_terms))])
 
 
 def sag_and_derivatives(

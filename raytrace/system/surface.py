@@ -2,7 +2,7 @@
 
     z = c r² / (1 + √(1 - (1+k) c² r²)) + Σ_j a_j b_j(r²) + D(x, y),  j = 1, 2, …
 
-b_j = r^(2j) of an even asphere; other kinds, some of which are not round, and the departures D that few surfaces have,
+b_j = r^(2j) of an even asphere; other kinds, some of which are not round, and the sag_terms D that few surfaces have,
 are rows of `shapes`.
 
 Every function works in the frame of the surface's vertex, components first, for any batch shape. Roots are found
@@ -26,7 +26,7 @@ from raytrace.system.intersection import conic_root, double, doubles, first_cros
 from raytrace.system.phases import Phase, kind_of
 from raytrace.system.poses import Gap, Pose, Turn
 from raytrace.system.sag_terms import Sag
-from raytrace.system.shapes import DEPARTURES, EVEN, KINDS, Departure, Relief, relief, sag_and_derivatives
+from raytrace.system.shapes import EVEN, KINDS, SAG_TERMS, Relief, SagTerms, relief, sag_and_derivatives
 
 
 @value
@@ -38,7 +38,7 @@ class Surface:
     conic: k; None is a sphere.
     coefficients: (m, ...) a_1, a_2, … of the `kind`, a key of `shapes.KINDS`: of an even asphere of r², r⁴, … in
         mm^(1-2j), of a toroid its curvature along x and terms of y², y⁴, …; None if not aspheric.
-    departure: what the sag has beside, of a kind of `shapes.DEPARTURES`; None if nothing. A height at the vertex
+    sag_terms: what the sag has beside, of a kind of `shapes.SAG_TERMS`; None if nothing. A height at the vertex
         belongs to the thickness before: paraxial optics takes D(0, 0) and the slopes there for 0.
     phase: what the surface adds to the path of light, or does in place of Snell's law, of a kind of `phases.PHASES`;
         None for a surface that refracts or reflects.
@@ -58,7 +58,7 @@ class Surface:
     conic: Tensor | None = None
     coefficients: Tensor | None = None
     kind: str = EVEN
-    departure: Departure | None = None
+    sag_terms: SagTerms | None = None
     phase: Phase | None = None
     before: Pose | Turn | None = None
     after: Pose | None = None
@@ -75,8 +75,8 @@ class Surface:
 
     @property
     def is_plane(self) -> bool:
-        """True if the surface has neither curvature nor aspheric terms nor a departure to model."""
-        return self.curvature is None and self.coefficients is None and self.departure is None
+        """True if the surface has neither curvature nor aspheric terms nor sag terms to model."""
+        return self.curvature is None and self.coefficients is None and self.sag_terms is None
 
 
 _BESIDE = (
@@ -104,7 +104,7 @@ def is_round(surface: Surface) -> bool:
         return False
     if is_freeform(surface):
         return False
-    return surface.departure is None or DEPARTURES[type(surface.departure).__name__].is_round
+    return surface.sag_terms is None or SAG_TERMS[type(surface.sag_terms).__name__].is_round
 
 
 def is_freeform(surface: Surface) -> bool:
@@ -114,19 +114,19 @@ def is_freeform(surface: Surface) -> bool:
 
 def is_even(surface: Surface) -> bool:
     """Whether the surface is a centred conic with the terms of an even asphere at most: what other programs know."""
-    plain = surface.departure is None and surface.phase is None and not is_posed(surface)
+    plain = surface.sag_terms is None and surface.phase is None and not is_posed(surface)
     return plain and (surface.coefficients is None or surface.kind == EVEN)
 
 
 def is_searched(surface: Surface) -> bool:
     """Whether rays look for the surface step by step: there is no formula for where they meet it."""
-    return surface.coefficients is not None or surface.departure is not None
+    return surface.coefficients is not None or surface.sag_terms is not None
 
 
 def vertex_curvature(surface: Surface) -> Tensor:
     """c + 2 P'(0) + (D_xx + D_yy)/2 in 1/mm: a term a r² bends the vertex like a curvature.
 
-    Of a toroid or a biconic it is that of the section along y, as other programs straighten an axis. A departure D may
+    Of a toroid or a biconic it is that of the section along y, as other programs straighten an axis. sag terms D may
     bend the vertex differently along x and y: this is the mean. Its tilt at the vertex, and that of an odd asphere, are
     left out.
     """
@@ -135,13 +135,13 @@ def vertex_curvature(surface: Surface) -> Tensor:
 
 
 def vertex_curvatures(surface: Surface) -> tuple[Tensor, Tensor]:
-    """The curvatures in 1/mm of the sections along x and along y at the vertex, departures included."""
+    """The curvatures in 1/mm of the sections along x and along y at the vertex, sag_terms included."""
     (along_x, along_y), bend = _vertex(surface), _bend(surface)
     return (along_x, along_y) if bend is None else (along_x + bend.xx, along_y + bend.yy)
 
 
 def _vertex(surface: Surface) -> tuple[Tensor, Tensor]:
-    """The curvatures at the vertex without a departure, along x and along y."""
+    """The curvatures at the vertex without sag terms, along x and along y."""
     centre = torch.zeros_like(surface.thickness)
     if is_freeform(surface):
         bend = _freeform(surface, centre, centre, 2)
@@ -153,11 +153,11 @@ def _vertex(surface: Surface) -> tuple[Tensor, Tensor]:
 
 
 def _bend(surface: Surface) -> Sag | None:
-    """The departure at the vertex."""
-    if surface.departure is None:
+    """The sag_terms at the vertex."""
+    if surface.sag_terms is None:
         return None
     centre = torch.zeros_like(surface.thickness)
-    return relief(surface.departure).sag(centre, centre)
+    return relief(surface.sag_terms).sag(centre, centre)
 
 
 def sag(surface: Surface, radius_squared: Tensor) -> Tensor:
@@ -165,7 +165,7 @@ def sag(surface: Surface, radius_squared: Tensor) -> Tensor:
 
     Raises ValueError for a surface that is not round, whose sag the radius does not tell: see `sag_at`.
     """
-    if surface.departure is not None or is_freeform(surface):
+    if surface.sag_terms is not None or is_freeform(surface):
         raise ValueError("the sag of a surface that is not round depends on x and y: use sag_at(surface, x, y)")
     return _round(surface, radius_squared, 0)[0]
 
@@ -173,17 +173,17 @@ def sag(surface: Surface, radius_squared: Tensor) -> Tensor:
 def sag_at(surface: Surface, x: Tensor, y: Tensor) -> Tensor:
     """Sag z in mm at points (...) mm of any surface; beyond its edge that of the edge."""
     z = _freeform(surface, x, y, 0).z if is_freeform(surface) else _round(surface, x * x + y * y, 0)[0]
-    return z if surface.departure is None else z + relief(surface.departure).sag(x, y, highest=0).z
+    return z if surface.sag_terms is None else z + relief(surface.sag_terms).sag(x, y, highest=0).z
 
 
 def _round(surface: Surface, u: Tensor, highest: int, along: Tensor | float = 1.0) -> tuple[Tensor, Tensor, Tensor]:
-    """`sag_and_derivatives` of all but the departure."""
+    """`sag_and_derivatives` of all but the sag terms."""
     c, k, a = surface.curvature, surface.conic, surface.coefficients
     return sag_and_derivatives(u, c, k, a, highest, along=along, kind=surface.kind)
 
 
 def _freeform(surface: Surface, x: Tensor, y: Tensor, highest: int) -> Sag:
-    """The sag of a kind that is not round, without the departure."""
+    """The sag of a kind that is not round, without the sag terms."""
     a = surface.coefficients
     c, k = (a.new_zeros(()) if number is None else number for number in (surface.curvature, surface.conic))
     return KINDS[surface.kind].form.sag(c, k, a, x, y, highest)
@@ -244,7 +244,7 @@ def normal(surface: Surface, hit: Sequence[Tensor]) -> tuple[tuple[Tensor, Tenso
     if surface.is_plane:
         return (torch.zeros_like(x), torch.zeros_like(x), torch.ones_like(x)), 1.0
     if is_searched(surface):
-        return _sloped_normal(surface, x, y, None if surface.departure is None else relief(surface.departure))
+        return _sloped_normal(surface, x, y, None if surface.sag_terms is None else relief(surface.sag_terms))
     c = surface.curvature
     if surface.conic is None:
         return (-c * x, -c * y, 1 - c * z), 1.0
@@ -309,7 +309,7 @@ def in_double(surface: Surface) -> Surface:
 def _meet_searched(surface: Surface, position, direction) -> Meeting:
     """F(t) = z - S(x² + y²) - D(x, y) = 0 along the ray; the root itself is found outside the graph."""
     c, k, a = surface.curvature, surface.conic, surface.coefficients
-    bumps = None if surface.departure is None else relief(surface.departure)
+    bumps = None if surface.sag_terms is None else relief(surface.sag_terms)
     zero = position[0].new_zeros((), dtype=torch.float64)
     foot, slide = foot_of(position, direction)
     way = way_of(position, direction, foot, slide)

@@ -84,6 +84,6 @@ def _bend(lens: Lens) -> str:
             return f"surface {number} is " + ("a coordinate break" if surface.is_break else "tilted or decentred")
     for number, surface in enumerate(lens.surfaces):
         if not is_round(surface):
-            part = surface.departure if surface.phase is None else surface.phase
+            part = surface.sag_terms if surface.phase is None else surface.phase
             return f"surface {number} ({named(part)}) takes light off it"
     return "it bends"

@@ -30,7 +30,7 @@ from raytrace.tracing.focus import (
     paraxial_sensor,
 )
 from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.ray_failures import LostRays, warn_of_losses
+from raytrace.tracing.ray_failures import LostRays, warn_of_failures
 from raytrace.tracing.stop_filling import warn_of_filling
 from raytrace.words import calling_level
 
@@ -221,7 +221,7 @@ def _tell_losses(lens: Lens, points: Tensor, distances: Tensor, fields: Tensor, 
         with torch.no_grad():
             valid = image_rays(trial, points, fields=fields, wavelengths=wavelengths).valid
         at = f"object at {float(distance):g} mm, " if len(distances) > 1 else ""
-        warn_of_losses(trial, points, ~valid.any(-1), fields=fields, wavelengths=wavelengths, at=at)
+        warn_of_failures(trial, points, ~valid.any(-1), fields=fields, wavelengths=wavelengths, at=at)
         arrived.append(valid.double().mean())
     lost = 1 - float(sum(arrived)) / len(arrived)
     if lost == 1:

@@ -67,12 +67,12 @@ def warn_of_defects(lens: Lens) -> tuple[Defect, ...]:
 
 def _semi_diameters(lens: Lens) -> list[float]:
     """mm of every surface: as given, else how far the light of all fields reaches with its margin; nan: unknown."""
-    intent, last = lens.intent, len(lens.surfaces) - 1
-    given = range(last + 1) if intent is None else intent.semi_diameters
+    optimization_data, last = lens.optimization_data, len(lens.surfaces) - 1
+    given = range(last + 1) if optimization_data is None else optimization_data.semi_diameters
     found = [(s.semi_diameter or math.nan) if k in given else math.nan for k, s in enumerate(lens.surfaces)]
     if all(map(math.isfinite, found[1:last])):
         return found
-    percent, length = (0.0, 0.0) if intent is None else intent.semi_diameter_margin
+    percent, length = (0.0, 0.0) if optimization_data is None else optimization_data.semi_diameter_margin
     for k, reach in enumerate(_reaches(lens), 1):
         if math.isnan(found[k]):
             bare = k in (lens.stop, last)

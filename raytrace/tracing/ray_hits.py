@@ -13,7 +13,7 @@ from raytrace.system.rays import Rays
 from raytrace.tracing.axis import is_bent
 from raytrace.tracing.focus import image_rays
 from raytrace.tracing.launch import launch
-from raytrace.tracing.ray_failures import STATUS, fates
+from raytrace.tracing.ray_failures import STATUS, ray_status
 from raytrace.tracing.trace import lens_steps
 
 _KEPT_BYTES = 100  # of a ray on the sensor, with its status
@@ -88,7 +88,7 @@ def _field(lens: Lens, pupil: Tensor, field: Tensor, ray_aiming: str | None) -> 
     """Rays (3, 1, W, P) of one field (2, 1) on the sensor, their status, and whether they reach it."""
     rays = launch(lens, pupil, fields=field, ray_aiming=ray_aiming)
     reached = rays.valid
-    for crossing, status in fates(lens, rays, lens.wavelengths[:, None]):
+    for crossing, status in ray_status(lens, rays, lens.wavelengths[:, None]):
         reached = reached & ~crossing.missed & ~crossing.totally_reflected
         found = crossing.rays, status, reached
     return found

@@ -73,7 +73,7 @@ class Traced(Rays, Result):
                 counts.update({(k, STATUS[status]): n for k, n in enumerate(newly, 1) if n})
         return [{"surface": k, "status": status, "rays": n} for (k, status), n in sorted(counts.items())]
 
-    def losses(self) -> list[str]:
+    def failures(self) -> list[str]:
         """The same in words."""
         words = {STATUS[status]: said for status, said in _LOST.items()}
         return [f"{one['rays']} rays {words[one['status']]} surface {one['surface']}" for one in self.lost()]

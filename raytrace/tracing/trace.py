@@ -19,7 +19,7 @@ from raytrace.system.phases import Added, added_path, ideal_path, kind_of, path_
 from raytrace.system.poses import Gap, Turn, direction_in, point_in
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface, gap_behind, in_double, meet, normal
-from raytrace.tracing.compiled.engine_choice import is_fused
+from raytrace.tracing.compiled.engine_choice import uses_compiled
 from raytrace.tracing.compiled.run import trace_compiled
 from raytrace.tracing.compiled.structure import is_expressible
 from raytrace.tracing.sequence import media, sequence_of
@@ -330,7 +330,7 @@ def trace_surfaces(
 ) -> Rays:
     """The rays behind the last of the surfaces; arguments as for `steps`.
 
-    The compiled trace takes the runs of surfaces that it knows, where it pays: see `fused.tracing`.
+    The compiled trace takes the runs of surfaces that it knows, where it pays: see `compiled.run`.
     """
     if torch.compiler.is_compiling():
         return _eager(surfaces, rays, indices=indices, wavelength=wavelength, side=side, gap=gap)
@@ -345,7 +345,7 @@ def trace_surfaces(
 
 
 def _fused(surfaces: Sequence[Surface], rays: Rays, **how) -> Rays:
-    if is_fused(rays, how["indices"][0], len(surfaces)):
+    if uses_compiled(rays, how["indices"][0], len(surfaces)):
         end = trace_compiled(surfaces, rays, **how, eager=_eager)
         if end is not None:
             return end

@@ -20,7 +20,7 @@ from raytrace.io.zemax.operands import IGNORED as OPERANDS_IGNORED
 from raytrace.io.zemax.operands import KEPT, REFUSED, ROWS, Cell, applied, cell, solved
 from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.glass import Glass
-from raytrace.system.configurations import Operand, Path, Place, differences, part, same, taken, with_part
+from raytrace.system.configurations import Operand, Path, ScaledPath, differences, part, same, taken, with_part
 from raytrace.system.lens import Lens
 
 #: More configurations, and more operands, than any file has.
@@ -86,7 +86,7 @@ def _chosen(lens: Lens, configuration: int, head: Record) -> Lens:
 def _with_operands(lens: Lens, operands: Sequence[Found], count: int, active: int) -> Lens:
     """The lens with its operands, all their places modelled; one that is not used tells the count where none does."""
     for one in operands:
-        for place in one.operand.places if one.operand.numbers is not None else ():
+        for place in one.operand.paths if one.operand.numbers is not None else ():
             if part(lens, place.path) is None:
                 lens = with_part(lens, place.path, double(0.0), like=one.like)
     exact = [_as_stored(one, lens, active) for one in operands]
@@ -169,17 +169,17 @@ def _operand(cells: tuple[Cell, ...], found: Sections, lens: Lens, rebuild: Rebu
     if not paths:
         return Found(plain, cells, lens)
     held = [[part(read[value], path) for path in paths] for value in values]
-    places = _places(paths, probes, held)
-    if places:
+    scaled = _scaled_paths(paths, probes, held)
+    if scaled:
         numbers = torch.stack([double(0.0) if row[0] is None else row[0] for row in held])
-        return Found(Operand(**named, places=places, numbers=numbers), cells, probes[0])
+        return Found(Operand(**named, paths=scaled, numbers=numbers), cells, probes[0])
     if not all(_has_room(lens, path) for path in paths):
         refusal = "as it is stored the lens has nothing there, an aperture, say"
         return Found(Operand(**named, words=words, refusal=refusal), cells, lens)
-    places = tuple(Place(path) for path in paths)
+    scaled = tuple(ScaledPath(path) for path in paths)
     if all(isinstance(row[0], Glass) and all(same(row[0], other) for other in row) for row in held):
-        return Found(Operand(**named, places=places, media=tuple(row[0] for row in held)), cells, lens)
-    return Found(Operand(**named, places=places, words=tuple(map(tuple, held))), cells, lens)
+        return Found(Operand(**named, paths=scaled, media=tuple(row[0] for row in held)), cells, lens)
+    return Found(Operand(**named, paths=scaled, words=tuple(map(tuple, held))), cells, lens)
 
 
 def _has_room(lens: Lens, path: Path) -> bool:
@@ -209,7 +209,7 @@ def _paths(one: Cell, lens: Lens, read: Sequence[Lens]) -> list[Path]:
     return [*told, *(path for path in dict.fromkeys(found) if path not in told)]
 
 
-def _places(paths: Sequence[Path], probes: Sequence[Lens], held: Sequence[Sequence]) -> tuple[Place, ...]:
+def _scaled_paths(paths: Sequence[Path], probes: Sequence[Lens], held: Sequence[Sequence]) -> tuple[ScaledPath, ...]:
     """The places of a number, each a line over the first; none where they are no numbers, or no lines."""
     if not probes or any(not _is_number(one) for row in held for one in row):
         return ()
@@ -217,15 +217,15 @@ def _places(paths: Sequence[Path], probes: Sequence[Lens], held: Sequence[Sequen
     if any(not _is_number(one) or one is None for row in seen for one in row):
         return ()
     probed = [[float(one) for one in row] for row in seen]
-    places = [Place(paths[0])]
+    scaled = [ScaledPath(paths[0])]
     for position, path in enumerate(paths[1:], 1):
         rise = (probed[1][position] - probed[0][position]) / (probed[1][0] - probed[0][0])
-        places.append(Place(path, rise, probed[0][position] - rise * probed[0][0]))
+        scaled.append(ScaledPath(path, rise, probed[0][position] - rise * probed[0][0]))
     for row in (*probed, *([0.0 if one is None else float(one) for one in row] for row in held)):
-        for number, place in zip(row, places, strict=True):
+        for number, place in zip(row, scaled, strict=True):
             if abs(place.factor * row[0] + place.offset - number) > 1e-12 * abs(number):
                 return ()
-    return tuple(places)
+    return tuple(scaled)
 
 
 def _is_number(one) -> bool:
@@ -241,9 +241,9 @@ def _agrees(one: Found, lens: Lens, configuration: int) -> bool | None:
     Operands are saved with 13 digits. A semi-diameter of 0 is left to be computed.
     """
     operand, k = one.operand, configuration - 1
-    if not operand.places:
+    if not operand.paths:
         return None
-    stored = part(lens, operand.places[0].path)
+    stored = part(lens, operand.paths[0].path)
     if operand.numbers is None:
         wanted = operand.media[k] if operand.media else operand.words[k][0]
         if operand.name == "SDIA":
@@ -276,16 +276,16 @@ def _say_of(one: Found, lens: Lens, active: int, count: int, report: Draft) -> N
     own, operand = one.cells[active - 1], one.operand
     place = own.record.place
     what = f"multi-configuration operand {own}"
-    if own.name in ("TEMP", "PRES") and not operand.places:
+    if own.name in ("TEMP", "PRES") and not operand.paths:
         _say_environment(own, report)
     elif operand.refusal:
         if count == 1 or any(other.value != own.value for other in one.cells):
             report.warn(f"{what} (configuration {active}): not followed: {operand.refusal}", place)
-    elif not operand.places:
+    elif not operand.paths:
         if operand.name not in KEPT:
             report.warn(f"{what}: not followed: no number of the lens depends on it", place)
     elif _agrees(one, lens, active) is False:
-        held = _shown(part(lens, operand.places[0].path))
+        held = _shown(part(lens, operand.paths[0].path))
         report.warn(f"{what}: not followed by the lens as stored, which holds {held} (configuration {active})", place)
 
 
@@ -321,7 +321,7 @@ def _bends(operand: Operand, found: Sections) -> bool:
     if row is None or not row.keyword.startswith("PARM"):
         return row is not None and row.bends
     kind = found.surfaces[operand.number].last("TYPE") if operand.number < len(found.surfaces) else None
-    return bool(operand.places) and not (kind and kind.words[:1] == ("COORDBRK",))
+    return bool(operand.paths) and not (kind and kind.words[:1] == ("COORDBRK",))
 
 
 def _varies(operand: Operand) -> bool:

@@ -100,7 +100,7 @@ def line(lens: Lens, place: Place) -> str:
 
 def is_of_surfaces(operand: Operand) -> bool:
     """Whether an operand sets the environment of some surfaces, and not that of the lens."""
-    return operand.name in OPERANDS and bool(operand.places) and operand.places[0].path[0] == "surfaces"
+    return operand.name in OPERANDS and bool(operand.paths) and operand.paths[0].path[0] == "surfaces"
 
 
 def with_operands(lens: Lens, place: Place) -> Lens:
@@ -124,7 +124,7 @@ def _is_told(lens: Lens, k: int) -> bool:
     """Whether operands of the lens set the environment of a surface; what they do not set of it is the lens's."""
     if lens.environment is None:
         return False
-    held = {path for operand in lens.operands for path, *_ in operand.places}
+    held = {path for operand in lens.operands for path, *_ in operand.paths}
     own = {name: ("surfaces", k, "environment", name) in held for name in OPERANDS.values()}
     as_around = [configurations.same(*(getattr(h.environment, n) for h in (lens.surfaces[k], lens))) for n in own]
     return any(own.values()) and all(map(max, own.values(), as_around))
@@ -138,14 +138,14 @@ def _named(listed: list[Operand], lens: Lens) -> list[Operand]:
         if is_of_surfaces(one):
             behind = itertools.takewhile(lambda other, name=one.name: other.name != name, listed[position + 1 :])
             named = {other.number for other in behind if other.name in _NAMING}
-            found += [_naming(lens, path[1]) for path, *_ in one.places if path[1] not in named]
+            found += [_naming(lens, path[1]) for path, *_ in one.paths if path[1] not in named]
     return found
 
 
 def _naming(lens: Lens, k: int) -> Operand:
     """An operand that changes nothing and names a surface."""
     media = (lens.surfaces[k].glass,) * configurations.count(lens.operands)
-    return Operand("GLSS", k, places=(configurations.Place(("surfaces", k, "glass")),), media=media)
+    return Operand("GLSS", k, paths=(configurations.ScaledPath(("surfaces", k, "glass")),), media=media)
 
 
 def _operands(lens: Lens, *path: str | int) -> list[Operand]:
@@ -154,7 +154,7 @@ def _operands(lens: Lens, *path: str | int) -> list[Operand]:
     return [
         Operand(
             name,
-            places=(configurations.Place((*path, "environment", field)),),
+            paths=(configurations.ScaledPath((*path, "environment", field)),),
             numbers=torch.stack([getattr(found, field)] * count),
         )
         for name, field in OPERANDS.items()

@@ -115,7 +115,7 @@ def tolerances(found: Iterable[Record], report: Draft) -> tuple[str, ...]:
 def read_merit(path: str | PathLike) -> tuple[Row, ...]:
     """The rows of a merit function file (.MF) of OpticStudio, in the unit of length of the lens that it belongs to.
 
-    `dataclasses.replace(lens.intent, merit=rows)` is the intent with them. Raises LensFileError.
+    `dataclasses.replace(lens.optimization_data, merit=rows)` is the optimisation data with them. Raises LensFileError.
     """
     name, report = str(path), Draft(str(path), "mf")
     listed = [record for record in records(read_text(Path(path)), name) if record.keyword != "VERS"]

@@ -1,4 +1,4 @@
-"""What a .zmx file says about how its lens is to be optimised: an `Intent`.
+"""What a .zmx file says about how its lens is to be optimised: an `OptimizationData`.
 
 The rules of surfaces (`zemax_rules`), the merit function and the tolerances (`zemax_merit`), and the status of numbers
 of the configurations: 1 variable, 2 a pickup; there a surface's own rule is void.
@@ -41,8 +41,8 @@ from raytrace.io.zemax.surface_types import types
 from raytrace.io.zemax.surfaces import numbers
 from raytrace.system.configurations import Path, part, with_part
 from raytrace.system.lens import Lens
-from raytrace.system.optimization_data import Intent, Solve, Vary
-from raytrace.system.parameter_paths import number_at, places
+from raytrace.system.optimization_data import OptimizationData, Solve, Vary
+from raytrace.system.parameter_paths import number_at, parameter_paths
 from raytrace.system.surface import Surface
 
 #: Values far from what lenses have, exact in binary.
@@ -53,7 +53,7 @@ FIRST_TERM = 3
 
 
 class Named(NamedTuple):
-    """A number of the lens: its name in `places.places`, and factor · (number of the file, in mm) + offset, it is."""
+    """A number of the lens: its name in `parameter_paths`, and factor · (number of the file, in mm) + offset, it is."""
 
     name: str
     factor: float
@@ -74,8 +74,8 @@ def names(surface: Surface, row: SurfaceType, told: Numbers, keyword: str, j: in
     except (KeyError, IndexError, ValueError):
         return (), surface
     found = []
-    for name, place in places(probed[0]).items():
-        one, other = (number_at(like, place) if name in places(like) else None for like in probed)
+    for name, place in parameter_paths(probed[0]).items():
+        one, other = (number_at(like, place) if name in parameter_paths(like) else None for like in probed)
         if isinstance(one, Tensor) and isinstance(other, Tensor) and float(one) != float(other):
             factor = (float(other) - float(one)) / (_PROBES[1] - _PROBES[0])
             found.append(Named(name, factor, float(one) - factor * _PROBES[0]))
@@ -103,7 +103,7 @@ def listed(row: SurfaceType, told: Numbers) -> list[tuple[str, int]]:
 
 def path_of(surface: Surface, name: str) -> Path | None:
     """Where a surface holds a number of a name; None of one that it has no room for."""
-    place = places(surface).get(name)
+    place = parameter_paths(surface).get(name)
     if place is None:
         return None
     entry = () if place.entry is None else ((place.entry,),)
@@ -378,7 +378,7 @@ def _glass(one: Told) -> Iterator[Vary | Solve]:
 
 
 def read(found: Sections, lens: Lens, millimetres: float, report: Draft) -> Lens:
-    """The lens with its intent, None where the file says no more than any does; what varies is modelled."""
+    """The lens with its optimisation data, None where the file says no more than any does; what varies is modelled."""
     told = [told_of(*pair, millimetres) for pair in zip(found.surfaces, lens.surfaces, strict=True)]
     rules = [rule for one in told for rule in rules_of(one, told, report)]
     configured, own = list(_of_configurations(found, lens)), _paths_of_configurations(lens)
@@ -392,7 +392,7 @@ def read(found: Sections, lens: Lens, millimetres: float, report: Draft) -> Lens
     tail = _before_configurations(found)
     merit, tolerances = zemax_merit.rows(tail, report), zemax_merit.tolerances(tail, report)
     given = [k for k, one in enumerate(told) if one.surface.semi_diameter and code_of(one.block, "DIAM") == GIVEN]
-    intent = Intent(
+    optimization_data = OptimizationData(
         variables,
         followed,
         merit,
@@ -402,8 +402,11 @@ def read(found: Sections, lens: Lens, millimetres: float, report: Draft) -> Lens
         semi_diameter_margin=_margin(found, millimetres),
         kept=kept,
     )
-    _refuse_infinite(intent, told)
-    return dataclasses.replace(_with_moving(lens, told, intent), intent=intent if _says_more(intent, lens) else None)
+    _refuse_infinite(optimization_data, told)
+    return dataclasses.replace(
+        _with_moving(lens, told, optimization_data),
+        optimization_data=optimization_data if _says_more(optimization_data, lens) else None,
+    )
 
 
 def _is_followed(one: Solve) -> bool:
@@ -418,14 +421,14 @@ def _is_linear(one: Solve) -> bool:
     return one.quantity in ("thickness", "curvature", "conic") or (not one.offset and one.quantity.islower())
 
 
-def _says_more(intent: Intent, lens: Lens) -> bool:
-    """Whether an intent is another than that of a lens without one, whose semi-diameters are all given."""
+def _says_more(optimization_data: OptimizationData, lens: Lens) -> bool:
+    """Whether optimisation data is another than that of a lens without one, whose semi-diameters are all given."""
     sized = tuple(k for k, surface in enumerate(lens.surfaces) if surface.semi_diameter)
-    return intent != Intent(semi_diameters=sized)
+    return optimization_data != OptimizationData(semi_diameters=sized)
 
 
-def _refuse_infinite(intent: Intent, told: list[Told]) -> None:
-    for one in (*intent.solves, *intent.kept):
+def _refuse_infinite(optimization_data: OptimizationData, told: list[Told]) -> None:
+    for one in (*optimization_data.solves, *optimization_data.kept):
         figures = *one.numbers, one.scale, one.offset
         if not all(map(math.isfinite, figures)):
             message = f"a rule of the {one.quantity}: a number is too large once converted to mm"
@@ -443,10 +446,10 @@ def _margin(found: Sections, millimetres: float) -> tuple[float, float]:
 # -- what moves is modelled -------------------------------------------------------------------------------------------
 
 
-def _with_moving(lens: Lens, told: list[Told], intent: Intent) -> Lens:
+def _with_moving(lens: Lens, told: list[Told], optimization_data: OptimizationData) -> Lens:
     """The lens with every number modelled that may change: variables, and what follows them."""
-    moving = {(one.surface, one.quantity) for one in intent.variables if one.operand is None}
-    for one in intent.solves:
+    moving = {(one.surface, one.quantity) for one in optimization_data.variables if one.operand is None}
+    for one in optimization_data.solves:
         if one.operand is not None or one.quantity == "glass":
             continue
         of = (one.source, one.quantity_of_source or one.quantity)
@@ -491,7 +494,7 @@ def _of_configurations(found: Sections, lens: Lens) -> Iterator[Vary | Solve]:
         status = int(plain(one.rule[0])) if one.rule and is_number(one.rule[0]) else 0
         if operand is None or not status or not 1 <= one.configuration <= len(lens.operands[operand]):
             continue
-        place = lens.operands[operand].places[:1]
+        place = lens.operands[operand].paths[:1]
         name = _name_at(lens, place[0].path) if place else ""
         where = {"configuration": one.configuration, "operand": operand}
         if status == VARIABLE and name:
@@ -534,11 +537,11 @@ def _name_at(lens: Lens, path: tuple) -> str:
     if path[2:] == ("thickness",):
         return "thickness"
     surface = lens.surfaces[path[1]]
-    return next((name for name in places(surface) if path_of(surface, name) == path[2:]), "")
+    return next((name for name in parameter_paths(surface) if path_of(surface, name) == path[2:]), "")
 
 
 def _paths_of_configurations(lens: Lens) -> set:
-    return {operand.places[0].path for operand in lens.operands if operand.places}
+    return {operand.paths[0].path for operand in lens.operands if operand.paths}
 
 
 def _is_void(one: Vary, lens: Lens, own: set) -> bool:

@@ -1,6 +1,6 @@
-"""The intent of a lens as lines of a .zmx file: `zemax_intent` and `zemax_rules` undone.
+"""The optimisation data of a lens as lines of a .zmx file: the inverse of `optimization.py`.
 
-The lines of a surface are those that a lens without an intent has; words in them are changed, and lines put in.
+The lines of a surface are those that a lens without optimisation data has; words in them are changed, and lines put in.
 
 The lines of a .zmx file in mm as lines in another unit of length.
 
@@ -43,7 +43,7 @@ from raytrace.io.zemax.surface_types import type_of, types
 from raytrace.system.apertures import SHAPES
 from raytrace.system.configurations import Operand, count, same, with_operands
 from raytrace.system.lens import Lens
-from raytrace.system.optimization_data import Intent, Solve, Vary
+from raytrace.system.optimization_data import OptimizationData, Solve, Vary
 from raytrace.system.surface import Surface
 
 #: Powers of length of the words of a line, from 1, by its keyword; others have none.
@@ -177,8 +177,8 @@ def with_pickups(lines: list[str], lens: Lens, number: int, place: Place) -> lis
     Raises LensFileError for one that a .zmx file is not known to have.
     """
     for operand in lens.operands:
-        first = operand.places[0].path if operand.places else ()
-        for path, factor, offset in operand.places[1:]:
+        first = operand.paths[0].path if operand.paths else ()
+        for path, factor, offset in operand.paths[1:]:
             if path[:2] != ("surfaces", number) or number == operand.number or path[2] == "environment":
                 continue
             name = "PRAM" if operand.name.startswith("PAR") else operand.name
@@ -227,7 +227,7 @@ def _line(operand: Operand, configuration: int, text: Sections, rule: tuple[str,
 
 def _word(operand: Operand, configuration: int, text: Sections, place: Place) -> str:
     """The value of an operand: the word in the file of its configuration, or its own where it stands for none."""
-    if operand.places and operand.name in ROWS and not zemax_environment.is_of_surfaces(operand):
+    if operand.paths and operand.name in ROWS and not zemax_environment.is_of_surfaces(operand):
         found = word(text, _cell(operand, configuration, place))
         if found is not None:
             return repr(FAR) if is_infinite(found) else found.replace('"', "'")
@@ -257,19 +257,23 @@ def _refuse_alike(operand: Operand, texts: list[Sections], place: Place) -> None
 Lines = list[str]
 
 
-def margin(intent: Intent | None) -> str:
+def margin(optimization_data: OptimizationData | None) -> str:
     """The line of SDMA."""
-    percent, length = (0.0, 0.0) if intent is None else intent.semi_diameter_margin
+    percent, length = (0.0, 0.0) if optimization_data is None else optimization_data.semi_diameter_margin
     return f"SDMA {_spelled(percent)} 1 {_spelled(length)}"
 
 
 def with_rules(lines: Lines, lens: Lens, number: int, place: Place) -> Lines:
     """The lines of a surface with its variables, solves and pickups. Raises LensFileError for what no line holds."""
-    intent = lens.intent
-    if intent is None:
+    optimization_data = lens.optimization_data
+    if optimization_data is None:
         return lines
-    lines = _with_diameter(lines, intent, number)
-    own = [one for one in (*intent.variables, *intent.solves, *intent.kept) if one.surface == number]
+    lines = _with_diameter(lines, optimization_data, number)
+    own = [
+        one
+        for one in (*optimization_data.variables, *optimization_data.solves, *optimization_data.kept)
+        if one.surface == number
+    ]
     own = [one for one in own if one.operand is None and one.quantity != "semi_diameter"]
     parameters = _parameters(lens.surfaces[number]) if own else {}
     for one in own:
@@ -280,9 +284,9 @@ def with_rules(lines: Lines, lens: Lens, number: int, place: Place) -> Lines:
     return lines
 
 
-def _with_diameter(lines: Lines, intent: Intent, number: int) -> Lines:
-    rules = [one for one in intent.kept if (one.surface, one.quantity) == (number, "semi_diameter")]
-    if number in intent.semi_diameters:
+def _with_diameter(lines: Lines, optimization_data: OptimizationData, number: int) -> Lines:
+    rules = [one for one in optimization_data.kept if (one.surface, one.quantity) == (number, "semi_diameter")]
+    if number in optimization_data.semi_diameters:
         code, source = GIVEN, 0
     elif rules:
         code, source = _code_of(rules[0].kind, SEMI_DIAMETER_RULES), rules[0].source
@@ -432,12 +436,12 @@ def statuses(lens: Lens, written: Sequence[Operand]) -> dict[tuple[int, int], tu
 
     written: the operands that are written, among them those of the lens.
     """
-    if lens.intent is None:
+    if lens.optimization_data is None:
         return {}
     positions = {id(one): k for k, one in enumerate(written)}
     at = [positions.get(id(one)) for one in lens.operands]
     found = {}
-    for one in (*lens.intent.variables, *lens.intent.solves, *lens.intent.kept):
+    for one in (*lens.optimization_data.variables, *lens.optimization_data.solves, *lens.optimization_data.kept):
         if one.operand is not None and one.operand < len(at) and at[one.operand] is not None:
             found[at[one.operand], one.configuration] = _status(one, at)
     return found

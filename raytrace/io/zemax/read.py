@@ -26,7 +26,7 @@ from raytrace.io.spelling import MILLIMETRES, double, refuse_overflow
 from raytrace.io.substitutes import NONE, Substitutes
 from raytrace.io.zemax import configurations as zemax_configurations
 from raytrace.io.zemax import environment as zemax_environment
-from raytrace.io.zemax import optimization as zemax_intent
+from raytrace.io.zemax import optimization
 from raytrace.io.zemax import surfaces as zemax_surface
 from raytrace.io.zemax.keywords import (
     AIMINGS,
@@ -86,7 +86,7 @@ def read(
         return changed
 
     lens = zemax_configurations.read(found, lens, rebuild, report, configuration)
-    lens = zemax_intent.read(found, lens, unit, report)
+    lens = optimization.read(found, lens, unit, report)
     zemax_environment.tell(found, lens, report)
     return lens, report.finished(strict=strict)
 

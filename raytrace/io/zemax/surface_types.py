@@ -87,23 +87,23 @@ def _coefficients(surface: Surface) -> Numbers:
 
 def _tilted(numbers: Numbers) -> dict:
     slopes = numbers.at(1), numbers.at(2)
-    return {"departure": TiltSag(*map(double, slopes))} if any(slopes) else {}
+    return {"sag_terms": TiltSag(*map(double, slopes))} if any(slopes) else {}
 
 
 def _polynomial(numbers: Numbers) -> dict:
-    return {"departure": PolynomialSag(numbers.terms, double(numbers.radius))} if len(numbers.terms) else {}
+    return {"sag_terms": PolynomialSag(numbers.terms, double(numbers.radius))} if len(numbers.terms) else {}
 
 
 def _fringe(numbers: Numbers) -> dict:
     found = beside(numbers)
     if len(numbers.terms):
         centre = double(numbers.at(9)), double(numbers.at(10))
-        found["departure"] = FringeSag(numbers.terms, double(numbers.radius), *centre)
+        found["sag_terms"] = FringeSag(numbers.terms, double(numbers.radius), *centre)
     return found
 
 
 def _fringe_numbers(surface: Surface) -> Numbers:
-    sag = surface.departure
+    sag = surface.sag_terms
     return Numbers({**even_numbers(surface), 9: sag.centre_x, 10: sag.centre_y}, sag.coefficients, sag.radius)
 
 
@@ -113,13 +113,13 @@ def _irregular(numbers: Numbers) -> dict:
     if spherical or astigmatism or coma:
         if numbers.size is None:
             raise ValueError("no semi-diameter (DIAM), by which the terms of an irregular surface are normalised")
-        found["departure"] = IrregularSag(*map(double, (spherical, astigmatism, coma, angle, numbers.size)))
+        found["sag_terms"] = IrregularSag(*map(double, (spherical, astigmatism, coma, angle, numbers.size)))
     own = pose_of([*(numbers.at(j) for j in range(1, 5)), 0.0], 0)
     return found if own is None else found | {"before": own, "after": undone(own)}
 
 
 def _irregular_numbers(surface: Surface) -> Numbers:
-    sag = surface.departure
+    sag = surface.sag_terms
     if surface.semi_diameter is None or float(sag.radius) != surface.semi_diameter:
         found = f"a radius of {float(sag.radius)!r} mm and a semi-diameter of {surface.semi_diameter!r}"
         raise ValueError(f"an irregular surface with {found}: the file has one number for both")
@@ -130,7 +130,7 @@ def _irregular_numbers(surface: Surface) -> Numbers:
 def stands_in_parameters(surface: Surface) -> bool:
     """Whether the poses of a surface are one that it makes and undoes itself: decentres, then tilts about x and y."""
     before, after = surface.before, surface.after
-    if not isinstance(surface.departure, IrregularSag) or before is None or after is None:
+    if not isinstance(surface.sag_terms, IrregularSag) or before is None or after is None:
         return False
     if before.tilts_first or before.z is not None or before.tilt_z is not None:
         return False
@@ -155,10 +155,10 @@ SAGS = {
     ),
     "TILTSURF": SurfaceType(
         "tilted",
-        ("departure",),
+        ("sag_terms",),
         {1: 0, 2: 0},
         fields=_tilted,
-        numbers=lambda surface: Numbers({1: surface.departure.tan_x, 2: surface.departure.tan_y}),
+        numbers=lambda surface: Numbers({1: surface.sag_terms.tan_x, 2: surface.sag_terms.tan_y}),
     ),
     "TOROIDAL": SurfaceType(
         "toroidal",
@@ -173,15 +173,15 @@ SAGS = {
     "BICONICX": SurfaceType("biconic", _ROUND, {1: INVERSE, 2: 0}, fields=_biconic, numbers=_coefficients),
     "XPOLYNOM": SurfaceType(
         "extended polynomial",
-        ("curvature", "conic", "departure"),
+        ("curvature", "conic", "sag_terms"),
         terms=1,
         most=230,
         fields=_polynomial,
-        numbers=lambda surface: Numbers({}, surface.departure.coefficients, surface.departure.radius),
+        numbers=lambda surface: Numbers({}, surface.sag_terms.coefficients, surface.sag_terms.radius),
     ),
     "FZERNSAG": SurfaceType(
         "Zernike fringe sag",
-        (*_ROUND, "departure"),
+        (*_ROUND, "sag_terms"),
         {**EVEN_POWERS, 9: 1, 10: 1},
         unused={0: "whether the sag ends with its terms' disc; it goes on"},
         terms=1,
@@ -191,15 +191,15 @@ SAGS = {
     ),
     "IRREGULA": SurfaceType(
         "irregular",
-        ("curvature", "conic", "departure"),
+        ("curvature", "conic", "sag_terms"),
         {1: 1, 2: 1, 3: 0, 4: 0, 5: 1, 6: 1, 7: 1, 8: 0},
         fields=_irregular,
         numbers=_irregular_numbers,
     ),
 }
 
-#: TYPE by the departure of a surface; a kind of sag has its own in its row of KINDS.
-OF_DEPARTURES = {
+#: TYPE by the added sag terms of a surface; a kind of sag has its own in its row of KINDS.
+OF_SAG_TERMS = {
     "TiltSag": "TILTSURF",
     "PolynomialSag": "XPOLYNOM",
     "FringeSag": "FZERNSAG",
@@ -366,8 +366,8 @@ def type_of(surface: Surface) -> str | None:
         return "COORDBRK"
     if surface.phase is not None:
         return _type_of_phase(surface)
-    if surface.departure is not None:
-        return OF_DEPARTURES.get(type(surface.departure).__name__)
+    if surface.sag_terms is not None:
+        return OF_SAG_TERMS.get(type(surface.sag_terms).__name__)
     if surface.coefficients is None:
         return "STANDARD"
     kind = KINDS[surface.kind]

@@ -11,7 +11,7 @@ from raytrace.io.source import LensFileError, Place
 from raytrace.io.spelling import exact, exact_list, one_line, thickness
 from raytrace.io.zemax import environment as zemax_environment
 from raytrace.io.zemax import merit as zemax_merit
-from raytrace.io.zemax import optimization_write as zemax_intent_write
+from raytrace.io.zemax import optimization_write
 from raytrace.io.zemax.keywords import (
     AIMINGS,
     BLANK,
@@ -50,7 +50,11 @@ def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
 
 def _merit(lens: Lens, place: Place) -> list[str]:
     """Merit function and tolerances; the line that there are none of these."""
-    merit, tolerances = ((), ()) if lens.intent is None else (lens.intent.merit, lens.intent.tolerances)
+    merit, tolerances = (
+        ((), ())
+        if lens.optimization_data is None
+        else (lens.optimization_data.merit, lens.optimization_data.tolerances)
+    )
     told = [one_line(line, "a tolerance", place) for line in tolerances]
     return [*zemax_merit.lines(merit, place), *(told or ["TOL TOFF   0   0 0 0   0 0 0 0 0"])]
 
@@ -60,9 +64,9 @@ def _body(lens: Lens, file: str, catalogs: Sequence[Path]) -> list[str]:
     lines = _system(lens, Place(file), catalogs)
     for number, surface in enumerate(lens.surfaces):
         place = Place(file, None, number)
-        own = zemax_intent_write.with_rules(_surface(lens, number, surface, place), lens, number, place)
+        own = optimization_write.with_rules(_surface(lens, number, surface, place), lens, number, place)
         lines += with_pickups(own, lens, number, place)
-    return in_unit(lines, 1.0 if lens.intent is None else lens.intent.unit, Place(file))
+    return in_unit(lines, 1.0 if lens.optimization_data is None else lens.optimization_data.unit, Place(file))
 
 
 def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
@@ -91,7 +95,7 @@ def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
         f"GCAT {' '.join(catalogs_needed(lens, catalogs, place.file))}".rstrip(),
         *_ray_aiming(lens),
         "PUSH 0 0 0 0 0 0",
-        zemax_intent_write.margin(lens.intent),
+        optimization_write.margin(lens.optimization_data),
         f"FTYP {kind} {int(fields.telecentric)} {len(fields.x)} {len(lens.wavelengths)} 0 0 0",
         "ROPD 2",
         "PICB 1",
@@ -166,7 +170,7 @@ _SHAPE = {
     "curvature": "curvature",
     "conic": "conic constant",
     "coefficients": "aspheric terms",
-    "departure": "departure from a conic",
+    "sag_terms": "added sag terms",
     "phase": "phase",
 }
 
@@ -193,12 +197,12 @@ def _own(surface: Surface) -> str:
     """What is special of a surface, as an error calls it."""
     if surface.is_break:
         return "a coordinate break"
-    return type(surface.phase or surface.departure).__name__ if surface.phase or surface.departure else surface.kind
+    return type(surface.phase or surface.sag_terms).__name__ if surface.phase or surface.sag_terms else surface.kind
 
 
 def _check_terms(surface: Surface, found: str, place: Place) -> None:
     kind, row, terms = KINDS[surface.kind], types()[found], surface.coefficients
-    if (surface.phase is not None or surface.departure is not None) and surface.kind != EVEN:
+    if (surface.phase is not None or surface.sag_terms is not None) and surface.kind != EVEN:
         message = f"{_own(surface)} on a surface that is {surface.kind}, expected one that is an {EVEN} at most"
         raise LensFileError(f"{message}; a .zmx file holds no such surface", place)
     most = row.most if found == "XASPHERE" else kind.most or kind.parameters
@@ -261,7 +265,7 @@ def _glass(glass: Glass, place: Place) -> list[str]:
 
 def _floats(lens: Lens, number: int) -> bool:
     """Whether the aperture of a surface follows its semi-diameter from one configuration to the next."""
-    followed = [place.path[:3] for operand in lens.operands if operand.name == "SDIA" for place in operand.places]
+    followed = [place.path[:3] for operand in lens.operands if operand.name == "SDIA" for place in operand.paths]
     return ("surfaces", number, "apertures") in followed
 
 

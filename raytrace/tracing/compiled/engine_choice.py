@@ -1,4 +1,4 @@
-"""Choice: which trace carries a batch of rays, torch's own operators ("eager") or the compiled one ("fused").
+"""Choice: which trace carries a batch of rays, torch's own operators ("eager") or the compiled one ("compiled").
 
 The program chooses by what is there and what pays; `trace_engine` and the environment variable RAYTRACE_TRACE force
 either.
@@ -17,7 +17,7 @@ from torch.autograd import forward_ad
 from raytrace.system.rays import Rays
 from raytrace.tracing.compiled.library import NoCompiler, is_built, library
 
-ENGINES = ("auto", "eager", "fused")
+ENGINES = ("auto", "eager", "compiled")
 
 WORTH_COMPILING = 2**23  # rays × surfaces of one call: it takes torch 0.3 s, and compiling, once for a machine, 10 s
 
@@ -27,10 +27,10 @@ _refused: list[str] = []
 
 @contextlib.contextmanager
 def trace_engine(engine: str) -> Iterator[None]:
-    """Within the block, trace by this engine: "eager", "fused" or "auto".
+    """Within the block, trace by this engine: "eager", "compiled" or "auto".
 
     "auto", the default, takes the compiled trace for tensors on the CPU where it has been compiled already, compiles
-    it for a batch that is worth it, and else falls back to eager. "fused" raises NoCompiler where it cannot be had,
+    it for a batch that is worth it, and else falls back to eager. "compiled" raises NoCompiler where it cannot be had,
     but still leaves to torch what it has no form for: other devices, forward derivatives, transforms of torch.func,
     height maps, kinds of sag that are not compiled, and Fresnel lenses but of even aspheres.
     Raises ValueError for another name.
@@ -48,20 +48,20 @@ def engine() -> str:
 
 
 def prepare() -> str:
-    """Make the compiled trace ready, compiling it if need be: "fused", or "eager" where it cannot be or is not wanted.
+    """Make the compiled trace ready, compiling it if need be: "compiled", or "eager" without it.
 
     For loops of many small batches, which would not compile it by themselves, and for runs whose numbers must not
     depend on when somebody else compiled it.
     """
-    return "fused" if engine() != "eager" and _available(build=True) else "eager"
+    return "compiled" if engine() != "eager" and _available(build=True) else "eager"
 
 
-def is_fused(rays: Rays, numbers: Tensor, surfaces: int) -> bool:
+def uses_compiled(rays: Rays, numbers: Tensor, surfaces: int) -> bool:
     """Whether the compiled trace carries these rays; numbers: any number of the lens, for its device and dtype."""
     asked = engine()
     if asked == "eager" or not _has_form(rays, numbers):
         return False
-    if asked == "fused":
+    if asked == "compiled":
         library()
         return True
     return _available(build=rays.direction[0].numel() * surfaces >= WORTH_COMPILING)

@@ -26,7 +26,7 @@ from raytrace.tracing.compiled.trust import check_file, open_folder, private_fol
 #: The folder of the C++ sources.
 CPP = Path(__file__).absolute().parents[1] / "cpp"
 SOURCES = (
-    *("block.h", "sags.h", "freeform.h", "apertures.h", "paths.h", "departures.h", "loops.h", "facets.h", "phases.h"),
+    *("block.h", "sags.h", "freeform.h", "apertures.h", "paths.h", "sag_terms.h", "loops.h", "facets.h", "phases.h"),
     *("search.h", "careful.h", "adjoint.h", "tangent.h", "phase_slopes.h", "turns.h", "trace.cpp"),
 )
 FLAGS = ("-O3", "-std=c++17", "-fPIC", "-fopenmp-simd", "-fno-math-errno", "-fno-trapping-math")
