@@ -26,7 +26,7 @@ from raytrace.imaging import Variables as Variables
 from raytrace.imaging.image import blur as blur
 from raytrace.imaging.image import blur_layers as blur_layers
 from raytrace.imaging.image import depth_masks as depth_masks
-from raytrace.imaging.restoration import blind_filter as blind_filter
+from raytrace.imaging.restoration import depth_invariant_wiener as depth_invariant_wiener
 from raytrace.imaging.restoration import power_law as power_law
 from raytrace.imaging.restoration import power_spectrum as power_spectrum
 from raytrace.imaging.restoration import psnr as psnr
@@ -58,7 +58,7 @@ from raytrace.maths.pupil import hexapolar as hexapolar
 from raytrace.maths.pupil import sobol as sobol
 from raytrace.maths.value import to as to
 from raytrace.optimization.constraints import Condition as Condition
-from raytrace.optimization.conventions import Readings as Readings
+from raytrace.optimization.conventions import Conventions as Conventions
 from raytrace.optimization.default_merit import BadMerit as BadMerit
 from raytrace.optimization.evaluate import evaluate as evaluate
 from raytrace.optimization.file_check import check as check
