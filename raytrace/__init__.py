@@ -65,7 +65,7 @@ PUBLIC = {
     "hit_jacobian": "tracing.jacobian",
     "info": "tracing.lens_report",
     "layout": "tracing.lens_report",
-    "mean_square_gradient": "tracing.streamed_gradient",
+    "mean_square_gradient": "tracing.streaming",
     "paraxial_image_distance": "tracing.paraxial",
     "prepare": "tracing.compiled",
     "rays": "tracing.launch",
@@ -126,7 +126,7 @@ PUBLIC = {
     # pictures and learning
     "add_noise": "imaging.sensor",
     "add_shot_noise": "imaging.sensor",
-    "blind_filter": "imaging.restoration",
+    "depth_invariant_wiener": "imaging.restoration",
     "blur": "imaging.image",
     "blur_layers": "imaging.image",
     "count_electrons": "imaging.sensor",

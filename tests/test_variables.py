@@ -11,9 +11,19 @@ from problems import scalar
 from torch.utils import _pytree as pytree
 
 from raytrace.imaging.camera import Camera
-from raytrace.imaging.limits import BadLimits, Limits, edge_thickness, limits_of, parse_range, violation
-from raytrace.imaging.phase_variables import PhaseVariables
-from raytrace.imaging.variables import BadVariables, OtherLens, Variables, parse_bounds
+from raytrace.imaging.variables import (
+    BadLimits,
+    BadVariables,
+    Limits,
+    OtherLens,
+    PhaseVariables,
+    Variables,
+    edge_thickness,
+    limits_of,
+    parse_bounds,
+    parse_range,
+    violation,
+)
 from raytrace.io import read_lens
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import AIR, MIRROR, constant, is_air, model_glass, nd

@@ -26,10 +26,9 @@ from raytrace.maths.grid import grid as make_grid
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
 from raytrace.psf_models import gaussian
-from raytrace.psf_models.convergence import between, by_order, by_rays, by_tolerance, climb
-from raytrace.psf_models.models import MODELS, RUNGS, Model
+from raytrace.psf_models.drt import deposit
+from raytrace.psf_models.models import MODELS, RUNGS, Model, between, by_order, by_rays, by_tolerance, climb
 from raytrace.psf_models.paraxial import has_one_focus
-from raytrace.psf_models.rays import deposit
 from raytrace.psf_models.result import EmptyPsf, Kernels, Psf, combined, mixture, polychromatic, without_dark
 from raytrace.shards import Share, agreeing, gathered, total
 from raytrace.system.lens import Lens, field_points, with_object_distance

@@ -27,7 +27,6 @@ import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -135,7 +134,7 @@ def fringe_size(numbers: Sequence[Tensor], radius: Tensor) -> Tensor:
 def _spline_coefficients(heights: Tensor) -> Tensor:
     """Coefficients (n + 2, ...) along the first axis of heights (n, ...); each feels only its surroundings."""
     count = len(heights)
-    matrix = heights.new_tensor(_prefilter(count))
+    matrix = _prefilter(count).to(heights)
     parts = []
     for first in range(0, count + 2, _BLOCK):
         near = slice(max(first - _FELT, 0), first + _BLOCK + _FELT)
@@ -144,16 +143,16 @@ def _spline_coefficients(heights: Tensor) -> Tensor:
 
 
 @functools.lru_cache(maxsize=8)
-def _prefilter(count: int) -> np.ndarray:
+def _prefilter(count: int) -> Tensor:
     """Matrix (n + 2, n) from heights at n points to the coefficients of their spline, c[k] at the point k - 1.
 
     (c[k-1] + 4 c[k] + c[k+1])/6 = h,   the fourth differences of the first five and the last five c are 0
     """
-    system = np.zeros((count + 2, count + 2))
+    system = torch.zeros((count + 2, count + 2), dtype=torch.float64)
     for k in range(count):
-        system[k + 1, k : k + 3] = 1 / 6, 4 / 6, 1 / 6
-    system[0, :5] = system[-1, -5:] = 1, -4, 6, -4, 1
-    return np.linalg.inv(system)[:, 1:-1].copy()
+        system[k + 1, k : k + 3] = torch.tensor([1 / 6, 4 / 6, 1 / 6], dtype=torch.float64)
+    system[0, :5] = system[-1, -5:] = torch.tensor([1.0, -4.0, 6.0, -4.0, 1.0], dtype=torch.float64)
+    return torch.linalg.inv(system)[:, 1:-1].contiguous()
 
 
 def spline_sag(numbers: Sequence[Tensor], x: Tensor, y: Tensor, highest: int) -> Sag:

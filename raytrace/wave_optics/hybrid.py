@@ -26,7 +26,9 @@ from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to
 from raytrace.maths.zernike import noll
 from raytrace.psf_models.dft import integrate, nodes_per_pixel, rings_and_arms, sub_pixels
-from raytrace.psf_models.diffraction import (
+from raytrace.psf_models.radial import is_centred, radii_of_waves, unfold
+from raytrace.psf_models.result import Kernels
+from raytrace.psf_models.wave import (
     Waves,
     amplitude,
     half_spread,
@@ -35,8 +37,6 @@ from raytrace.psf_models.diffraction import (
     phase_along_radius,
     waves,
 )
-from raytrace.psf_models.radial import is_centred, radii_of_waves, unfold
-from raytrace.psf_models.result import Kernels
 from raytrace.system.lens import Fields, Lens, SystemAperture, field_points, with_object_distance
 from raytrace.system.sag_terms import GridSag, ZernikeSag, spline
 from raytrace.system.shapes import relief
@@ -166,7 +166,7 @@ def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: i
     """Wave PSFs of a scene whose lens carries elements in contact at its stop.
 
     Differentiable in the numbers of the elements and of the lens. order: as for the wave model
-    (`psf_models.diffraction`);
+    (`psf_models.wave`);
     the rays follow the phase of the lens and of the elements together. Kernels of flat pixels, rings and wrapped
     heights converge slowly in it, by the rays across a step. Moments are left out.
     Raises ValueError for a stop between other media than air, a beam wider than an element at the stop (beyond a margin
@@ -182,7 +182,7 @@ def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: i
 
 
 def _field_kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, order: int) -> tuple[int, Tensor]:
-    """Rays and kernel (D, 1, W, rows, columns) of one field; without elements those of `psf_models.diffraction`."""
+    """Rays and kernel (D, 1, W, rows, columns) of one field; without elements those of `psf_models.wave`."""
     like = {"dtype": scene.wavelengths.dtype, "device": scene.wavelengths.device}
     probe = wavefront_of(scene, *gauss_rings(*_PROBE, **like))
     centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))) - probe.centre[:2]

@@ -2,7 +2,7 @@
 
 The MTF of diffraction follows from a few rings of rays (`sheared.py`), that of rays is a sum over a beam; both are
 traced with all the rows' rays. What remains, a beam that apertures clip and the Strehl ratio, are the functions of
-`analysis.mtf` and `psf_models.diffraction`, with their derivatives by torch.
+`analysis.mtf` and `psf_models.wave`, with their derivatives by torch.
 
 Beams whose modulation of diffraction is asked for: their rays, and the MTF of all of them with its derivatives.
 """
@@ -32,7 +32,7 @@ from raytrace.optimization.operands.wavefront import (
     rings,
     sphere_of,
 )
-from raytrace.psf_models.diffraction import strehl
+from raytrace.psf_models.wave import strehl
 from raytrace.system.lens import Lens
 from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.scene import Scene
