@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from raytrace.cli.door import CommandError
-from raytrace.imaging.phase_variables import PhaseVariables
-from raytrace.imaging.restoration import blind_filter, errors, psnr, wiener
+from raytrace.imaging.restoration import depth_invariant_wiener, errors, psnr, wiener
 from raytrace.imaging.training import OtherSettings
+from raytrace.imaging.variables import PhaseVariables
 from raytrace.materials.glass import index
 from raytrace.maths.zernike import polynomials
 from raytrace.studies.edof import table as edof_table
@@ -32,9 +32,9 @@ from raytrace.studies.edof.world import (
     transfer,
 )
 from raytrace.studies.pictures import dead_leaves, digest
+from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import aim, baseline
 from raytrace.wave_optics.element import Element, EvenPowers, height
-from raytrace.wave_optics.psf import psf
 
 #: One colour, three depths, a window of 0.47 mm: a step takes milliseconds.
 SMALL = World(depths=(500.0, 1000.0, math.inf), wavelengths=(0.55,), size=63, pixel=0.00738)
@@ -69,7 +69,7 @@ def test_the_closed_form_is_the_error_of_restored_pictures():
     random = torch.Generator().manual_seed(0)
     noise = SMALL.noise * torch.randn(24, 1, 128, 128, generator=random, dtype=torch.float64)
     many = PICTURES.repeat(3, 1, 1)
-    for G in (blind_filter(H, S, SMALL.noise), wiener(H[1], 0.01)):
+    for G in (depth_invariant_wiener(H, S, SMALL.noise), wiener(H[1], 0.01)):
         expected = errors(H, S, SMALL.noise, filter=G)[:, 0]
         found = [(restored(H_z, G, many, noise)[1] - many[:, None]).square().mean() for H_z in H]
         torch.testing.assert_close(torch.stack(found), expected, rtol=0.01, atol=0)

@@ -17,9 +17,9 @@ from raytrace.studies.edof.free_report import title_of
 from raytrace.studies.edof.world import World, periodic, scene, spectrum
 from raytrace.studies.pictures import dead_leaves
 from raytrace.wave_optics.coarse import Coarse
+from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import aim, baseline
 from raytrace.wave_optics.element import Element, as_pixels, as_rings, wrapped
-from raytrace.wave_optics.psf import psf
 
 DOCS = Path(__file__).parents[1] / "docs"
 SMALL = World(radius=0.5, depths=(500.0, 1000.0, math.inf), wavelengths=(0.46, 0.64), size=31)

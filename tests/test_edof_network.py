@@ -15,8 +15,8 @@ from raytrace.studies.edof.table import Content
 from raytrace.studies.edof.world import World, periodic, spectrum, transfer
 from raytrace.studies.edof.world import scene as scene_of
 from raytrace.studies.pictures import dead_leaves
+from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import aim, baseline
-from raytrace.wave_optics.psf import psf
 
 SMALL = World(depths=(500.0, 1000.0, math.inf), wavelengths=(0.55,), size=63, pixel=0.00738)
 PICTURES = periodic(dead_leaves(8, size=96, seed=5, smallest=2.5), 192)

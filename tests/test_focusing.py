@@ -18,7 +18,7 @@ from raytrace.studies.focusing.experiment import (
     scene_of,
 )
 from raytrace.studies.pictures import dead_leaves
-from raytrace.wave_optics.psf import psf
+from raytrace.wave_optics.compute import psf
 
 AIRY = 1.2197 * 0.55e-3 * 25
 

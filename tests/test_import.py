@@ -15,7 +15,7 @@ from raytrace.io.report import substitutes_of
 from raytrace.materials.catalogs import UnknownGlass, find_glass, shipped_catalog
 from raytrace.materials.glass import ImplausibleWavelength, OutOfRange, abbe_number, index, model_glass, nd
 from raytrace.system.lens import check_media
-from raytrace.system.optimization_data import Intent, Row
+from raytrace.system.optimization_data import OptimizationData, Row
 
 #: A pickup of a medium with figures that are left from before.
 PICKUP = "GLAS {name} 2 0 1.5 40 0 0 0 0 0 0"
@@ -32,11 +32,11 @@ def test_a_medium_that_is_picked_up_is_that_of_its_surface(glass, name, index, t
     lens, report = read(text)
     glass = lens.surfaces[2].glass
     assert (glass.name, glass.coefficients.tolist()) == (name, [index])
-    assert [(one.surface, one.source) for one in lens.intent.solves] == [(2, 0)]
+    assert [(one.surface, one.source) for one in lens.optimization_data.solves] == [(2, 0)]
     assert not report.warnings
     write_lens(lens, tmp_path / "again.zmx")
     again = read_lens(tmp_path / "again.zmx")
-    assert again.intent == lens.intent
+    assert again.optimization_data == lens.optimization_data
     assert again.surfaces[2].glass.coefficients.equal(glass.coefficients)
 
 
@@ -74,7 +74,7 @@ def test_fields_beyond_twelve_stand_in_lines_of_their_own(tmp_path):
     assert lens.fields.vignetting[3].tolist() == [0.0] * 12 + [0.25, 0.0]
     for unit, scale in (("MM", 1.0), ("CM", 10.0)):
         given = read(text.replace("UNIT MM", f"UNIT {unit}"))[0]
-        given = dataclasses.replace(given, intent=Intent(unit=scale, merit=(Row("EFFL"),)))
+        given = dataclasses.replace(given, optimization_data=OptimizationData(unit=scale, merit=(Row("EFFL"),)))
         write_lens(given, tmp_path / "again.zmx")
         assert "FENF 14 14\nFEFD 1.0 12.0 0.5 0.0 0.0 0.0 0.25 0.0" in (tmp_path / "again.zmx").read_text()
         again = read_lens(tmp_path / "again.zmx").fields

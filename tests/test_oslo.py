@@ -21,7 +21,7 @@ from raytrace.io import FORMATS, LensFileError, UnsupportedSurface, convert, rea
 from raytrace.materials.catalogs import UnknownGlass, find_glass
 from raytrace.materials.glass import refractive_index
 from raytrace.system.lens import check
-from raytrace.tracing.frames import frames
+from raytrace.tracing.geometry import frames
 from raytrace.tracing.scene import scene
 from raytrace.tracing.wavefront import wavefront_of
 

@@ -25,11 +25,11 @@ from raytrace.studies.quantise.experiment import (
     tolerances_of,
     whole,
 )
+from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import aim, baseline
 from raytrace.wave_optics.element import Element, EvenPowers, Rings, as_pixels, as_rings, period
 from raytrace.wave_optics.element_files import read_element, write_element
-from raytrace.wave_optics.exchange import write_heights
-from raytrace.wave_optics.psf import psf
+from raytrace.wave_optics.height_maps import write_heights
 
 #: Small, and quick: 1 mm, f/20, one colour, three depths.
 WORLD = World(radius=0.5, sensor_distance=20.0, depths=(200.0, 400.0, math.inf), design=400.0, wavelengths=(0.5, 0.6),

@@ -36,7 +36,7 @@ from raytrace.studies.superres.experiment import (
     world_of,
 )
 from raytrace.studies.superres.inversion import coarse_image, least_error
-from raytrace.wave_optics.psf import psf
+from raytrace.wave_optics.compute import psf
 
 LEAVES = dead_leaves(6, size=64)
 WORLD = world_of([0.55], noise=0.001, size=33)

@@ -7,7 +7,15 @@ import torch
 from problems import covariance, draws, gaussian
 
 from raytrace.imaging.image import blur, transfer_functions, visible
-from raytrace.imaging.restoration import blind_filter, errors, mean_square_error, power_law, psnr, restore, within
+from raytrace.imaging.restoration import (
+    depth_invariant_wiener,
+    errors,
+    mean_square_error,
+    power_law,
+    psnr,
+    restore,
+    within,
+)
 from raytrace.studies.pictures import dead_leaves
 from raytrace.studies.superres.inversion import (
     bicubic,
@@ -88,7 +96,7 @@ def test_factor_one_is_deconvolution():
     T = coarse_transfer(kernels, (12, 10), 1)
     torch.testing.assert_close(T, H, atol=1e-15, rtol=0)
     G = inversion(T, S, sigma, 1)
-    torch.testing.assert_close(G, blind_filter(H, S, sigma), atol=1e-14, rtol=0)
+    torch.testing.assert_close(G, depth_invariant_wiener(H, S, sigma), atol=1e-14, rtol=0)
     torch.testing.assert_close(inversion_errors(T, S, sigma, 1), errors(H, S, sigma), rtol=1e-12, atol=0)
     image = draws(12, 10)
     torch.testing.assert_close(superresolve(image, G, 1), restore(image, G), atol=1e-14, rtol=0)

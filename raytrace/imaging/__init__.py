@@ -5,5 +5,5 @@ The only `nn.Module`s of the package stand here.
 
 from raytrace.imaging.camera import Camera as Camera
 from raytrace.imaging.network import RedNet as RedNet
-from raytrace.imaging.phase_variables import PhaseVariables as PhaseVariables
+from raytrace.imaging.variables import PhaseVariables as PhaseVariables
 from raytrace.imaging.variables import Variables as Variables

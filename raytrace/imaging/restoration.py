@@ -50,7 +50,7 @@ def towards_measurement(transfer: Tensor, gamma: Tensor | float) -> Tensor:
     return 1 + wiener(transfer, gamma) * (1 - transfer)
 
 
-def blind_filter(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
+def depth_invariant_wiener(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
     """The best linear filter (..., rows, columns) that does not know which transfer function (Z, ...) it meets.
 
         G = S ⟨H*⟩/(S ⟨|H|²⟩ + σ²),   ⟨·⟩ the mean over the first axis
@@ -63,22 +63,22 @@ def blind_filter(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> T
 
 def errors(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float, *, filter: Tensor | None = None) -> Tensor:
     """Mean square error (Z, ...) of a pixel at each transfer function, by one filter: by default the best blind one."""
-    G = blind_filter(transfer, spectrum, sigma) if filter is None else filter
+    G = depth_invariant_wiener(transfer, spectrum, sigma) if filter is None else filter
     return (spectrum * _square(G * transfer - 1) + _variance(sigma) * _square(G)).mean((-2, -1))
 
 
-def blind_error(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
+def depth_invariant_error(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
     """Mean over the kernels of `errors` by the best blind filter (...), without the filter.
 
         e = S - S² |⟨H⟩|²/(S ⟨|H|²⟩ + σ²) = S (S (⟨|H|²⟩ - |⟨H⟩|²) + σ²)/(S ⟨|H|²⟩ + σ²)
 
     In the second form, whose difference is the variance ⟨|H - ⟨H⟩|²⟩, small errors keep their digits.
     """
-    return blind_density(transfer, spectrum, sigma).mean((-2, -1))
+    return depth_invariant_density(transfer, spectrum, sigma).mean((-2, -1))
 
 
-def blind_density(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
-    """e (..., frequencies) whose mean over all frequencies is `blind_error`; any axes for the frequencies."""
+def depth_invariant_density(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
+    """e (..., frequencies) whose mean over all frequencies is `depth_invariant_error`; any axes for the frequencies."""
     middle = transfer.mean(0)
     spread, noise = _square(transfer - middle).mean(0), _variance(sigma)
     total = spectrum * (spread + _square(middle)) + noise
@@ -87,7 +87,7 @@ def blind_density(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> 
 
 
 def kernel_error(kernels: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
-    """`blind_error` (...) of kernels (Z, ..., h, w), at half the cost: by the half of the frequencies that tells all.
+    """`depth_invariant_error` (...) of kernels (Z, ..., h, w), from the non-redundant half of the frequencies.
 
     Pictures and kernels are real, so that S and |H| at f and -f are equal; and where the middle of the kernels lies
     does not matter, as long as it is the same for all Z.
@@ -99,12 +99,12 @@ def kernel_error(kernels: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Te
     # Every column stands for its mirror image as well, but 0 and the Nyquist frequency, which are their own.
     weight = torch.where((place == 0) | (2 * place == columns), 1.0, 2.0).to(spectrum.dtype) * (half / columns)
     transfer = torch.fft.rfft2(kernels, s=(rows, columns))
-    return (weight * blind_density(transfer, spectrum[..., :half], sigma)).mean((-2, -1))
+    return (weight * depth_invariant_density(transfer, spectrum[..., :half], sigma)).mean((-2, -1))
 
 
 def errors_knowing(transfer: Tensor, spectrum: Tensor, sigma: Tensor | float) -> Tensor:
     """Mean square error (Z, ...) where the filter knows every transfer function: the least any linear one leaves."""
-    return blind_error(transfer[None], spectrum, sigma)
+    return depth_invariant_error(transfer[None], spectrum, sigma)
 
 
 def restore(image: Tensor, filter: Tensor, *, boundary: str = "circular") -> Tensor:

@@ -43,7 +43,7 @@ from raytrace.maths.value import value
 from raytrace.system.configurations import count
 from raytrace.system.lens import Lens, check_media
 from raytrace.system.lens import check as check_lens
-from raytrace.system.optimization_data import Intent
+from raytrace.system.optimization_data import OptimizationData
 from raytrace.words import calling_level, named_value
 
 #: Substitutes for glasses of a file: {"SSK4": "SSK4A"}, words like "SSK4=SSK4A", "nearest" for every unknown glass.
@@ -173,7 +173,7 @@ def read_lens_with_report(
         message = f"has no configuration {configuration}; a file of this format holds one"
         raise LensFileError(message, Place(file))
     varied = [Varied(str(operand), tuple(operand.values())) for operand in lens.operands if operand.name != "MOFF"]
-    intent = Intent() if lens.intent is None else lens.intent
+    data = OptimizationData() if lens.optimization_data is None else lens.optimization_data
     report = dataclasses.replace(
         report,
         surfaces=len(lens.surfaces),
@@ -182,11 +182,11 @@ def read_lens_with_report(
         wavelengths=tuple(lens.wavelengths.tolist()),
         ray_aiming=lens.ray_aiming,
         configurations=tuple(varied),
-        variables=tuple(map(str, intent.variables)),
-        solves=tuple(map(str, intent.solves)),
-        kept=tuple(map(str, intent.kept)),
-        operands=operand_uses(intent.merit, evaluated),
-        tolerances=len(intent.tolerances),
+        variables=tuple(map(str, data.variables)),
+        solves=tuple(map(str, data.solves)),
+        kept=tuple(map(str, data.kept)),
+        operands=operand_uses(data.merit, evaluated),
+        tolerances=len(data.tolerances),
     )
     return lens, report
 
@@ -322,15 +322,15 @@ def _changes(lens: Lens, content: bytes, form: Format, path: Path, catalogs: Seq
         pairs.append((f"the other configurations, {count(lens.operands)} in all", lens.current_configuration, 0))
     else:
         pairs += [(str(a), a.values(), b.values()) for a, b in zip(lens.operands, again.operands, strict=False)]
-    intent, read_again = lens.intent, again.intent
-    if intent is not None and any((intent.variables, intent.solves, intent.merit, intent.tolerances, intent.kept)):
+    data, read_again = lens.optimization_data, again.optimization_data
+    if data is not None and any((data.variables, data.solves, data.merit, data.tolerances, data.kept)):
         if read_again is not None:
-            free = [[dataclasses.replace(v, bounds=()) for v in data.variables] for data in (intent, read_again)]
-            both = zip(intent.variables, read_again.variables, strict=False)
+            free = [[dataclasses.replace(v, bounds=()) for v in data.variables] for data in (data, read_again)]
+            both = zip(data.variables, read_again.variables, strict=False)
             unbound = [f"{a.quantity} of surface {a.surface}" for a, b in both if a.bounds and not b.bounds]
             if unbound and free[0] == free[1]:
                 pairs.append(("bounds of variables other than thicknesses", ", ".join(unbound), ""))
-                read_again = dataclasses.replace(read_again, variables=intent.variables)
-        if read_again != intent:
-            pairs.append(("the optimisation data", f"{len(intent.merit)} rows of a merit function", ""))
+                read_again = dataclasses.replace(read_again, variables=data.variables)
+        if read_again != data:
+            pairs.append(("the optimisation data", f"{len(data.merit)} rows of a merit function", ""))
     return [f"{what} ({shown(str(before))})" for what, before, after in pairs if before != after]

@@ -181,8 +181,8 @@ class ImportReport(Result):
     A note reports a choice that the file leaves open; a warning reports an assumption or a loss, and is an error when
     the file is read with `strict=True`. surfaces, stop_surface, primary_wavelength (its number, from 1), wavelengths
     (µm), ray_aiming: of the lens that was read. configurations: values of multi-configuration operands.
-    variables, solves, kept: of `Lens.intent`, in words; operands: those of its merit function; tolerances: number of
-    its lines. geometry: surfaces and gaps that cannot be fabricated.
+    variables, solves, kept: of `Lens.optimization_data`, in words; operands: of its merit function; tolerances: number
+    of its lines. geometry: surfaces and gaps that cannot be fabricated.
     """
 
     file: str

@@ -194,10 +194,10 @@ def thickness(number: Tensor, infinity: str, place: Place) -> str:
     return exact(number, "thickness", place)
 
 
-def refuse_departure(surface: Surface, place: Place) -> None:
+def refuse_sag_terms(surface: Surface, place: Place) -> None:
     """Raise LensFileError for a surface that formats of conics and rotationally symmetric terms do not hold."""
-    if surface.departure is not None:
-        feature = f"has sag terms of {named(surface.departure)}"
+    if surface.sag_terms is not None:
+        feature = f"has sag terms of {named(surface.sag_terms)}"
     elif is_freeform(surface):
         feature = f"is {surface.kind}"
     elif surface.phase is not None:

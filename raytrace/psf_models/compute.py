@@ -26,17 +26,15 @@ from raytrace.maths.grid import grid as make_grid
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
 from raytrace.psf_models import gaussian
-from raytrace.psf_models.convergence import between, by_order, by_rays, by_tolerance, climb
-from raytrace.psf_models.models import MODELS, RUNGS, Model
+from raytrace.psf_models.drt import deposit
+from raytrace.psf_models.models import MODELS, RUNGS, Model, between, by_order, by_rays, by_tolerance, climb
 from raytrace.psf_models.paraxial import has_one_focus
-from raytrace.psf_models.rays import deposit
 from raytrace.psf_models.result import EmptyPsf, Kernels, Psf, combined, mixture, polychromatic, without_dark
 from raytrace.shards import Share, agreeing, gathered, total
 from raytrace.system.lens import Lens, field_points, with_object_distance
-from raytrace.tracing.memo import Memo
-from raytrace.tracing.ray_failures import beam_hint, losses, warn_of_losses
-from raytrace.tracing.scene import Scene, beam_share, chief_landing, scene, symmetry
-from raytrace.tracing.stop_filling import warn_of_filling
+from raytrace.tracing.launch import warn_of_filling
+from raytrace.tracing.ray_failures import beam_hint, ray_failures, warn_of_failures
+from raytrace.tracing.scene import Memo, Scene, beam_share, chief_landing, scene, symmetry
 from raytrace.tracing.streaming import (
     MAX_BYTES,
     Moments,
@@ -370,7 +368,7 @@ def _lost(lens: Lens, fields: Tensor, distances: Tensor, wavelengths: Tensor) ->
     """Where the rays of the first field and wavelength end, and what to do about a beam too wide."""
     lens = with_object_distance(lens, distances[0].detach())
     points = gauss_rings(6, dtype=fields.dtype, device=fields.device)[0]
-    found = losses(lens, points, fields=fields[:, :1].detach(), wavelengths=wavelengths[:1].detach())
+    found = ray_failures(lens, points, fields=fields[:, :1].detach(), wavelengths=wavelengths[:1].detach())
     return "; ".join(filter(None, (found.words(0, 0), beam_hint(lens))))
 
 
@@ -384,7 +382,7 @@ def _warn_of_dark(lens: Lens, fields: Tensor, distances: Tensor, wavelengths: Te
     for distance, lost in zip(distances.detach(), dark, strict=True):
         at = f"object at {float(distance):g} mm, " if len(distances) > 1 else ""
         trial = with_object_distance(lens, distance)
-        warn_of_losses(trial, points, lost, fields=fields.detach(), wavelengths=wavelengths.detach(), at=at)
+        warn_of_failures(trial, points, lost, fields=fields.detach(), wavelengths=wavelengths.detach(), at=at)
 
 
 def _of_its_window(kernel: Tensor) -> Tensor:

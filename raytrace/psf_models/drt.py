@@ -1,4 +1,13 @@
-"""Ray map: the image point as a polynomial of the pupil point, fitted through dozens of traced rays.
+"""DRT: the energy of traced rays integrated over pixels.
+
+    E_ij = (1/π) ∬ [x(p) in pixel ij] [light passes at p] d²p,   p on the unit disc of the entrance pupil
+
+Rays are traced on lines from the centre of the pupil to its rim. Between four neighbours lies a cell of the pupil; the
+image of the cell is spread over the pixels, and cut by the apertures, in closed form (`splat_cells`). Pixel edges and
+vignetting edges are thus crossed smoothly: no blur is needed for a derivative, and none is there.
+
+
+Ray map: the image point as a polynomial of the pupil point, fitted through dozens of traced rays.
 
     x(ρ, θ) = Σ_mj c_mj ρ^m T_j(2ρ² - 1) {cos mθ, sin mθ},   m + 2j <= degree
 
@@ -6,37 +15,497 @@ As many rays as coefficients, on concentric rings where the interpolation is wel
 Granero, Fernández-Martínez and Martínez-Finkelshtein, Appl. Math. Comput. 274, 2016), so the fit is one constant
 matrix. Rays that were not fitted check it. The points where rays cross an aperture are mapped in the same way, which
 gives smooth edges of vignetting. Where no polynomial fits, rays are traced, and the reason is said.
+
+
+Splat: the energy of weighted points and of small cells in the pixels of a Grid, differentiable in all of them.
+
+Positions are counted in pixels before anything else. Whatever lies outside the window is dropped, never moved to its
+edge, so the sum of an image is the energy inside the window.
 """
 
+import dataclasses
 import functools
 import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from raytrace.budget import afford
+from raytrace.maths import pupil
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.value import value
 from raytrace.psf_models.radial import energy_of_rings, is_centred, lit_part, unfold
-from raytrace.psf_models.rays import (
-    Fans,
-    afford_cells,
-    cell_width,
-    energy_of_fans,
-    kernels_of_fans,
-    moments_of_fans,
-    places,
-    trace_apertures,
-    trace_fans,
-    turned,
-)
-from raytrace.psf_models.result import Kernels
-from raytrace.psf_models.splat import cell_widths
+from raytrace.psf_models.result import Kernels, moments
 from raytrace.system.apertures import Aperture, clearance
-from raytrace.tracing.scene import Scene, beam_share, symmetry, varies
+from raytrace.tracing.scene import Scene, beam_share, cross_scene, symmetry, trace_scene, varies
 
-_LINES = 32  # round the pupil at least, and half as many cells on each
+
+def splat(grid: Grid, points: Tensor, weights: Tensor) -> Tensor:
+    """Bilinear deposition: each point shares its weight between the four nearest pixel centres.
+
+    It is the energy of a box one pixel wide about every point, so it widens a kernel by pitch²/12 per axis (the
+    exact kernel, at double the resolution of a pixel, is `splat_smooth`'s with width -> 0).
+    points: (2, ..., P) mm; weights: (P,) or (..., P); returns (..., rows, columns). A point on a pixel centre gives it
+    all its weight and has the derivative of the side towards larger coordinates.
+    """
+    column, right = _between_centres(_in_pixels(grid, points, 0) - 0.5, grid.columns)
+    row, up = _between_centres(_in_pixels(grid, points, 1) - 0.5, grid.rows)
+    return _four(grid, column, row, right, up, weights)
+
+
+def splat_smooth(grid: Grid, points: Tensor, weights: Tensor, *, width: float) -> Tensor:
+    """Energy in each pixel of points blurred by a smooth kernel smaller than a pixel; twice differentiable.
+
+        k(t) = 15/16 (1 - t²)²,  t = x/(width·pitch),   ∫_{-1}^{t} k = s³(10 - 15 s + 6 s²),  s = (t + 1)/2
+
+    width: half width of the kernel in pixels, above 0 and up to 1/2. The bias is known: the blur adds
+    (width·pitch)²/7 to the variance per axis; it vanishes with the square of the width where the kernel is smooth.
+    points, weights and result as for `splat`.
+    """
+    column, right = _about_edges(_in_pixels(grid, points, 0), grid.columns, width)
+    row, up = _about_edges(_in_pixels(grid, points, 1), grid.rows, width)
+    return _four(grid, column, row, right, up, weights)
+
+
+def histogram(grid: Grid, points: Tensor, weights: Tensor) -> Tensor:
+    """Energy of the points in each pixel; no derivative in their positions. Arguments and result as for `splat`."""
+    column = _clamped(torch.floor(_in_pixels(grid, points, 0)), grid.columns)
+    row = _clamped(torch.floor(_in_pixels(grid, points, 1)), grid.rows)
+    return _deposit(grid, [(column, row, weights)])
+
+
+def splat_cells(
+    grid: Grid, points: Tensor, radius: Tensor, clearances: Sequence[Tensor] = (), *, closed: bool = True
+) -> Tensor:
+    """Energy in each pixel of the images of small cells of the pupil: between two lines and two radii each.
+
+    To first order a cell's image is a parallelogram c ± a ± b, also where it folds to a segment or a point, on a
+    caustic. The share of its energy on either side of a pixel edge is exact: along x it has the density of the sum of
+    two uniform variables of half widths |a_x| and |b_x|. A cell on the corner of a pixel needs the share below both
+    edges; it is F_x F_y + cov f_x f_y, whose mean over all places of the corner is exact (Hoeffding), held within what
+    the shares allow. The derivative needs no blur, and no bias is left as the cells shrink.
+
+    points: (2, ..., A, N) mm, N nodes on each of A lines at equal angles round the pupil; radius: (N,) of the nodes.
+    clearances: each (..., A, N), above 0 where light passes; the share of a cell below 0 is cut away.
+    closed: whether the last line is followed by the first; otherwise it is the first line itself, a turn later.
+    A cell may be as wide as a pixel, not wider: see `cell_widths`.
+    """
+    lines = points.shape[-2] - (0 if closed else 1)
+    u, v = _in_pixels(grid, points, 0), _in_pixels(grid, points, 1)
+    energy = cell_energy(radius, lines) * clear_share(clearances, radius, closed=closed)
+    (x, ax, bx), (y, ay, by) = (cells(w, radius, closed=closed) for w in (u, v))
+    (column, right, dense_x), (row, up, dense_y) = _shares(x, ax, bx, grid.columns), _shares(y, ay, by, grid.rows)
+    both = right * up + (ax * ay + bx * by) / 3 * dense_x * dense_y
+    both = torch.maximum(torch.minimum(both, torch.minimum(right, up)), (right + up - 1).clamp_min(0))
+    deposits = (
+        (column, row, 1 - right - up + both),
+        (column + 1, row, right - both),
+        (column, row + 1, up - both),
+        (column + 1, row + 1, both),
+    )
+    return _deposit(grid, [(i, j, energy * share) for i, j, share in deposits], axes=2)
+
+
+def cell_widths(grid: Grid, points: Tensor, largest: Callable[[Tensor], Tensor]) -> tuple[float, float, float]:
+    """Width in pixels of the widest cell of points (2, ..., A, N), across the lines and along them; and their sum.
+
+    The sum, 1 … 2, is that of both parts of one cell along x or y, each in units of its largest: cut into that many
+    times as many parts as its widths alone ask for, no cell is wider than a pixel. largest: as `Scene` has it.
+    """
+    w = points.detach() / grid.pitch.detach()
+    across, along = (torch.roll(w, -1, -2) - w).abs(), w.diff().abs()
+    sides = torch.maximum(across[..., 1:], across[..., :-1]), torch.maximum(along, torch.roll(along, -1, -2))
+    widest = largest(torch.stack([side.amax() for side in sides])).unbind()
+    both = sum(safe_divide(side, most.expand_as(side)) for side, most in zip(sides, widest, strict=True))
+    return *(float(most) for most in widest), max(1.0, float(largest(both.amax())))
+
+
+def half_widths(w: Tensor, *, closed: bool = True) -> tuple[Tensor, Tensor]:
+    """Half vectors of the cells of a map w (..., A, N): b across the lines and a along them, (..., A, N - 1) each."""
+    after = torch.roll(w, -1, -2) if closed else w[..., 1:, :]
+    before = w if closed else w[..., :-1, :]
+    across, along = after - before, (after + before).diff()
+    return 0.25 * (across[..., 1:] + across[..., :-1]), 0.25 * along
+
+
+def cells(w: Tensor, radius: Tensor, *, closed: bool = True) -> tuple[Tensor, Tensor, Tensor]:
+    """Centre of energy and half vectors along and across (..., A, N - 1) of the cells of a map w (..., A, N)."""
+    across, along = half_widths(w, closed=closed)
+    after, before = (torch.roll(w, -1, -2), w) if closed else (w[..., 1:, :], w[..., :-1, :])
+    both = after + before
+    # Energy grows with the pupil radius: its mean lies a little outside the middle of a cell.
+    outward = radius.diff() / (3 * (radius[1:] + radius[:-1]))
+    return 0.25 * (both[..., 1:] + both[..., :-1]) + outward * along, along, across
+
+
+def cell_energy(radius: Tensor, lines: int) -> Tensor:
+    """Share (N - 1) of the pupil of the cells between radii (N,) and two of so many lines."""
+    return radius.diff() * (radius[1:] + radius[:-1]) / lines
+
+
+def clear_share(clearances: Sequence[Tensor], radius: Tensor, *, closed: bool = True) -> Tensor | float:
+    """The share (..., A, N - 1) of each cell that passes every aperture; clearances (..., A, N)."""
+    share = None
+    for values in clearances:
+        centre, along, across = cells(values, radius, closed=closed)
+        passed = 1 - below_edge(-centre, along, across)[0]
+        share = passed if share is None else torch.minimum(share, passed)
+    return 1.0 if share is None else share
+
+
+def below_edge(z: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """P(a s + b t < z) for s, t uniform in [-1, 1]: a straight middle and two parabolic ends; finite if a = b = 0.
+
+    p = max(|a|, |b|), q = min(|a|, |b|):  1/2 + z/2p for |z| < p - q;  a tail of (p + q - |z|)²/8pq beyond
+
+    And its derivative in z, the density there; 0 for a cell without width.
+    """
+    p, q = torch.maximum(a.abs(), b.abs()), torch.minimum(a.abs(), b.abs())
+    distance = z.abs()
+    middle = distance <= p - q
+    on_end = ~middle & (distance < p + q)
+    wide = middle & (p > 0)
+    straight = 0.5 - 0.5 * torch.where(wide, distance, 0.0) / torch.where(wide, p, 1.0)
+    reach = torch.where(on_end, p + q - distance, 0.0)
+    tail = torch.where(middle, straight, reach * reach / torch.where(on_end, 8 * p * q, 1.0))
+    end = reach / torch.where(on_end, 4 * p * q, 1.0)
+    density = torch.where(wide, 0.5 / torch.where(p > 0, p, 1.0), end)
+    return torch.where(z > 0, 1 - tail, tail), density
+
+
+def _shares(centre: Tensor, along: Tensor, across: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The pixel below the edge nearest to each cell, the share of the next pixel, and the density at the edge."""
+    reached = (centre > -1) & (centre < count + 1)
+    centre = torch.where(reached, centre, -1.0)
+    edge = torch.round(centre).detach()
+    below, density = below_edge(edge - centre, along, across)
+    return edge.long() - 1, 1 - below, density
+
+
+def _in_pixels(grid: Grid, points: Tensor, axis: int) -> Tensor:
+    """Coordinate counted in pixels: pixel i covers i to i + 1. The grid's batch axes stand before those of points."""
+    count = grid.columns if axis == 0 else grid.rows
+    centre, pitch = (_aligned(t, points[axis]) for t in (grid.centre[axis], grid.pitch))
+    return (points[axis] - centre) / pitch + 0.5 * count
+
+
+def _aligned(number: Tensor, like: Tensor) -> Tensor:
+    """A grid's number (...) with axes of length 1 for the points of each kernel."""
+    return number.reshape(*number.shape, *(1,) * (like.dim() - number.dim())) if number.dim() else number
+
+
+def _between_centres(u: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """The pixel centre i below u, -1 … count - 1, and the share u - i of its neighbour i + 1."""
+    reached = (u > -1) & (u < count)  # a NaN is not
+    u = torch.where(reached, u, -1.0)
+    below = torch.floor(u).detach()
+    return below.long(), u - below
+
+
+def _about_edges(u: Tensor, count: int, width: float) -> tuple[Tensor, Tensor]:
+    """The pixel i below the edge nearest to u, and the share of pixel i + 1 behind that edge."""
+    reached = (u > -0.5) & (u < count + 0.5)
+    u = torch.where(reached, u, -0.5)
+    edge = torch.floor(u + 0.5).detach()
+    s = (0.5 + (u - edge) / (2 * width)).clamp(0, 1)
+    return edge.long() - 1, s * s * s * (10 - s * (15 - 6 * s))
+
+
+def _clamped(pixel: Tensor, count: int) -> Tensor:
+    """Pixel numbers as integers; -1 or `count`, outside the window, for all that lies further out, or is NaN."""
+    return torch.where(torch.isfinite(pixel), pixel.clamp(-1, count), -1.0).long()
+
+
+def _four(grid: Grid, column: Tensor, row: Tensor, right: Tensor, up: Tensor, weights: Tensor) -> Tensor:
+    right_weight, left_weight = weights * right, weights * (1 - right)
+    return _deposit(
+        grid,
+        [
+            (column, row, left_weight * (1 - up)),
+            (column + 1, row, right_weight * (1 - up)),
+            (column, row + 1, left_weight * up),
+            (column + 1, row + 1, right_weight * up),
+        ],
+    )
+
+
+def _deposit(grid: Grid, deposits: list[tuple[Tensor, Tensor, Tensor]], *, axes: int = 1) -> Tensor:
+    """Sum (column, row, energy), each (..., P) over its last `axes` axes, into (..., rows, columns)."""
+    image = None
+    dropped = grid.rows * grid.columns
+    for column, row, energy in deposits:
+        inside = (column >= 0) & (column < grid.columns) & (row >= 0) & (row < grid.rows)
+        place = torch.where(inside, row * grid.columns + column, dropped).flatten(-axes)
+        energy = energy.expand(inside.shape).flatten(-axes)
+        image = energy.new_zeros(*place.shape[:-1], dropped + 1) if image is None else image
+        image = image.scatter_add(-1, place, energy)
+    return image[..., :-1].unflatten(-1, grid.shape)
+
+
+_TRACED_LINES = (
+    16,
+    24,
+    32,
+    48,
+    64,
+    96,
+    128,
+    192,
+    256,
+    384,
+    512,
+)  # by order; half as many nodes on each
+_CHUNK = 2**17  # cells that are deposited at once: 50 MB of temporaries
+_FINEST = 4096  # cells across the pupil at most, when cells are wider than a pixel
+
+
+@value
+class Fans:
+    """Image points of rays on A lines through the pupil, N nodes each, from its centre to its rim.
+
+    points: (2, D, F, W, A, N) mm; radius: (N,) of the nodes, of the pupil.
+    clearances: one (D, F, W, A, N) for each aperture, above 0 where light passes it; no unit.
+    rays: how many were traced for each kernel.
+    is_half: whether the lines are those of x > 0 and one more beyond either end, of light symmetric in x: cells between
+        the outer two on either side are their own images, all others have one.
+    """
+
+    points: Tensor
+    radius: Tensor
+    clearances: tuple[Tensor, ...]
+    rays: int
+    is_half: bool = False
+
+
+def kernels_of_rays(
+    scene: Scene,
+    grid: Grid,
+    *,
+    order: int = 4,
+    rays: int | None = None,
+    sampling: Callable[..., tuple[Tensor, Tensor]] = pupil.sobol,
+    width: float = 0.25,
+) -> Kernels:
+    """Ray-traced PSFs, differentiable in every number of the lens, the sensor distance and the grid.
+
+    order: 0 … 10; each has twice the rays of the one before, and half its error.
+    rays: instead, that many plain rays of `sampling` (`pupil.sobol`, `pupil.random`), each blurred by the kernel of
+    `splat_smooth` of half width `width` pixels; a width of 0 is the histogram, which has no derivative.
+    A kernel that no ray reaches has energy 0 and gradient 0. Vignetting factors of a field shrink the beam, and its
+    energy with it.
+    """
+    if rays is None:
+        return kernels_of_fans(scene, grid, trace_fans(scene, order), width=cell_width(order))
+    like = scene.lens.surfaces[-2].thickness
+    points, weights = sampling(rays, dtype=like.dtype, device=like.device)
+    return dataclasses.replace(kernels_of_points(scene, grid, points, weights, width=width), rays=rays)
+
+
+def trace_fans(scene: Scene, order: int) -> Fans:
+    """Trace the rays of an order; of a scene symmetric in x half the pupil, of a rotational one a single line."""
+    like = scene.lens.surfaces[-2].thickness
+    angle, radius = lines(_TRACED_LINES[order], _TRACED_LINES[order] // 2, like)
+    fold = symmetry(scene)
+    seen = (
+        like.new_tensor([torch.pi / 2]) if fold == "round" else angle[: len(angle) // 2] if fold == "mirror" else angle
+    )
+    disc = radius * torch.stack([torch.cos(seen), torch.sin(seen)])[..., None]
+    hits, clearances = trace_clearances(scene, disc.flatten(1))
+    hits, clearances = hits.unflatten(-1, disc.shape[1:]), [c.unflatten(-1, disc.shape[1:]) for c in clearances]
+    if fold == "round":
+        hits = turned(hits[1], angle)
+        clearances = [c.expand(hits.shape[1:]) for c in clearances]
+    elif fold == "mirror":
+        hits = torch.cat([hits, torch.stack([-hits[0], hits[1]]).flip(-2)], -2)
+        clearances = [torch.cat([c, c.flip(-2)], -2) for c in clearances]
+    return Fans(hits, radius, tuple(clearances), disc[0].numel())
+
+
+def lines(count: int, nodes: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Angles (A,) of lines round the pupil, those of x > 0 first; and radii (N + 1,), closer towards the rim."""
+    return tuple(torch.as_tensor(t, dtype=like.dtype, device=like.device) for t in places(count, nodes))
+
+
+def places(count: int, nodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """The same, as plain numbers."""
+    angle = (np.arange(count) + 0.5) * (2 * np.pi / count) - np.pi / 2
+    return angle, np.linspace(0, 1, nodes + 1) ** 0.75
+
+
+def turned(height: Tensor, angle: Tensor) -> Tensor:
+    """Points (2, ..., A, N) of one meridional line of image heights (..., 1, N), turned to pupil angles (A,)."""
+    return torch.stack([height * torch.cos(angle)[:, None], height * torch.sin(angle)[:, None]])
+
+
+def trace_clearances(scene: Scene, disc: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """Hits (2, D, F, W, P) on the sensor of pupil points (2, P), and their clearances, each (D, F, W, P).
+
+    A ray that misses a surface has the clearance -1 in the last one; that one is there only if some ray does.
+    """
+    hits, crossed, met = trace_apertures(scene, disc)
+    clearances = [clearance(aperture, hit) for aperture, hit in crossed]
+    if not bool(met.all()):
+        clearances.append(torch.where(met, 1.0, -1.0).to(hits.dtype))
+        hits = torch.where(met, hits, 0.0)
+    return hits, clearances
+
+
+def trace_apertures(scene: Scene, disc: Tensor) -> tuple[Tensor, list[tuple[Aperture, Tensor]], Tensor]:
+    """Hits (2, D, F, W, P) on the sensor, on every aperture, and which rays met every surface; none is clipped.
+
+    disc: pupil points (2, P), or (2, D, F, W, P) with axes of 1 where kernels have the same ones.
+    """
+    if not any(surface.apertures for surface in scene.lens.surfaces):
+        rays = trace_scene(scene, disc)  # nothing to record on the way
+        return rays.position[:2], [], rays.valid
+    shape = (*scene.shape, disc.shape[-1])
+    crossings = cross_scene(scene, disc)
+    # Rays that do not start are lost before the first surface.
+    met = crossings[0].rays.valid | crossings[0].clipped
+    crossed = []
+    for surface, crossing in zip(scene.lens.surfaces[1:], crossings, strict=True):
+        met = met & ~crossing.missed & ~crossing.totally_reflected
+        hit = crossing.rays.position[:2]
+        crossed += [(aperture, hit.expand(2, *shape)) for aperture in surface.apertures]
+    return hit.expand(2, *shape), crossed, met.expand(shape)
+
+
+def cell_width(order: int) -> float:
+    """Width in pixels of the cells that traced ones are cut into, at least: rays decide the error, not cells."""
+    return min(1.0, 2.0 ** (1 - order / 2))
+
+
+def kernels_of_fans(scene: Scene, grid: Grid, fans: Fans, *, width: float = 1.0) -> Kernels:
+    """Energy, centroid and covariance of fans; all light through the pupil is 1.
+
+    Cells wider than `width` pixels (at most 1) are cut, the image point running linearly between rays.
+    """
+    *widths, both = cell_widths(grid, fans.points, scene.largest)
+    fine = refined(fans, [math.ceil(found * max(1 / width, both)) for found in widths])
+    centroid, covariance = moments_of_fans(fans)
+    kernel = energy_of_fans(grid, fine) * beam_share(scene)[..., None, None]
+    return Kernels(kernel, grid, centroid, covariance, fans.rays)
+
+
+def energy_of_fans(grid: Grid, fans: Fans) -> Tensor:
+    """Energy (D, F, W, rows, columns) of fans whose cells are no wider than a pixel, some lines at a time.
+
+    The window of half a fan is symmetric in x as well.
+    """
+    count = fans.points.shape[-2]
+    if not fans.is_half:
+        return _energy_of_lines(grid, fans, range(count + 1), count)
+    whole = 2 * (count - 2)
+    half = _energy_of_lines(grid, fans, range(1, count - 1), whole)
+    own = [_energy_of_lines(grid, fans, range(first, first + 2), whole) for first in (0, count - 2)]
+    return half + half.flip(-1) + sum(own)
+
+
+def _energy_of_lines(grid: Grid, fans: Fans, lines: range, cells_round: int) -> Tensor:
+    """Energy of the cells between these lines, of so many round the pupil."""
+    count = fans.points.shape[-2]
+    height = max(1, _CHUNK // fans.points[0, ..., 0, :].numel())
+    if len(lines) > count and height >= count:
+        return splat_cells(grid, fans.points, fans.radius, fans.clearances)
+    kernel = 0.0
+    for first in range(lines.start, lines.stop - 1, height):
+        rows = torch.arange(first, min(first + height + 1, lines.stop), device=fans.points.device) % count
+        points, *clearances = (t.index_select(-2, rows) for t in (fans.points, *fans.clearances))
+        part = splat_cells(grid, points, fans.radius, clearances, closed=False)
+        kernel = kernel + part * ((len(rows) - 1) / cells_round)
+    return kernel
+
+
+def refined(fans: Fans, parts: Sequence[int]) -> Fans:
+    """The fans with every cell cut into so many parts across and along the lines, by linear interpolation."""
+    limits = _FINEST // fans.points.shape[-2], _FINEST // fans.points.shape[-1]
+    across, along = (max(1, min(part, limit)) for part, limit in zip(parts, limits, strict=True))
+    *kernels, count, nodes = fans.points.shape[1:]
+    # Points, clearances and what the last cut needs beside them: 33 bytes of a cell measured, with one clearance.
+    afford_cells(kernels, count * across, nodes * along, each=16.0 * (2 + len(fans.clearances)))
+
+    def cut(t: Tensor) -> Tensor:
+        if across > 1:
+            share = torch.arange(across, dtype=t.dtype, device=t.device)[:, None] / across
+            t = (t[..., None, :] + share * (torch.roll(t, -1, -2) - t)[..., None, :]).flatten(-3, -2)
+        return cut_line(t, along)
+
+    points, *clearances = (cut(t) for t in (fans.points, *fans.clearances))
+    return Fans(points, cut_line(fans.radius, along), tuple(clearances), fans.rays)
+
+
+def afford_cells(kernels: Sequence[int], across: int, along: int, *, each: float) -> None:
+    """Raise OverBudget where cells of the pupil narrow enough for the pixels, `each` so many bytes, are too much.
+
+    kernels: (D, F, W); across, along: cells round the pupil and from its centre to its rim.
+    """
+    count = math.prod(kernels)
+    afford(
+        each * count * across * along,
+        f"the ray-traced PSF needs {across:,} × {along:,} cells of the pupil for each of {count} kernels: the blur is "
+        "wide beside a pixel",
+        helps="give a larger `pixel`, fewer fields or wavelengths at once, `rays`, `model=gaussian`",
+    )
+
+
+def cut_line(t: Tensor, parts: int) -> Tensor:
+    """Values (..., N) at nodes and at parts - 1 places between each two."""
+    share = torch.arange(parts, dtype=t.dtype, device=t.device) / parts
+    inner = (t[..., :-1, None] + share * t.diff()[..., None]).flatten(-2)
+    return torch.cat([inner, t[..., -1:]], -1) if parts > 1 else t
+
+
+def moments_of_fans(fans: Fans) -> tuple[Tensor, Tensor]:
+    """Centroid (2, D, F, W) mm and covariance (3, D, F, W) mm² of the light of fans, no pixels and no window."""
+    reference = fans.points[..., :1, :1].detach()
+    if fans.is_half:
+        reference = torch.stack([torch.zeros_like(reference[0]), reference[1]])
+    closed = not fans.is_half
+    (x, ax, bx), (y, ay, by) = (cells(t, fans.radius, closed=closed) for t in fans.points - reference)
+    weights = cell_energy(fans.radius, x.shape[-2]) * clear_share(fans.clearances, fans.radius, closed=closed)
+    weights = torch.as_tensor(weights).expand(x.shape)
+    if fans.is_half:
+        # All but the outer cells stand for two.
+        weights = torch.cat([0.5 * weights[..., :1, :], weights[..., 1:-1, :], 0.5 * weights[..., -1:, :]], -2)
+    share = safe_divide(weights, weights.sum((-2, -1), keepdim=True))
+    mean_x, mean_y = ((share * t).sum((-2, -1), keepdim=True) for t in (x, y))
+    mean_x = torch.zeros_like(mean_x) if fans.is_half else mean_x
+    x, y = x - mean_x, y - mean_y
+    pairs = (x * x + (ax * ax + bx * bx) / 3, x * y + (ax * ay + bx * by) / 3, y * y + (ay * ay + by * by) / 3)
+    covariance = torch.stack([(share * pair).sum((-2, -1)) for pair in pairs])
+    if fans.is_half:
+        covariance = torch.stack([covariance[0], torch.zeros_like(covariance[1]), covariance[2]])
+    lit = weights.sum((-2, -1)) > 0
+    centroid = torch.stack([mean_x, mean_y])[..., 0, 0] + reference[..., 0, 0]
+    return torch.where(lit, centroid, 0.0), covariance
+
+
+def kernels_of_points(scene: Scene, grid: Grid, disc: Tensor, weights: Tensor, *, width: float) -> Kernels:
+    """Kernels of plain rays through pupil points (2, P), by their weights (P,), shares of the light."""
+    traced = trace_scene(scene, disc)
+    energy = torch.where(traced.valid, weights, 0.0).expand(*scene.shape, -1)
+    points = torch.where(traced.valid, traced.position[:2], 0.0).expand(2, *scene.shape, -1)
+    light = beam_share(scene)
+    kernel = deposit(grid, points, energy, width) * light[..., None, None]
+    arrived = energy.sum(-1)
+    share = safe_divide(energy, arrived[..., None].expand(energy.shape))
+    # Counted from the first ray that arrives, a small spot far off the axis keeps its digits.
+    first = (energy > 0) & ((energy > 0).to(torch.int64).cumsum(-1) == 1)
+    reference = torch.where(first, points, 0.0).sum(-1, keepdim=True)
+    centroid, covariance = moments(*torch.where(energy > 0, points - reference, 0.0), share)
+    centroid = centroid + reference[..., 0]
+    return Kernels(kernel, grid, centroid, covariance, disc.shape[-1], arrived=arrived * light)
+
+
+def deposit(grid: Grid, points: Tensor, energy: Tensor, width: float) -> Tensor:
+    """Energy in pixels of points blurred by a kernel of half width `width` pixels; 0: not blurred, no derivative."""
+    return splat_smooth(grid, points, energy, width=width) if width else histogram(grid, points, energy)
+
+
+_MAP_LINES = 32  # round the pupil at least, and half as many cells on each
 _MOST_LINES = 8192
 _PIECES = 32  # of the meridian of round light at order 0
 _DEGREES = (6, 8, 10, 12, 14, 16, 20)
@@ -187,11 +656,11 @@ def _kernels_of_map(scene: Scene, grid: Grid, ray_map: RayMap, order: int) -> Ke
     if ray_map.axial and is_centred(grid, scene):
         return _kernels_of_meridian(scene, grid, ray_map, order)
     # Order 0 has cells as wide as a pixel, measured on a coarse map; each order makes them √2 narrower.
-    coarse = fans_of_map(ray_map, 2 * _LINES, _LINES)
+    coarse = fans_of_map(ray_map, 2 * _MAP_LINES, _MAP_LINES)
     *widths, both = cell_widths(grid, coarse.points, scene.largest)
     across, along = (
         2 * math.ceil(min(_MOST_LINES, max(least, width * count) * both * 2 ** (order / 2)) / 2)
-        for width, count, least in zip(widths, (2 * _LINES, _LINES), (_LINES, _LINES // 2), strict=True)
+        for width, count, least in zip(widths, (2 * _MAP_LINES, _MAP_LINES), (_MAP_LINES, _MAP_LINES // 2), strict=True)
     )
     is_half = ray_map.is_mirrored and _is_symmetric(grid)
     # With their moments: 129 bytes of a cell measured, 175 with a clearance.

@@ -3,14 +3,29 @@
 Each gives `kernels(scene, grid, order=…) -> Kernels`, energy integrated over pixels, 1 = all light through the entrance
 pupil: a pure function, which `ladder.py` drives to a tolerance, `sharing.py` shares between processes and
 `streaming.py` feeds ray by ray.
-"""
+
+
+Ladders: a PSF model as orders of growing effort, climbed until the estimated error meets a tolerance."""
 
 import dataclasses
+import itertools
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 
-from raytrace.psf_models import diffraction, fourier, gaussian, paraxial, rays
-from raytrace.psf_models import drt as raymap
-from raytrace.psf_models.result import Kernels
+import torch
+from torch import Tensor
+from torch.utils import _pytree as pytree
+
+from raytrace.budget import OverBudget
+from raytrace.maths.grid import Grid
+from raytrace.maths.numerics import safe_divide, safe_sqrt
+from raytrace.psf_models import drt, fourier, gaussian, paraxial, wave
+from raytrace.psf_models.dft import TooManyPoints
+from raytrace.psf_models.result import Kernels, Psf, polychromatic
+from raytrace.tracing.f_number import axial_f_number
+from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.scene import Scene, varies
+from raytrace.words import calling_level
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,11 +95,11 @@ _ROWS = (
     # All traced rays: geometric optics. Cells halve their error with each order: no faster, whatever a lucky change
     # says. The table of rings that round light is read from (radial.py) is good to 1e-5.
     Model(
-        "drt", "DRT", raymap.kernels, range(11), plain=rays.kernels, is_rung=True, row=0, compared={"rays": 256},
+        "drt", "DRT", drt.kernels, range(11), plain=drt.kernels_of_rays, is_rung=True, row=0, compared={"rays": 256},
         first=0.6, least=0.6, most=0.6, unseen=0.15, floor=1e-5,
     ),
     # The traced wavefront: diffraction with the true aberrations.
-    Model("wave", "wave", diffraction.kernels, range(-2, 6), is_rung=True, by_field=True, row=4, **_OF_WAVES),
+    Model("wave", "wave", wave.kernels, range(-2, 6), is_rung=True, by_field=True, row=4, **_OF_WAVES),
 )
 # fmt: on
 
@@ -93,3 +108,167 @@ MODELS = {row.name: row for row in _ROWS}
 
 #: The rungs of `model="auto"`.
 RUNGS = tuple(row.name for row in _ROWS if row.is_rung)
+
+
+class NotConverged(UserWarning):
+    """A PSF whose estimated error stayed above the tolerance at the finest order there is."""
+
+
+def by_order(batch: Scene, pixels: Grid, weights: Tensor | None, model: Model, order: int) -> Psf:
+    """The kernels of one order, for loops that have planned it: no error is estimated, and no residual."""
+    if order not in model.orders:
+        orders = ", ".join(map(str, model.orders))
+        raise ValueError(f"{model.name} has no order {order}; expected one of {orders}")
+    return _at(order, model.lean or model.kernels, batch, pixels, weights, model)
+
+
+def _at(order: int, kernels: Callable[..., Kernels], batch: Scene, pixels: Grid, weights: Tensor | None, model: Model):
+    found = polychromatic(kernels(batch, pixels, order=order), weights, model.name)
+    return dataclasses.replace(found, order=order)
+
+
+def by_tolerance(batch: Scene, pixels: Grid, weights: Tensor | None, model: Model, tol: float) -> Psf:
+    """Climb the orders until the estimated error of the last meets the tolerance; see `_estimate`."""
+    with torch.no_grad():
+        before, changes = None, []
+        for order in model.orders:
+            found = _at(order, model.kernels, batch, pixels, weights, model)
+            if before is not None:
+                changes.append(_change(before, found, model))
+            rounding = _rounding(batch, pixels, found, model)
+            if model.proof is not None and changes:
+                error = model.proof * changes[-1] + rounding
+                if bool((error <= tol).all()):
+                    found = before
+                    break
+            error = _estimate(model, changes, found, rounding)
+            if model.proof is None and bool((error <= tol).all()):
+                break
+            before = found
+    reason = ""
+    if not bool((error <= tol).all()):
+        reason = f"{model.name}: the estimated error {float(error.max()):.1e} stays above the tolerance {tol:g}"
+        warnings.warn(reason, NotConverged, stacklevel=calling_level())
+    residual, order = found.residual, found.order
+    # Derivatives by any number of the scene, the pixels or the model's own options.
+    numbers = pytree.tree_leaves((batch, pixels, weights, getattr(model.kernels, "keywords", {})))
+    if torch.is_grad_enabled() and any(varies(number) for number in numbers):
+        found = by_order(batch, pixels, weights, model, order)
+    return dataclasses.replace(found, error=error, residual=residual, reason=reason)
+
+
+def by_rays(batch: Scene, pixels: Grid, weights: Tensor | None, model: Model, count: int) -> Psf:
+    """About `count` rays a kernel; the error is the change from half as many."""
+    if model.plain is not None:
+        halves = (model.plain(batch, pixels, rays=n) for n in (count, max(count // 2, 1)))
+        return between(*halves, weights, model)
+    before, coarser = None, None
+    for order in model.orders:
+        found = _at(order, model.kernels, batch, pixels, weights, model)
+        if found.rays > count:
+            break
+        before, coarser = found, before
+    if before is None:
+        raise ValueError(f"{model.name} needs at least {found.rays} rays a kernel; {count} given")
+    if len(model.orders) == 1:
+        return dataclasses.replace(before, error=torch.zeros_like(before.energy))
+    return before if coarser is None else dataclasses.replace(before, error=_change(coarser, before, model).detach())
+
+
+def between(found: Kernels, half: Kernels, weights: Tensor | None, model: Model) -> Psf:
+    """The PSF of plain rays, its error the change from half as many."""
+    found, half = (polychromatic(kernels, weights, model.name) for kernels in (found, half))
+    return dataclasses.replace(found, error=_kernel_change(half, found).detach())
+
+
+def climb(batch: Scene, pixels: Grid, weights: Tensor | None, rungs: Sequence[Model], tol: float) -> Psf:
+    """The first rung whose kernels differ from those of the next by less than the tolerance.
+
+    Waves that are too much to be summed, as over a spectrum many pixels long, leave the rung below, with a warning.
+    """
+    here = by_tolerance(batch, pixels, weights, rungs[0], tol)
+    for model in rungs[1:]:
+        try:
+            above = by_tolerance(batch, pixels, weights, model, tol)
+        except (TooManyPoints, OverBudget) as error:
+            if not model.waves:
+                raise
+            return _unproven(here, str(error))
+        with torch.no_grad():
+            gap = float(_kernel_change(above, here).max())
+        if gap <= tol and (model.waves or not _diffracts(batch, pixels, above)):
+            said = f"{here.model}: its kernels differ from those of {model.name} by {gap:.1e}, within {tol:g}"
+            return dataclasses.replace(here, reason=said)
+        here, below = above, here.model
+    return dataclasses.replace(here, reason=f"{here.model}: {below} differs from it by {gap:.1e}, more than {tol:g}")
+
+
+def _unproven(found: Psf, why: str) -> Psf:
+    """The kernels of a rung that the one above cannot be compared with. Warns NotConverged."""
+    reason = f"{found.model}: not compared with waves: {why}"
+    warnings.warn(reason, NotConverged, stacklevel=calling_level())
+    return dataclasses.replace(found, reason=reason)
+
+
+def _diffracts(batch: Scene, pixels: Grid, light: Psf) -> bool:
+    """Whether somewhere neither a pixel nor the blur is twice as wide as the Airy disc: rays alike prove nothing."""
+    with torch.no_grad():
+        airy = 1.22e-3 * batch.wavelengths.max() * axial_f_number(batch.lens).max()
+        blur = 2 * safe_sqrt(light.ray_covariance[0] + light.ray_covariance[2])
+        return bool((torch.maximum(blur, pixels.pitch) < 4 * airy).any())
+
+
+def _estimate(model: Model, changes: list[Tensor], found: Psf, rounding: Tensor) -> Tensor:
+    """Estimated error (D, F) after changes δ_1 … δ_n from one order to the next; inf while too few are known.
+
+    The geometric series δ_n ρ/(1 - ρ) times a margin, ρ the largest ratio of successive changes so far: one lucky small
+    change is not believed. Added are the share of the model's residual that no change shows, and rounding.
+    """
+    if len(model.orders) == 1:
+        return torch.zeros_like(found.energy)
+    ratios = [safe_divide(later, earlier) for earlier, later in itertools.pairwise(changes)]
+    if ratios:
+        rho = torch.stack(ratios).amax(0).clamp(model.least, model.most)
+    elif changes and model.first is not None:
+        rho = torch.full_like(found.energy, model.first)
+    else:
+        return torch.full_like(found.energy, torch.inf)
+    unseen = model.unseen * found.residual if model.unseen else 0.0
+    return model.margin * changes[-1] * rho / (1 - rho) + unseen + rounding
+
+
+def _rounding(batch: Scene, pixels: Grid, found: Psf, model: Model) -> Tensor:
+    """Error (D, F) by rounding, at least the model's floor.
+
+    Of rays: that of directions, over a focal length, in units of σ or of a pixel; inf for a σ that is rounding itself.
+    In float32 the measured error is 0.02 to 0.7 of it. Waves are summed in float64 whatever they start from: there it
+    is the rounding of the lens, whose image is out of focus by ε f and so blurred by ε f/2N.
+    """
+    paraxial = first_order(batch.lens)
+    focal, f_number = (
+        t.abs().reshape(-1)[:1] for t in (paraxial.effective_focal_length, paraxial.paraxial_working_f_number)
+    )
+    spread = torch.finfo(found.kernel.dtype).eps * torch.where(torch.isfinite(focal), focal, 1.0)
+    if model.waves:
+        spread = spread / (2 * torch.where(torch.isfinite(f_number), f_number, 1.0))
+    width = safe_sqrt(found.covariance[0] + found.covariance[2]) if model.by_width else pixels.pitch
+    error = safe_divide(spread, width)
+    if model.by_width:
+        error = torch.where(error > 0.3, torch.inf, error)
+    return error.clamp_min(model.floor).expand(found.energy.shape)
+
+
+def _change(one: Psf, other: Psf, model: Model) -> Tensor:
+    return _width_change(one, other) if model.by_width else _kernel_change(one, other)
+
+
+def _kernel_change(one: Psf, other: Psf) -> Tensor:
+    """Relative L1 difference of two kernels, in units of the second's energy; 0 where both are empty."""
+    return safe_divide((one.kernel - other.kernel).abs().sum((-2, -1)), other.energy)
+
+
+def _width_change(one: Psf, other: Psf) -> Tensor:
+    """Relative difference (D, F) of σ, from the larger change of the two variances, and of the energy."""
+    width = other.covariance[0] + other.covariance[2]
+    variance = 0.5 * safe_divide((one.covariance[::2] - other.covariance[::2]).abs().sum(0), width)
+    return torch.maximum(variance, safe_divide((one.energy - other.energy).abs(), other.energy))

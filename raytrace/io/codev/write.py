@@ -11,7 +11,7 @@ from torch import Tensor
 from raytrace.io.codev import glass as codev_glass
 from raytrace.io.codev.keywords import APERTURES, FIELD_KINDS, LEFT_HANDED, LETTERS, OWN, POSE_WORDS, RING
 from raytrace.io.codev.surfaces import INFINITY, phase_lines
-from raytrace.io.source import LensFileError, Place, exact, exact_list, one_line, quoted, refuse_departure, word
+from raytrace.io.source import LensFileError, Place, exact, exact_list, one_line, quoted, refuse_sag_terms, word
 from raytrace.materials.glass import Glass
 from raytrace.system.apertures import Aperture
 from raytrace.system.lens import Lens, SystemAperture
@@ -160,7 +160,7 @@ def _surface(
 ) -> list[str]:
     is_round = isinstance(surface.phase, RadialPhase)
     rest = dataclasses.replace(surface, before=None, after=None, is_break=False)
-    refuse_departure(dataclasses.replace(rest, phase=None) if is_round else rest, place)
+    refuse_sag_terms(dataclasses.replace(rest, phase=None) if is_round else rest, place)
     last = len(lens.surfaces) - 1
     name = {0: "SO", last: "SI"}.get(number, "S")
     curvature = "0.0" if surface.curvature is None else exact(surface.curvature, "curvature", place)

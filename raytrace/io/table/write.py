@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from raytrace.io.materials import is_code, is_left_out, is_listed, listed_name
-from raytrace.io.source import LensFileError, Place, exact, exact_list, quoted, refuse_departure, thickness
+from raytrace.io.source import LensFileError, Place, exact, exact_list, quoted, refuse_sag_terms, thickness
 from raytrace.io.table.columns import order
 from raytrace.io.table.system import ENVIRONMENT, written, written_environment
 from raytrace.materials.glass import Glass, mil_glass
@@ -44,7 +44,7 @@ def rows(lens: Lens, file: str) -> dict[str, list[str]]:
 
 
 def _row(lens: Lens, number: int, surface: Surface, place: Place) -> dict[str, str]:
-    refuse_departure(surface, place)
+    refuse_sag_terms(surface, place)
     last = len(lens.surfaces) - 1
     kind = None if surface.coefficients is None else KINDS[surface.kind]
     roles = [name for k, name in ((0, "object"), (lens.stop, "stop"), (last, "image")) if k == number]

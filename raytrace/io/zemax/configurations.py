@@ -32,8 +32,7 @@ from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.environment import REFERENCE, Environment, objection
 from raytrace.materials.glass import Glass
 from raytrace.system import configurations
-from raytrace.system.configurations import Operand, Path, differences, part, same, taken, with_part
-from raytrace.system.configurations import Place as LensPlace
+from raytrace.system.configurations import Operand, Path, ScaledPath, differences, part, same, taken, with_part
 from raytrace.system.lens import Lens, unknown_changes
 from raytrace.system.surface import Surface
 
@@ -476,7 +475,7 @@ def read(sections: Sections, lens: Lens, rebuild: Rebuild, report: Draft, config
 def _with_operands(lens: Lens, operands: Sequence[PlacedOperand], count: int, active: int) -> Lens:
     """The lens with its operands, all their places modelled; an unused one keeps the count where no other does."""
     for placed in operands:
-        for place in placed.operand.places if placed.operand.numbers is not None else ():
+        for place in placed.operand.paths if placed.operand.numbers is not None else ():
             if part(lens, place.path) is None:
                 lens = with_part(lens, place.path, double(0.0), like=placed.like)
     # the surfaces have more digits than the operands, where both agree
@@ -516,21 +515,21 @@ def _placed_operand(cells: tuple[Cell, ...], sections: Sections, lens: Lens, reb
     if not paths:
         return PlacedOperand(unplaced, cells, lens)
     held = [[part(lenses[value], path) for path in paths] for value in values]
-    if lens_places := _linear_places(paths, probes, held):
+    if scaled_paths := _linear_paths(paths, probes, held):
         numbers = torch.stack([double(0.0) if parts[0] is None else parts[0] for parts in held])
-        return PlacedOperand(Operand(**named, places=lens_places, numbers=numbers), cells, probes[0])
+        return PlacedOperand(Operand(**named, paths=scaled_paths, numbers=numbers), cells, probes[0])
     for *owner, end in paths:
         if part(lens, (*owner, end)) is None and not (isinstance(end, str) and part(lens, tuple(owner)) is not None):
             refusal = "the lens as stored has no such part, an aperture for example"
             return PlacedOperand(Operand(**named, words=words, refusal=refusal), cells, lens)
-    lens_places = tuple(map(LensPlace, paths))
+    scaled_paths = tuple(map(ScaledPath, paths))
     if all(isinstance(parts[0], Glass) and all(same(parts[0], other) for other in parts) for parts in held):
         media = tuple(parts[0] for parts in held)
-        return PlacedOperand(Operand(**named, places=lens_places, media=media), cells, lens)
-    return PlacedOperand(Operand(**named, places=lens_places, words=tuple(map(tuple, held))), cells, lens)
+        return PlacedOperand(Operand(**named, paths=scaled_paths, media=media), cells, lens)
+    return PlacedOperand(Operand(**named, paths=scaled_paths, words=tuple(map(tuple, held))), cells, lens)
 
 
-def _linear_places(paths: Sequence[Path], probes: Sequence[Lens], held: Sequence[Sequence]) -> tuple[LensPlace, ...]:
+def _linear_paths(paths: Sequence[Path], probes: Sequence[Lens], held: Sequence[Sequence]) -> tuple[ScaledPath, ...]:
     """The places of a number, each linear in the first; none where they are no numbers, or not linear."""
 
     def is_scalar(value) -> bool:
@@ -542,15 +541,15 @@ def _linear_places(paths: Sequence[Path], probes: Sequence[Lens], held: Sequence
     if not all(is_scalar(value) for row in parts for value in row):
         return ()
     probed = [[float(value) for value in row] for row in parts]
-    lens_places = [LensPlace(paths[0])]
+    scaled_paths = [ScaledPath(paths[0])]
     for position, path in enumerate(paths[1:], 1):
         rise = (probed[1][position] - probed[0][position]) / (probed[1][0] - probed[0][0])
-        lens_places.append(LensPlace(path, rise, probed[0][position] - rise * probed[0][0]))
+        scaled_paths.append(ScaledPath(path, rise, probed[0][position] - rise * probed[0][0]))
     for row in (*probed, *([0.0 if value is None else float(value) for value in row] for row in held)):
-        for number, place in zip(row, lens_places, strict=True):
+        for number, place in zip(row, scaled_paths, strict=True):
             if abs(place.factor * row[0] + place.offset - number) > 1e-12 * abs(number):
                 return ()
-    return tuple(lens_places)
+    return tuple(scaled_paths)
 
 
 def _agrees(placed: PlacedOperand, lens: Lens, configuration: int) -> bool | None:
@@ -559,9 +558,9 @@ def _agrees(placed: PlacedOperand, lens: Lens, configuration: int) -> bool | Non
     Operands are saved with 13 digits. A semi-diameter of 0 is left to be computed.
     """
     operand, k = placed.operand, configuration - 1
-    if not operand.places:
+    if not operand.paths:
         return None
-    stored = part(lens, operand.places[0].path)
+    stored = part(lens, operand.paths[0].path)
     if operand.numbers is None:
         wanted = operand.media[k] if operand.media else operand.words[k][0]
         if operand.name == "SDIA":
@@ -600,7 +599,7 @@ def _report_operand(placed: PlacedOperand, lens: Lens, active: int, count: int, 
     """Warn of an operand that is not followed, and of one that contradicts the surfaces."""
     cell, operand = placed.cells[active - 1], placed.operand
     place, label = cell.record.place, f"multi-configuration operand {cell}"
-    if cell.name in ENVIRONMENT_OPERANDS and not operand.places:
+    if cell.name in ENVIRONMENT_OPERANDS and not operand.paths:
         normal, unit, what = {"PRES": (1, "atm", "pressure"), "TEMP": (20, "°C", "temperature")}[cell.name]
         if is_number(cell.value) and plain(cell.value) != normal:
             message = f"{cell.name} {plain(cell.value):g} {unit} ({what} of configuration {cell.configuration})"
@@ -608,11 +607,11 @@ def _report_operand(placed: PlacedOperand, lens: Lens, active: int, count: int, 
     elif operand.refusal:
         if count == 1 or any(other.value != cell.value for other in placed.cells):
             report.warn(f"{label} (configuration {active}): not followed: {operand.refusal}", place)
-    elif not operand.places:
+    elif not operand.paths:
         if operand.name not in KEPT:
             report.warn(f"{label}: not followed: no number of the lens depends on it", place)
     elif _agrees(placed, lens, active) is False:
-        stored = part(lens, operand.places[0].path)
+        stored = part(lens, operand.paths[0].path)
         if isinstance(stored, Glass):
             value = stored.name or "air"
         elif stored is None:
@@ -630,7 +629,7 @@ def _report_solved(sections: Sections, operands: Sequence[PlacedOperand], active
         if row is None or not row.keyword.startswith("PARM"):
             return row is not None and row.refracts
         kind = sections.surfaces[operand.number].last("TYPE") if operand.number < len(sections.surfaces) else None
-        return bool(operand.places) and not (kind and kind.words[:1] == ("COORDBRK",))
+        return bool(operand.paths) and not (kind and kind.words[:1] == ("COORDBRK",))
 
     solved = []
     for block in sections.surfaces:
@@ -715,7 +714,7 @@ def environment_line(lens: Lens, place: Place) -> str:
 
 def is_of_surfaces(operand: Operand) -> bool:
     """Whether an operand sets the environment of some surfaces, and not that of the lens."""
-    return operand.name in ENVIRONMENT_OPERANDS and bool(operand.places) and operand.places[0].path[0] == "surfaces"
+    return operand.name in ENVIRONMENT_OPERANDS and bool(operand.paths) and operand.paths[0].path[0] == "surfaces"
 
 
 def with_environments(lens: Lens, place: Place) -> Lens:
@@ -734,7 +733,7 @@ def with_environments(lens: Lens, place: Place) -> Lens:
         if is_of_surfaces(operand):  # is followed by operands that name its surfaces
             behind = itertools.takewhile(lambda o, name=operand.name: o.name != name, candidates[position + 1 :])
             named = {other.number for other in behind if other.name in _NAMING}
-            listed += [_naming(lens, path[1]) for path, *_ in operand.places if path[1] not in named]
+            listed += [_naming(lens, path[1]) for path, *_ in operand.paths if path[1] not in named]
     for name, last in zip(ENVIRONMENT_OPERANDS, _environment_operands(lens) if lens.environment else (), strict=False):
         of_name = [operand for operand in listed if operand.name == name]
         listed += [last] if of_name and is_of_surfaces(of_name[-1]) else []
@@ -745,7 +744,7 @@ def _is_set(lens: Lens, k: int) -> bool:
     """Whether operands of the lens set the environment of a surface; the quantities they do not set are the lens's."""
     if lens.environment is None:
         return False
-    held = {path for operand in lens.operands for path, *_ in operand.places}
+    held = {path for operand in lens.operands for path, *_ in operand.paths}
     is_set = {name: ("surfaces", k, "environment", name) in held for name in ENVIRONMENT_OPERANDS.values()}
     as_lens = (same(getattr(lens.surfaces[k].environment, n), getattr(lens.environment, n)) for n in is_set)
     return any(is_set.values()) and all(map(max, is_set.values(), as_lens))
@@ -754,7 +753,7 @@ def _is_set(lens: Lens, k: int) -> bool:
 def _naming(lens: Lens, k: int) -> Operand:
     """An operand that changes nothing and names a surface."""
     media = (lens.surfaces[k].glass,) * configurations.count(lens.operands)
-    return Operand("GLSS", k, places=(LensPlace(("surfaces", k, "glass")),), media=media)
+    return Operand("GLSS", k, paths=(ScaledPath(("surfaces", k, "glass")),), media=media)
 
 
 def _environment_operands(lens: Lens, *path: str | int) -> list[Operand]:
@@ -763,7 +762,7 @@ def _environment_operands(lens: Lens, *path: str | int) -> list[Operand]:
     return [
         Operand(
             name,
-            places=(LensPlace((*path, "environment", field)),),
+            paths=(ScaledPath((*path, "environment", field)),),
             numbers=torch.stack([getattr(air, field)] * count),
         )
         for name, field in ENVIRONMENT_OPERANDS.items()

@@ -49,8 +49,8 @@ from raytrace.system.configurations import Operand, part, with_part
 from raytrace.system.configurations import Path as LensPath
 from raytrace.system.dimensions import DIMENSION
 from raytrace.system.lens import Lens
-from raytrace.system.optimization_data import Intent, Row, Solve, Vary
-from raytrace.system.parameter_paths import places
+from raytrace.system.optimization_data import OptimizationData, Row, Solve, Vary
+from raytrace.system.parameter_paths import parameter_paths
 from raytrace.system.surface import Surface
 
 
@@ -287,7 +287,7 @@ def read(sections: Sections, lens: Lens, millimetres: float, report: Draft) -> L
     head = sections.system.last("MNUM")
     start = head.place.line if head and head.place.line > sections.surfaces[-1].place.line else math.inf
     tail = [record for record in sections.tail if record.place.line < start]
-    set_by_operands = {operand.places[0].path for operand in lens.operands if operand.places}
+    set_by_operands = {operand.paths[0].path for operand in lens.operands if operand.paths}
 
     def is_overridden(rule: Vary | Solve) -> bool:
         """Whether a variable of a surface is a number of the configurations, whose status holds."""
@@ -308,7 +308,7 @@ def read(sections: Sections, lens: Lens, millimetres: float, report: Draft) -> L
     merit, tolerances = merit_rows(tail, report), _tolerances(tail, report)
     margin = sections.system.last("SDMA")
     percent, length = (margin.number(k, "margin of semi-diameters", 0.0) if margin else 0.0 for k in (0, 2))
-    intent = Intent(
+    data = OptimizationData(
         variables,
         tuple(solve for solve in solves if _is_followed(solve)),
         merit,
@@ -321,8 +321,8 @@ def read(sections: Sections, lens: Lens, millimetres: float, report: Draft) -> L
         kept=kept,
     )
     sized = tuple(k for k, surface in enumerate(lens.surfaces) if surface.semi_diameter)
-    lens = _with_variables_modelled(lens, surfaces, intent)
-    return dataclasses.replace(lens, intent=None if intent == Intent(semi_diameters=sized) else intent)
+    lens = _with_variables_modelled(lens, surfaces, data)
+    return dataclasses.replace(lens, optimization_data=None if data == OptimizationData(semi_diameters=sized) else data)
 
 
 def _is_followed(solve: Solve) -> bool:
@@ -337,14 +337,14 @@ def _path_of(surface: Surface, quantity: str) -> LensPath | None:
     """The path of a quantity in a surface; None where the surface does not have it."""
     if quantity == "thickness":
         return ("thickness",)
-    place = places(surface).get(quantity)
+    place = parameter_paths(surface).get(quantity)
     return place and (*place.path, *(() if place.entry is None else ((place.entry,),)))
 
 
-def _with_variables_modelled(lens: Lens, surfaces: Sequence[TypedSurface], intent: Intent) -> Lens:
+def _with_variables_modelled(lens: Lens, surfaces: Sequence[TypedSurface], data: OptimizationData) -> Lens:
     """The lens with every number modelled that may change: variables, and solves and pickups of them."""
-    moving = {(rule.surface, rule.quantity) for rule in intent.variables if rule.operand is None}
-    for solve in intent.solves:
+    moving = {(rule.surface, rule.quantity) for rule in data.variables if rule.operand is None}
+    for solve in data.solves:
         if solve.operand is not None or solve.quantity == "glass":
             continue
         source = (solve.source, solve.quantity_of_source or solve.quantity)
@@ -393,7 +393,7 @@ def _configuration_rules(sections: Sections, lens: Lens) -> Iterator[Vary | Solv
         status = int(plain(cell.rule[0])) if cell.rule and is_number(cell.rule[0]) else 0
         if operand is None or not status or not 1 <= cell.configuration <= len(lens.operands[operand]):
             continue
-        lens_places = lens.operands[operand].places[:1]
+        lens_places = lens.operands[operand].paths[:1]
         name = _quantity_at(lens, lens_places[0].path) if lens_places else ""
         where = {"configuration": cell.configuration, "operand": operand}
         if status == _VARIABLE and name:
@@ -415,7 +415,7 @@ def _quantity_at(lens: Lens, path: tuple) -> str:
     if len(path) < 3 or path[0] != "surfaces":
         return ""
     surface = lens.surfaces[path[1]]
-    return next((name for name in ("thickness", *places(surface)) if _path_of(surface, name) == path[2:]), "")
+    return next((name for name in ("thickness", *parameter_paths(surface)) if _path_of(surface, name) == path[2:]), "")
 
 
 # -- the merit function and tolerances --------------------------------------------------------------------------------
@@ -479,7 +479,7 @@ def _tolerances(lines: Iterable[Record], report: Draft) -> tuple[str, ...]:
 def read_merit(path: str | PathLike) -> tuple[Row, ...]:
     """The rows of a merit function file (.MF) of OpticStudio, in the unit of length of its lens.
 
-    `dataclasses.replace(lens.intent, merit=rows)` are the optimisation data with them. Raises LensFileError.
+    `dataclasses.replace(lens.optimization_data, merit=rows)` are the optimisation data with them. Raises LensFileError.
     """
     name = str(path)
     lines = [record for record in records(read_text(Path(path)), name) if record.keyword != "VERS"]
@@ -512,9 +512,9 @@ def merit_lines(merit: Iterable[Row], place: Place) -> list[str]:
     return lines
 
 
-def tail_lines(intent: Intent | None, place: Place) -> list[str]:
+def tail_lines(data: OptimizationData | None, place: Place) -> list[str]:
     """The lines of merit function and tolerances; TOFF where there are no tolerances."""
-    merit, tolerances = ((), ()) if intent is None else (intent.merit, intent.tolerances)
+    merit, tolerances = ((), ()) if data is None else (data.merit, data.tolerances)
     lines = [one_line(line, "a tolerance", place) for line in tolerances]
     return [*merit_lines(merit, place), *(lines or [f"TOL {_NO_TOLERANCE}   0   0 0 0   0 0 0 0 0"])]
 
@@ -524,20 +524,20 @@ def tail_lines(intent: Intent | None, place: Place) -> list[str]:
 Lines = list[str]
 
 
-def margin_line(intent: Intent | None) -> str:
+def margin_line(data: OptimizationData | None) -> str:
     """The line of SDMA."""
-    percent, length = (0.0, 0.0) if intent is None else intent.semi_diameter_margin
+    percent, length = (0.0, 0.0) if data is None else data.semi_diameter_margin
     return f"SDMA {_spelled(percent)} 1 {_spelled(length)}"
 
 
 def with_rules(lines: Lines, lens: Lens, number: int, place: Place) -> Lines:
     """The lines of a surface with its variables, solves and pickups. Raises LensFileError for what no line holds."""
-    intent = lens.intent
-    if intent is None:
+    data = lens.optimization_data
+    if data is None:
         return lines
-    own = [rule for rule in (*intent.variables, *intent.solves, *intent.kept) if rule.surface == number]
+    own = [rule for rule in (*data.variables, *data.solves, *data.kept) if rule.surface == number]
     sizes = [rule for rule in own if rule.quantity == "semi_diameter"]
-    code, source = (_FIXED if number in intent.semi_diameters else 0), 0
+    code, source = (_FIXED if number in data.semi_diameters else 0), 0
     if not code and sizes:
         code, source = _code_of(sizes[0].kind, _SEMI_DIAMETER_RULES), sizes[0].source
     lines = _changed(lines, "DIAM", {2: str(code), 3: str(source)})
@@ -677,12 +677,12 @@ def statuses(lens: Lens, written: Sequence[Operand]) -> dict[tuple[int, int], tu
 
     written: the operands that are written, among them those of the lens.
     """
-    if lens.intent is None:
+    if lens.optimization_data is None:
         return {}
     positions = {id(operand): k for k, operand in enumerate(written)}
     at = [positions.get(id(operand)) for operand in lens.operands]
     words = {}
-    for rule in (*lens.intent.variables, *lens.intent.solves, *lens.intent.kept):
+    for rule in (*lens.optimization_data.variables, *lens.optimization_data.solves, *lens.optimization_data.kept):
         if rule.operand is None or rule.operand >= len(at) or at[rule.operand] is None:
             continue
         if isinstance(rule, Vary) or rule.kind == "variable":

@@ -26,8 +26,7 @@ from raytrace.io.zemax.keywords import APERTURE_KEYWORDS, TYPE_NAMES, glass_sour
 from raytrace.materials.catalogs import Catalog
 from raytrace.materials.glass import AIR, MIRROR, Glass, mil_glass
 from raytrace.system.apertures import SHAPES, Aperture
-from raytrace.system.parameter_paths import Place as LensPlace
-from raytrace.system.parameter_paths import places
+from raytrace.system.parameter_paths import ParameterPath, parameter_paths
 from raytrace.system.phases import (
     Facets,
     FringePhase,
@@ -37,9 +36,8 @@ from raytrace.system.phases import (
     PolynomialPhase,
     RadialPhase,
 )
-from raytrace.system.polynomials import IrregularSag, PolynomialSag, TiltSag
 from raytrace.system.poses import Pose, undone
-from raytrace.system.sag_terms import FringeSag
+from raytrace.system.sag_terms import FringeSag, IrregularSag, PolynomialSag, TiltSag
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface
 
@@ -94,10 +92,10 @@ class Numbers(NamedTuple):
         return self.parameters.get(j, 0.0)
 
 
-def _place(path: str) -> LensPlace:
+def _place(path: str) -> ParameterPath:
     """The place of "phase.power_x", "coefficients.0" or "phase.first.2" in a surface."""
     *fields, last = path.split(".")
-    return LensPlace(tuple(fields), int(last)) if last.isdigit() else LensPlace((*fields, last))
+    return ParameterPath(tuple(fields), int(last)) if last.isdigit() else ParameterPath((*fields, last))
 
 
 class Parameter(NamedTuple):
@@ -106,10 +104,10 @@ class Parameter(NamedTuple):
     is_integer: a switch, which is no variable. followers: further places that hold factor times the number.
     """
 
-    place: LensPlace
+    place: ParameterPath
     power: int | None = 0
     is_integer: bool = False
-    followers: Mapping[LensPlace, float] = {}
+    followers: Mapping[ParameterPath, float] = {}
 
 
 def _parameter(path: str, power: int | None = 0, is_integer: bool = False, **followers: float) -> Parameter:
@@ -119,7 +117,7 @@ def _parameter(path: str, power: int | None = 0, is_integer: bool = False, **fol
 
 
 class Named(NamedTuple):
-    """A number of the lens by its name in `parameter_paths.places`; it is factor times the number of the file in mm."""
+    """A number of the lens by its name in `parameter_paths`; it is factor times the number of the file in mm."""
 
     name: str
     factor: float
@@ -132,7 +130,7 @@ class SurfaceType:
     name: OpticStudio's name; holds: fields of a surface's shape that the type has.
     parameters: the PARM that are used; unused: PARM that are known and change no ray, with the reason.
     kind: of the coefficients, a key of KINDS; least: how many of them are modelled even if 0, None: as many as given.
-    part: class of the sag terms (departure) or phase. amplitudes: PARM that are all 0 where the sag terms vanish.
+    part: class of the added sag terms or phase. amplitudes: PARM that are all 0 where the sag terms vanish.
     terms: power of length in the terms of XDAT, None if the type has none; most: their maximum number.
     objection: numbers -> why they are out of range; beyond: numbers -> what of them is not modelled; "" for neither.
     is_break: whether the type is a coordinate break; flat: whether a curvature is not modelled.
@@ -164,7 +162,7 @@ class SurfaceType:
         """The fields of `Surface`. Raises ValueError for numbers out of range."""
         if objection := self.objection(numbers):
             raise ValueError(objection)
-        values: dict[str, dict] = {"coefficients": {}, "departure": {}, "phase": {}, "before": {}}
+        values: dict[str, dict] = {"coefficients": {}, "sag_terms": {}, "phase": {}, "before": {}}
         for j, parameter in self.parameters.items():
             number = numbers.at(j)
             for place in (parameter.place, *parameter.followers):
@@ -180,7 +178,7 @@ class SurfaceType:
         return (
             fields
             | self._coefficients(values["coefficients"].get("coefficients", []), numbers)
-            | self._part(values["departure"] | values["phase"], numbers)
+            | self._part(values["sag_terms"] | values["phase"], numbers)
         )
 
     def _coefficients(self, coefficients: list[float], numbers: Numbers) -> dict:
@@ -203,11 +201,11 @@ class SurfaceType:
             values |= {"coefficients": numbers.terms if has_terms else double([0.0]), "radius": double(numbers.radius)}
         if self.part is IrregularSag:
             values["radius"] = double(numbers.size)
-        return {"phase" if "phase" in self.holds else "departure": self.part(**values)}
+        return {"phase" if "phase" in self.holds else "sag_terms": self.part(**values)}
 
     def numbers(self, surface: Surface) -> Numbers:
         """`fields` inverted. Raises ValueError for what the type cannot hold."""
-        sag, pose, parameters = surface.departure, surface.before, {}
+        sag, pose, parameters = surface.sag_terms, surface.before, {}
         if self.is_break and pose is not None and pose.z is not None:
             raise ValueError("a decentre along z; add it to the thickness before")
         if isinstance(sag, IrregularSag):
@@ -244,17 +242,17 @@ class SurfaceType:
             entry, terms = j - FIRST_TERM, numbers.terms.clone()
             terms[entry] = modelled
             numbers = numbers._replace(terms=terms)
-            owner = "phase" if "phase" in self.holds else "departure"
-            factors = {LensPlace((owner, "coefficients"), entry): 1.0} if self.part else {}
+            owner = "phase" if "phase" in self.holds else "sag_terms"
+            factors = {ParameterPath((owner, "coefficients"), entry): 1.0} if self.part else {}
             if self.terms_are_coefficients:
-                factors = {LensPlace(("coefficients",), entry): float(numbers.radius) ** (-2 * (entry + 1))}
+                factors = {ParameterPath(("coefficients",), entry): float(numbers.radius) ** (-2 * (entry + 1))}
         else:
             return (), surface
         try:
             like = dataclasses.replace(surface, **self.fields(numbers))
         except ValueError:
             return (), surface
-        names = {place: name for name, place in places(like).items()}
+        names = {place: name for name, place in parameter_paths(like).items()}
         return tuple(Named(names[place], factor) for place, factor in factors.items() if place in names), like
 
 
@@ -321,8 +319,8 @@ TYPES = {
     "XASPHERE": SurfaceType("extended asphere", _ROUND, least=None, terms=1, most=240),
     "TILTSURF": SurfaceType(
         "tilted",
-        ("departure",),
-        {1: _parameter("departure.tan_x"), 2: _parameter("departure.tan_y")},
+        ("sag_terms",),
+        {1: _parameter("sag_terms.tan_x"), 2: _parameter("sag_terms.tan_y")},
         part=TiltSag,
         amplitudes=(1, 2),
     ),
@@ -338,12 +336,12 @@ TYPES = {
     ),
     "BICONICX": SurfaceType("biconic", _ROUND, _coefficients(1, [INVERSE, 0]), kind="biconic", least=2),
     "XPOLYNOM": SurfaceType(
-        "extended polynomial", ("curvature", "conic", "departure"), part=PolynomialSag, terms=1, most=230
+        "extended polynomial", ("curvature", "conic", "sag_terms"), part=PolynomialSag, terms=1, most=230
     ),
     "FZERNSAG": SurfaceType(
         "Zernike fringe sag",
-        (*_ROUND, "departure"),
-        {**_EVEN, 9: _parameter("departure.centre_x", 1), 10: _parameter("departure.centre_y", 1)},
+        (*_ROUND, "sag_terms"),
+        {**_EVEN, 9: _parameter("sag_terms.centre_x", 1), 10: _parameter("sag_terms.centre_y", 1)},
         unused={0: "whether the sag ends with its terms' disc; it continues"},
         part=FringeSag,
         terms=1,
@@ -351,16 +349,16 @@ TYPES = {
     ),
     "IRREGULA": SurfaceType(
         "irregular",
-        ("curvature", "conic", "departure"),
+        ("curvature", "conic", "sag_terms"),
         {
             1: _parameter("before.x", 1, after__x=-1.0),
             2: _parameter("before.y", 1, after__y=-1.0),
             3: _parameter("before.tilt_x", 0, after__tilt_x=-1.0),
             4: _parameter("before.tilt_y", 0, after__tilt_y=-1.0),
-            5: _parameter("departure.spherical", 1),
-            6: _parameter("departure.astigmatism", 1),
-            7: _parameter("departure.coma", 1),
-            8: _parameter("departure.angle"),
+            5: _parameter("sag_terms.spherical", 1),
+            6: _parameter("sag_terms.astigmatism", 1),
+            7: _parameter("sag_terms.coma", 1),
+            8: _parameter("sag_terms.angle"),
         },
         part=IrregularSag,
         amplitudes=(5, 6, 7),
@@ -439,8 +437,8 @@ def type_of(surface: Surface) -> str | None:
         phase = surface.phase
         ideal = isinstance(phase, IdealLens) and phase.power_x.dim() == 0
         return "PARAXIAL" if ideal and float(phase.power_x) == float(phase.power_y) != 0 else _OF_PARTS.get(type(phase))
-    if surface.departure is not None:
-        return _OF_PARTS.get(type(surface.departure))
+    if surface.sag_terms is not None:
+        return _OF_PARTS.get(type(surface.sag_terms))
     if surface.coefficients is None:
         return "STANDARD"
     kind = KINDS[surface.kind]
@@ -463,7 +461,7 @@ def poses_are_parameters(surface: Surface) -> bool:
     """Whether an irregular surface has a pose that its parameters hold: decentres, then tilts about x and y, undone
     behind the surface."""
     before, after = surface.before, surface.after
-    if not isinstance(surface.departure, IrregularSag) or before is None or after is None:
+    if not isinstance(surface.sag_terms, IrregularSag) or before is None or after is None:
         return False
     if before.tilts_first or before.z is not None or before.tilt_z is not None or not after.tilts_first:
         return False

@@ -87,7 +87,7 @@ def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
     than 8 aspheric terms or 24 wavelengths, a glass whose coefficients are not those of its catalog.
     """
     body = partial(_body, file=file, catalogs=catalogs)
-    lines = [*body(lens), *tail_lines(lens.intent, Place(file)), *_operand_lines(lens, body, file)]
+    lines = [*body(lens), *tail_lines(lens.optimization_data, Place(file)), *_operand_lines(lens, body, file)]
     text = "\n".join(lines) + "\n"
     return text.encode("ascii") if text.isascii() else b"\xff\xfe" + text.encode("utf-16-le")
 
@@ -99,7 +99,7 @@ def _body(lens: Lens, file: str, catalogs: Sequence[Path]) -> list[str]:
         place = Place(file, None, number)
         own = with_rules(_surface(lens, number, surface, place), lens, number, place)
         lines += _with_pickups(own, lens, number, place)
-    return _in_unit(lines, 1.0 if lens.intent is None else lens.intent.unit, Place(file))
+    return _in_unit(lines, 1.0 if lens.optimization_data is None else lens.optimization_data.unit, Place(file))
 
 
 # -- the system -------------------------------------------------------------------------------------------------------
@@ -142,7 +142,7 @@ def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
         f"GCAT {' '.join(catalogs_needed(lens, catalogs, place.file))}".rstrip(),
         *([] if aiming == "auto" else [f"RAIM 0 {AIMINGS.index(aiming)} 1 1 0 0 0 0 0"]),
         "PUSH 0 0 0 0 0 0",
-        margin_line(lens.intent),
+        margin_line(lens.optimization_data),
         f"FTYP {kind} {int(fields.telecentric)} {len(fields.x)} {len(lens.wavelengths)} 0 0 0",
         "ROPD 2",
         "PICB 1",
@@ -174,7 +174,7 @@ def _surface(lens: Lens, number: int, surface: Surface, place: Place) -> list[st
         semi_diameter = float(lens.aperture.value)
     size = "0 0" if semi_diameter is None else f"{exact(semi_diameter, 'semi-diameter', place)} 1"
     # an aperture that follows the semi-diameter from one configuration to the next
-    followed = [place.path[:3] for operand in lens.operands if operand.name == "SDIA" for place in operand.places]
+    followed = [place.path[:3] for operand in lens.operands if operand.name == "SDIA" for place in operand.paths]
     posed = () if kind == "COORDBRK" or poses_are_parameters(surface) else ((1, surface.before), (2, surface.after))
     comment = one_line(surface.comment, "the comment", place)
     return [
@@ -198,14 +198,14 @@ _SHAPE = {
     "curvature": "curvature",
     "conic": "conic constant",
     "coefficients": "aspheric terms",
-    "departure": "sag terms",
+    "sag_terms": "sag terms",
     "phase": "phase",
 }
 
 
 def _type(surface: Surface, place: Place) -> str:
     """The TYPE of a surface. Raises LensFileError for a surface that no type holds."""
-    kind, part = type_of(surface), surface.phase or surface.departure
+    kind, part = type_of(surface), surface.phase or surface.sag_terms
     feature = "a coordinate break" if surface.is_break else type(part).__name__ if part else surface.kind
     if kind is None:
         message = f"a .zmx file has no type for a surface of {feature}; write a table (.csv)"
@@ -429,7 +429,7 @@ def _operand_lines(lens: Lens, body: Callable[[Lens], list[str]], file: str) -> 
 
 def _value(operand: Operand, configuration: int, text: Sections, place: Place) -> str:
     """The value of an operand: the word in the file of its configuration, or its own where it stands for none."""
-    if operand.places and operand.name in ROWS and not is_of_surfaces(operand):
+    if operand.paths and operand.name in ROWS and not is_of_surfaces(operand):
         record = Record(operand.name, (), "", place)
         cell = Cell(operand.name, operand.number, operand.parameter, configuration, "", record)
         word = word_of(text, cell)
@@ -446,8 +446,8 @@ def _with_pickups(lines: list[str], lens: Lens, number: int, place: Place) -> li
     Raises LensFileError for a pickup that a .zmx file is not known to have.
     """
     for operand in lens.operands:
-        first = operand.places[0].path if operand.places else ()
-        for path, factor, offset in operand.places[1:]:
+        first = operand.paths[0].path if operand.paths else ()
+        for path, factor, offset in operand.paths[1:]:
             if path[:2] != ("surfaces", number) or number == operand.number or path[2] == "environment":
                 continue
             name = "PRAM" if operand.name.startswith("PAR") else operand.name

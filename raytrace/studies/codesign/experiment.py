@@ -20,10 +20,9 @@ from torch import Tensor
 
 from raytrace.files import write_json
 from raytrace.imaging.camera import Camera
-from raytrace.imaging.limits import parse_range
 from raytrace.imaging.network import RedNet, RedNetShape
 from raytrace.imaging.training import DamagedRun, Record, Run, Share, train
-from raytrace.imaging.variables import Variables, parse_bounds
+from raytrace.imaging.variables import Variables, parse_bounds, parse_range
 from raytrace.io import write_lens
 from raytrace.maths.grid import grid
 from raytrace.maths.result import plain

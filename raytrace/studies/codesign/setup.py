@@ -16,9 +16,9 @@ from tqdm import tqdm
 
 from raytrace.cli.door import CommandError, catalogs, find_lens, open_lens, say
 from raytrace.cli.progress import progress
-from raytrace.imaging.limits import Limits
 from raytrace.imaging.network import PRESETS, RedNet, RedNetShape
 from raytrace.imaging.training import NotFinite, Record, read_json
+from raytrace.imaging.variables import Limits
 from raytrace.io import FORMATS
 from raytrace.shards import share
 from raytrace.studies.codesign.closed_form import power_spectrum

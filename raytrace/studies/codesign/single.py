@@ -9,7 +9,7 @@ from pathlib import Path
 from raytrace.cli.door import CommandError, say
 from raytrace.cli.run import present
 from raytrace.files import write_json
-from raytrace.imaging.limits import Limits
+from raytrace.imaging.variables import Limits
 from raytrace.io import FORMATS, read_lens, write_lens
 from raytrace.maths.result import Result, plain
 from raytrace.shards import share

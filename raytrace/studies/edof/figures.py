@@ -12,8 +12,8 @@ from raytrace.studies.edof.scene import Deep
 from raytrace.studies.edof.table import ROWS, title_of
 from raytrace.studies.edof.world import Judged, Quality, World, depth_text
 from raytrace.studies.figures import picture as show
+from raytrace.wave_optics.compute import ElementPsf
 from raytrace.wave_optics.element import Element, height
-from raytrace.wave_optics.psf import ElementPsf
 
 _LEARNED = ("learned", "learned-16", "learned-smooth")
 #: Panels of the figure over noise, by filter.

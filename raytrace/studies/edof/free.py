@@ -14,8 +14,8 @@ import torch
 from torch import Tensor, nn
 
 from raytrace.files import write_atomically
-from raytrace.imaging.phase_variables import PhaseVariables
 from raytrace.imaging.training import Record, Run, Share, load_state, read_state, train
+from raytrace.imaging.variables import PhaseVariables
 from raytrace.maths.value import detached
 from raytrace.studies.edof.noise import best_strengths, mark_of_elements
 from raytrace.studies.edof.training import scheduled

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from raytrace.imaging.network import RedNet, RedNetShape
-from raytrace.imaging.restoration import blind_filter
+from raytrace.imaging.restoration import depth_invariant_wiener
 from raytrace.imaging.training import Record, Run, Share, train
 from raytrace.studies.edof.training import scheduled
 from raytrace.studies.edof.world import restored
@@ -32,7 +32,7 @@ class Filtered:
 
     @classmethod
     def of(cls, H: Tensor, S: Tensor, noise: float) -> "Filtered":
-        return cls(H, blind_filter(H, S, noise), noise)
+        return cls(H, depth_invariant_wiener(H, S, noise), noise)
 
     def estimate(self, picture: Tensor, depth: int, *key: int) -> Tensor:
         """The filter's picture (W, n, n) of one (n, n) at a depth, noise drawn by the key."""

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.imaging.restoration import blind_error, blind_filter, psnr, wiener
+from raytrace.imaging.restoration import depth_invariant_error, depth_invariant_wiener, psnr, wiener
 from raytrace.studies.edof.settings import Settings
 from raytrace.studies.edof.table import ROWS, STRENGTHS
 from raytrace.studies.edof.world import World, best_gamma, errors_of_pictures, kernels, power, transfer
@@ -125,7 +125,7 @@ def errors_of(H: Tensor, world: World, bank: Bank) -> Errors:
     """Of each picture at every depth in every colour, expected over noise, of transfer functions H (D, W, n, n)."""
     at_design = H[world.depths.index(world.design)]
     gamma = best_gamma(H, bank.spectrum, world.noise, at_design)
-    filters = {"wiener": wiener(at_design, gamma), "blind": blind_filter(H, bank.spectrum, world.noise)}
+    filters = {"wiener": wiener(at_design, gamma), "blind": depth_invariant_wiener(H, bank.spectrum, world.noise)}
     return {name: errors_of_pictures(H, G, world.noise, bank.powers) for name, G in filters.items()}
 
 
@@ -228,5 +228,5 @@ def best_strengths(noises: Sequence[float], S: Tensor) -> dict[float, float]:
     found = {}
     for strength in STRENGTHS:
         H = transfer(kernels(baseline("cubic-refractive", made_for, strength=strength), world), S.shape[-1])
-        found[strength] = {noise: float(blind_error(H, S, noise).mean()) for noise in noises}
+        found[strength] = {noise: float(depth_invariant_error(H, S, noise).mean()) for noise in noises}
     return {noise: min(STRENGTHS, key=lambda own: found[own][noise]) for noise in noises}

@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace):
     from raytrace.cli.progress import progress
     from raytrace.shards import torch_threads
     from raytrace.studies.focusing.experiment import Setting, learn_to_focus
-    from raytrace.wave_optics.exchange import FORMATS
+    from raytrace.wave_optics.height_maps import FORMATS
 
     refuse_suffix("-o", arguments.output, tuple(FORMATS))
     if len(arguments.wavelengths) > 1:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from raytrace.imaging.image import blur, visible
-from raytrace.imaging.phase_variables import PhaseVariables
+from raytrace.imaging.variables import PhaseVariables
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import index
 from raytrace.maths.grid import grid
@@ -24,13 +24,13 @@ from raytrace.maths.result import Result
 from raytrace.psf_models.dft import phasor
 from raytrace.studies.options import Settings
 from raytrace.studies.pictures import Pictures, crop, dead_leaves
-from raytrace.tracing.memo import Memo
+from raytrace.tracing.scene import Memo
+from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import Aim, aim, ideal
 from raytrace.wave_optics.element import Element, Pixels, height
 from raytrace.wave_optics.element_files import write_element
 from raytrace.wave_optics.plan import Plan
 from raytrace.wave_optics.plan import plan as plan_of
-from raytrace.wave_optics.psf import psf
 from raytrace.wave_optics.pupil import disc_cells
 from raytrace.wave_optics.scene import WaveScene, millimetres, residual
 

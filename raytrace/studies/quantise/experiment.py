@@ -17,9 +17,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from raytrace.imaging.phase_variables import PhaseVariables
-from raytrace.imaging.restoration import blind_filter, errors, psnr
+from raytrace.imaging.restoration import depth_invariant_wiener, errors, psnr
 from raytrace.imaging.training import DamagedRun, load_state, read_json
+from raytrace.imaging.variables import PhaseVariables
 from raytrace.maths.value import detached
 from raytrace.studies import options
 from raytrace.studies.edof.settings import Settings
@@ -112,7 +112,7 @@ class Judge:
     def restored(self, element: Element, test: Tensor) -> float:
         """PSNR of test pictures (B, n, n) behind a filter made for S, dB: mean over depths, expected over noise."""
         H = self.transfer(element)
-        G = blind_filter(H, self.S, self.world.noise)
+        G = depth_invariant_wiener(H, self.S, self.world.noise)
         left = errors(H, spectrum(test), self.world.noise, filter=G)  # (D, W)
         return float(psnr(left.mean(1)).mean())
 

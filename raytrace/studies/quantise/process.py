@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from raytrace.imaging.phase_variables import PhaseVariables
+from raytrace.imaging.variables import PhaseVariables
 from raytrace.maths.value import detached
 from raytrace.studies.edof.noise import Unit
 from raytrace.studies.edof.training import adam

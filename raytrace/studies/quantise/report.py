@@ -36,7 +36,7 @@ from raytrace.studies.quantise.experiment import (
 from raytrace.wave_optics.designs import aim, baseline, singlet
 from raytrace.wave_optics.element import Element
 from raytrace.wave_optics.element_files import read_element
-from raytrace.wave_optics.exchange import FORMATS
+from raytrace.wave_optics.height_maps import FORMATS
 from raytrace.words import did_you_mean
 
 _NAMED = ("fresnel", "learned")  # elements that are no files

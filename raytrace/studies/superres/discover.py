@@ -14,17 +14,17 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from raytrace.imaging.phase_variables import PhaseVariables
 from raytrace.imaging.restoration import psnr
+from raytrace.imaging.variables import PhaseVariables
 from raytrace.maths.value import detached
 from raytrace.maths.zernike import noll, polynomials
 from raytrace.studies.descent import minimise
 from raytrace.studies.edof.world import WAVELENGTH, World, scene
 from raytrace.studies.pictures import draws
 from raytrace.studies.superres.experiment import Elements, plated, summed, wedges
-from raytrace.tracing.memo import Memo
+from raytrace.tracing.scene import Memo
+from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.plan import plan
-from raytrace.wave_optics.psf import psf
 
 SIDE, WINDOW = 16, 49  # pixels of the picture along the scene, and along the kernel
 _CELLS = 128  # of a plate, across the aperture

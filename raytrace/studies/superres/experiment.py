@@ -19,8 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from raytrace.imaging.phase_variables import PhaseVariables
 from raytrace.imaging.restoration import mean_square_error, psnr
+from raytrace.imaging.variables import PhaseVariables
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import index
 from raytrace.maths.value import detached
@@ -37,11 +37,11 @@ from raytrace.studies.superres.inversion import (
     joint_superresolve,
     superresolve,
 )
-from raytrace.tracing.memo import Memo
+from raytrace.tracing.scene import Memo
+from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import aim, baseline
 from raytrace.wave_optics.element import Element, Pixels, Zernike
 from raytrace.wave_optics.plan import plan
-from raytrace.wave_optics.psf import psf
 
 #: Pixels of the picture along a small scene, of its dark border, and of the window of one place.
 FIELD, BORDER, TILE = 96, 16, 47
