@@ -11,7 +11,7 @@ import raytrace as rt
 from raytrace.cli import main
 from raytrace.io import FORMATS, LensFileError, LensFileWarning, read_lens, write_lens
 from raytrace.io.codev.glass import _fictitious_error
-from raytrace.io.report import substitutes_of
+from raytrace.io.report import BadSubstitute, substitutes_of
 from raytrace.materials.catalogs import UnknownGlass, find_glass, shipped_catalog
 from raytrace.materials.glass import ImplausibleWavelength, OutOfRange, abbe_number, index, model_glass, nd
 from raytrace.system.lens import check_media
@@ -149,7 +149,7 @@ def test_substitutes_that_mean_nothing_are_refused_or_reported(tmp_path):
     with pytest.warns(LensFileWarning, match="a substitute for the glass SF5 was requested, which is not in the file"):
         read_lens(path, substitute="SF5=F2")
     for wrong in ("SF5", "=F2", {"SF5": ""}, {"SF5": 3}):
-        with pytest.raises(rt.formats.BadSubstitute, match="expected GLASS=OTHER, nearest or formula"):
+        with pytest.raises(BadSubstitute, match="expected GLASS=OTHER, nearest or formula"):
             read_lens(path, substitute=wrong)
     path.write_text(UNKNOWN[".zmx"].replace("1.5168 64.17", "1.5 40"))
     with pytest.raises(UnknownGlass, match="the file has no nd and Vd"):
