@@ -26,9 +26,8 @@ from raytrace.imaging.variables import Variables
 from raytrace.maths.grid import Grid, grid
 from raytrace.psf_models import MODELS, NotConverged, psf
 from raytrace.system.lens import Lens, field_points
-from raytrace.tracing.memo import Memo
-from raytrace.tracing.scene import chief_landing, scene
-from raytrace.tracing.stop_filling import warn_of_filling
+from raytrace.tracing.launch import warn_of_filling
+from raytrace.tracing.scene import Memo, chief_landing, scene
 from raytrace.words import named_value
 
 _LARGEST = 2.0  # of a picture in [0, 1] whose resampling overshoots

@@ -32,10 +32,9 @@ from raytrace.psf_models.paraxial import has_one_focus
 from raytrace.psf_models.result import EmptyPsf, Kernels, Psf, combined, mixture, polychromatic, without_dark
 from raytrace.shards import Share, agreeing, gathered, total
 from raytrace.system.lens import Lens, field_points, with_object_distance
-from raytrace.tracing.memo import Memo
+from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.ray_failures import beam_hint, ray_failures, warn_of_failures
-from raytrace.tracing.scene import Scene, beam_share, chief_landing, scene, symmetry
-from raytrace.tracing.stop_filling import warn_of_filling
+from raytrace.tracing.scene import Memo, Scene, beam_share, chief_landing, scene, symmetry
 from raytrace.tracing.streaming import (
     MAX_BYTES,
     Moments,

@@ -1,8 +1,8 @@
-"""The columns of a prescription table: the headings that designers, programs and patents write, and what each means.
+"""The columns of a prescription table: the headings of designers, programs and patents, and the quantity of each.
 
-A column of numbers is read by its name or refused by it, never guessed and never dropped. Case counts where it tells
-apart: `nD` is the index at the sodium D line, `nd` at the helium d line; `D` is a diameter beside a named thickness,
-and the thickness where nothing else could be.
+A column of numbers is read by its name or refused by it, never guessed and never dropped. Case is significant where it
+distinguishes: `nD` is the index at the sodium D line, `nd` at the helium d line; `D` is a diameter where another column
+is named thickness, and else the thickness.
 """
 
 import functools
@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from raytrace.io.report import IGNORED, READ, UNKNOWN, Draft
-from raytrace.io.source import LensFileError, Place, shown
-from raytrace.io.spelling import MILLIMETRES
+from raytrace.io.source import MILLIMETRES, LensFileError, Place, shown
 from raytrace.materials.glass import LINES
 from raytrace.system.shapes import KINDS
 
@@ -59,14 +58,14 @@ _SPELLINGS = {
     "pressure": "pressure",
 }
 
-#: Columns that are known and tell nothing that a surface needs, with the reason.
+#: Columns that are known and left out, with the reason.
 _OTHERS = {
     "a focal length follows from the surfaces": "f, fl, efl, focal length, lens focal length, element focal length"
     ", focal length of lens, component focal length, 焦点距離, 焦距, brennweite, focale, distance focale",
     "a size of the mechanical part": "mech semidia, mechanical semidiameter, mech diam, mech dia, mechanical diameter"
     ", chip zone, edge thickness, コバ厚",
     "a setting of the program": "ccy, cuc, thc, glc, spe, id no",
-    "coatings and heat bend no rays": "coating, tce, tce x 1e6, cte, specific gravity, density, 比重",
+    "coatings and heat refract no rays": "coating, tce, tce x 1e6, cte, specific gravity, density, 比重",
 }
 
 
@@ -82,7 +81,7 @@ def _by_spelling(spellings: dict[str, str]) -> dict[str, str]:
 
 
 _HEADINGS, _IGNORED = _by_spelling(_SPELLINGS), _by_spelling(_OTHERS)
-#: Read with its case: what may be a thickness or a diameter.
+#: A thickness or a diameter; case-sensitive.
 _EITHER = {"d": "d", "D": "D"}
 
 #: Headings of the coefficient of r^n: a4, A4, r4, r^4, 4th, 4th order.
@@ -94,13 +93,13 @@ _UNITS = {"mm": "mm", "millimeter": "mm", "millimeters": "mm", "millimetre": "mm
 _UNITS |= {"mm^1": "mm", "mm1": "mm", "/mm": "mm", "in": "in", "inch": "in", "inches": "in", '"': "in", "cm": "cm"}
 _UNITS |= {"m": "m", "meter": "m", "meters": "m", "μm": "μm", "um": "μm", "micron": "μm", "microns": "μm", "nm": "nm"}
 _UNITS |= {"1/in": "in", "1/cm": "cm", "1/m": "m", "unit:mm": "mm", "unitmm": "mm", "単位mm": "mm", "单位mm": "mm"}
-#: Stands for a column whose meaning is not known: its cells may be words, but no numbers.
+#: A column of unknown meaning: its cells may be words, but not numbers.
 UNREAD = "?"
 _LENGTHS = ("radius", "thickness", "curvature", "semi_diameter", "diameter", "d", "D")
 
 
 class Heading(NamedTuple):
-    """What one heading says: a key of the spellings, "a4", "index F", "abbe e", "d", "D", "ignored"; and its unit."""
+    """The meaning of a heading: a key of _SPELLINGS, "a4", "index F", "abbe e", "d", "D", "ignored"; and its unit."""
 
     name: str
     unit: str = ""
@@ -108,7 +107,7 @@ class Heading(NamedTuple):
 
 @functools.lru_cache(4096)
 def meaning(heading: str) -> Heading | None:
-    """What a heading means by itself; None where it is not known."""
+    """The meaning of a single heading; None where it is not known."""
     text = unicodedata.normalize("NFKC", heading).strip().strip('"*')
     text = re.sub(r"\s+", " ", re.sub(r"(?<=[\u3040-\u9fff])(?=[!-~νυφ])", " ", text))
     text = re.sub(r"(?<=\s)(?:at|for|the)\s", "", text)
@@ -160,7 +159,7 @@ def _at_line(kind: str, line: str, *, capital: bool) -> Heading | None:
 
 
 def _merged(parts: list[Heading | None]) -> Heading | None:
-    """One meaning of several words or symbols that say the same, as 'Abbe number (νe)' and 'R [mm]'; else None."""
+    """One meaning of several words or symbols of the same quantity, as 'Abbe number (νe)' and 'R [mm]'; else None."""
     if None in parts:
         return None
     units = {part.unit for part in parts if part.unit}
@@ -197,8 +196,8 @@ def is_header(cells: list[str], *, known: float = 0.5) -> bool:
 def columns(cells: Sequence[str], units: str, ignored: Sequence[str], place: Place, report: Draft) -> list[str | None]:
     """The meaning of each column of a line of headings, every one reported; None for those left out, else UNREAD.
 
-    units: of the header; ignored: headings that the header tells to leave out. Raises LensFileError for two columns of
-    one meaning, for one in other units, and for what may mean two things.
+    units: of the header; ignored: headings that the header leaves out. Raises LensFileError for two columns of one
+    meaning, for a column in other units, and for an ambiguous one.
     """
     cells, found = _without_counters(cells)
     for k, cell in enumerate(cells):
@@ -242,7 +241,7 @@ def _check_units(cells: Sequence[str], found: list[Heading | None], units: str, 
 
 
 def _settle_thickness(cells: list[str], names: list[str | None], place: Place, report: Draft) -> None:
-    """d and D: the thickness if nothing else could be; D beside a named thickness is the diameter; else an error."""
+    """d and D: the thickness if nothing else could be; D next to a named thickness is the diameter; else an error."""
     either = [k for k, name in enumerate(names) if name in ("d", "D")]
     named = [cells[k] for k, name in enumerate(names) if name == "thickness"]
     if len(either) + len(named) > 1 and not (named and len(either) == 1 and names[either[0]] == "D"):
@@ -255,7 +254,7 @@ def _settle_thickness(cells: list[str], names: list[str | None], place: Place, r
 
 
 def _settle_lines(cells: list[str], names: list[str | None], place: Place) -> None:
-    """An index or Abbe number that does not say its line is of the d line, unless other columns are of another."""
+    """An index or Abbe number without a spectral line is of the d line, unless other columns are of another line."""
     for kind, other in (("index", "abbe"), ("abbe", "index")):
         lines = {name.split()[1] for name in names if name and name.startswith(other + " ")}
         for k, name in enumerate(names):
@@ -265,7 +264,7 @@ def _settle_lines(cells: list[str], names: list[str | None], place: Place) -> No
             if (kind == "abbe" and lines and not lines & {"d", "D"}) or (kind == "index" and (lines - {"d"} or own)):
                 symbol = "n" if kind == "index" else "V"
                 fix = f"write '{symbol}d' or '{symbol}e'"
-                raise LensFileError(f"column {shown(cells[k])} does not say its spectral line; {fix}", place)
+                raise LensFileError(f"column {shown(cells[k])} does not name its spectral line; {fix}", place)
             names[k] = f"{kind} D" if lines == {"D"} else f"{kind} d"
 
 

@@ -1,7 +1,4 @@
-"""A row of a prescription table as a `Surface`: shape, medium and apertures.
-
-Media of a prescription table by their numbers: indices at spectral lines, Abbe numbers, partial dispersions.
-"""
+"""A row of a prescription table as a `Surface`: shape, medium (by name, or by indices and Abbe numbers), apertures."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -12,8 +9,7 @@ from torch import Tensor
 
 from raytrace.io.materials import by_figures, is_code, listed_glass
 from raytrace.io.report import Draft
-from raytrace.io.source import LensFileError, Place, UnsupportedSurface, shown
-from raytrace.io.spelling import double, is_infinite, is_number, number
+from raytrace.io.source import LensFileError, Place, UnsupportedSurface, double, is_infinite, is_number, number, shown
 from raytrace.io.table.columns import order
 from raytrace.io.table.system import ENVIRONMENT, environment_of
 from raytrace.io.table.text import Row
@@ -25,12 +21,12 @@ from raytrace.system.apertures import SHAPES, Aperture
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface
 
-#: What an empty or undispersed medium's Abbe number is written as.
+#: Spellings of the Abbe number of air or of a medium without dispersion.
 NOTHING = ("", "-", "0", "0.0", "∞", "inf", "infinity", "nan", "none")
 
 
 def figures(cells: dict[str, str]) -> dict[str, str]:
-    """The cells of a row that tell its medium by numbers, by column: "index d", "abbe d", "pgf", "dpgf"."""
+    """The cells of a row that give its medium by numbers, by column: "index d", "abbe d", "pgf", "dpgf"."""
     named = {name: cell for name, cell in cells.items() if name.startswith(("index ", "abbe ")) or name in _PARTIAL}
     return {name: cell for name, cell in named.items() if cell.lower() not in NOTHING}
 
@@ -41,7 +37,7 @@ _PARTIAL = ("pgf", "dpgf")
 def medium(cells: dict[str, str], place: Place, report: Draft) -> Glass:
     """The medium of a row without a named glass; air where no figure is given.
 
-    One index alone is constant. n_d, V_d and ΔP_gF are kept as they stand; any other set of figures is met by the model
+    One index alone is constant. n_d, V_d and ΔP_gF are kept unchanged; any other set of figures is met by the model
     glass n = A + B/λ + C/λ^3.5 (`raytrace.materials.formulas`), on the normal line of glasses where two are
     given, by least squares where more than three are.
     """
@@ -113,7 +109,7 @@ def _fitted(indices: dict[str, float], given: dict[str, float], place: Place) ->
 _AIR = ("", "air", "-", "none", "nan", "vacuum", "luft", "空気", "空气")
 _MIRROR = re.compile(r"\b(mirror|reflect|reflecting|refl)\b", re.IGNORECASE)
 
-#: What a type may be called, beside the words of `shapes.KINDS`. Any other word is a shape that is not modelled.
+#: Words of a type, in addition to those of `shapes.KINDS`. Any other word is a shape that is not modelled.
 _TYPE = re.compile(
     r"standard|spher(e|ical)|plan(e|o)?|flat|conic(oid)?|aspher(e|ic|ical)|lens|surface|s"
     r"|stop|sto|aperture|diaphragm|iris|image|ima|img|sensor|detector|object|obj"
@@ -156,17 +152,19 @@ def build(row: Row, unit: float, catalogs: Sequence[str | Catalog], user: Sequen
         kind=kind,
         glass=_glass(row, catalogs, user, report),
         semi_diameter=_semi_diameter(row, unit),
-        apertures=tuple(_aperture(text, unit, place) for text in _several(cells.get("apertures", ""))),
+        apertures=tuple(
+            _aperture(text, unit, place) for text in re.split(r"\s\+\s", cells.get("apertures", "")) if text.strip()
+        ),
         environment=_environment(cells, place),
         comment=cells.get("comment") or ("" if is_number(cells.get("label", "0")) else cells["label"]),
     )
 
 
 def _environment(cells: Mapping[str, str], place: Place) -> Environment | None:
-    told = [key for key in ENVIRONMENT if key in cells]
-    if len(told) == 1:
-        raise LensFileError(f"a {told[0]} alone; give {' and '.join(ENVIRONMENT)}, or neither", place)
-    return environment_of(cells, place) if told else None
+    keys = [key for key in ENVIRONMENT if key in cells]
+    if len(keys) == 1:
+        raise LensFileError(f"a {keys[0]} alone; give {' and '.join(ENVIRONMENT)}, or neither", place)
+    return environment_of(cells, place) if keys else None
 
 
 def _cell(row: Row, column: str) -> float | None:
@@ -234,20 +232,15 @@ def _glass(row: Row, catalogs: Sequence[str | Catalog], user: Sequence[Path], re
         return mil_glass(text)
     if equals or all(is_number(part.strip()) for part in digits.split("/")):
         return _by_figures(name, digits, place, report)
-    how = {"catalogs": catalogs, "user": user, "place": place, "report": report}
-    glass = listed_glass(text, **how, figures=_d_line(given, place))
+    d_line = [given.get(name) for name in ("index d", "abbe d")]
+    nearest = None if None in d_line else tuple(number(cell, "index or Abbe number", place) for cell in d_line)
+    glass = listed_glass(text, catalogs=catalogs, user=user, place=place, report=report, figures=nearest)
     for name, cell in given.items():
         kind, _, line = name.partition(" ")
         listed = float(refractive_index(glass, double(LINES[line]))) if kind == "index" else 0.0
         if kind == "index" and abs(listed - number(cell, name, place)) > 2e-3:
             report.warn(f"index {cell} stated for {text}, whose n{line} is {listed:.5f}; the catalog is used", place)
     return glass
-
-
-def _d_line(given: dict[str, str], place: Place) -> tuple[float, float] | None:
-    """n_d and V_d among the cells of a row, None where they do not both stand there."""
-    cells = [given.get(name) for name in ("index d", "abbe d")]
-    return None if None in cells else tuple(number(cell, "figure of the glass", place) for cell in cells)
 
 
 def _by_figures(name: str, digits: str, place: Place, report: Draft) -> Glass:
@@ -258,13 +251,8 @@ def _by_figures(name: str, digits: str, place: Place, report: Draft) -> Glass:
         raise LensFileError(f"glass is {shown(digits)}, expected an index, nd/Vd or nd/Vd/ΔPgF", place)
     if nd == 1 and vd == 0 and not name:
         return AIR
-    report.glass(place.surface, name, f"constant index {nd!r}" if vd == dpgf == 0 else f"model glass {figures}")
+    report.glass(place.surface, name, f"constant index {nd!r}" if vd == dpgf == 0 else f"model glass {digits}")
     return by_figures(nd, vd, dpgf, name)
-
-
-def _several(text: str) -> list[str]:
-    """The apertures of a cell, joined by a plus between blanks."""
-    return [part for part in re.split(r"\s\+\s", text) if part.strip()]
 
 
 def _aperture(text: str, unit: float, place: Place) -> Aperture:
@@ -274,9 +262,8 @@ def _aperture(text: str, unit: float, place: Place) -> Aperture:
     at = words.index("at") if "at" in words else len(words)
     shape = SHAPES.get(words[0]) if words else None
     if shape is None or at - 1 != (shape.sizes or at - 1) or len(words[at + 1 :]) != (2 if words[at:] else 0):
-        raise LensFileError(
-            f"aperture is {shown(text)}, expected for example 'circular 0 12.5' or 'rectangular 3 4'", place
-        )
+        expected = "expected for example 'circular 0 12.5' or 'rectangular 3 4'"
+        raise LensFileError(f"aperture is {shown(text)}, {expected}", place)
     sizes = tuple(number(word, "size of the aperture", place) * unit for word in words[1:at])
     x, y = [number(word, "centre of the aperture", place) * unit for word in words[at + 1 :]] or [0.0, 0.0]
     if shape.objection(sizes):
