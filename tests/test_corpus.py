@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from raytrace.io import UnsupportedSurface, read_lens
-from raytrace.io.zemax.surfaces import TYPES
+from raytrace.io.zemax.surfaces import types
 from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.glass import constant, refractive_index
 from raytrace.system.lens import Lens
@@ -213,7 +213,7 @@ def test_file_is_right_or_refused_by_name(name):
 @needs_corpus
 def test_unsupported_files_are_the_refused_ones():
     """A file is refused for what the oracle knows the project not to model, or for a glass that is not shipped."""
-    modelled = set(TYPES)
+    modelled = set(types())
     for name in FILES:
         result = compare(name)
         beyond = set(oracle()[name]["types"]) - modelled

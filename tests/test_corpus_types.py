@@ -24,7 +24,7 @@ from zemax_by_definition import surfaces, trace
 
 from raytrace.io import UnsupportedSurface, read_lens
 from raytrace.io.source import Place, decode
-from raytrace.io.zemax.surfaces import TYPES
+from raytrace.io.zemax.surfaces import types
 from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.glass import refractive_index
 from raytrace.system.lens import Lens
@@ -280,7 +280,7 @@ def by_type() -> str:
         counts = [sum(compare(name).outcome == outcome for name in names) for outcome in (RIGHT, REFUSED, WRONG)]
         sizes = [reproduced(n) for n in names if FILES[n]["stored_semidiameters"]["matched"]]
         matched = f"{sum(one[0] for one in sizes)} of {sum(one[1] for one in sizes)}" if sizes else ""
-        called = TYPES[kind].name if kind in TYPES else "before and after any surface (SCBD)"
+        called = types()[kind].name if kind in types() else "before and after any surface (SCBD)"
         lines.append(f"| `{kind}` {called} | {' · '.join(map(str, counts))} | {matched} | {SETTLED[kind]} |")
     return "\n".join(lines)
 
@@ -305,7 +305,7 @@ def by_file() -> str:
 
 
 def document() -> str:
-    modelled = ", ".join(f"`{kind}`" for kind in TYPES)
+    modelled = ", ".join(f"`{kind}`" for kind in types())
     return "\n".join(
         [
             _HEAD.format(count=len(FILES) + len(test_corpus.FILES)),

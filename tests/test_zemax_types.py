@@ -18,7 +18,7 @@ import raytrace as rt
 from raytrace.io import FORMATS, LensFileError, UnsupportedSurface
 from raytrace.io.source import Place, decode
 from raytrace.io.zemax import write as zemax_write
-from raytrace.io.zemax.surfaces import TYPES, inverse, spelled_inverse
+from raytrace.io.zemax.surfaces import inverse, spelled_inverse, types
 from raytrace.system.rays import start
 from raytrace.tracing.trace import media, steps
 
@@ -68,7 +68,7 @@ CASES = {
     "tilts first": ("STANDARD", "CURV 0.02\nSCBD 1 1 0 0.5 0.1 -2 5 10\nSCBD 2 0 1 0 0 30 10 0\nGLAS MIRROR"),
     "tilted grating": ("DGRATING", f"{parm(1, 0.3, -1)}\nSCBD 1 0 0 0.3 -0.2 4 -3 25\nGLAS MIRROR"),
 }  # fmt: skip
-CASES = {name: case for name, case in CASES.items() if case[0] in TYPES}
+CASES = {name: case for name, case in CASES.items() if case[0] in types()}
 
 
 def text(name: str, unit: str = "MM", *more: str) -> str:
@@ -102,7 +102,7 @@ def again(lens) -> tuple[rt.Lens, str]:
 
 
 def test_every_type_has_a_case():
-    assert {kind for kind, _ in CASES.values()} == set(TYPES)
+    assert {kind for kind, _ in CASES.values()} == set(types())
 
 
 def rays(seed: int) -> list[tuple[list[float], list[float]]]:
@@ -163,8 +163,8 @@ _SUITED = {
 @st.composite
 def seconds(draw) -> str:
     """The lines of a surface of any type, with any numbers."""
-    kind = draw(st.sampled_from(sorted(TYPES)))
-    row, lines = TYPES[kind], [f"TYPE {kind}"]
+    kind = draw(st.sampled_from(sorted(types())))
+    row, lines = types()[kind], [f"TYPE {kind}"]
     if "curvature" in row.holds:
         lines += [f"CURV {draw(amounts)}", f"CONI {draw(amounts)}"]
     lines += [f"PARM {j} {draw(_SUITED.get((kind, j), amounts))}" for j in row.parameters]

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from raytrace.io.report import IGNORED, READ, UNKNOWN, Draft
 from raytrace.io.source import Block, LensFileError, Place, Record, double, exact, is_infinite, is_number, plain, shown
-from raytrace.io.zemax.keywords import APERTURE_KEYWORDS, FIELD_LISTS, Sections, glass_source, is_blank
+from raytrace.io.zemax.keywords import FIELD_LISTS, Sections, aperture_keywords, glass_source, is_blank
 from raytrace.materials import environment as environments
 from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.environment import REFERENCE, Environment, objection
@@ -308,7 +308,7 @@ def _target(block: Block, cell: Cell) -> tuple[Record | None, int, tuple[str, ..
     if row.keyword == "SIZE":
         return block.last("ENPD", "FNUM", "OBNA"), 0, ("ENPD",)
     if row.keyword == "APERTURE":
-        apertures = block.all(*(keyword for keyword in APERTURE_KEYWORDS if keyword != "FLAP"))
+        apertures = block.all(*(keyword for keyword in aperture_keywords() if keyword != "FLAP"))
         return (apertures[-1] if apertures else None), position, ("CLAP", "0", "0")
     if row.keyword.startswith("SCBD"):
         side = row.keyword[4:]

@@ -8,23 +8,17 @@ from raytrace.io.report import IGNORED, READ, UNKNOWN, Draft
 from raytrace.io.source import MAX_SURFACES, Block, LensFileError, Place, Record, shown, warn_of_repeats
 from raytrace.system.apertures import SHAPES
 
-#: Shape of an aperture, and whether it obscures, by keyword; FLAP follows the semi-diameter.
-APERTURE_KEYWORDS = {
-    "FLAP": ("circular", False),
-    **{keyword: (name, bool(k)) for name, shape in SHAPES.items() for k, keyword in enumerate(shape.zemax)},
-}
-
 
 def _words(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
-#: Keywords of the system and of a surface that are read.
+#: Keywords of the system and of a surface that are read; apertures have theirs in `apertures.SHAPES`.
 SYSTEM_READ = _words(
     "VERS MODE NAME NOTE UNIT GCAT ENVD GFAC RAIM FTYP PWAV MNUM ENPD FNUM OBNA FLOA XFLN YFLN FWGN XFLD YFLD FWGT"
     " FEFD SDMA VDXN VDYN VCXN VCYN VANN ZVDX ZVDY ZVCX ZVCY ZVAN VDX VDY VCX VCY VAN WAVM WAVL WAVN WWGT WWGN"
 )
-SURFACE_READ = APERTURE_KEYWORDS.keys() | _words(
+_SURFACE_READ = _words(
     "SURF TYPE CURV CONI DISZ GLAS DIAM STOP PARM COMM OBDC USAP USOB UDAD SCBD IGNR XDAT VCON VDSZ VPAR PPAR PZUP"
     " MAZH TOLE EDGE"
 )
@@ -125,6 +119,13 @@ AIMINGS = ("off", "paraxial", "real")
 #: OpticStudio splits a long note into lines of this many characters.
 NOTE_PIECE = 200
 
+
+def aperture_keywords() -> dict[str, tuple[str, bool]]:
+    """Shape of an aperture, and whether it obscures, by keyword; FLAP follows the semi-diameter."""
+    rows = {keyword: (name, bool(k)) for name, shape in SHAPES.items() for k, keyword in enumerate(shape.zemax)}
+    return {"FLAP": ("circular", False), **rows}
+
+
 #: In place of the name in a GLAS line: the medium is a model glass, or that of another surface.
 BLANK = "___BLANK"
 
@@ -167,7 +168,7 @@ def sections(text: str, file: str, report: Draft) -> Sections:
     A surface's records are indented in files of OpticStudio; in files that lost the indentation the keyword decides.
     The merit function, tolerances and configurations after the last surface are reported by their readers.
     """
-    lines = list(records(text, file))
+    lines, surface_read = list(records(text, file)), _SURFACE_READ | aperture_keywords().keys()
     start = next((position for position, record in enumerate(lines, 1) if record.keyword == "SURF"), None)
     if start is None:
         hint = "is it a sequential lens file of OpticStudio (.zmx)?"
@@ -187,16 +188,16 @@ def sections(text: str, file: str, report: Draft) -> Sections:
             block, after_surfaces = Block(record.place._replace(surface=len(surfaces))), False
             surfaces.append(block)
             report.met("SURF", READ, block.place)
-        elif block is not system and (record.indented if indents else word in SURFACE_READ or word in SURFACE_IGNORED):
+        elif block is not system and (record.indented if indents else word in surface_read or word in SURFACE_IGNORED):
             record = record._replace(place=record.place._replace(surface=block.place.surface))
-            _sort(record, block, SURFACE_READ, SURFACE_IGNORED, report)
+            _sort(record, block, surface_read, SURFACE_IGNORED, report)
         elif word not in SYSTEM_READ and (after_surfaces or (surfaces and word not in SYSTEM_IGNORED)):
             block, after_surfaces = system, True
             tail.append(record)
         else:
             block = system
             _sort(record, system, SYSTEM_READ, SYSTEM_IGNORED, report)
-    once = (SYSTEM_READ | SURFACE_READ) - {*_REPEATED}
+    once = (SYSTEM_READ | surface_read) - {*_REPEATED}
     warn_of_repeats([system, *surfaces], once.__contains__, report)
     _join_fields(system)
     return Sections(system, surfaces, tail)

@@ -36,7 +36,6 @@ from raytrace.io.zemax.keywords import BLANK, SYSTEM_IGNORED, TAIL_REASON, Secti
 from raytrace.io.zemax.surfaces import (
     FIRST_TERM,
     INVERSE,
-    TYPES,
     Named,
     Numbers,
     SurfaceType,
@@ -44,6 +43,7 @@ from raytrace.io.zemax.surfaces import (
     numbers_of,
     type_name,
     type_of,
+    types,
 )
 from raytrace.system.configurations import Operand, part, with_part
 from raytrace.system.configurations import Path as LensPath
@@ -282,7 +282,7 @@ def read(sections: Sections, lens: Lens, millimetres: float, report: Draft) -> L
     """The lens with its optimisation data, None where the file has none; every variable is modelled."""
     surfaces = []
     for block, surface in zip(sections.surfaces, lens.surfaces, strict=True):
-        row = TYPES[type_name(block)]
+        row = types()[type_name(block)]
         surfaces.append(TypedSurface(block, surface, row, numbers_of(block, row, millimetres), millimetres))
     head = sections.system.last("MNUM")
     start = head.place.line if head and head.place.line > sections.surfaces[-1].place.line else math.inf
@@ -651,7 +651,7 @@ def _with_parameter(lines: Lines, rule: Vary | Solve, parameters: dict, place: P
 
 def _parameters(surface: Surface) -> dict[str, tuple[str, int]]:
     """PARM and XDAT of a surface by the names of the numbers of the lens that they give."""
-    row = TYPES.get(type_of(surface) or "")
+    row = types().get(type_of(surface) or "")
     if row is None:
         return {}
     numbers, by_name = row.numbers(surface)._replace(size=surface.semi_diameter), {}

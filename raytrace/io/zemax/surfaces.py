@@ -10,6 +10,7 @@ Reader, writer, unit conversion, variables and pickups use the same row. Lengths
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from decimal import Context, Decimal
 from fractions import Fraction
@@ -22,7 +23,7 @@ from torch import Tensor
 from raytrace.io.materials import by_figures, is_code, listed_glass
 from raytrace.io.report import Draft
 from raytrace.io.source import Block, LensFileError, Record, UnsupportedSurface, double, is_infinite, shown
-from raytrace.io.zemax.keywords import APERTURE_KEYWORDS, TYPE_NAMES, glass_source, is_blank
+from raytrace.io.zemax.keywords import TYPE_NAMES, aperture_keywords, glass_source, is_blank
 from raytrace.materials.catalogs import Catalog
 from raytrace.materials.glass import AIR, MIRROR, Glass, mil_glass
 from raytrace.system.apertures import SHAPES, Aperture
@@ -299,6 +300,7 @@ def _no_construction(numbers: Numbers) -> str:
     return ""
 
 
+@functools.cache
 def _round(name: str) -> SurfaceType:
     """The type of a kind of rotationally symmetric terms: PARM j is a_j; without any it has as many zeros."""
     kind = KINDS[name]
@@ -312,10 +314,9 @@ def _diffractive(name: str, phase: type, most: int) -> SurfaceType:
     return SurfaceType(name, (*_ROUND, "phase"), parameters, part=phase, terms=0, most=most, objection=_no_order)
 
 
-#: Every type that is modelled, STANDARD first.
-TYPES = {
+#: The types that are modelled, but those of rotationally symmetric terms, which have their rows in KINDS.
+_TYPES = {
     "STANDARD": SurfaceType("standard"),
-    **{kind.zemax: _round(kind.name) for kind in KINDS.values() if kind.zemax and kind.form is None},
     "XASPHERE": SurfaceType("extended asphere", _ROUND, least=None, terms=1, most=240),
     "TILTSURF": SurfaceType(
         "tilted",
@@ -425,8 +426,15 @@ TYPES = {
     "JONESMAT": SurfaceType("Jones matrix", (), unused=_POLARISATION),
 }
 
+
+def types() -> dict[str, SurfaceType]:
+    """Every type that is modelled, STANDARD first."""
+    symmetric = {kind.zemax: _round(kind.name) for kind in KINDS.values() if kind.zemax and kind.form is None}
+    return {"STANDARD": _TYPES["STANDARD"], **symmetric, **_TYPES}
+
+
 #: TYPE by the class of the sag terms or the phase of a surface; a kind of coefficients has its own in KINDS.
-_OF_PARTS = {row.part: kind for kind, row in TYPES.items() if row.part is not None and kind != "PARAXIAL"}
+_OF_PARTS = {row.part: kind for kind, row in _TYPES.items() if row.part is not None and kind != "PARAXIAL"}
 
 
 def type_of(surface: Surface) -> str | None:
@@ -599,7 +607,7 @@ def refuse_unsupported(blocks: Sequence[Block]) -> None:
 def _unsupported(block: Block, at_end: bool) -> str:
     """Why a surface is not modelled; at_end: whether it is the object or the image."""
     kind = type_name(block)
-    row = TYPES.get(kind)
+    row = types().get(kind)
     if row is None:
         return f"type {kind[:40]}" + (f" ({TYPE_NAMES[kind]})" if kind in TYPE_NAMES else "")
     ignored = block.last("IGNR")
@@ -632,7 +640,7 @@ def type_name(block: Block) -> str:
 
 
 def _modelled() -> str:
-    *first, last = TYPES
+    *first, last = types()
     return f"{', '.join(first)} and {last}"
 
 
@@ -664,12 +672,12 @@ def build(
     else:
         distance = thickness.number(0, "thickness") * millimetres
     kind, fields = type_name(block), {}
-    row = TYPES[kind]
+    row = types()[kind]
     if "curvature" in row.holds:
         fields["curvature"] = _nonzero(block, "CURV", "curvature", millimetres)
         fields["conic"] = _nonzero(block, "CONI", "conic constant", 1.0)
     if row.is_break:
-        for keyword in ("GLAS", *APERTURE_KEYWORDS):
+        for keyword in ("GLAS", *aperture_keywords()):
             record = block.last(keyword)
             if record and (keyword != "GLAS" or record.words[:1] != ("AIR",)):
                 message = f"{keyword} on a coordinate break is not used: the medium stays, and nothing clips"
@@ -767,14 +775,14 @@ def _apertures(block: Block, millimetres: float, report: Draft) -> tuple[Apertur
 
     A floating aperture (FLAP) follows the semi-diameter of its surface: it clips at DIAM.
     """
-    records = block.all(*APERTURE_KEYWORDS)
+    records = block.all(*aperture_keywords())
     if not records:
         return ()
     record = records[-1]
     if len({other.keyword for other in records}) > 1:
         names = ", ".join(other.keyword for other in records)
         report.warn(f"several apertures on one surface ({names}); the last is used", record.place)
-    shape, obscures = APERTURE_KEYWORDS[record.keyword]
+    shape, obscures = aperture_keywords()[record.keyword]
     count = SHAPES[shape].sizes
     if count is None:
         sizes = _corners(block.all("UDAD"), millimetres)

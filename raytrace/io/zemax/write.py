@@ -39,7 +39,6 @@ from raytrace.io.zemax.configurations import (
 )
 from raytrace.io.zemax.keywords import (
     AIMINGS,
-    APERTURE_KEYWORDS,
     BLANK,
     FIELD_KINDS,
     FIELD_LISTS,
@@ -47,6 +46,7 @@ from raytrace.io.zemax.keywords import (
     NOTE_PIECE,
     SYSTEM_APERTURES,
     Sections,
+    aperture_keywords,
     sections,
 )
 from raytrace.io.zemax.optimization import (
@@ -60,12 +60,12 @@ from raytrace.io.zemax.optimization import (
 )
 from raytrace.io.zemax.surfaces import (
     INVERSE,
-    TYPES,
     SurfaceType,
     in_millimetres,
     poses_are_parameters,
     spelled_inverse,
     type_of,
+    types,
 )
 from raytrace.materials.glass import Glass, mil_glass
 from raytrace.system.apertures import SHAPES, Aperture
@@ -183,7 +183,7 @@ def _surface(lens: Lens, number: int, surface: Surface, place: Place) -> list[st
         f"  TYPE {kind}",
         *(f"  SCBD {side} {_pose(pose, place)}" for side, pose in posed if pose is not None),
         f'  CURV {curvature} 0 0 0 0 ""',
-        *_numbers(surface, TYPES[kind], place),
+        *_numbers(surface, types()[kind], place),
         f"  DISZ {thickness(surface.thickness, 'INFINITY', place)}",
         *_glass(surface.glass, place),
         *([] if surface.conic is None else [f"  CONI {exact(surface.conic, 'conic constant', place)}"]),
@@ -210,7 +210,7 @@ def _type(surface: Surface, place: Place) -> str:
     if kind is None:
         message = f"a .zmx file has no type for a surface of {feature}; write a table (.csv)"
         raise LensFileError(message, place)
-    row = TYPES[kind]
+    row = types()[kind]
     for name, quantity in _SHAPE.items():
         if getattr(surface, name) is not None and name not in row.holds:
             raise LensFileError(f"{feature} with a {quantity}: a {kind} surface has none", place)
@@ -322,10 +322,6 @@ _POWERS = {
         keyword: {k: power for k, power in enumerate(row.powers, 1 + row.from_surface) if power}
         for keyword, row in THICKNESS_SOLVES.items()
     },
-    **{
-        keyword: dict.fromkeys(range(1, 1 + (SHAPES[name].sizes or 0)), 1)
-        for keyword, (name, _) in APERTURE_KEYWORDS.items()
-    },
 }
 
 
@@ -337,7 +333,7 @@ def _in_unit(lines: Iterable[str], millimetres: float, place: Place) -> list[str
     if unit is None:
         message = f"a unit of {millimetres!r} mm, expected 1, 10, 25.4 or 1000 (MM, CM, IN, METER)"
         raise LensFileError(message, place)
-    angles, row, converted = False, TYPES["STANDARD"], []
+    angles, row, converted = False, types()["STANDARD"], []
     for line in lines:
         words = line.split()
         keyword = words[0] if words else ""
@@ -346,7 +342,7 @@ def _in_unit(lines: Iterable[str], millimetres: float, place: Place) -> list[str
         elif keyword == "FTYP":
             angles = words[1] == "0"
         elif keyword == "TYPE":
-            row = TYPES[words[1]]
+            row = types()[words[1]]
         if powers := _powers_of(words, row, angles):
             indent = line[: len(line) - len(line.lstrip())]
             numbers = (in_file(w, powers[k], millimetres) if k in powers else w for k, w in enumerate(words))
@@ -373,7 +369,8 @@ def _powers_of(words: list[str], row: SurfaceType, angles: bool) -> dict[int, in
         return {} if angles else dict.fromkeys(range(1, len(words)), 1)
     if keyword == "FEFD":
         return {} if angles else {1: 1, 2: 1}
-    return _POWERS.get(keyword, {})
+    shape, _ = aperture_keywords().get(keyword, ("", False))
+    return dict.fromkeys(range(1, 1 + (SHAPES[shape].sizes or 0)), 1) if shape else _POWERS.get(keyword, {})
 
 
 def in_file(word: str, power: int | None, millimetres: float) -> str:
