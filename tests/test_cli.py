@@ -708,7 +708,7 @@ BAD_RAYS = {
         "bad.csv:1: column 'wavelenght' is not known; is 'wavelength'",
     ),
     "in nm": ("x,y,z,l,m,n,wavelength_nm\n0,0,0,0,0,1,500\n", "bad.csv:1: column 'wavelength_nm' is not known"),
-    "twice": ("x,X,y,z,l,m,n\n0,0,0,0,0,0,1\n", "bad.csv:1: column 'x' stands twice"),
+    "twice": ("x,X,y,z,l,m,n\n0,0,0,0,0,0,1\n", "bad.csv:1: column 'x' occurs twice"),
     "no wavelength": ("x,y,z,l,m,n,wavelength\n0,0,0,0,0,1,\n", "bad.csv:2: column wavelength"),
     "binary": ("\x00\xff\x17" * 300, "bad.csv"),
 }

@@ -446,7 +446,7 @@ def test_a_catalog_beside_the_file_is_found_by_its_name(tmp_path):
     path.write_text(SINGLET.replace("NBK7_SCHOTT", "MY1_MINE"))
     lens, report = read_lens_with_report(path)
     assert (lens.surfaces[1].glass.name, float(index(lens.surfaces[1].glass, 0.5))) == ("MY-1", 1.6)
-    assert any("Mine.agf beside the lens" in note for note in report.notes)
+    assert any("Mine.agf in the folder of the lens" in note for note in report.notes)
     write_lens(lens, tmp_path / "again.seq")
     assert leaves(read_lens(tmp_path / "again.seq")) == leaves(lens)
     with pytest.raises(UnknownGlass, match="MY1_MINE"):

@@ -223,7 +223,7 @@ def check(
 ) -> ImportReport:
     """The report of a lens file: keywords that were read and left out, the source of each glass, notes and warnings.
 
-    strict: raise where something was assumed. configuration: the one that has to be traceable. evaluated: as for
+    strict: raise where something was assumed. configuration: that which must be traceable. evaluated: as for
     `read_lens_with_report`. Raises as `read_lens`, and LensFileError for a lens that cannot be traced.
     """
     return checked(path, catalogs, strict, configuration, substitute, evaluated)[1]
@@ -283,9 +283,9 @@ def convert(
 def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | Path] = ()) -> None:
     """Write a lens in the format of the suffix. The file is replaced as a whole or not at all.
 
-    catalogs: the glass catalogs (.agf) that the lens was read with. Raises LensFileError for what the format cannot
-    hold, for what would not be read again, and where the file cannot be written. Warns LensFileWarning of texts and
-    other data that the file does not bring back.
+    catalogs: the glass catalogs (.agf) that the lens was read with. Raises LensFileError for a lens that the format
+    cannot hold or that could not be read again, and where the file cannot be written. Warns LensFileWarning of texts
+    and other data that the file does not bring back.
     """
     path = Path(path)
     try:
@@ -333,4 +333,4 @@ def _changes(lens: Lens, content: bytes, form: Format, path: Path, catalogs: Seq
                 read_again = dataclasses.replace(read_again, variables=data.variables)
         if read_again != data:
             pairs.append(("the optimisation data", f"{len(data.merit)} rows of a merit function", ""))
-    return [f"{what} ({shown(str(before))})" for what, before, after in pairs if before != after]
+    return [f"{quantity} ({shown(str(before))})" for quantity, before, after in pairs if before != after]

@@ -134,13 +134,16 @@ def catalogs_in_folder(file: str) -> AtHand:
         paths = sorted(path for path in Path(file).parent.iterdir() if path.suffix.lower() == ".agf" and path.is_file())
     except (OSError, ValueError):
         return {}
-    return {path.stem.upper(): (f"{path.name} beside the lens", partial(load, path, listed=True)) for path in paths}
+    return {
+        path.stem.upper(): (f"{path.name} in the folder of the lens", partial(load, path, listed=True))
+        for path in paths
+    }
 
 
 def catalogs_of_lens(
     names: Sequence[str], user: Sequence[Path], report: Draft, packed: AtHand | None = None
 ) -> tuple[str | Catalog, ...]:
-    """The catalogs that a lens file names, in its order: one that came with the lens itself, any other by its name.
+    """The catalogs that a lens file names, in its order: a `Catalog` that came with the lens, others by name.
 
     A catalog comes with the lens as NAME.agf in its folder, in upper or lower case, or `packed` in an archive. It
     precedes a shipped catalog of its name, and is ignored where `user` has one. The report lists the catalogs that were

@@ -29,7 +29,7 @@ NEAREST, FORMULA = "nearest", "formula"
 
 
 class BadSubstitute(ValueError):
-    """A malformed substitute; the message says what was found and what was expected."""
+    """A malformed substitute; the message has the value found and the value expected."""
 
 
 @dataclass(frozen=True)
@@ -319,8 +319,8 @@ class Draft:
             keywords.append(Keyword(name, status, count, tuple(lines[:_LISTED]), tuple(surfaces)[:_LISTED], reason))
             if status == UNKNOWN:
                 times = "" if count == 1 else f" ({count} times)"
-                what = name if name.startswith("member ") else f"keyword {name}"
-                self.warn(f"unknown {what}{times}: left out", place._replace(surface=None))
+                label = name if name.startswith("member ") else f"keyword {name}"
+                self.warn(f"unknown {label}{times}: left out", place._replace(surface=None))
         for name in self.substitutes.named:
             if name not in self.substituted:
                 message = f"a substitute for the glass {name} was requested, which is not in the file"

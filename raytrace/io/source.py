@@ -50,7 +50,7 @@ class Place(NamedTuple):
 
 
 class LensFileError(ValueError):
-    """A lens file that cannot be read or written. The message is one line: where, what was found, how to fix it.
+    """A lens file that cannot be read or written. The message is one line: place, finding, expectation, remedy.
 
     file, line, surface: the position in the file; None where that does not apply.
     """
@@ -130,21 +130,21 @@ def decode(content: bytes, place: Place) -> str:
 # -- numbers ----------------------------------------------------------------------------------------------------------
 
 
-def number(text: str, what: str, place: Place) -> float:
+def number(text: str, quantity: str, place: Place) -> float:
     """A finite decimal number, Fortran's D exponent included. Raises LensFileError for anything else."""
     if len(text) > _DIGITS or not _NUMBER.fullmatch(text):
-        raise LensFileError(f"{what} is {shown(text)}, expected a finite number", place)
+        raise LensFileError(f"{quantity} is {shown(text)}, expected a finite number", place)
     result = plain(text)
     if result in (float("inf"), float("-inf")):
-        raise LensFileError(f"{what} is {shown(text)}, too large for a 64-bit number", place)
+        raise LensFileError(f"{quantity} is {shown(text)}, too large for a 64-bit number", place)
     return result
 
 
-def integer(text: str, what: str, place: Place) -> int:
+def integer(text: str, quantity: str, place: Place) -> int:
     """A whole number below a million in size, written with or without a decimal point."""
-    result = number(text, what, place)
+    result = number(text, quantity, place)
     if result != int(result) or abs(result) >= 1e6:
-        raise LensFileError(f"{what} is {shown(text)}, expected a whole number", place)
+        raise LensFileError(f"{quantity} is {shown(text)}, expected a whole number", place)
     return int(result)
 
 
@@ -168,22 +168,22 @@ def double(numbers: float | list) -> Tensor:
     return torch.as_tensor(numbers, dtype=torch.float64)
 
 
-def exact(number: Tensor | float, what: str, place: Place) -> str:
+def exact(number: Tensor | float, quantity: str, place: Place) -> str:
     """The shortest decimal (at most 17 digits) that reads back as the same 64-bit number.
 
     Raises LensFileError for a batch of numbers, nan and infinity.
     """
-    return exact_list(torch.as_tensor(number, dtype=torch.float64), what, place, axes=0)[0]
+    return exact_list(torch.as_tensor(number, dtype=torch.float64), quantity, place, axes=0)[0]
 
 
-def exact_list(numbers: Tensor, what: str, place: Place, *, axes: int = 1) -> list[str]:
+def exact_list(numbers: Tensor, quantity: str, place: Place, *, axes: int = 1) -> list[str]:
     """`exact` of every number of a one-dimensional tensor."""
     if numbers.ndim != axes:
         shape = tuple(numbers.shape)
-        raise LensFileError(f"{what} has the shape {shape}; a file holds one lens: write one of them", place)
+        raise LensFileError(f"{quantity} has the shape {shape}; a file holds one lens: write one of them", place)
     values = numbers.detach().double().reshape(-1)
     for value in values[~torch.isfinite(values)].tolist():
-        raise LensFileError(f"{what} is {value}; only finite numbers can be written", place)
+        raise LensFileError(f"{quantity} is {value}; only finite numbers can be written", place)
     return [repr(value) for value in values.tolist()]
 
 
@@ -206,7 +206,7 @@ def refuse_sag_terms(surface: Surface, place: Place) -> None:
         feature = "is tilted or decentred"
     else:
         return
-    raise LensFileError(f"the surface {feature}, which this format does not hold; write a .zmx file", place)
+    raise LensFileError(f"the surface {feature}, which this format does not hold; a .zmx file holds most kinds", place)
 
 
 # -- texts: unchanged where that reads back, else quoted and escaped as in JSON ---------------------------------------
@@ -256,10 +256,10 @@ def _is_quoted(text: str) -> bool:
     return len(text) > 1 and text[0] == text[-1] == '"'
 
 
-def one_line(text: str, what: str, place: Place) -> str:
+def one_line(text: str, quantity: str, place: Place) -> str:
     """A text without its surrounding blanks. Raises LensFileError if it does not fit on one line of a file."""
     if not is_printable(text.replace("\t", " ")):
-        raise LensFileError(f"{what} holds a line break or a control character, and cannot be written", place)
+        raise LensFileError(f"{quantity} holds a line break or a control character, and cannot be written", place)
     return text.strip()
 
 
@@ -275,20 +275,20 @@ class Record(NamedTuple):
     place: Place
     indented: bool = False
 
-    def number(self, position: int, what: str, default: float | None = None) -> float:
+    def number(self, position: int, quantity: str, default: float | None = None) -> float:
         """The finite number at a position (0 is the first after the keyword), or `default` where the line ends."""
         if position < len(self.words):
-            return number(self.words[position], f"{self.keyword}: {what}", self.place)
+            return number(self.words[position], f"{self.keyword}: {quantity}", self.place)
         if default is None:
-            raise LensFileError(f"{self.keyword} has {len(self.words)} values; {what} is missing", self.place)
+            raise LensFileError(f"{self.keyword} has {len(self.words)} values; {quantity} is missing", self.place)
         return default
 
-    def integer(self, position: int, what: str, default: int | None = None) -> int:
+    def integer(self, position: int, quantity: str, default: int | None = None) -> int:
         """The whole number at a position, or `default` where the line ends."""
         if position >= len(self.words) and default is not None:
             return default
-        self.number(position, what)
-        return integer(self.words[position], f"{self.keyword}: {what}", self.place)
+        self.number(position, quantity)
+        return integer(self.words[position], f"{self.keyword}: {quantity}", self.place)
 
 
 class Block:

@@ -127,15 +127,15 @@ def _refuse_estimates(name: str, waves: Sequence[float], error: float, *, place:
     if not waves:
         return
     listed = ", ".join(f"{1e3 * wave:g}" for wave in waves[:5])
-    what = f"the index of {name} at {listed} nm is estimated by a formula, to about {error:.1e}"
+    estimate = f"the index of {name} at {listed} nm is estimated by a formula, to about {error:.1e}"
     if error <= _MOST_ERROR:
-        report.note(f"{place}: {what}")
+        report.note(f"{place}: {estimate}")
     elif report.substitutes.takes_formula(name):
         report.substituted.add(name.upper())
-        report.warn(f"{what}, as requested", place)
+        report.warn(f"{estimate}, as requested", place)
     else:
         ways = f"--substitute {name}=GLASS, or {name}={FORMULA} to accept the estimate (`substitute`)"
-        message = f"{what}; expected {_MOST_ERROR:.0e} at most: name the intended glass by {ways}"
+        message = f"{estimate}; expected {_MOST_ERROR:.0e} at most: name the intended glass by {ways}"
         raise LensFileError(message, place)
 
 

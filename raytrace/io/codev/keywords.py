@@ -12,7 +12,7 @@ from typing import NamedTuple
 from raytrace.io.report import IGNORED, READ, UNKNOWN, Draft
 from raytrace.io.source import MAX_SURFACES, Block, LensFileError, Place, Record, UnsupportedSurface, is_number, shown
 
-#: Field points by what they are: the commands of x and y.
+#: Commands of x and y of the field points, by the kind of field.
 FIELD_KINDS = {
     "angle": ("XAN", "YAN"),
     "object_height": ("XOB", "YOB"),
@@ -209,7 +209,7 @@ class Stream:
             self._take_glass(record)
         elif any("^" in word for word in (record.keyword, *record.words) if word[0] not in "'\""):
             raise LensFileError("variables of macros (^) are not followed; export the lens as numbers", record.place)
-        elif zoom := next((found for word in record.words[:2] if (found := _ZOOM.fullmatch(word))), None):
+        elif zoom := next((match for word in record.words[:2] if (match := _ZOOM.fullmatch(word))), None):
             self._take_zoomed(record, zoom)
         else:
             self._take_command(record)
@@ -271,15 +271,15 @@ class Stream:
             raise LensFileError(f"S{number} where S{count} should follow; lines lost or reordered?", record.place)
         self._first_numbers(record._replace(place=self._place(record)))
 
-    def _append(self, record: Record, what: str) -> None:
+    def _append(self, record: Record, role: str) -> None:
         count = len(self.surfaces)
         if count >= MAX_SURFACES:
             raise LensFileError(f"more than {MAX_SURFACES} surfaces; no sequential lens has so many", record.place)
         if self.has_image:
             raise LensFileError("a surface after SI, the image", record.place)
-        if (count == 0) != (what == "object"):
+        if (count == 0) != (role == "object"):
             raise LensFileError(f"{record.keyword} as surface {count}; a lens begins with SO, the object", record.place)
-        self.has_image = what == "image"
+        self.has_image = role == "image"
         self.pointer = Block(record.place._replace(surface=count))
         self.surfaces.append(self.pointer)
 
@@ -298,8 +298,8 @@ class Stream:
             message = "its first number may be a radius (RDM) or a curvature (RDM N), which is not specified before"
             raise LensFileError(f"{message}; add one of them", place)
         mirror = len(words) > 2 and unquoted(words[2]).upper() == "REFL"
-        given = (self.slope or "RDY", "THI", "RMD" if mirror else "GLA", "RMD")
-        for word, keyword in zip(words, given, strict=False):
+        keywords = (self.slope or "RDY", "THI", "RMD" if mirror else "GLA", "RMD")
+        for word, keyword in zip(words, keywords, strict=False):
             slot = "CUY" if keyword == "RDY" else keyword
             self.pointer.records.setdefault(slot, []).append(record._replace(keyword=keyword, words=(word,)))
 

@@ -202,9 +202,9 @@ def _list(system: Block, keyword: str) -> tuple[list[str], Record] | None:
     return (listed, record) if listed else None
 
 
-def _numbers(system: Block, keyword: str, what: str) -> tuple[list[float], Record] | None:
+def _numbers(system: Block, keyword: str, quantity: str) -> tuple[list[float], Record] | None:
     listed = _list(system, keyword)
-    return listed and ([number(word, f"{keyword}: {what}", listed[1].place) for word in listed[0]], listed[1])
+    return listed and ([number(word, f"{keyword}: {quantity}", listed[1].place) for word in listed[0]], listed[1])
 
 
 def _fields(system: Block, unit: float, report: Draft) -> dict:

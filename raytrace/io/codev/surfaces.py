@@ -54,8 +54,8 @@ def phase(block: Block, radius: float, unit: float) -> RadialPhase | None:
     if [word.upper() for word in kind] != ["DOE"]:
         raise UnsupportedSurface(f"DIF {' '.join(kind)[:40]} (diffractive surface) is not modelled", record.place)
     if not type_ or [word.upper() for word in type_.words] != ["R"]:
-        found = f"HCT {' '.join(type_.words)[:40]}" if type_ else "DIF DOE without HCT"
-        raise UnsupportedSurface(f"{found} is not modelled; modelled is HCT R, powers of r²", record.place)
+        stated = f"HCT {' '.join(type_.words)[:40]}" if type_ else "DIF DOE without HCT"
+        raise UnsupportedSurface(f"{stated} is not modelled; modelled is HCT R, powers of r²", record.place)
     if wave is None or wave.number(0, "wavelength") <= 0:
         raise LensFileError("DIF DOE without the wavelength of its construction (HWL)", record.place)
     length = _fraction(wave.words[0]) * _NANOMETRE
@@ -85,9 +85,9 @@ def _radians(record: Record | None, j: int, length: Fraction, radius: float, uni
     if record is None:
         return 0.0
     written = _fraction(record.words[1]) / Fraction(unit) ** (2 * j - 1)
-    found = Fraction(2 * math.pi) * written * Fraction(radius) ** (2 * j) / length
+    radians = Fraction(2 * math.pi) * written * Fraction(radius) ** (2 * j) / length
     try:
-        return float(found) + 0.0
+        return float(radians) + 0.0
     except OverflowError as error:
         raise LensFileError(f"HCO C{j} is too large", record.place) from error
 
@@ -112,9 +112,9 @@ def phase_lines(phase: RadialPhase, wavelength: float, place: Place) -> list[str
 
 def _length(term: float, j: int, length: Fraction, radius: float) -> str:
     """C_j with up to _DIGITS digits."""
-    found = Fraction(term) * length / (Fraction(2 * math.pi) * Fraction(radius) ** (2 * j))
+    length_of_term = Fraction(term) * length / (Fraction(2 * math.pi) * Fraction(radius) ** (2 * j))
     with localcontext(prec=_DIGITS):
-        return str(Decimal(found.numerator) / Decimal(found.denominator))
+        return str(Decimal(length_of_term.numerator) / Decimal(length_of_term.denominator))
 
 
 #: An object at this distance or further away, in the unit of the file, is at infinity.
@@ -160,21 +160,21 @@ def _thickness(block: Block, unit: float) -> Tensor:
         raise LensFileError("surface without a thickness; S is followed by radius, thickness, glass", block.place)
     word = record.words[0] if record.words else ""
     is_object = block.place.surface == 0
-    found = float("inf") if is_object and is_infinite(word) else number(word, "thickness", record.place)
-    if is_object and found <= -INFINITY:
+    distance = float("inf") if is_object and is_infinite(word) else number(word, "thickness", record.place)
+    if is_object and distance <= -INFINITY:
         raise LensFileError(
             f"thickness is {shown(word)}, expected a distance or {INFINITY:g} for infinity", record.place
         )
-    return double(float("inf") if is_object and found >= INFINITY else found * unit)
+    return double(float("inf") if is_object and distance >= INFINITY else distance * unit)
 
 
 def _curvature(block: Block, unit: float) -> Tensor | None:
     """Of RDY, a radius, or CUY; 0 is a plane in both."""
     record = block.last("CUY")
-    found = record.number(0, "radius or curvature") if record else 0.0
-    if not found:
+    value = record.number(0, "radius or curvature") if record else 0.0
+    if not value:
         return None
-    curvature = found / unit if record.keyword == "CUY" else 1.0 / (found * unit)
+    curvature = value / unit if record.keyword == "CUY" else 1.0 / (value * unit)
     return double(curvature) if curvature else None
 
 
@@ -187,15 +187,15 @@ def _conic(block: Block) -> Tensor | None:
     record, flat = block.last("K"), block.last("CUF")
     if flat and flat.number(0, "CUF", 0.0):
         raise UnsupportedSurface(f"CUF {flat.words[0][:40]} (fraction of a curvature) is not modelled", flat.place)
-    found = record.number(0, "conic constant") if record else 0.0
-    if found and _type(block) == "SPH":
+    conic = record.number(0, "conic constant") if record else 0.0
+    if conic and _type(block) == "SPH":
         raise LensFileError("K on a sphere; put CON or ASP before it", record.place)
-    return double(found) if found else None
+    return double(conic) if conic else None
 
 
 def _coefficients(block: Block, unit: float) -> Tensor | None:
     """a_j of r^(2j): A is a_2; those up to the last letter that is there."""
-    given = [letter for letter in LETTERS if block.last(letter)]
+    letters = [letter for letter in LETTERS if block.last(letter)]
     records = [block.last(letter) for letter in LETTERS]
     if _type(block) != "ASP":
         for record in filter(None, records):
@@ -203,9 +203,9 @@ def _coefficients(block: Block, unit: float) -> Tensor | None:
                 message = f"{record.keyword} on a surface that is no asphere; put ASP before it"
                 raise LensFileError(message, record.place)
         return None
-    count = LETTERS.index(given[-1]) + 1 if given else 0
-    found = [record.number(0, "coefficient") if record else 0.0 for record in records[:count]]
-    return double([0.0, *(value / unit ** (2 * j - 1) for j, value in enumerate(found, 2))])
+    count = LETTERS.index(letters[-1]) + 1 if letters else 0
+    terms = [record.number(0, "coefficient") if record else 0.0 for record in records[:count]]
+    return double([0.0, *(value / unit ** (2 * j - 1) for j, value in enumerate(terms, 2))])
 
 
 def _medium(block: Block, before: Glass, library: GlassLibrary, report: Draft) -> Glass:
@@ -214,14 +214,14 @@ def _medium(block: Block, before: Glass, library: GlassLibrary, report: Draft) -
     if word not in ("REFL", "REFR"):
         raise UnsupportedSurface(f"RMD {word[:40]} is not modelled; modelled are REFL and REFR", mode.place)
     place = glass.place if glass else block.place
-    given = glass.words[0] if glass and glass.words else ""
-    found = medium(given, library, place=place, report=report)
+    name = glass.words[0] if glass and glass.words else ""
+    glass_behind = medium(name, library, place=place, report=report)
     if word == "REFR":
-        return found
+        return glass_behind
     if block.place.surface == 0:
         raise LensFileError("the object is a mirror (REFL)", mode.place)
-    if given and found.name != before.name:
-        message = f"a mirror followed by {shown(given)}, while light stays in {before.name or 'air'}"
+    if name and glass_behind.name != before.name:
+        message = f"a mirror followed by {shown(name)}, while light stays in {before.name or 'air'}"
         raise LensFileError(f"{message}; leave out the glass behind REFL", place)
     return MIRROR
 
@@ -250,10 +250,10 @@ def _pose(block: Block, unit: float) -> Pose | None:
     numbers = {}
     for name, word in POSE_WORDS.items():
         record = block.last(word)
-        found = record.number(0, "decentre or tilt") if record else 0.0
-        if found:
+        value = record.number(0, "decentre or tilt") if record else 0.0
+        if value:
             sign = -1.0 if word in LEFT_HANDED else 1.0
-            numbers[name] = double(sign * found * (1.0 if name.startswith("tilt") else unit))
+            numbers[name] = double(sign * value * (1.0 if name.startswith("tilt") else unit))
     return Pose(**numbers) if numbers else None
 
 
@@ -269,7 +269,7 @@ def _apertures(block: Block, unit: float, report: Draft) -> tuple[tuple[Aperture
             word = words.pop(0)
             kind, label = (word.upper(), label) if word.upper() in _KINDS else (kind, word[1:].upper())
         groups.setdefault((kind, label), {})[record.keyword] = record._replace(words=tuple(words))
-    found, semi_diameter = [], None
+    apertures, semi_diameter = [], None
     for (kind, label), sizes in groups.items():
         if kind == "EDG":
             semi_diameter = sizes["CIR"].number(0, "edge of the part") * unit if "CIR" in sizes else semi_diameter
@@ -277,16 +277,16 @@ def _apertures(block: Block, unit: float, report: Draft) -> tuple[tuple[Aperture
             first = next(iter(sizes.values()))
             report.warn("a hole in the part (HOL) is left out: no ray is clipped by it", first.place)
         else:
-            found.append(_aperture(sizes, kind == "OBS", unit))
-            if label.strip("'\"") == RING and len(found) > 1:
-                found[-2:] = _ring(*found[-2:])
-    clear = [aperture for aperture in found if not aperture.obscures]
+            apertures.append(_aperture(sizes, kind == "OBS", unit))
+            if label.strip("'\"") == RING and len(apertures) > 1:
+                apertures[-2:] = _ring(*apertures[-2:])
+    clear = [aperture for aperture in apertures if not aperture.obscures]
     if len(clear) > 1:
         message = f"{len(clear)} clear apertures on one surface; whether light passes any or all of them is ambiguous"
         raise LensFileError(message, block.all("APERTURE")[0].place)
     if semi_diameter is not None and semi_diameter < 0:
         raise LensFileError("CIR EDG is negative, expected a semi-diameter of 0 or more", block.place)
-    return tuple(found), semi_diameter
+    return tuple(apertures), semi_diameter
 
 
 def _ring(outer: Aperture, inner: Aperture) -> list[Aperture]:

@@ -33,8 +33,8 @@ def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
     """The content of a .seq file of the lens, in mm, its surfaces by their curvatures.
 
     file: its name, for messages. catalogs: the user's glass catalogs that the lens was read with.
-    Raises LensFileError for what a .seq file cannot hold: a batch of lenses, nan, terms of r² and beyond r²⁰, apertures
-    other than EPD, FNO and NAO, polygons, names and partial dispersion of model glasses.
+    Raises LensFileError for data that a .seq file cannot hold: a batch of lenses, nan, terms of r² and beyond r²⁰,
+    apertures other than EPD, FNO and NAO, polygons, names and partial dispersion of model glasses.
     """
     place, private = Place(file), {}
     surfaces = []
@@ -71,9 +71,9 @@ def _system(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
     ]
 
 
-def _weights(numbers: Tensor, what: str, place: Place) -> list[str]:
+def _weights(numbers: Tensor, quantity: str, place: Place) -> list[str]:
     """Whole numbers without a point."""
-    return [weight.removesuffix(".0") for weight in exact_list(numbers, what, place)]
+    return [weight.removesuffix(".0") for weight in exact_list(numbers, quantity, place)]
 
 
 def _own(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
@@ -88,12 +88,12 @@ def _own(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
     ]
 
 
-def _quoted(text: str, what: str, place: Place) -> str:
+def _quoted(text: str, quantity: str, place: Place) -> str:
     """A text in quotes, of the kind that is not in it."""
-    line = one_line(text, what, place)
+    line = one_line(text, quantity, place)
     mark = next((mark for mark in "'\"" if mark not in line), None)
     if mark is None:
-        raise LensFileError(f"{what} holds both kinds of quotes, of which a .seq file needs one around it", place)
+        raise LensFileError(f"{quantity} holds both kinds of quotes, of which a .seq file needs one around it", place)
     return f"{mark}{line}{mark}"
 
 

@@ -44,7 +44,7 @@ _SYSTEM_REFUSED = _rows(
         "a jump between surfaces": "GTO",
     }
 )
-#: Switches of the system that change what is traced, unless they are off.
+#: Switches of the system that change the trace, unless they are off.
 _OFF = ("OFF", "0", "NO")
 _SWITCHES = {"TELE": "telecentric object space", "WARM": "wide-angle ray aiming", "AFO": "afocal image space"}
 
@@ -129,8 +129,8 @@ def sections(text: str, file: str, report: Draft) -> Sections:
         if ended:
             word = record.keyword[:40]
             if word in ("LEN", "CFG"):
-                what = "another lens" if word == "LEN" else "further configurations"
-                report.warn(f"{word} ({what}) after END: the lens before it is read, unchanged", record.place)
+                kind = "another lens" if word == "LEN" else "further configurations"
+                report.warn(f"{word} ({kind}) after END: the lens before it is read, unchanged", record.place)
             report.met(word, IGNORED, record.place, TAIL_REASON)
             continue
         ended = record.keyword == "END"
@@ -213,8 +213,8 @@ def _beyond(of_surface: Record, record: Record, report: Draft, at_end: bool) -> 
     elif word == "LMO" and [text.upper() for text in record.words[:1]] in (["ELE"], ["EGR"]):
         report.met(word, IGNORED, of_surface.place, "a group of surfaces under one name")
     elif word in _SURFACE_REFUSED or word == "LMO" or re.fullmatch(r"AS\d+", word):
-        what = _SURFACE_REFUSED.get(word, "a group that is not sequential" if word == "LMO" else "a general asphere")
-        raise UnsupportedSurface(f"{word} ({what}) is not modelled", of_surface.place)
+        feature = _SURFACE_REFUSED.get(word, "a group that is not sequential" if word == "LMO" else "a general asphere")
+        raise UnsupportedSurface(f"{word} ({feature}) is not modelled", of_surface.place)
     elif at_end:
         report.met(word[:40], UNKNOWN, record.place)
     else:

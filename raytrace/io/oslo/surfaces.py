@@ -71,7 +71,7 @@ def poses(commands: Commands, unit: float) -> dict[str, Pose]:
 
 
 class Built(NamedTuple):
-    """A surface, and the commands that it was made of."""
+    """A surface and its commands."""
 
     surface: Surface
     commands: Commands
@@ -253,9 +253,9 @@ def build(commands: Commands, before: Sequence[Built], unit: float, user: Sequen
     return Built(surface, commands)
 
 
-def _last_number(commands: Commands, word: str, what: str) -> float:
+def _last_number(commands: Commands, word: str, quantity: str) -> float:
     record = commands.last(word)
-    return record.number(0, what) if record else 0.0
+    return record.number(0, quantity) if record else 0.0
 
 
 def step_of(built: Built, primary: float, before: Step | None) -> Step:
@@ -313,8 +313,8 @@ def _thickness(commands: Commands, unit: float) -> float:
 
 def _coefficients(commands: Commands, unit: float) -> torch.Tensor | None:
     """Of r², r⁴, … r¹⁰: OSLO's asphere begins with r⁴."""
-    found = {power: commands.last(word) for word, power in _TERMS.items()}
-    terms = [0.0, *(r.number(0, f"coefficient of r^{p}") / unit ** (p - 1) if r else 0.0 for p, r in found.items())]
+    records = {power: commands.last(word) for word, power in _TERMS.items()}
+    terms = [0.0, *(r.number(0, f"coefficient of r^{p}") / unit ** (p - 1) if r else 0.0 for p, r in records.items())]
     return double(terms) if any(terms) else None
 
 

@@ -112,9 +112,9 @@ def meaning(heading: str) -> Heading | None:
     text = re.sub(r"\s+", " ", re.sub(r"(?<=[\u3040-\u9fff])(?=[!-~νυφ])", " ", text))
     text = re.sub(r"(?<=\s)(?:at|for|the)\s", "", text)
     bare = squeezed(text)
-    found = _named(bare) or _at_wavelength(text.replace(" ", ""))
-    if found or len(text) > 60 or text.count(" ") > 8:
-        return found
+    known = _named(bare) or _at_wavelength(text.replace(" ", ""))
+    if known or len(text) > 60 or text.count(" ") > 8:
+        return known
     if bare.casefold() in _UNITS:
         return Heading("", _UNITS[bare.casefold()])
     for separators in (r"[\[\](){}【】（）]", r"[,;/=]", r"\s(?=\S+$)", r"(?<=\S)\s"):
@@ -145,8 +145,8 @@ def _named(bare: str) -> Heading | None:
 
 def _at_wavelength(text: str) -> Heading | None:
     """An index, or a line, by its wavelength: n(587.6nm) is nd."""
-    found = _WAVELENGTH.fullmatch(text)
-    near = [name for name, place in LINES.items() if abs(1e3 * place - float(found[1])) < 0.6] if found else []
+    match = _WAVELENGTH.fullmatch(text)
+    near = [name for name, place in LINES.items() if abs(1e3 * place - float(match[1])) < 0.6] if match else []
     return Heading(f"{'index' if text[0] in 'nN' else 'line'} {near[0]}") if len(near) == 1 else None
 
 
@@ -187,10 +187,10 @@ def is_header(cells: list[str], *, known: float = 0.5) -> bool:
     cells = [cell for cell in cells if cell.strip()]
     if not 2 <= len(cells) <= 200 or max(map(len, cells)) > 60:
         return False
-    found = [column for column in _without_counters(cells)[1] if column is not None]
-    names = {column.name for column in found}
+    headings = [column for column in _without_counters(cells)[1] if column is not None]
+    names = {column.name for column in headings}
     complete = names & {"thickness", "d", "D"} and names & {"curvature", "radius"}
-    return bool(complete) and len(found) >= known * len(cells)
+    return bool(complete) and len(headings) >= known * len(cells)
 
 
 def columns(cells: Sequence[str], units: str, ignored: Sequence[str], place: Place, report: Draft) -> list[str | None]:
@@ -199,12 +199,12 @@ def columns(cells: Sequence[str], units: str, ignored: Sequence[str], place: Pla
     units: of the header; ignored: headings that the header leaves out. Raises LensFileError for two columns of one
     meaning, for a column in other units, and for an ambiguous one.
     """
-    cells, found = _without_counters(cells)
+    cells, headings = _without_counters(cells)
     for k, cell in enumerate(cells):
         if squeezed(cell).casefold() in ignored and cell.strip():
-            found[k] = Heading("ignored as the header says")
-    _check_units(cells, found, units, place)
-    names = [column.name if column else None for column in found]
+            headings[k] = Heading("ignored as the header says")
+    _check_units(cells, headings, units, place)
+    names = [column.name if column else None for column in headings]
     if names and not cells[0].strip():
         names[0] = "label"
     _settle_thickness(cells, names, place, report)
@@ -228,8 +228,8 @@ def _without_counters(cells: Sequence[str]) -> tuple[list[str], list[Heading | N
     return list(cells), [meaning(cell) for cell in cells]
 
 
-def _check_units(cells: Sequence[str], found: list[Heading | None], units: str, place: Place) -> None:
-    for cell, column in zip(cells, found, strict=True):
+def _check_units(cells: Sequence[str], headings: list[Heading | None], units: str, place: Place) -> None:
+    for cell, column in zip(cells, headings, strict=True):
         if column is None or column.name not in _LENGTHS or not column.unit:
             continue
         scale = MILLIMETRES.get(column.unit.upper())
@@ -260,8 +260,10 @@ def _settle_lines(cells: list[str], names: list[str | None], place: Place) -> No
         for k, name in enumerate(names):
             if name != kind:
                 continue
-            own = {n.split()[1] for n in names if n and n.startswith(kind + " ")}
-            if (kind == "abbe" and lines and not lines & {"d", "D"}) or (kind == "index" and (lines - {"d"} or own)):
+            lines_of_kind = {n.split()[1] for n in names if n and n.startswith(kind + " ")}
+            if (kind == "abbe" and lines and not lines & {"d", "D"}) or (
+                kind == "index" and (lines - {"d"} or lines_of_kind)
+            ):
                 symbol = "n" if kind == "index" else "V"
                 fix = f"write '{symbol}d' or '{symbol}e'"
                 raise LensFileError(f"column {shown(cells[k])} does not name its spectral line; {fix}", place)
@@ -281,12 +283,12 @@ def _refuse_repeats(cells: list[str], names: list[str | None], place: Place) -> 
 
 
 def _report(cell: str, name: str | None, place: Place, report: Draft) -> None:
-    what = f"column {cell[:40] or '(unnamed)'}"
+    label = f"column {cell[:40] or '(unnamed)'}"
     if name and name.startswith("ignored"):
-        report.met(what, IGNORED, place, name.removeprefix("ignored "))
+        report.met(label, IGNORED, place, name.removeprefix("ignored "))
     elif name:
-        report.met(what, READ, place)
+        report.met(label, READ, place)
     elif cell.strip():
-        report.met(what, UNKNOWN, place)
+        report.met(label, UNKNOWN, place)
     if name == "diameter":
         report.note(f"column {shown(cell)} is a diameter: halved")

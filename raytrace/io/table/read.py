@@ -56,7 +56,7 @@ _IMAGE = re.compile(r"\b(image|ima|img|sensor|detector|bild|bildebene)\b|像面|
 _OBJECT = re.compile(r"\b(object|obj|objekt|objet)\b|物体|物面", re.IGNORECASE)
 
 
-#: Where a row may be called the stop, and by what; the first column that has one counts.
+#: Columns in which a row may be called the stop, and its names there; the first column that has one counts.
 _STOP_MARKS = (
     ("stop", re.compile(r"x|yes|true|1|stop|sto|\*|y", re.IGNORECASE).fullmatch),
     ("type", _STOP.search),

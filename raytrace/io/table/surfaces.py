@@ -124,14 +124,14 @@ _UNSUPPORTED = re.compile(
 
 def refuse_unsupported(rows: Sequence[Row]) -> None:
     """Raise UnsupportedSurface for the first row whose type, or name, is that of a surface that is not modelled."""
-    own = {word for kind in KINDS.values() for word in kind.words}
+    words_of_kinds = {word for kind in KINDS.values() for word in kind.words}
     for row in rows:
         kind, label = row.cells.get("type", ""), row.cells.get("label", "")
-        unknown = any(not _TYPE.fullmatch(word) and word not in own for word in _words(kind))
-        other = _UNSUPPORTED.search(label) and not own & set(_words(label))
-        found = kind if unknown else label if other else ""
-        if found:
-            message = f"type {shown(found)} is not modelled; modelled are conics and {', '.join(KINDS)}s"
+        unknown = any(not _TYPE.fullmatch(word) and word not in words_of_kinds for word in _words(kind))
+        other = _UNSUPPORTED.search(label) and not words_of_kinds & set(_words(label))
+        refused = kind if unknown else label if other else ""
+        if refused:
+            message = f"type {shown(refused)} is not modelled; modelled are conics and {', '.join(KINDS)}s"
             raise UnsupportedSurface(message, row.place)
 
 
@@ -179,8 +179,8 @@ def _thickness(row: Row) -> float:
     text = row.cells.get("thickness", "")
     if is_infinite(text) and row.place.surface == 0 and not text.startswith("-"):
         return float("inf")
-    found = _cell(row, "thickness")
-    return 0.0 if found is None else found
+    thickness = _cell(row, "thickness")
+    return 0.0 if thickness is None else thickness
 
 
 def _curvature(row: Row, unit: float) -> Tensor | None:
@@ -190,8 +190,8 @@ def _curvature(row: Row, unit: float) -> Tensor | None:
         raise LensFileError(f"radius is {radius:g}, too small", row.place)
     if radius and curvature and abs(radius * curvature - 1) > 1e-3:
         raise LensFileError(f"curvature {curvature:g} and radius {radius:g} contradict each other", row.place)
-    found = curvature if curvature is not None else 1 / radius if radius else 0.0
-    return double(found / unit) if found else None
+    value = curvature if curvature is not None else 1 / radius if radius else 0.0
+    return double(value / unit) if value else None
 
 
 def _terms(row: Row, unit: float) -> tuple[str, Tensor | None]:
@@ -208,20 +208,22 @@ def _terms(row: Row, unit: float) -> tuple[str, Tensor | None]:
 
 def _semi_diameter(row: Row, unit: float) -> float | None:
     semi_diameter, diameter = _cell(row, "semi_diameter"), _cell(row, "diameter")
-    found = semi_diameter if semi_diameter is not None else (diameter or 0.0) / 2
-    if found < 0:
-        raise LensFileError(f"semi-diameter is {found:g}, expected 0 or more", row.place)
-    return found * unit or None
+    size = semi_diameter if semi_diameter is not None else (diameter or 0.0) / 2
+    if size < 0:
+        raise LensFileError(f"semi-diameter is {size:g}, expected 0 or more", row.place)
+    return size * unit or None
 
 
 def _glass(row: Row, catalogs: Sequence[str | Catalog], user: Sequence[Path], report: Draft) -> Glass:
     text, place = row.cells.get("glass", ""), row.place
-    given = figures(row.cells)
-    if text.lower() in _AIR or (given and text.lower() == "unknown"):
-        found = MIRROR if _MIRROR.search(row.cells.get("type", "")) else medium(row.cells, place, report)
-        if text and text.lower() in _AIR[1:] and text != "-" and found not in (AIR, MIRROR):
-            raise LensFileError(f"the medium is {shown(text)}, but its figures are {', '.join(given.values())}", place)
-        return found
+    numbers = figures(row.cells)
+    if text.lower() in _AIR or (numbers and text.lower() == "unknown"):
+        glass = MIRROR if _MIRROR.search(row.cells.get("type", "")) else medium(row.cells, place, report)
+        if text and text.lower() in _AIR[1:] and text != "-" and glass not in (AIR, MIRROR):
+            raise LensFileError(
+                f"the medium is {shown(text)}, but its figures are {', '.join(numbers.values())}", place
+            )
+        return glass
     if text.lower() in ("mirror", "refl", "reflect"):
         return MIRROR
     name, equals, digits = text.partition("=")
@@ -232,10 +234,10 @@ def _glass(row: Row, catalogs: Sequence[str | Catalog], user: Sequence[Path], re
         return mil_glass(text)
     if equals or all(is_number(part.strip()) for part in digits.split("/")):
         return _by_figures(name, digits, place, report)
-    d_line = [given.get(name) for name in ("index d", "abbe d")]
+    d_line = [numbers.get(name) for name in ("index d", "abbe d")]
     nearest = None if None in d_line else tuple(number(cell, "index or Abbe number", place) for cell in d_line)
     glass = listed_glass(text, catalogs=catalogs, user=user, place=place, report=report, figures=nearest)
-    for name, cell in given.items():
+    for name, cell in numbers.items():
         kind, _, line = name.partition(" ")
         listed = float(refractive_index(glass, double(LINES[line]))) if kind == "index" else 0.0
         if kind == "index" and abs(listed - number(cell, name, place)) > 2e-3:

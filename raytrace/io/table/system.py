@@ -234,8 +234,8 @@ def written_environment(air: Environment | None, place: Place) -> dict[str, str]
 def written(lens: Lens, place: Place, catalogs: Sequence[Path] = ()) -> list[tuple[str, str]]:
     """The system of a lens as keys and values of header lines."""
 
-    def listed(numbers: Tensor, what: str) -> str:
-        return " ".join(exact_list(numbers, what, place))
+    def listed(numbers: Tensor, quantity: str) -> str:
+        return " ".join(exact_list(numbers, quantity, place))
 
     fields, aperture = lens.fields, lens.aperture
     size = exact(aperture.value, "system aperture", place)

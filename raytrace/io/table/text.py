@@ -154,7 +154,7 @@ def _preamble(table: Table, line: str, place: Place) -> None:
 
 
 def _headings(line: str, following: list[str], place: Place) -> tuple[Callable, list[str], int] | None:
-    """(what splits lines like these into cells, the headings, lines they take beyond the first), or None.
+    """(a function that splits lines into cells, the headings, further lines of headings), or None.
 
     A second line of words or units, as "curvature" and "(mm)" under "Radius of", belongs to the headings.
     """

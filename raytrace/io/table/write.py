@@ -20,8 +20,8 @@ def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = (), separator: st
     """The content of a table: header lines '# key: value', headings, one row per surface; UTF-8.
 
     file: its name, for messages. catalogs: the user's glass catalogs that the lens was read with.
-    Raises LensFileError for what a table cannot hold: a batch of lenses, nan, a glass whose coefficients are not those
-    of its catalog. All texts come back (`source.quoted`).
+    Raises LensFileError for data that a table cannot hold: a batch of lenses, nan, a glass whose coefficients are not
+    those of its catalog. All texts come back (`source.quoted`).
     """
     text = io.StringIO()
     for key, value in written(lens, Place(file), catalogs):
@@ -60,8 +60,8 @@ def _row(lens: Lens, number: int, surface: Surface, place: Place) -> dict[str, s
     if surface.semi_diameter is not None:
         row["semi_diameter"] = exact(surface.semi_diameter, "semi-diameter", place)
     if kind is not None:
-        found = exact_list(surface.coefficients, "aspheric terms", place)
-        row |= {f"a{kind.step * j}": term for j, term in enumerate(found, 1)}
+        terms = exact_list(surface.coefficients, "aspheric terms", place)
+        row |= {f"a{kind.step * j}": term for j, term in enumerate(terms, 1)}
     if surface.apertures:
         row["apertures"] = " + ".join(_aperture(aperture, place) for aperture in surface.apertures)
     row |= written_environment(surface.environment, place)

@@ -265,7 +265,7 @@ def _refuse_outside(cell: Cell, number: int, last: int) -> None:
 
 
 def word_of(sections: Sections, cell: Cell) -> str | None:
-    """The word of the records that an operand stands for; None where there is none."""
+    """The word of the records that is an operand's value; None where there is none."""
     row = ROWS[cell.name]
     if row.keyword == "STOP":
         return next((str(k) for k, block in enumerate(sections.surfaces) if block.last("STOP")), None)
@@ -480,7 +480,7 @@ def _with_operands(lens: Lens, operands: Sequence[PlacedOperand], count: int, ac
                 lens = with_part(lens, place.path, double(0.0), like=placed.like)
     # the surfaces have more digits than the operands, where both agree
     listed = [taken(p.operand, lens, active - 1) if _agrees(p, lens, active) else p.operand for p in operands]
-    listed = tuple(operand for operand in listed if operand.name != "MOFF" or any(operand.values()))
+    listed = tuple(o for o in listed if o.name != "MOFF" or o.numbers is not None or any(map(any, o.words)))
     if count > 1 and not listed:
         listed = (Operand("MOFF", words=(("",),) * count),)
     return dataclasses.replace(lens, operands=listed, current_configuration=active)
@@ -600,9 +600,9 @@ def _report_operand(placed: PlacedOperand, lens: Lens, active: int, count: int, 
     cell, operand = placed.cells[active - 1], placed.operand
     place, label = cell.record.place, f"multi-configuration operand {cell}"
     if cell.name in ENVIRONMENT_OPERANDS and not operand.paths:
-        normal, unit, what = {"PRES": (1, "atm", "pressure"), "TEMP": (20, "°C", "temperature")}[cell.name]
+        normal, unit, quantity = {"PRES": (1, "atm", "pressure"), "TEMP": (20, "°C", "temperature")}[cell.name]
         if is_number(cell.value) and plain(cell.value) != normal:
-            message = f"{cell.name} {plain(cell.value):g} {unit} ({what} of configuration {cell.configuration})"
+            message = f"{cell.name} {plain(cell.value):g} {unit} ({quantity} of configuration {cell.configuration})"
             report.warn(f"{message}: not followed; indices are those at {normal} {unit}", place)
     elif operand.refusal:
         if count == 1 or any(other.value != cell.value for other in placed.cells):

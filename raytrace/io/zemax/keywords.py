@@ -103,7 +103,7 @@ class FieldList(NamedTuple):
 
     keywords: tuple[str, ...]
     default: float
-    what: str
+    quantity: str
 
 
 FIELD_LISTS = {
@@ -214,11 +214,11 @@ def _sort(record: Record, block: Block, read: frozenset[str], ignored: dict[str,
 def _join_fields(system: Block) -> None:
     """Append the fields beyond the twelfth (FEFD) to the lists; each list has a number in every FEFD line."""
     further = system.all("FEFD")
-    for position, (keywords, default, what) in enumerate(FIELD_LISTS.values()) if further else ():
+    for position, (keywords, default, quantity) in enumerate(FIELD_LISTS.values()) if further else ():
         record = system.last(*keywords) or Record(keywords[0], (), "", further[0].place)
         words = [*record.words[:FIELDS_IN_LISTS]]
         words += [repr(default)] * (FIELDS_IN_LISTS - len(words))
         for line in further:
-            line.number(position, what)
+            line.number(position, quantity)
             words.append(line.words[position])
         system.records[record.keyword] = [record._replace(words=tuple(words))]

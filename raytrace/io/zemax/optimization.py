@@ -531,7 +531,7 @@ def margin_line(data: OptimizationData | None) -> str:
 
 
 def with_rules(lines: Lines, lens: Lens, number: int, place: Place) -> Lines:
-    """The lines of a surface with its variables, solves and pickups. Raises LensFileError for what no line holds."""
+    """The lines of a surface with its variables, solves and pickups. Raises LensFileError for a rule without a line."""
     data = lens.optimization_data
     if data is None:
         return lines
@@ -663,8 +663,8 @@ def _parameters(surface: Surface) -> dict[str, tuple[str, int]]:
 
 
 def _unheld(rule: Vary | Solve, place: Place) -> LensFileError:
-    what = "variable" if isinstance(rule, Vary) else f"solve {rule.kind!r}"
-    return LensFileError(f"a {what} of the {rule.quantity}, which a .zmx file does not hold; leave it out", place)
+    role = "variable" if isinstance(rule, Vary) else f"solve {rule.kind!r}"
+    return LensFileError(f"a {role} of the {rule.quantity}, which a .zmx file does not hold; leave it out", place)
 
 
 def _spelled(number: float) -> str:

@@ -61,12 +61,12 @@ def read(
     surface = partial(build, millimetres=unit, catalogs=came, user=catalogs)
     surfaces = [surface(block, blocks=parts.surfaces, report=report) for block in parts.surfaces]
     lens = _lens(parts, surfaces, unit, report, file)
-    for keyword, position, what, message in (
+    for keyword, position, quantity, message in (
         ("GFAC", 1, "kind of apodisation", "the beam is apodised (GFAC); taken as uniform"),
         ("FTYP", 6, "afocal", "afocal image space (FTYP, seventh value); the image is taken as a plane"),
     ):
         record = parts.system.last(keyword)
-        if record and record.integer(position, what, 0):
+        if record and record.integer(position, quantity, 0):
             report.warn(message, record.place)
     known = dict(zip(parts.surfaces, lens.surfaces, strict=True))
 
@@ -183,13 +183,13 @@ def _aperture(system: Block, stop_semi_diameter: float | None, unit: float, repo
     return kind, size * unit if flag is None else size, record
 
 
-def _count(system: Block, position: int, what: str) -> int | None:
+def _count(system: Block, position: int, quantity: str) -> int | None:
     record = system.last("FTYP")
     if record is None or len(record.words) <= position:
         return None
-    count = record.integer(position, what)
+    count = record.integer(position, quantity)
     if not 1 <= count <= MOST_POINTS:
-        raise LensFileError(f"FTYP: {what} is {count}, expected 1 to {MOST_POINTS}", record.place)
+        raise LensFileError(f"FTYP: {quantity} is {count}, expected 1 to {MOST_POINTS}", record.place)
     return count
 
 

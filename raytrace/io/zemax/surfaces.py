@@ -132,7 +132,7 @@ class SurfaceType:
     kind: of the coefficients, a key of KINDS; least: how many of them are modelled even if 0, None: as many as given.
     part: class of the added sag terms or phase. amplitudes: PARM that are all 0 where the sag terms vanish.
     terms: power of length in the terms of XDAT, None if the type has none; most: their maximum number.
-    objection: numbers -> why they are out of range; beyond: numbers -> what of them is not modelled; "" for neither.
+    objection: numbers -> why they are out of range, or ""; beyond: numbers -> the feature that is not modelled, or "".
     is_break: whether the type is a coordinate break; flat: whether a curvature is not modelled.
     powers: the powers of r of the parameters, in words.
     """
@@ -204,7 +204,7 @@ class SurfaceType:
         return {"phase" if "phase" in self.holds else "sag_terms": self.part(**values)}
 
     def numbers(self, surface: Surface) -> Numbers:
-        """`fields` inverted. Raises ValueError for what the type cannot hold."""
+        """`fields` inverted. Raises ValueError for numbers that the type cannot hold."""
         sag, pose, parameters = surface.sag_terms, surface.before, {}
         if self.is_break and pose is not None and pose.z is not None:
             raise ValueError("a decentre along z; add it to the thickness before")
@@ -232,7 +232,7 @@ class SurfaceType:
     def names(self, surface: Surface, numbers: Numbers, keyword: str, j: int) -> tuple[tuple[Named, ...], Surface]:
         """The numbers of the lens that PARM j, or XDAT j, gives, and a surface in which all of them are modelled.
 
-        No number of the lens belongs to a switch, or to what the surface does not model.
+        Empty for a switch, and for numbers that the surface does not model.
         """
         modelled = 0.34375  # any number other than 0
         if keyword == "PARM" and j in self.parameters:
@@ -694,9 +694,9 @@ def build(
     )
 
 
-def _nonzero(block: Block, keyword: str, what: str, divisor: float) -> Tensor | None:
+def _nonzero(block: Block, keyword: str, quantity: str, divisor: float) -> Tensor | None:
     record = block.last(keyword)
-    number = record.number(0, what) / divisor if record else 0.0
+    number = record.number(0, quantity) / divisor if record else 0.0
     return double(number) if number else None
 
 

@@ -83,8 +83,8 @@ def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
     """The content of a .zmx file of the lens, in mm or the unit of its merit: ASCII, or UTF-16 where a text needs it.
 
     file: its name, for messages. catalogs: the user's glass catalogs that the lens was read with.
-    Raises LensFileError for what a .zmx file cannot hold: a batch of lenses, nan, two apertures on one surface, more
-    than 8 aspheric terms or 24 wavelengths, a glass whose coefficients are not those of its catalog.
+    Raises LensFileError for data that a .zmx file cannot hold: a batch of lenses, nan, two apertures on one surface,
+    more than 8 aspheric terms or 24 wavelengths, a glass whose coefficients are not those of its catalog.
     """
     body = partial(_body, file=file, catalogs=catalogs)
     lines = [*body(lens), *tail_lines(lens.optimization_data, Place(file)), *_operand_lines(lens, body, file)]
@@ -155,7 +155,7 @@ def _system(lens: Lens, place: Place, catalogs: Sequence[Path]) -> list[str]:
 def _fields(lists: Sequence[Tensor], place: Place) -> list[str]:
     """The lists of fields, and a line for every field beyond those that they hold."""
     rows = FIELD_LISTS.values()
-    texts = [exact_list(numbers, row.what, place) for row, numbers in zip(rows, lists, strict=True)]
+    texts = [exact_list(numbers, row.quantity, place) for row, numbers in zip(rows, lists, strict=True)]
     lines = [f"{row.keywords[0]} {' '.join(text[:FIELDS_IN_LISTS])}" for row, text in zip(rows, texts, strict=True)]
     further = list(zip(*(text[FIELDS_IN_LISTS:] for text in texts), strict=True))
     number = FIELDS_IN_LISTS + len(further)
@@ -211,9 +211,9 @@ def _type(surface: Surface, place: Place) -> str:
         message = f"a .zmx file has no type for a surface of {feature}; write a table (.csv)"
         raise LensFileError(message, place)
     row = TYPES[kind]
-    for name, what in _SHAPE.items():
+    for name, quantity in _SHAPE.items():
         if getattr(surface, name) is not None and name not in row.holds:
-            raise LensFileError(f"{feature} with a {what}: a {kind} surface has none", place)
+            raise LensFileError(f"{feature} with a {quantity}: a {kind} surface has none", place)
     if row.is_break and (not is_left_out(surface.glass) or surface.apertures or surface.after is not None):
         message = "a coordinate break with a medium, an aperture or a pose behind it"
         raise LensFileError(f"{message}; a .zmx file holds none of them: put it on a surface of its own", place)
@@ -400,7 +400,7 @@ def in_file(word: str, power: int | None, millimetres: float) -> str:
 def _operand_lines(lens: Lens, body: Callable[[Lens], list[str]], file: str) -> list[str]:
     """MNUM and a line for every operand in every configuration.
 
-    The value of an operand is the word that it stands for in the file of the lens in that configuration.
+    The value of an operand is its word in the file of the lens in that configuration.
     body: the lines of system and surfaces of a lens. Raises LensFileError for operands that the lines cannot give.
     """
     original, lens, place = lens, with_environments(lens, Place(file)), Place(file)
@@ -428,7 +428,7 @@ def _operand_lines(lens: Lens, body: Callable[[Lens], list[str]], file: str) -> 
 
 
 def _value(operand: Operand, configuration: int, text: Sections, place: Place) -> str:
-    """The value of an operand: the word in the file of its configuration, or its own where it stands for none."""
+    """The value of an operand: the word in the file of its configuration, or its own where it has none there."""
     if operand.paths and operand.name in ROWS and not is_of_surfaces(operand):
         record = Record(operand.name, (), "", place)
         cell = Cell(operand.name, operand.number, operand.parameter, configuration, "", record)
