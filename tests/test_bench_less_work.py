@@ -15,8 +15,7 @@ from raytrace.psf_models import MODELS, fourier, psf
 from raytrace.system.lens import with_object_distance
 from raytrace.tracing.compiled import prepare, trace_engine
 from raytrace.tracing.launch import rays_of_field
-from raytrace.tracing.memo import Memo, trace_bundle
-from raytrace.tracing.scene import scene, symmetry
+from raytrace.tracing.scene import Memo, scene, symmetry, trace_bundle
 
 TINY = Sizes(less=64, distances=2)
 ROUNDING = 1e-10  # of sums of kernels and gradients; a kernel 1e-12 degrees off the axis moves by 3e-11 of itself

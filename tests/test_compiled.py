@@ -22,7 +22,7 @@ from raytrace.system.rays import Rays, start
 from raytrace.system.sag_terms import ZernikeSag
 from raytrace.system.surface import Aperture
 from raytrace.tracing.compiled import engine, prepare, trace_engine
-from raytrace.tracing.compiled.engine_choice import uses_compiled
+from raytrace.tracing.compiled.library import uses_compiled
 from raytrace.tracing.compiled.run import task_of, trace_compiled
 from raytrace.tracing.compiled.structure import with_numbers
 from raytrace.tracing.jacobian import hit_jacobian, pushed
@@ -243,7 +243,7 @@ PROBE = """
 import raytrace, torch
 from raytrace.tracing.trace import trace_lens
 from raytrace.tracing.compiled import library
-from raytrace.tracing.compiled.engine_choice import uses_compiled
+from raytrace.tracing.compiled.library import uses_compiled
 from raytrace.system.rays import Rays, start
 library.FLAGS = tuple(flag for flag in library.FLAGS if flag != "-O3")  # compiled in 2 s instead of 14 s
 lens = raytrace.read_lens({lens!r})

@@ -13,10 +13,9 @@ from torch.testing import assert_close
 import raytrace as rt
 from raytrace.materials.glass import MIRROR
 from raytrace.maths.value import to
-from raytrace.system.polynomials import PolynomialSag, TiltSag
 from raytrace.system.poses import Gap, Pose, direction_in, passage, point_in
 from raytrace.system.rays import Rays, start
-from raytrace.system.sag_terms import FringeSag
+from raytrace.system.sag_terms import FringeSag, PolynomialSag, TiltSag
 from raytrace.system.shapes import EVEN
 from raytrace.system.surface import Aperture, Surface, gap_behind
 from raytrace.tracing.compiled import trace_engine

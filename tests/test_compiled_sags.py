@@ -11,9 +11,8 @@ from torch.utils._pytree import tree_flatten, tree_leaves, tree_unflatten
 
 from raytrace.materials.glass import MIRROR
 from raytrace.maths.value import to
-from raytrace.system.polynomials import IrregularSag, PolynomialSag, PowerSag, TiltSag
 from raytrace.system.rays import Rays
-from raytrace.system.sag_terms import FringeSag, GridSag, ZernikeSag
+from raytrace.system.sag_terms import FringeSag, GridSag, IrregularSag, PolynomialSag, PowerSag, TiltSag, ZernikeSag
 from raytrace.system.shapes import SAG_TERMS
 from raytrace.system.surface import Surface
 from raytrace.tracing.compiled import trace_engine

@@ -17,9 +17,8 @@ from raytrace.materials.environment import Environment, NoThermalCoefficients, a
 from raytrace.materials.glass import AIR, constant, from_table, model_glass, refractive_index
 from raytrace.system.lens import index_behind
 from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.sequence import media
 from raytrace.tracing.spot import spot_of
-from raytrace.tracing.trace import trace_lens
+from raytrace.tracing.trace import media, trace_lens
 
 float64 = partial(torch.tensor, dtype=torch.float64)
 
@@ -203,7 +202,7 @@ def test_without_an_environment_nothing_is_computed_for_it(monkeypatch):
     lens = rt.read_lens("double_gauss")
     before = media(lens, lens.wavelengths)
     monkeypatch.setattr("raytrace.system.lens.index_in", None)
-    monkeypatch.setattr("raytrace.tracing.sequence._media_in_environment", None)
+    monkeypatch.setattr("raytrace.tracing.trace._media_in_environment", None)
     assert all(torch.equal(a, b) for a, b in zip(before, media(lens, lens.wavelengths), strict=True))
     assert lens.environment is None
     assert lens.at(f_number=4).environment is None

@@ -21,7 +21,7 @@ from raytrace.io import read_lens
 from raytrace.maths.pupil import hexapolar
 from raytrace.plotting.analysis import distortion_curves
 from raytrace.tracing.ray_failures import LOST, STATUS, ray_failures
-from raytrace.tracing.ray_hits import arrivals
+from raytrace.tracing.spot import arrivals
 from raytrace.words import did_you_mean
 
 #: Options whose form differs between commands, and why.

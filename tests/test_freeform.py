@@ -12,11 +12,11 @@ from torch.testing import assert_close
 from raytrace.maths import zernike
 from raytrace.maths.bivariate import powers
 from raytrace.maths.value import to
-from raytrace.system.polynomials import IrregularSag, PolynomialSag, TiltSag, as_polynomial
+from raytrace.system.intersection import intersect, normal
 from raytrace.system.rays import start
-from raytrace.system.sag_terms import FringeSag
+from raytrace.system.sag_terms import FringeSag, IrregularSag, PolynomialSag, TiltSag, as_polynomial
 from raytrace.system.shapes import KINDS, relief
-from raytrace.system.surface import Surface, intersect, normal, sag_at, vertex_curvature, vertex_curvatures
+from raytrace.system.surface import Surface, sag_at, vertex_curvature, vertex_curvatures
 from raytrace.tracing.trace import trace_surfaces
 
 

@@ -14,7 +14,7 @@ from raytrace.studies.codesign.experiment import camera, optimise
 from raytrace.studies.codesign.optima import closed_form
 from raytrace.studies.codesign.settings import Settings
 from raytrace.studies.pictures import dead_leaves
-from raytrace.tracing.sequence import media
+from raytrace.tracing.trace import media
 
 MICROMETRE = 1e-3
 SPACES = "sensor thickness:2,9,5,6"

@@ -27,10 +27,8 @@ from raytrace.system.optimization_data import OptimizationData, Row, Vary
 from raytrace.system.poses import Pose
 from raytrace.system.sag_terms import ZernikeSag
 from raytrace.system.surface import Surface, sag_at
-from raytrace.tracing.launch import rays_of_field
-from raytrace.tracing.sequence import media
-from raytrace.tracing.trace import trace_surfaces
-from raytrace.tracing.vignetting import vignette
+from raytrace.tracing.launch import rays_of_field, vignette
+from raytrace.tracing.trace import media, trace_surfaces
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

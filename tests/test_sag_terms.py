@@ -14,10 +14,11 @@ from raytrace.maths import zernike
 from raytrace.maths.grid import grid
 from raytrace.maths.value import to
 from raytrace.psf_models import psf
+from raytrace.system.intersection import intersect, normal
 from raytrace.system.rays import start
 from raytrace.system.sag_terms import GridSag, ZernikeSag, spline
 from raytrace.system.shapes import Relief, relief
-from raytrace.system.surface import intersect, normal, sag, sag_at
+from raytrace.system.surface import sag, sag_at
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import scene, symmetry

@@ -12,8 +12,8 @@ from raytrace.io import read_lens
 from raytrace.materials.glass import MIRROR, model_glass
 from raytrace.system.lens import Lens, SystemAperture, with_object_distance, with_sensor_distance, with_wavelengths
 from raytrace.system.sag_terms import ZernikeSag
-from raytrace.tracing.focus import image_rays
 from raytrace.tracing.paraxial import first_order, marginal_ray, signed, system_matrix
+from raytrace.tracing.spot import image_rays
 from raytrace.tracing.trace import media
 
 INF = math.inf

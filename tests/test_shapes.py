@@ -24,17 +24,17 @@ from raytrace.plotting.outline import depth
 from raytrace.psf_models import psf
 from raytrace.system import shapes
 from raytrace.system.apertures import SHAPES, Aperture, Edge, Shape, clearance, inside, reach, stands_inside
+from raytrace.system.intersection import intersect, normal
 from raytrace.system.parameter_paths import number_at, parameter_paths, with_number
 from raytrace.system.prescription import lens as lens_of_rows
 from raytrace.system.rays import start
 from raytrace.system.sag_terms import Sag
-from raytrace.system.surface import intersect, normal, sag, sag_at
+from raytrace.system.surface import sag, sag_at
 from raytrace.tracing.compiled import trace_engine
 from raytrace.tracing.compiled.structure import is_expressible
 from raytrace.tracing.launch import launch
-from raytrace.tracing.memo import Memo, trace_bundle
 from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.scene import symmetry
+from raytrace.tracing.scene import Memo, symmetry, trace_bundle
 from raytrace.tracing.spot import spot_of
 from raytrace.tracing.streaming import stream_spot
 from raytrace.tracing.trace import trace_lens, trace_surfaces

@@ -9,7 +9,7 @@ from problems import scalar, vector
 from test_wave_propagation import PLASTIC, R, Z, lens, relative, scene
 
 from raytrace.psf_models.dft import bessel_j0, bessel_j1
-from raytrace.tracing.memo import Memo
+from raytrace.tracing.scene import Memo
 from raytrace.wave_optics import propagation
 from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.element import Element, EvenPowers, Rings

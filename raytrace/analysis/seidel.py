@@ -22,7 +22,7 @@ from raytrace.maths.result import cell
 from raytrace.maths.value import value
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.surface import Surface, is_even, vertex_curvature
-from raytrace.tracing.axis import need_axis
+from raytrace.tracing.aiming import need_axis
 from raytrace.tracing.launch import paraxial_field
 from raytrace.tracing.paraxial import FirstOrder, first_order, largest_field, marginal_ray, signed, ynu
 from raytrace.tracing.trace import media

@@ -12,13 +12,12 @@ from raytrace.budget import RAY_BYTES, afford
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.result import flat
 from raytrace.system.lens import FIELD_UNITS, Lens, field_points, name_of_field, with_field_kind, with_wavelengths
-from raytrace.tracing.launch import is_at_infinity, object_field
+from raytrace.tracing.launch import is_at_infinity, object_field, warn_of_filling
 from raytrace.tracing.paraxial import first_order, largest_field
 from raytrace.tracing.ray_failures import check_reach, ray_failures
 from raytrace.tracing.scene import Scene
 from raytrace.tracing.scene import scene as make_scene
 from raytrace.tracing.spot import EmptySpot
-from raytrace.tracing.stop_filling import warn_of_filling
 
 #: What verbs take for fields, y or pairs (x, y), and for other numbers; None stands for the lens's own.
 Points = Tensor | Sequence | float | None

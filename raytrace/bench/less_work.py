@@ -21,7 +21,7 @@ from raytrace.shards import torch_threads
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.rays import Rays
 from raytrace.tracing.compiled import prepare, trace_engine
-from raytrace.tracing.memo import Memo, trace_bundle
+from raytrace.tracing.scene import Memo, trace_bundle
 from raytrace.tracing.trace import trace_lens
 
 SKEW = 1e-12  # degrees: off the axis by less than rounding, but not on it

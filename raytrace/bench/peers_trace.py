@@ -27,7 +27,7 @@ from raytrace.system.lens import Lens
 from raytrace.system.phases import Grating
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface
-from raytrace.tracing.frames import Frame, frames
+from raytrace.tracing.geometry import Frame, frames
 from raytrace.tracing.trace import media
 
 _RAY_OPTICS_MOST = 1024  # rays: it traces one at a time in Python

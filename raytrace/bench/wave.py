@@ -24,7 +24,7 @@ from raytrace.maths.value import to
 from raytrace.pages import measured
 from raytrace.psf_models.dft import Aliased, phasor
 from raytrace.shards import torch_threads
-from raytrace.tracing.memo import Memo
+from raytrace.tracing.scene import Memo
 from raytrace.wave_optics import propagation
 from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import aim, singlet

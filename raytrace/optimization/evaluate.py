@@ -16,7 +16,7 @@ from raytrace.optimization.merit_rows import Evaluation
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import Row
-from raytrace.tracing.stop_filling import warn_of_filling
+from raytrace.tracing.launch import warn_of_filling
 
 _WHOLE = 40  # rows that are listed one by one
 _TOGETHER = 3  # rows of one field that share a line in longer tables

@@ -19,10 +19,10 @@ from raytrace.system.optimization_data import Solve, Vary
 from raytrace.system.parameter_paths import ParameterPath, number_at, parameter_paths, with_number
 from raytrace.system.phases import power_of
 from raytrace.system.surface import Surface, gap_behind, vertex_curvature
-from raytrace.tracing.axis import is_round_about_axis
+from raytrace.tracing.aiming import is_round_about_axis
 from raytrace.tracing.compiled.structure import structure_of
 from raytrace.tracing.paraxial import signed
-from raytrace.tracing.sequence import media, sequence_of
+from raytrace.tracing.trace import media, sequence_of
 
 #: A number of a lens: of which surface, and which.
 Address = tuple[int, str]

@@ -20,11 +20,9 @@ from raytrace.system.lens import Lens, index_behind
 from raytrace.system.optimization_data import Solve
 from raytrace.system.rays import Rays
 from raytrace.system.surface import sag_at, vertex_curvature
-from raytrace.tracing.launch import rays_of_field
+from raytrace.tracing.launch import rays_of_field, vignette
 from raytrace.tracing.paraxial import brackets, power, signed
-from raytrace.tracing.sequence import media, sequence_of
-from raytrace.tracing.trace import trace_surfaces
-from raytrace.tracing.vignetting import vignette
+from raytrace.tracing.trace import media, sequence_of, trace_surfaces
 
 #: Through which points of the pupil light reaches furthest from the vertex of a surface.
 ENDS = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0))

@@ -47,7 +47,7 @@ from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.tracing.compiled import prepare
 from raytrace.tracing.geometry import warn_of_defects
-from raytrace.tracing.stop_filling import warn_of_filling
+from raytrace.tracing.launch import warn_of_filling
 from raytrace.words import calling_level
 
 #: Parts of the pupil and of the field, in the order in which they are opened.

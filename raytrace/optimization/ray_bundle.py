@@ -28,14 +28,12 @@ from raytrace.optimization.lens_model import GLASS, unbent
 from raytrace.optimization.lens_state import LensState
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
-from raytrace.tracing.axis import aiming_of, is_bent
+from raytrace.tracing.aiming import aiming_of, is_bent
 from raytrace.tracing.compiled.run import Pushed, Task
 from raytrace.tracing.compiled.structure import is_expressible, rows_of
 from raytrace.tracing.jacobian import ends, pushed, pushed_everywhere
-from raytrace.tracing.launch import rays_of_field
-from raytrace.tracing.sequence import media, sequence_of
-from raytrace.tracing.trace import trace_surfaces
-from raytrace.tracing.vignetting import vignette
+from raytrace.tracing.launch import rays_of_field, vignette
+from raytrace.tracing.trace import media, sequence_of, trace_surfaces
 
 
 def launched(state: LensState, field: np.ndarray, pupil: np.ndarray):

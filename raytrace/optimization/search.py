@@ -35,7 +35,7 @@ from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import Row
 from raytrace.system.parameter_paths import parse_range
 from raytrace.tracing.compiled import prepare
-from raytrace.tracing.stop_filling import warn_of_filling
+from raytrace.tracing.launch import warn_of_filling
 from raytrace.words import calling_level
 
 STARTS = 64

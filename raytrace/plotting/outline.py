@@ -14,10 +14,10 @@ from torch import Tensor
 from raytrace.maths.pupil import fan
 from raytrace.plotting.style import array
 from raytrace.system.apertures import reach
+from raytrace.system.intersection import intersect
 from raytrace.system.lens import Lens
-from raytrace.system.surface import Surface, intersect, sag_at
-from raytrace.tracing.frames import Frame, frames
-from raytrace.tracing.geometry import edge_radius
+from raytrace.system.surface import Surface, sag_at
+from raytrace.tracing.geometry import Frame, edge_radius, frames
 from raytrace.tracing.launch import launch, stop_radius
 from raytrace.tracing.trace import lens_steps, media
 

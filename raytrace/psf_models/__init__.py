@@ -21,4 +21,4 @@ from raytrace.psf_models.models import NotConverged as NotConverged
 from raytrace.psf_models.result import EmptyPsf as EmptyPsf
 from raytrace.psf_models.result import Kernels as Kernels
 from raytrace.psf_models.result import Psf as Psf
-from raytrace.tracing.memo import Memo as Memo
+from raytrace.tracing.scene import Memo as Memo

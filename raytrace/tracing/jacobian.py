@@ -12,7 +12,7 @@ from torch import Tensor
 
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface
-from raytrace.tracing.compiled.engine_choice import uses_compiled
+from raytrace.tracing.compiled.library import uses_compiled
 from raytrace.tracing.compiled.run import Pushed, Task, forward, push, push_everywhere, task_of
 from raytrace.tracing.compiled.structure import is_expressible, with_numbers
 from raytrace.tracing.trace import trace_surfaces

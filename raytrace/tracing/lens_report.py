@@ -20,12 +20,12 @@ from raytrace.system.phases import IdealLens
 from raytrace.system.poses import Pose
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface, is_posed, is_round, vertex_curvature
-from raytrace.tracing.axis import aiming_of
+from raytrace.tracing.aiming import aiming_of
 from raytrace.tracing.base_ray import base_ray
 from raytrace.tracing.f_number import working_f_number
 from raytrace.tracing.geometry import defects, warn_of_defects
+from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.stop_filling import warn_of_filling
 from raytrace.tracing.trace import media
 
 #: What phases and departures are called, with their own numbers; of others their kind stands alone.

@@ -10,11 +10,9 @@ from raytrace.maths import pupil
 from raytrace.maths.result import Result, axis, cell, number, numbers
 from raytrace.maths.value import value
 from raytrace.system.lens import FIELD_UNITS, Lens, field_points, name_of_field, with_wavelengths
-from raytrace.tracing.launch import with_ray_aiming
+from raytrace.tracing.launch import warn_of_filling, with_ray_aiming
 from raytrace.tracing.ray_failures import STATUS, LostRays, warn_of_failures
-from raytrace.tracing.ray_hits import Arrivals, arrivals, chief_reference
-from raytrace.tracing.spot import Spot, spot_of, spot_of_points
-from raytrace.tracing.stop_filling import warn_of_filling
+from raytrace.tracing.spot import Arrivals, Spot, arrivals, chief_reference, spot_of, spot_of_points
 from raytrace.tracing.streaming import MAX_BYTES, StreamedSpot, stream_spots
 from raytrace.words import calling_level
 

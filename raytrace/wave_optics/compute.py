@@ -20,7 +20,7 @@ from raytrace.materials.glass import Glass, check_unit, check_wavelengths, from_
 from raytrace.maths.grid import Grid, centres, grid
 from raytrace.maths.result import Result, number, object_text, rows
 from raytrace.maths.value import value
-from raytrace.tracing.memo import Memo
+from raytrace.tracing.scene import Memo
 from raytrace.wave_optics import plan as planning
 from raytrace.wave_optics.designs import BASELINES, STEPPED, aim, baseline
 from raytrace.wave_optics.element import Element, EvenPowers, height_range

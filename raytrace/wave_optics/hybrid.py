@@ -41,12 +41,9 @@ from raytrace.system.lens import Fields, Lens, SystemAperture, field_points, wit
 from raytrace.system.sag_terms import GridSag, ZernikeSag, spline
 from raytrace.system.shapes import relief
 from raytrace.system.surface import Surface, sag_at
-from raytrace.tracing.launch import rays_of_field
+from raytrace.tracing.launch import rays_of_field, vignette, warn_of_filling
 from raytrace.tracing.scene import Scene, chief_landing, scene, symmetry
-from raytrace.tracing.sequence import sequence_of
-from raytrace.tracing.stop_filling import warn_of_filling
-from raytrace.tracing.trace import media, trace_surfaces
-from raytrace.tracing.vignetting import vignette
+from raytrace.tracing.trace import media, sequence_of, trace_surfaces
 from raytrace.tracing.wavefront import Wavefront, wavefront_of
 from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike, is_flat, is_radial, path, slopes_of
 

@@ -15,9 +15,9 @@ from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.operands.paraxial import along, chief_ray, field_of, listed, paraxial_image_distance
 from raytrace.optimization.operands.rays import known
 from raytrace.system.surface import is_even
-from raytrace.tracing.axis import is_bent
+from raytrace.tracing.aiming import is_bent
+from raytrace.tracing.launch import vignette
 from raytrace.tracing.paraxial import ynu
-from raytrace.tracing.vignetting import vignette
 
 _NEAR_AXIS = 1e-4  # of the field: its chief ray tells the scale of the image
 _NEAR_CHIEF = 1e-3  # of the pupil: close rays tell where they meet

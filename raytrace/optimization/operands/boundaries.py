@@ -31,7 +31,7 @@ from raytrace.optimization.ray_bundle import Bundle, Marks
 from raytrace.system.lens import Lens
 from raytrace.system.shapes import EVEN
 from raytrace.system.surface import Surface, sag_at
-from raytrace.tracing.sequence import media
+from raytrace.tracing.trace import media
 
 
 class SemiDiameters:

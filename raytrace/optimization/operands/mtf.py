@@ -34,7 +34,7 @@ from raytrace.optimization.operands.wavefront import (
 )
 from raytrace.psf_models.wave import strehl
 from raytrace.system.lens import Lens
-from raytrace.tracing.axis import is_bent
+from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.scene import Scene
 
 _MISSED = 0.02  # waves of RMS that the polynomials of a wave may leave

@@ -13,9 +13,10 @@ from raytrace.maths.dual import Dual, value_of
 from raytrace.maths.numerics import dot, safe_sqrt
 from raytrace.optimization.context import Evaluate, EvaluationContext, Found, Line, Operand, Planner
 from raytrace.optimization.ray_bundle import Hits
+from raytrace.system.intersection import normal
 from raytrace.system.lens import Lens
 from raytrace.system.poses import Gap, direction_in
-from raytrace.system.surface import gap_behind, normal
+from raytrace.system.surface import gap_behind
 
 
 def from_centroid(component: int | None, part: str = "position") -> Callable[[Sequence[Line], Planner], Evaluate]:

@@ -21,7 +21,7 @@ from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, F
 from raytrace.optimization.operands.paraxial import listed
 from raytrace.optimization.operands.rays import known
 from raytrace.optimization.ray_bundle import Hits
-from raytrace.tracing.axis import is_bent
+from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.base_ray import base_ray
 
 

@@ -11,9 +11,10 @@ from torch import Tensor
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
 from raytrace.system.lens import Lens, with_object_distance
-from raytrace.tracing.focus import best_focus, focus_moments, image_rays, real_image_distance
+from raytrace.tracing.focus import best_focus, focus_moments, real_image_distance
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import paraxial_image_distance
+from raytrace.tracing.spot import image_rays
 from raytrace.tracing.trace import lens_steps
 
 _RINGS = 12  # of the pupil, where focus is found

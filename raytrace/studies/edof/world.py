@@ -23,7 +23,7 @@ from raytrace.maths.result import Result
 from raytrace.studies.descent import NoOptimum, minimise
 from raytrace.studies.edof.octant import Octant, fits
 from raytrace.studies.pictures import Pictures, draws
-from raytrace.tracing.memo import Memo
+from raytrace.tracing.scene import Memo
 from raytrace.wave_optics.compute import ElementPsf, psf
 from raytrace.wave_optics.element import Element, Rings
 from raytrace.wave_optics.plan import plan

@@ -24,7 +24,7 @@ from raytrace.maths.result import Result
 from raytrace.psf_models.dft import phasor
 from raytrace.studies.options import Settings
 from raytrace.studies.pictures import Pictures, crop, dead_leaves
-from raytrace.tracing.memo import Memo
+from raytrace.tracing.scene import Memo
 from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import Aim, aim, ideal
 from raytrace.wave_optics.element import Element, Pixels, height

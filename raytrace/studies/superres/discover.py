@@ -22,7 +22,7 @@ from raytrace.studies.descent import minimise
 from raytrace.studies.edof.world import WAVELENGTH, World, scene
 from raytrace.studies.pictures import draws
 from raytrace.studies.superres.experiment import Elements, plated, summed, wedges
-from raytrace.tracing.memo import Memo
+from raytrace.tracing.scene import Memo
 from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.plan import plan
 

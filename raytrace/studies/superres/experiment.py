@@ -37,7 +37,7 @@ from raytrace.studies.superres.inversion import (
     joint_superresolve,
     superresolve,
 )
-from raytrace.tracing.memo import Memo
+from raytrace.tracing.scene import Memo
 from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import aim, baseline
 from raytrace.wave_optics.element import Element, Pixels, Zernike

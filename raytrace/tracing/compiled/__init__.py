@@ -19,7 +19,7 @@ adjoint.h   the adjoint of a surface, with its derivation; tangent.h: its deriva
 trace.cpp   rays through all surfaces and back, block by block
 """
 
-from raytrace.tracing.compiled.engine_choice import engine as engine
-from raytrace.tracing.compiled.engine_choice import prepare as prepare
-from raytrace.tracing.compiled.engine_choice import trace_engine as trace_engine
 from raytrace.tracing.compiled.library import NoCompiler as NoCompiler
+from raytrace.tracing.compiled.library import engine as engine
+from raytrace.tracing.compiled.library import prepare as prepare
+from raytrace.tracing.compiled.library import trace_engine as trace_engine

@@ -16,8 +16,8 @@ from torch.utils._pytree import tree_leaves
 
 from raytrace.system.apertures import SHAPES
 from raytrace.system.phases import Facets, HologramPath, IdealLens, Phase, PolynomialPath, RadialPath, kind_of, path_of
-from raytrace.system.polynomials import PowerSag
 from raytrace.system.poses import Gap, Turn, passage
+from raytrace.system.sag_terms import PowerSag
 from raytrace.system.shapes import EVEN, KINDS, SAG_TERMS, SagTerms
 from raytrace.system.surface import Surface, gap_behind
 

@@ -1,4 +1,4 @@
-// What a sag has beside its conic and even terms, by powers of x and y about a centre: `PowerSag` of raytrace/system/polynomials.py.
+// What a sag has beside its conic and even terms, by powers of x and y about a centre: `PowerSag` of raytrace/system/sag_terms.py.
 //
 //     D = c_0 + Σ c_k u^i v^j,   u = (x - x_0)/R,   v = (y - y_0)/R,   in the order of paths.h
 //
