@@ -4,7 +4,7 @@
 
 TEMP and PRES of the multi-configuration table hold for the surfaces that operands behind them name (CRVT, THIC, GLSS),
 up to the next one of the same name; the last is the lens's own, which ENVD repeats. So OpticStudio's sample of a cell
-without air is told, and with that its stored image distance is met to 4e-12 mm.
+without air is in_words, and with that its stored image distance is met to 4e-12 mm.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from raytrace.io.source import LensFileError, Place
 from raytrace.io.spelling import double, exact
 from raytrace.io.zemax.keywords import Block, Sections
 from raytrace.io.zemax.operands import UNTOLD, Cell
-from raytrace.materials.environment import REFERENCE, Environment, objection, told
+from raytrace.materials.environment import REFERENCE, Environment, in_words, objection
 from raytrace.system import configurations
 from raytrace.system.configurations import Operand
 from raytrace.system.lens import Lens, unknown_changes
@@ -77,7 +77,7 @@ def tell(found: Sections, lens: Lens, report: Draft) -> None:
     """Say what the lens makes of its environment, and of which glasses not enough is known."""
     record = found.system.last("ENVD")
     if lens.environment is not None:
-        report.note(f"indices are those at {told(lens.environment)} (ENVD); radii and thicknesses stay as stored")
+        report.note(f"indices are those at {in_words(lens.environment)} (ENVD); radii and thicknesses stay as stored")
     elif record and record.words:
         place = record.number(0, "temperature"), record.number(1, "pressure", REFERENCE[1])
         if place != REFERENCE:
