@@ -36,7 +36,7 @@ PUBLIC = {
     "convert": "io",
     "lens": "system.prescription",
     "read_lens": "io",
-    "read_merit": "io.zemax.merit",
+    "read_merit": "io.zemax.optimization",
     "write_lens": "io",
     "with_object_distance": "system.lens",
     "with_sensor_distance": "system.lens",

@@ -44,7 +44,7 @@ from raytrace.io import convert as convert
 from raytrace.io import read_lens as read_lens
 from raytrace.io import write_lens as write_lens
 from raytrace.io.ray_tables import read_rays as read_rays
-from raytrace.io.zemax.merit import read_merit as read_merit
+from raytrace.io.zemax.optimization import read_merit as read_merit
 from raytrace.materials.catalogs import UnknownGlass as UnknownGlass
 from raytrace.materials.catalogs import find_glass as find_glass
 from raytrace.materials.glass import AIR as AIR

@@ -227,7 +227,7 @@ def test_writing_replaces_the_file_as_a_whole_or_not_at_all(tmp_path):
 
 
 def test_suffixes_and_paths_that_are_no_lens_files(tmp_path):
-    with pytest.raises(LensFileError, match=r"'\.pdf' names no format.*\.zmx"):
+    with pytest.raises(LensFileError, match=r"'\.pdf' is that of no format.*\.zmx"):
         read_lens(tmp_path / "lens.pdf")
     with pytest.raises(LensFileError, match="no suffix"):
         write_lens(read_lens("double_gauss"), tmp_path / "lens")

@@ -336,7 +336,7 @@ def test_an_optimisation_follows_a_function_of_the_lens(tmp_path):
     assert told["operand"] == "sharpness"
     assert told["after"] == pytest.approx(float(sharpness(found.lens)), rel=1e-9)
     assert "sharpness" in str(found)
-    with pytest.warns(LensFileWarning, match="what is to be optimised"):
+    with pytest.warns(LensFileWarning, match="the optimisation data"):
         rt.write_lens(found.lens, tmp_path / "found.zmx")
     row = rt.read_lens(tmp_path / "found.zmx").optimization_data.merit[0]
     assert (row.operand, row.text) == ("BLNK", "sharpness: a function of the lens, target 1, weight 1")
