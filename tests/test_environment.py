@@ -295,8 +295,8 @@ def test_a_glass_whose_change_is_not_known_is_told_once_with_its_surface():
         lens.at(temperature=40)
     told = [str(warning.message) for warning in caught]
     assert len(told) == 2
-    assert told[0].startswith("surface 1: LZ_K8 (LZOS) has no thermal coefficients: at 40 °C it has the index of 20 °C")
-    assert told[1].startswith("surface 2: the medium of index 1.6 is told by numbers")
+    assert told[0].startswith("surface 1: LZ_K8 (LZOS) has no thermal coefficients: at 40 °C it keeps its index")
+    assert told[1].startswith("surface 2: the medium of index 1.6 is not of a catalog")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         lens.at(temperature=20, pressure=1)

@@ -1,12 +1,10 @@
-"""Focus: the sensor distance of least RMS spot, in closed form.
+"""Focus: the sensor distance of the smallest spot, and the verb `focus`.
 
 Rays in image space are straight: moving the sensor by s along its normal moves a hit by s·m, m = (L, M)/N. The mean
-square radius about each spot's own centroid is a parabola in s, so nothing is retraced:
+square radius about each spot's own centroid is a parabola in s, and its minimum over objects, fields and wavelengths of
+weights W needs no second trace:
 
     s = -Σ W cov(x, m) / Σ W var(m)
-
-
-Focusing: the best sensor distance by a criterion, and what it does to the spots.
 """
 
 import warnings
@@ -47,14 +45,21 @@ _RINGS = 12  # of the pupil, where focus on the axis is found
 
 
 class NoImage(ValueError):
-    """An object without a real image: there is no place for a sensor."""
+    """An object without a real image."""
+
+
+class NoFocus(ValueError):
+    """The light of an object has no focus; the message says why and what helps."""
+
+
+class VirtualImage(UserWarning):
+    """The best sensor distance is on the side that light comes from."""
 
 
 def focus_moments(rays: Rays, weights: Tensor | None = None, *, empty: str = "nan") -> tuple[Tensor, Tensor]:
-    """cov(x, m) in mm and var(m), x the hits and m = (L, M)/N the slopes, over the last axis of rays (3, ..., P).
+    """cov(x, m) in mm and var(m) of hits x and slopes m = (L, M)/N over the last axis of rays (3, ..., P).
 
-    The mean square radius on a sensor moved by s is its value at 0 plus 2 s cov + s² var. weights: (P,) or (..., P);
-    empty: what those of a spot without rays are, see `spot_of`.
+    weights: (P,) or (..., P); empty: as for `spot_of`.
     """
     points, slopes = _points_and_slopes(rays)
     weights = torch.ones_like(points[0]) if weights is None else weights.expand(points.shape[1:])
@@ -70,11 +75,9 @@ def focus_moments(rays: Rays, weights: Tensor | None = None, *, empty: str = "na
 def spot_parabola(rays: Rays, weights: Tensor | None = None, *, empty: str = "nan") -> tuple[Tensor, Tensor, Tensor]:
     """Q0 mm², Q1 mm, Q2 of the mean square radius Q0 + 2 s Q1 + s² Q2 on a sensor moved by s mm; each (...).
 
-    rays: (3, ..., P) as `image_rays` gives them. Once they are traced, a step of an optimisation of the sensor distance
-    is this polynomial, whatever the number of rays. empty: as for `spot_of`.
+    rays: (3, ..., P) of `image_rays`; empty: as for `spot_of`.
     """
-    here = spot_of(rays, weights, empty=empty)
-    return here.mean_square_radius, *focus_moments(rays, weights)
+    return spot_of(rays, weights, empty=empty).mean_square_radius, *focus_moments(rays, weights)
 
 
 def through_focus(rays: Rays, shifts: Tensor, weights: Tensor | None = None, *, empty: str = "nan") -> Spot:
@@ -92,9 +95,8 @@ def focus_of_rms(lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = "na
     """Sensor distance (scalar, mm) of least RMS spot over object distances × fields × wavelengths.
 
     pupil, weights: (2, P), (P,) of a rule in `pupil`; scene: as for `bundles`. Differentiable in every number of the
-    lens.
-    empty: "nan" leaves spots without rays out, for they are nowhere in focus; where none is left, or all rays are
-    parallel, the distance is nan with gradient 0. "error" raises EmptySpot for either.
+    lens. empty: "nan" ignores spots without rays; without any ray, or with parallel rays, the distance is nan with
+    gradient 0. "error" raises EmptySpot for either.
     """
     covariance = variance = torch.zeros_like(lens.surfaces[-2].thickness)
     for rays, share in bundles(lens, pupil, **scene):
@@ -112,9 +114,9 @@ def focus_of_rms(lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = "na
 def focus_of_mean_radius(lens: Lens, pupil: Tensor, weights: Tensor, **scene) -> Tensor:
     """Sensor distance (scalar, mm) of least mean distance of the hits from the centroid of their spot.
 
-    Arguments as for `focus_of_rms`, from where the search begins. Rays in image space are straight: they are traced
-    once, on the sensor as it stands, and what its rim clips there stays clipped. Not differentiated.
-    Raises EmptySpot where there is no focus of the rays, ValueError as `focus_of_merit`.
+    Arguments as for `focus_of_rms`, whose result starts the search. Rays are traced once, to the sensor's present
+    position; those that its rim clips there stay clipped. Not differentiable. Raises EmptySpot if the rays have no
+    focus, ValueError as `focus_of_merit`.
     """
     with torch.no_grad():
         start = focus_of_rms(lens, pupil, weights, **scene)
@@ -126,8 +128,8 @@ def focus_of_mean_radius(lens: Lens, pupil: Tensor, weights: Tensor, **scene) ->
         total = torch.zeros_like(sensor)
         for rays, share in traced:
             shift = (sensor - lens.surfaces[-2].thickness) * along_normal(lens)
-            found = through_focus(rays, shift.reshape(1), weights)
-            x, y = torch.where(found.valid, found.points - found.centroid[..., None], 0.0)
+            spots = through_focus(rays, shift.reshape(1), weights)
+            x, y = torch.where(spots.valid, spots.points - spots.centroid[..., None], 0.0)
             light = torch.where(rays.valid, weights, 0.0)
             radius = safe_divide((light * safe_sqrt(x * x + y * y)).sum(-1), light.sum(-1))
             total = total + (share * radius).sum()
@@ -139,8 +141,8 @@ def focus_of_mean_radius(lens: Lens, pupil: Tensor, weights: Tensor, **scene) ->
 def mean_rms_radius(lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = "nan", **scene) -> Tensor:
     """√ of the weighted mean of the mean square radii (scalar, mm) over object distances × fields × wavelengths.
 
-    Arguments as for `focus_of_rms`, which minimises it; spots without rays are left out, and it is nan if none is left,
-    or, with empty = "error", raises EmptySpot.
+    Arguments as for `focus_of_rms`, which minimises it. Spots without rays are ignored; without any ray it is nan or,
+    with empty = "error", raises EmptySpot.
     """
     total = sum_of_shares = torch.zeros_like(lens.surfaces[-2].thickness)
     for rays, share in bundles(lens, pupil, **scene):
@@ -167,7 +169,7 @@ def bundles(
     field_weights: Tensor | None = None,
     wavelength_weights: Tensor | None = None,
 ) -> Iterator[tuple[Rays, Tensor]]:
-    """The rays (3, F, W, P) of every object distance (mm, the lens's by default) and what their spots (F, W) count.
+    """The rays (3, F, W, P) of every object distance (mm, the lens's by default) and the weights (F, W) of their spots.
 
     fields, wavelengths: as for `launch`; weights: one for each, 1 by default.
     """
@@ -190,8 +192,7 @@ def best_focus(lens: Lens) -> Tensor:
 
 
 def along_normal(lens: Lens) -> Tensor | float:
-    """By how many mm the sensor moves along its own normal where its distance grows by 1 mm: less where it is tilted
-    in the axes that the distance is laid along."""
+    """Motion of the sensor along its own normal per mm of sensor distance: cos of the tilt of the image surface."""
     pose = lens.surfaces[-1].before
     if pose is None:
         return 1.0
@@ -202,7 +203,7 @@ def along_normal(lens: Lens) -> Tensor | float:
 def paraxial_sensor(lens: Lens, object_distances: Tensor) -> Tensor:
     """Sensor distances (D,) mm of the paraxial images of objects at distances (D,) mm, inf allowed.
 
-    Where the axis bends, that halfway between the images of both sections along the base ray; or that of one.
+    Where the axis bends: the mean of the images of both sections along the base ray, or the only one.
     """
     if not is_bent(lens):
         return paraxial_image_distance(lens, object_distances)
@@ -214,12 +215,11 @@ def paraxial_sensor(lens: Lens, object_distances: Tensor) -> Tensor:
 
 
 def real_image_distance(lens: Lens, object_distances: Tensor) -> Tensor:
-    """Sensor distances (D,) mm of the paraxial images of objects at distances (D,) mm. Raises NoImage for one that is
-    not behind the lens."""
+    """`paraxial_sensor`; raises NoImage for an image that is not behind the lens."""
     images = paraxial_sensor(lens, object_distances)
     wrong = ~(_behind(lens, images) & torch.isfinite(images))
     if bool(wrong.any()):
-        distance, image = (float(one[wrong][0]) for one in (object_distances.detach(), images.detach()))
+        distance, image = (float(part[wrong][0]) for part in (object_distances.detach(), images.detach()))
         raise NoImage(
             f"no real image of an object at {distance:g} mm: it lies within the focal length, or the lens diverges "
             f"(paraxial image at {image:g} mm)"
@@ -228,7 +228,7 @@ def real_image_distance(lens: Lens, object_distances: Tensor) -> Tensor:
 
 
 def is_behind(lens: Lens, distance: Tensor) -> bool:
-    """Whether a sensor distance (mm) is one: on the side of the last surface that the light goes to."""
+    """Whether a sensor distance (mm) lies on the side of the last surface that the light travels to."""
     return bool(_behind(lens, distance).all())
 
 
@@ -259,23 +259,19 @@ def _points_and_slopes(rays: Rays) -> tuple[Tensor, Tensor]:
 
 
 def focus_of_merit(merit: Callable[[Tensor], Tensor], start: Tensor, *, step: float = 0.1, tolerance: float = 1e-10):
-    """Sensor distance (scalar, mm) that minimises any differentiable merit of it, found by its gradient.
+    """Sensor distance (scalar, mm) that minimises a differentiable merit of it.
 
-    merit: sensor distance (scalar, mm) -> scalar, smooth near its minimum; start: mm, where the search begins, within
-    the basin of the minimum; step: mm, the first step of the search for a bracket; tolerance: mm.
-    The slope is bracketed and its zero found by Brent's method (scipy); one Newton step then attaches the implicit
-    derivative ds/dp = -∂²M/∂s∂p / ∂²M/∂s², so the result is differentiable once in all that the merit depends on.
-    Raises ValueError if the merit has no minimum within 2²⁰ steps.
+    merit: sensor distance (scalar, mm) -> scalar, smooth near its minimum; start: mm, within the basin of the minimum;
+    step: mm, the first step of the bracketing; tolerance: mm. The zero of the slope is bracketed and found by Brent's
+    method (scipy); one Newton step attaches the implicit derivative ds/dp = -∂²M/∂s∂p / ∂²M/∂s², so that the result is
+    differentiable once. Raises ValueError if the merit has no minimum within 2²⁰ steps.
     """
 
     def slope(s: Tensor, *, create_graph: bool = False) -> Tensor:
         s = s if s.requires_grad else s.detach().requires_grad_()
         return torch.autograd.grad(merit(s), s, create_graph=create_graph)[0]
 
-    def slope_at(s: float) -> float:
-        return float(slope(start.new_tensor(s)))
-
-    first = float(start)
+    first, slope_at = float(start), lambda s: float(slope(start.new_tensor(s)))
     here = slope_at(first)
     if here != 0:
         direction = -step if here > 0 else step
@@ -297,21 +293,13 @@ def focus_of_merit(merit: Callable[[Tensor], Tensor], start: Tensor, *, step: fl
     return s.detach() - (gradient - gradient.detach()) / bend.detach()
 
 
-class NoFocus(ValueError):
-    """There is no place where the light of an object comes together; the message says why and what helps."""
-
-
-class VirtualImage(UserWarning):
-    """The best sensor distance is on the side that light comes from, where no sensor can stand."""
-
-
 @value
 class Focus(Result):
-    """The lens with its sensor where the criterion is best, and the sensor distances that it was chosen from, mm.
+    """The refocused lens, and the sensor distances by other criteria, mm.
 
-    lens, before: the same but for the sensor. paraxial: (D,) of the paraxial image of every object; rms: of least RMS
-    spot; criterion: as for `focus`. object_distances: (D,) mm, fields: (2, F), wavelengths: (W,) µm, their weights
-    (or None) and the rule of the pupil, points (2, P) and weights (P,): what was looked at.
+    lens, before: with the new and the old sensor distance; paraxial: (D,) of the paraxial image of every object; rms:
+    of least RMS spot; criterion: as for `focus`. object_distances: (D,) mm, fields: (2, F), wavelengths: (W,) µm, their
+    weights (or None), and points (2, P) and weights (P,) of the pupil: those evaluated.
     """
 
     lens: Lens
@@ -337,21 +325,31 @@ class Focus(Result):
 
     @property
     def is_real(self) -> bool:
-        """Whether light gets there: behind the lens."""
+        """Whether the image is real: behind the lens."""
         return is_behind(self.lens, self.sensor_distance)
 
     def rms_radius(self, sensor_distance: Tensor | float | None = None) -> Tensor:
-        """RMS radius (mm) over distances, fields and wavelengths by their weights, by default on the sensor found."""
+        """Weighted RMS radius (mm) over distances, fields and wavelengths, by default at the new sensor distance."""
         lens = self.lens if sensor_distance is None else with_sensor_distance(self.before, sensor_distance)
-        return mean_rms_radius(lens, self.points, self.weights, **_rule(self))
+        return mean_rms_radius(
+            lens,
+            self.points,
+            self.weights,
+            object_distances=self.object_distances,
+            distance_weights=self.distance_weights,
+            fields=self.fields,
+            field_weights=self.field_weights,
+            wavelengths=self.wavelengths,
+            wavelength_weights=self.wavelength_weights,
+        )
 
     def columns(self) -> dict[str, Tensor]:
-        places = torch.stack([place for _, place in self._places()])
-        radii = torch.stack([self.rms_radius(place) for place in places])
-        return {"place": torch.arange(len(places)), "sensor_distance": places, "rms_radius": radii}
+        sensors = torch.stack([sensor for _, sensor in self._sensors()])
+        radii = torch.stack([self.rms_radius(sensor) for sensor in sensors])
+        return {"place": torch.arange(len(sensors)), "sensor_distance": sensors, "rms_radius": radii}
 
     def words(self) -> dict:
-        return {"place": [words for words, _ in self._places()]}
+        return {"place": [words for words, _ in self._sensors()]}
 
     def units(self) -> dict[str, str]:
         return {"sensor_distance": "mm", "rms_radius": "mm"}
@@ -372,7 +370,7 @@ class Focus(Result):
 
     def __str__(self) -> str:
         data, kind = first_order(self.before), self.before.fields.kind
-        across, place = float(data.entrance_pupil_diameter), float(data.entrance_pupil_position)
+        diameter, position = float(data.entrance_pupil_diameter), float(data.entrance_pupil_position)
         focal, back = float(data.effective_focal_length), float(data.back_focal_distance)
         objects = ", ".join(_words(d) for d in self.object_distances.tolist())
         fields = ", ".join(name_of_field(field) for field in self.fields.unbind(1))
@@ -380,22 +378,22 @@ class Focus(Result):
         lines = [
             self.before.name,
             f"  effective focal length {focal:.6f} mm, F/{float(data.f_number):.4g}, back focal distance {back:.6f} mm",
-            f"  entrance pupil {across:.5g} mm across, {place:.5g} mm from surface 1",
+            f"  entrance pupil {diameter:.5g} mm across, {position:.5g} mm from surface 1",
             f"  object at {objects}; field {fields} {FIELD_UNITS[kind]}; {colours} µm; criterion {self.criterion}\n",
             f"  {'':<28} {'sensor distance':>18} {'RMS spot radius':>18}",
         ]
-        for words, sensor in self._places():
+        for words, sensor in self._sensors():
             rms = number(self.rms_radius(sensor))
             radius = "no rays" if rms is None else f"{1000 * rms:>15.4f} µm"
             lines.append(f"  {words:<28} {float(sensor):>15.6f} mm {radius}")
         return "\n".join(lines)
 
-    def _places(self) -> list[tuple[str, Tensor]]:
-        """Sensor distances of interest, and what they are."""
+    def _sensors(self) -> list[tuple[str, Tensor]]:
+        """Sensor distances with their names."""
         several = len(self.object_distances) > 1
         named = [f"paraxial image of {_words(d)}" if several else "paraxial" for d in self.object_distances.tolist()]
-        found = [("before", self.before.surfaces[-2].thickness), ("after", self.sensor_distance)]
-        return [*found, *zip(named, self.paraxial, strict=True), ("best RMS", self.rms)]
+        both = [("before", self.before.surfaces[-2].thickness), ("after", self.sensor_distance)]
+        return [*both, *zip(named, self.paraxial, strict=True), ("best RMS", self.rms)]
 
     def save(self, path: str | PathLike) -> None:
         """Write the lens with its new sensor distance."""
@@ -417,13 +415,13 @@ def focus(
     points: int | None = None,
     seed: int = 0,
 ) -> Focus:
-    """The lens with its sensor at the best distance for objects, fields and wavelengths, by their weights.
+    """The lens with its sensor at the best distance for weighted objects, fields and wavelengths.
 
-    criterion: "rms", the least RMS spot radius, in closed form and differentiable; "paraxial", the paraxial image, or
-    the weighted mean of those of several objects; "mean", the least mean distance from the centroid.
-    object_distances: mm, inf allowed, by default the lens's own; fields: y, (x, y) or (2, F), by default the axis;
-    wavelengths: µm, by default the primary one; weights: one for each, by default alike. sampling, rings, points, seed:
-    as for `pupil.sampled`. Warns LostRays and VirtualImage. Raises NoFocus, and ValueError for what is not known.
+    criterion: "rms", least RMS spot radius, in closed form and differentiable; "paraxial", the paraxial image, or the
+    weighted mean of those of several objects; "mean", least mean distance from the centroid.
+    object_distances: mm, inf allowed, by default the lens's; fields: y, (x, y) or (2, F), by default the axis;
+    wavelengths: µm, by default the primary one; weights: one for each, by default equal. sampling, rings, points, seed:
+    as for `pupil.sampled`. Warns LostRays and VirtualImage. Raises NoFocus, and ValueError for an unknown argument.
     """
     if criterion not in ("rms", "paraxial", "mean"):
         raise ValueError(f"criterion {criterion!r}: expected one of rms, paraxial, mean")
@@ -435,7 +433,7 @@ def focus(
     like = lens.surfaces[-2].thickness
     at, weights = pupil.sampled(sampling, rings=rings, points=points, seed=seed, dtype=like.dtype, device=like.device)
     paraxial = paraxial_sensor(lens, distances)
-    looked_at = {
+    scene = {
         "object_distances": distances,
         "fields": fields,
         "wavelengths": wavelengths,
@@ -445,37 +443,38 @@ def focus(
     }
     if not bool(torch.isfinite(paraxial).all()):
         raise NoFocus("the lens is afocal for this object distance; there is no focus to find")
-    rms = focus_of_rms(lens, at, weights, **looked_at)
-    _tell_losses(lens, at, distances, fields, wavelengths)
+    rms = focus_of_rms(lens, at, weights, **scene)
+    _check_rays(lens, at, distances, fields, wavelengths)
     if not bool(torch.isfinite(rms)):
         raise NoFocus("one ray, or parallel rays, have no focus; give more `rings` or `points`")
     best = rms
     if criterion == "mean":
-        best = focus_of_mean_radius(lens, at, weights, **looked_at)
+        best = focus_of_mean_radius(lens, at, weights, **scene)
     elif criterion == "paraxial":
-        shares = looked_at["distance_weights"]
+        shares = scene["distance_weights"]
         best = paraxial.mean() if shares is None else (shares * paraxial).sum() / shares.sum()
-    found = Focus(
+    result = Focus(
         with_sensor_distance(lens, best), lens, paraxial, rms, points=at, weights=weights, criterion=criterion,
-        **looked_at,
+        **scene,
     )  # fmt: skip
-    if not found.is_real:
-        place = f"{float(best):g} mm, on the side of the last surface that the light comes from"
-        told = f"the image is virtual, at {place}: no sensor can stand there; take the object further away"
-        warnings.warn(told, VirtualImage, stacklevel=calling_level())
-    return found
+    if not result.is_real:
+        message = (
+            f"the image is virtual, at {float(best):g} mm, on the side of the last surface that the light comes from"
+        )
+        warnings.warn(f"{message}: move the object further away", VirtualImage, stacklevel=calling_level())
+    return result
 
 
-def _weights(lens: Lens, given, count: int, option: str) -> Tensor | None:
-    if given is None:
+def _weights(lens: Lens, weights, count: int, option: str) -> Tensor | None:
+    if weights is None:
         return None
-    found = vector(given, like=lens)
-    if len(found) != count:
-        raise ValueError(f"{option}: {len(found)} given, expected {count}, one for each")
-    return found
+    weights = vector(weights, like=lens)
+    if len(weights) != count:
+        raise ValueError(f"{option}: {len(weights)} given, expected {count}, one for each")
+    return weights
 
 
-def _tell_losses(lens: Lens, points: Tensor, distances: Tensor, fields: Tensor, wavelengths: Tensor) -> None:
+def _check_rays(lens: Lens, points: Tensor, distances: Tensor, fields: Tensor, wavelengths: Tensor) -> None:
     """Warn of rays that do not reach the image. Raises NoFocus if none does."""
     arrived = []
     for distance in distances:
@@ -489,13 +488,8 @@ def _tell_losses(lens: Lens, points: Tensor, distances: Tensor, fields: Tensor, 
     if lost == 1:
         raise NoFocus("no ray reaches the image")
     if lost > 0:
-        message = f"{lost:.2%} of the rays are lost; the focus is of the rest"
+        message = f"{lost:.2%} of the rays fail or are vignetted; the focus is that of the others"
         warnings.warn(message, LostRays, stacklevel=calling_level())
-
-
-def _rule(found: Focus) -> dict:
-    names = ("object_distances", "fields", "wavelengths", "distance_weights", "field_weights", "wavelength_weights")
-    return {name: getattr(found, name) for name in names}
 
 
 def _words(distance: float) -> str:

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from raytrace.materials.environment import told
+from raytrace.materials.environment import in_words
 from raytrace.materials.glass import label
 from raytrace.maths.result import Result, number, numbers
 from raytrace.maths.value import detached, value
@@ -241,7 +241,7 @@ class Info(Result):
             f"  {'ray aiming':<24} {_aiming(lens)}",
             *([f"  {'configuration':<24} {' of '.join(map(str, which.values()))}"] if which else []),
             f"  {'fields':<24} {points} {FIELD_UNITS[lens.fields.kind]}, {lens.fields.kind.replace('_', ' ')}",
-            *([f"  {'environment':<24} {told(lens.environment)}"] if lens.environment else []),
+            *([f"  {'environment':<24} {in_words(lens.environment)}"] if lens.environment else []),
             "",
             f"  {'surface':>7} {'radius':>13} {'thickness':>12} {'glass':<12} {'index':>9} {'semi-dia.':>10}  note",
         ]
@@ -420,6 +420,6 @@ def _remarks(lens: Lens, k: int) -> str:
         parts.append(f"conic {float(surface.conic):g}")
     parts += remarks(surface)
     if surface.environment is not None:
-        parts.append(f"in {told(surface.environment)}")
+        parts.append(f"in {in_words(surface.environment)}")
     parts += [f"{a.shape} {'obscuration' if a.obscures else 'aperture'}" for a in surface.apertures]
     return ", ".join(dict.fromkeys(filter(None, [*parts, surface.comment])))

@@ -689,7 +689,7 @@ def report_environment(sections: Sections, lens: Lens, report: Draft) -> None:
     record = sections.system.last("ENVD")
     if lens.environment is not None:
         report.note(
-            f"indices are those at {environments.told(lens.environment)} (ENVD); radii and thicknesses stay as stored"
+            f"indices are those at {environments.in_words(lens.environment)} (ENVD); radii, thicknesses as stored"
         )
         for number, message in unknown_changes(lens).items():
             glass = sections.surfaces[number].last("GLAS")
