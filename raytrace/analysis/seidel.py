@@ -23,8 +23,8 @@ from raytrace.maths.value import value
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.surface import Surface, is_even, vertex_curvature
 from raytrace.tracing.aiming import need_axis
-from raytrace.tracing.launch import paraxial_field
-from raytrace.tracing.paraxial import FirstOrder, first_order, largest_field, marginal_ray, signed, ynu
+from raytrace.tracing.launch import is_at_infinity, paraxial_field
+from raytrace.tracing.paraxial import FirstOrder, chief_ray, first_order, largest_field, marginal_ray, signed, ynu
 from raytrace.tracing.trace import media
 from raytrace.words import named, with_article
 
@@ -160,14 +160,15 @@ def _chief_ray(lens: Lens, fields: Tensor, paraxial: FirstOrder) -> tuple[Tensor
     """(ȳ, ω̄) (F,) in front of surface 1, of fields in the direction of +y."""
     upwards = torch.stack([torch.zeros_like(fields[0]), torch.hypot(*fields)])
     extent = paraxial_field(lens, upwards, paraxial)[1]
-    distance, pupil = lens.surfaces[0].thickness, paraxial.entrance_pupil_position
-    n = media(lens, primary_wavelength(lens))[0]
-    if bool(torch.isinf(distance)):
-        return -pupil * extent, n * extent
-    if lens.fields.telecentric or not bool(torch.isfinite(pupil)):
-        return extent, torch.zeros_like(extent)
-    slope = -extent / (distance + pupil)
-    return -pupil * slope, n * slope
+    pupil, n = paraxial.entrance_pupil_position, media(lens, primary_wavelength(lens))[0]
+    height, slope = chief_ray(
+        extent,
+        at_infinity=is_at_infinity(lens),
+        distance=lens.surfaces[0].thickness,
+        entrance_pupil=pupil,
+        parallel=lens.fields.telecentric or not bool(torch.isfinite(pupil)),
+    )
+    return height, n * slope
 
 
 def _indices(lens: Lens) -> tuple[list[Tensor], list[Tensor]]:

@@ -11,6 +11,8 @@ Source: Clifford 1873; Griewank & Walther, Evaluating Derivatives, 2008, ch. 3 (
 from collections.abc import Callable
 
 import numpy as np
+import torch
+from torch import Tensor
 
 
 class Dual:
@@ -112,6 +114,16 @@ def value_of(number):
 def slope_of(number, variables: int) -> np.ndarray:
     """The derivatives (n, ...) of a number by n variables; 0 where it is no dual one."""
     return number.full() if isinstance(number, Dual) else np.zeros((variables, *np.shape(number)))
+
+
+def quotient(a, b):
+    """a/b of tensors or numbers; infinite where a number b is 0."""
+    return a / b if isinstance(b, Tensor) or value_of(b) != 0 else np.inf
+
+
+def select(condition, a, b):
+    """a where a condition holds, else b: entry by entry of tensors, else one or the other number."""
+    return torch.where(condition, a, b) if isinstance(condition, Tensor) else a if condition else b
 
 
 def _dim(one: Dual, other) -> int:

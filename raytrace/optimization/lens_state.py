@@ -9,7 +9,6 @@ Each is found from the numbers of the surfaces before, at the primary wavelength
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,7 +20,7 @@ from raytrace.system.optimization_data import Solve
 from raytrace.system.rays import Rays
 from raytrace.system.surface import sag_at, vertex_curvature
 from raytrace.tracing.launch import rays_of_field, vignette
-from raytrace.tracing.paraxial import brackets, power, signed
+from raytrace.tracing.paraxial import CONES, Gaussian, brackets, field_scale, power, signed
 from raytrace.tracing.trace import media, sequence_of, trace_surfaces
 
 #: Through which points of the pupil light reaches furthest from the vertex of a surface.
@@ -138,32 +137,6 @@ SOLVES = {
 
 _PASSES = 60  # through solves that depend on one another
 _STILL = 1e-15  # relative
-
-
-class Gaussian(NamedTuple):
-    """First-order data at one wavelength, signed as in `tracing.paraxial`: y′ = A y + B ω, ω′ = C y + D ω, ω = n u.
-
-    A to D: from surface 1 to behind the last one before the image; front: A and B to the stop; rear: B and D from the
-    stop; n_object, n_image: signed indices.
-    """
-
-    A: Dual
-    B: Dual
-    C: Dual
-    D: Dual
-    front: tuple[Dual, Dual]
-    rear: tuple[Dual, Dual]
-    n_object: float
-    n_image: float
-
-    @property
-    def effective_focal_length(self):
-        return -abs(self.n_image) / self.C
-
-    @property
-    def entrance_pupil_position(self):
-        """mm from surface 1."""
-        return self.n_object * self.front[1] / self.front[0]
 
 
 class LensState:
@@ -291,7 +264,28 @@ class LensState:
     @cached_property
     def vergence(self):
         """n / object distance at the primary wavelength, 0 for an object at infinity."""
-        return self.index(self.primary)[0] / self.object_distance
+        return self.vergence_at(self.primary)
+
+    def vergence_at(self, wavelength: int):
+        return self.index(wavelength)[0] / self.object_distance
+
+    @property
+    def is_at_infinity(self) -> bool:
+        """Whether the object is."""
+        return bool(np.isinf(value_of(self.thickness[0])))
+
+    @cached_property
+    def field_scale(self):
+        """Slope or object height in mm per tan θ or mm of the fields, as `paraxial.field_scale`."""
+        data, at_infinity = self.gaussian(self.primary), self.is_at_infinity
+        return field_scale(
+            self.lens.fields.kind,
+            at_infinity=at_infinity,
+            distance=self.thickness[0],
+            entrance_pupil=data.entrance_pupil_position,
+            power=-data.C / data.n_object,
+            magnification=None if at_infinity else data.magnification(self.vergence),
+        )
 
     @property
     def object_distance(self):
@@ -301,35 +295,24 @@ class LensState:
     @cached_property
     def entrance_pupil_diameter(self):
         """mm, as the aperture of the lens means it, at the primary wavelength."""
-        kind, number = self.lens.aperture.kind, float(self.lens.aperture.value)
-        data = self.gaussian(self.primary)
-        if kind == "entrance_pupil_diameter":
-            return number
-        if kind == "image_f_number":
-            return np.abs(data.effective_focal_length) / number
-        if kind == "float_by_stop":
-            return 2 * number / np.abs(data.front[0])
-        if kind == "paraxial_working_f_number":
-            slope, omega = 0.5 / (number * abs(data.n_image)), data.C + data.D * self.vergence
-            pupil = data.entrance_pupil_position
-            return 2 * np.abs(slope * data.n_image / omega * (1 + pupil * self.vergence / data.n_object))
-        return 2 * np.abs((self.thickness[0] + data.entrance_pupil_position) * np.tan(self.cone_angle))
+        aperture, data = self.lens.aperture, self.gaussian(self.primary)
+        number, distance = float(aperture.value), self.thickness[0]
+        return data.entrance_pupil_diameter(aperture.kind, number, distance, self.vergence, self.tan_cone)
 
     @property
-    def cone_angle(self) -> float:
-        """Half angle of the cone at the object, radians, of an aperture that is given as one."""
+    def tan_cone(self) -> float | None:
+        """Of the half angle of the cone at the object, of an aperture that is given as one."""
         kind, number = self.lens.aperture.kind, float(self.lens.aperture.value)
-        return np.arcsin(number / self.index(self.primary)[0]) if kind == "object_na" else np.deg2rad(number)
+        if kind not in CONES:
+            return None
+        return np.tan(np.arcsin(number / self.index(self.primary)[0]) if kind == "object_na" else np.deg2rad(number))
 
     @cached_property
     def marginal_height(self):
         """mm at surface 1 of the paraxial marginal ray."""
+        kind, diameter = self.lens.aperture.kind, self.entrance_pupil_diameter
         data = self.gaussian(self.primary)
-        reach = 1 + data.entrance_pupil_position * self.vergence / data.n_object
-        if self.lens.aperture.kind in ("object_na", "object_cone_angle"):
-            height = np.abs(self.thickness[0] * np.tan(self.cone_angle))
-            return -height if value_of(reach) < 0 else height
-        return 0.5 * self.entrance_pupil_diameter / reach
+        return data.marginal_height(kind, diameter, self.thickness[0], self.vergence, self.tan_cone)
 
     # -- what follows --------------------------------------------------------------------------------------------------
 
@@ -361,6 +344,7 @@ class LensState:
             "vertex_curvature",
             "media",
             "vergence",
+            "field_scale",
             "entrance_pupil_diameter",
             "marginal_height",
         ):

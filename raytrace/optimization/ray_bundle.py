@@ -43,14 +43,7 @@ def launched(state: LensState, field: np.ndarray, pupil: np.ndarray):
     index = np.abs(state.view.indices[:, :1])
     radius, depth = 0.5 * state.entrance_pupil_diameter, data.entrance_pupil_position
     at_infinity = np.isinf(value_of(distance))
-    if kind == "angle":
-        slope = np.tan(np.deg2rad(field))
-        x, y = slope if at_infinity else (-(distance + depth) * part for part in slope)
-    elif kind == "object_height":
-        x, y = field
-    else:
-        scale = -data.C / data.n_object if at_infinity else (data.C + data.D * state.vergence) / state.vergence
-        x, y = (scale * part for part in field)
+    x, y = (state.field_scale * part for part in (np.tan(np.deg2rad(field)) if kind == "angle" else field))
     aim = radius * pupil[0], radius * pupil[1], depth
     if at_infinity:
         length = np.sqrt(x * x + y * y + 1.0)

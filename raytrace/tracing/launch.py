@@ -50,7 +50,7 @@ from raytrace.system.rays import Rays, start
 from raytrace.system.surface import sag
 from raytrace.tracing.aiming import aim_at_image, aim_at_stop, aiming_of, at_stop, is_bent
 from raytrace.tracing.base_ray import Entrance, entrance_of
-from raytrace.tracing.paraxial import FirstOrder, first_order
+from raytrace.tracing.paraxial import FirstOrder, field_scale, first_order
 from raytrace.words import calling_level
 
 
@@ -177,18 +177,23 @@ def object_field(lens: Lens, field: Tensor, paraxial: FirstOrder) -> tuple[Tenso
 
 def paraxial_field(lens: Lens, field: Tensor, paraxial: FirstOrder) -> Tensor:
     """As `object_field`, real image heights as if they were paraxial ones."""
-    distance, kind = lens.surfaces[0].thickness, lens.fields.kind
-    at_infinity = is_at_infinity(lens)
-    if kind == "angle":
-        slope = torch.tan(torch.deg2rad(field))
-        return slope if at_infinity else _scaled(slope, -(distance + paraxial.entrance_pupil_position))
+    kind, at_infinity = lens.fields.kind, is_at_infinity(lens)
     if kind == "object_height":
         if at_infinity:
             raise ValueError("fields are object heights but the object is at infinity: give angles, or a distance")
         return field
-    index = index_behind(lens, 0, lens.primary)
-    scale = paraxial.power / index if at_infinity else 1 / paraxial.magnification
-    return _scaled(field, scale)
+    scale = field_scale(
+        kind,
+        at_infinity=at_infinity,
+        distance=lens.surfaces[0].thickness,
+        entrance_pupil=paraxial.entrance_pupil_position,
+        power=paraxial.power / index_behind(lens, 0, lens.primary),
+        magnification=paraxial.magnification,
+    )
+    if kind != "angle":
+        return _scaled(field, scale)
+    slope = torch.tan(torch.deg2rad(field))
+    return slope if at_infinity else _scaled(slope, scale)
 
 
 def _part_of_field(lens: Lens, field: Tensor, fraction: float) -> Tensor:

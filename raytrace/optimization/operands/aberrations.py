@@ -12,7 +12,7 @@ from raytrace.analysis.seidel import OF_WAVEFRONT, departure_from_sphere, third_
 from raytrace.maths.dual import value_of
 from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Found, Line, Operand, Planner
 from raytrace.optimization.lens_state import LensState
-from raytrace.optimization.operands.paraxial import along, chief_ray, field_of, listed, paraxial_image_distance
+from raytrace.optimization.operands.paraxial import along, chief_ray_of, field_of, listed, paraxial_image_distance
 from raytrace.optimization.operands.rays import known
 from raytrace.system.surface import is_even
 from raytrace.tracing.aiming import is_bent
@@ -107,7 +107,7 @@ def _seidel(state: LensState, wavelength: int, shapes: "_Shapes"):
     surfaces = range(1, len(c) - 1)
     powers = [c[k] * (n[k] - n[k - 1]) for k in surfaces]
     gaps = [state.thickness[k] / n[k] for k in surfaces[:-1]]
-    y, (y_bar, slope) = state.marginal_height, chief_ray(state)
+    y, (y_bar, slope) = state.marginal_height, chief_ray_of(state)
     omega, omega_bar = n[0] * y / state.object_distance, n[0] * slope
     rays = [ynu(*ray, powers, gaps)[:-1] for ray in ((y, omega), (y_bar, omega_bar))]
     marginal, chief = ([listed(column, state.count) for column in zip(*ray, strict=True)] for ray in rays)

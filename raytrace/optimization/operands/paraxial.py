@@ -7,12 +7,13 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from raytrace.maths.dual import Dual, slope_of, value_of
+from raytrace.maths.dual import Dual, quotient, slope_of, value_of
 from raytrace.optimization.context import Evaluate, EvaluationContext, Found, Line, Operand, Planner
 from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.operands.arguments import need
 from raytrace.optimization.operands.rays import known
 from raytrace.optimization.ray_bundle import Hits
+from raytrace.tracing.paraxial import chief_ray, petzval_sum
 
 _RIM = 32  # rays by which the outline of a cone is known
 
@@ -42,48 +43,36 @@ def listed(numbers: Sequence, count: int):
     return Dual(values, np.stack([slope_of(n, count) for n in numbers], -1)) if count else values
 
 
-def over(a, b):
-    """a/b, infinite where b is 0."""
-    return a / b if value_of(b) != 0 else np.inf
-
-
 # -- focal length, pupils and conjugates -------------------------------------------------------------------------------
 
 
 def _focal_length(context: EvaluationContext, line: Line):
     data = context.state.gaussian(line.wavelength)
-    return over(-1.0, data.C) if context.planner.conventions.focal_length == "in air" else data.effective_focal_length
+    return (
+        quotient(-1.0, data.C) if context.planner.conventions.focal_length == "in air" else data.effective_focal_length
+    )
 
 
 def _exit_pupil_position(state: LensState):
-    data = state.gaussian(state.primary)
-    return over(-data.n_image * data.rear[0], data.rear[1]) - state.thickness[-2]
+    return state.gaussian(state.primary).exit_pupil_distance - state.thickness[-2]
 
 
 def _exit_pupil_diameter(state: LensState):
-    data = state.gaussian(state.primary)
-    return state.entrance_pupil_diameter * np.abs(over(data.front[0], data.rear[1]))
-
-
-def _vergence(state: LensState, wavelength: int):
-    """n / object distance; 0 for an object at infinity."""
-    return state.index(wavelength)[0] / state.object_distance
+    return state.entrance_pupil_diameter * state.gaussian(state.primary).pupil_magnification
 
 
 def _magnification(state: LensState, wavelength: int):
-    data, vergence = state.gaussian(wavelength), _vergence(state, wavelength)
-    return over(vergence, data.C + data.D * vergence)
+    return state.gaussian(wavelength).magnification(state.vergence_at(wavelength))
 
 
 def _angular_magnification(state: LensState, wavelength: int):
-    data = state.gaussian(wavelength)
-    return over(data.n_object * data.rear[1], data.n_image * data.front[0])
+    return state.gaussian(wavelength).angular_magnification
 
 
 def image_slope(state: LensState):
     """u′ of the paraxial marginal ray behind the lens."""
     data = state.gaussian(state.primary)
-    return state.marginal_height * (data.C + data.D * state.vergence) / data.n_image
+    return state.marginal_height * data.omega_behind(state.vergence) / data.n_image
 
 
 def _image_na(state: LensState):
@@ -96,8 +85,7 @@ def _f_number(state: LensState):
 
 def paraxial_image_distance(state: LensState, wavelength: int):
     """mm from the last surface before the image."""
-    data, vergence = state.gaussian(wavelength), _vergence(state, wavelength)
-    return over(-data.n_image * (data.A + data.B * vergence), data.C + data.D * vergence)
+    return state.gaussian(wavelength).image_distance(state.vergence_at(wavelength))
 
 
 # -- the chief ray of the largest field --------------------------------------------------------------------------------
@@ -105,34 +93,28 @@ def paraxial_image_distance(state: LensState, wavelength: int):
 
 def extent_of_field(state: LensState):
     """Slope of the largest field at infinity, or mm of the object; real image heights as if they were paraxial ones."""
-    fields, data = state.lens.fields, state.gaussian(state.primary)
+    fields = state.lens.fields
     largest = float(np.hypot(fields.x.numpy(), fields.y.numpy()).max())
-    at_infinity = np.isinf(value_of(state.thickness[0]))
-    if fields.kind == "angle":
-        slope = np.tan(np.deg2rad(largest))
-        return slope if at_infinity else -slope * (state.thickness[0] + data.entrance_pupil_position)
-    if fields.kind == "object_height":
-        return largest
-    return largest * (-data.C / data.n_object if at_infinity else 1 / _magnification(state, state.primary))
+    return state.field_scale * (np.tan(np.deg2rad(largest)) if fields.kind == "angle" else largest)
 
 
-def chief_ray(state: LensState) -> tuple:
+def chief_ray_of(state: LensState) -> tuple:
     """(ȳ, ū) in front of surface 1 of the chief ray of the largest field, upwards, at every wavelength."""
-    extent, pupil = extent_of_field(state), state.gaussian(state.primary).entrance_pupil_position
-    distance = state.thickness[0]
-    if np.isinf(value_of(distance)):
-        return -pupil * extent, extent
-    if state.lens.fields.telecentric or not np.isfinite(value_of(pupil)):
-        return extent, 0.0
-    slope = -extent / (distance + pupil)
-    return -pupil * slope, slope
+    pupil, distance = state.gaussian(state.primary).entrance_pupil_position, state.thickness[0]
+    return chief_ray(
+        extent_of_field(state),
+        at_infinity=state.is_at_infinity,
+        distance=distance,
+        entrance_pupil=pupil,
+        parallel=state.lens.fields.telecentric or not np.isfinite(value_of(pupil)),
+    )
 
 
 def _image_height(state: LensState, wavelength: int):
     """Of the largest field, in the paraxial image: m h, or -n u/C of an object at infinity."""
     extent, data = extent_of_field(state), state.gaussian(wavelength)
-    if np.isinf(value_of(state.thickness[0])):
-        return over(-data.n_object * extent, data.C)
+    if state.is_at_infinity:
+        return quotient(-data.n_object * extent, data.C)
     return _magnification(state, wavelength) * extent
 
 
@@ -159,11 +141,11 @@ def petzval_curvature(state: LensState, wavelength: int):
     """1/mm of the surface on which an image without astigmatism lies: -n′ Σ c (n′ - n)/(n n′)."""
     n, c = state.index(wavelength), state.vertex_curvature
     last = len(c) - 1
-    return -n[last - 1] * sum(c[k] * ((n[k] - n[k - 1]) / (n[k] * n[k - 1])) for k in range(1, last))
+    return -n[last - 1] * petzval_sum(c[1:last], n[:last])
 
 
 def _petzval_radius(state: LensState, wavelength: int):
-    return over(1.0, petzval_curvature(state, wavelength))
+    return quotient(1.0, petzval_curvature(state, wavelength))
 
 
 # -- cones of real rays ------------------------------------------------------------------------------------------------
