@@ -107,8 +107,8 @@ def walks() -> dict[str, Callable[[], object]]:
 def tell_walks() -> None:
     for name, run in walks().items():
         files, upward = walked(run)
-        work = sorted(file for file in files if _floor(file) >= FLOORS["optics"])
-        print(f"{name}: {len(files)} files, {len(work)} of them from optics/ up, {len(upward)} calls upward")
+        work = sorted(file for file in files if _floor(file) >= FLOORS["tracing"])
+        print(f"{name}: {len(files)} files, {len(work)} of them from tracing/ up, {len(upward)} calls upward")
         print(f"  {' '.join(sorted(files))}")
 
 

@@ -23,7 +23,7 @@ from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import Scene, scene
 
 #: Runs a test by torch alone and by the compiled trace (fixture `engine`).
-both_engines = pytest.mark.parametrize("engine", ["eager", "fused"], indirect=True)
+both_engines = pytest.mark.parametrize("engine", ["eager", "compiled"], indirect=True)
 
 #: Lengths in mm, for tolerances that carry a unit.
 MICROMETRE = 1e-3

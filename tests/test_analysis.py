@@ -17,11 +17,10 @@ from raytrace.materials.glass import model_glass
 from raytrace.maths.numerics import safe_sqrt
 from raytrace.maths.pupil import gauss_rings
 from raytrace.system.lens import Lens, with_sensor_distance
-from raytrace.tracing.focus import image_rays
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.ray_failures import OutOfReach
-from raytrace.tracing.spot import EmptySpot
+from raytrace.tracing.spot import EmptySpot, image_rays
 from raytrace.tracing.trace import trace_lens
 
 WAVELENGTH = 0.55e-3  # mm

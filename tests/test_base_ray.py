@@ -8,8 +8,7 @@ import torch
 from bends import pose, real
 
 import raytrace as rt
-from raytrace.tracing.aiming import at_stop
-from raytrace.tracing.axis import Bent, is_bent
+from raytrace.tracing.aiming import Bent, at_stop, is_bent
 from raytrace.tracing.paraxial import largest_field
 
 

@@ -15,8 +15,7 @@ from raytrace.psf_models import MODELS, fourier, psf
 from raytrace.system.lens import with_object_distance
 from raytrace.tracing.compiled import prepare, trace_engine
 from raytrace.tracing.launch import rays_of_field
-from raytrace.tracing.memo import Memo, trace_bundle
-from raytrace.tracing.scene import scene, symmetry
+from raytrace.tracing.scene import Memo, scene, symmetry, trace_bundle
 
 TINY = Sizes(less=64, distances=2)
 ROUNDING = 1e-10  # of sums of kernels and gradients; a kernel 1e-12 degrees off the axis moves by 3e-11 of itself
@@ -47,7 +46,7 @@ def test_rows_say_what_was_compared(monkeypatch):
     rows = measure(TINY, repeats=1, progress=words.append)
     assert torch.get_num_threads() == before
     assert words == [row.what for row in rows] == [case.what for case in few]
-    assert {row.engine for row in rows} == {"eager"} | ({"fused"} if prepare() == "fused" else set())
+    assert {row.engine for row in rows} == {"eager"} | ({"compiled"} if prepare() == "compiled" else set())
     for row in rows:
         assert row.gain == row.seconds_without / row.seconds
         assert 0 <= row.error < ROUNDING

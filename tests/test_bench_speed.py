@@ -34,7 +34,7 @@ from raytrace.maths.value import to
 from raytrace.system.rays import Rays
 from raytrace.tracing.compiled import NoCompiler, trace_engine
 from raytrace.tracing.focus import spot_parabola
-from raytrace.tracing.memo import Memo, trace_bundle
+from raytrace.tracing.scene import Memo, trace_bundle
 from raytrace.tracing.trace import trace_lens, trace_surfaces
 
 pytestmark = pytest.mark.usefixtures("same_threads")

@@ -10,7 +10,7 @@ from bends import pose, real
 
 import raytrace as rt
 from raytrace.analysis.setting import scene_of
-from raytrace.tracing.axis import Bent
+from raytrace.tracing.aiming import Bent
 from raytrace.tracing.focus import along_normal, focus_of_rms
 from raytrace.tracing.scene import symmetry
 from raytrace.tracing.wavefront import rms, wavefront_of

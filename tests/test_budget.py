@@ -22,7 +22,7 @@ from raytrace.files import shipped
 from raytrace.psf_models import psf
 from raytrace.psf_models.dft import rings_to_grid, to_grid, to_grid_mirrored
 from raytrace.system.lens import SystemAperture
-from raytrace.tracing.focus import image_rays
+from raytrace.tracing.spot import image_rays
 
 LENS = shipped("lenses") / "double_gauss.zmx"
 

@@ -16,7 +16,7 @@ from raytrace.maths.grid import grid
 from raytrace.maths.pupil import gauss_rings
 from raytrace.psf_models import NotConverged, psf
 from raytrace.system.lens import with_object_distance
-from raytrace.tracing.focus import image_rays
+from raytrace.tracing.spot import image_rays
 
 LENSES = Path(__file__).parents[1] / "lenses"
 ROWS = ("DRT", "Gaussian DRT", "paraxial", "Fourier", "wave")

@@ -107,12 +107,12 @@ def compare(seed: int, engine: str) -> int:
     return sum(len(of[name]) for name in NUMBERS)
 
 
-@pytest.mark.parametrize("engine", ["eager", "fused"])
+@pytest.mark.parametrize("engine", ["eager", "compiled"])
 def test_derivatives_of_random_systems_are_those_of_complex_steps(engine):
     assert sum(compare(seed, engine) for seed in range(12)) > 300
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["eager", "fused"])
+@pytest.mark.parametrize("engine", ["eager", "compiled"])
 def test_derivatives_of_many_random_systems_are_those_of_complex_steps(engine):
     assert sum(compare(seed, engine) for seed in range(12, 400)) > 10_000

@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from raytrace.io import UnsupportedSurface, read_lens
-from raytrace.io.zemax.surface_types import types
+from raytrace.io.zemax.surfaces import types
 from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.glass import constant, refractive_index
 from raytrace.system.lens import Lens

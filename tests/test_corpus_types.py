@@ -24,7 +24,7 @@ from zemax_by_definition import surfaces, trace
 
 from raytrace.io import UnsupportedSurface, read_lens
 from raytrace.io.source import Place, decode
-from raytrace.io.zemax.surface_types import types
+from raytrace.io.zemax.surfaces import types
 from raytrace.materials.catalogs import UnknownGlass
 from raytrace.materials.glass import refractive_index
 from raytrace.system.lens import Lens

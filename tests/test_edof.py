@@ -10,10 +10,10 @@ from scripts import script
 
 from raytrace.cli.door import CommandError
 from raytrace.cli.wave_design_run import learn
-from raytrace.imaging.phase_variables import PhaseVariables
 from raytrace.imaging.pictures import dead_leaves, digest
-from raytrace.imaging.restoration import blind_filter, errors, psnr, wiener
+from raytrace.imaging.restoration import depth_invariant_wiener, errors, psnr, wiener
 from raytrace.imaging.training import OtherSettings
+from raytrace.imaging.variables import PhaseVariables
 from raytrace.imaging.wave_camera import (
     WaveCameraConfig,
     best_gamma,
@@ -31,9 +31,9 @@ from raytrace.imaging.wave_design import begin, learn_element, radial_powers, sc
 from raytrace.materials.glass import index
 from raytrace.maths.zernike import polynomials
 from raytrace.settings import DesignSettings
+from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import aim, baseline
 from raytrace.wave_optics.element import Element, EvenPowers, height
-from raytrace.wave_optics.psf import psf
 
 edof_table = script("wave_edof")
 STRENGTHS, Content, elements_of = edof_table.STRENGTHS, edof_table.Content, edof_table.elements_of
@@ -71,7 +71,7 @@ def test_the_closed_form_is_the_error_of_restored_pictures():
     random = torch.Generator().manual_seed(0)
     noise = SMALL.noise * torch.randn(24, 1, 128, 128, generator=random, dtype=torch.float64)
     many = PICTURES.repeat(3, 1, 1)
-    for G in (blind_filter(H, S, SMALL.noise), wiener(H[1], 0.01)):
+    for G in (depth_invariant_wiener(H, S, SMALL.noise), wiener(H[1], 0.01)):
         expected = errors(H, S, SMALL.noise, filter=G)[:, 0]
         found = [(restored(H_z, G, many, noise)[1] - many[:, None]).square().mean() for H_z in H]
         torch.testing.assert_close(torch.stack(found), expected, rtol=0.01, atol=0)

@@ -14,7 +14,7 @@ from raytrace.cli import wave_design_run
 from raytrace.cli.door import CommandError
 from raytrace.imaging.octant import Octant, fits
 from raytrace.imaging.pictures import Pictures, dead_leaves
-from raytrace.imaging.restoration import blind_density, blind_error, blind_filter, psnr
+from raytrace.imaging.restoration import depth_invariant_density, depth_invariant_error, depth_invariant_wiener, psnr
 from raytrace.imaging.training import OtherSettings
 from raytrace.imaging.wave_camera import (
     FILTERS,
@@ -28,11 +28,11 @@ from raytrace.imaging.wave_camera import (
     spectrum,
     transfer,
 )
+from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import aim, baseline
 from raytrace.wave_optics.element import Element, Zernike, as_rings
 from raytrace.wave_optics.element_files import write_element
 from raytrace.wave_optics.plan import plan
-from raytrace.wave_optics.psf import psf
 
 edof, noise = script("wave_edof"), script("wave_noise")
 Content = edof.Content
@@ -86,7 +86,7 @@ def test_pictures_that_are_not_their_mirror_images_have_no_octant():
 
 def test_density_adds_up_to_the_error():
     H = transfer(psf(scene(baseline("singlet", aim()), SMALL)), 128)
-    torch.testing.assert_close(blind_density(H, S, 0.01).mean((-2, -1)), blind_error(H, S, 0.01))
+    torch.testing.assert_close(depth_invariant_density(H, S, 0.01).mean((-2, -1)), depth_invariant_error(H, S, 0.01))
 
 
 def test_errors_of_pictures_are_those_of_pictures_restored():
@@ -97,7 +97,7 @@ def test_errors_of_pictures_are_those_of_pictures_restored():
     found = errors_of(H, SMALL, bank)
     generator = torch.Generator().manual_seed(0)
     noise = SMALL.noise * torch.randn(3, 2, 128, 128, generator=generator, dtype=torch.float64)
-    G = blind_filter(H, bank.spectrum, SMALL.noise)
+    G = depth_invariant_wiener(H, bank.spectrum, SMALL.noise)
     left = [(restored(H_z, G, PICTURES[5:], noise)[1] - PICTURES[5:, None]).square().mean((-2, -1)) for H_z in H]
     torch.testing.assert_close(found["blind"], torch.stack(left, 1), rtol=0.02, atol=0)
     table = quality(elements, SMALL, train=PICTURES[:5], test=PICTURES[5:])

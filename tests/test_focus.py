@@ -15,13 +15,12 @@ from raytrace.tracing.focus import (
     focus_moments,
     focus_of_mean_radius,
     focus_of_rms,
-    image_rays,
     mean_rms_radius,
     spot_parabola,
     through_focus,
 )
 from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.spot import EmptySpot, spot_of
+from raytrace.tracing.spot import EmptySpot, image_rays, spot_of
 
 POINTS, WEIGHTS = pupil.gauss_rings(6)
 AXIS = torch.zeros(2, 1, dtype=torch.float64)

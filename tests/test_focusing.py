@@ -7,7 +7,7 @@ import torch
 from scripts import script
 
 from raytrace.imaging.pictures import dead_leaves
-from raytrace.wave_optics.psf import psf
+from raytrace.wave_optics.compute import psf
 
 focusing = script("focusing")
 Setting, _behind, best_kernel, draw = focusing.Setting, focusing._behind, focusing.best_kernel, focusing.draw

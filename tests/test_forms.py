@@ -20,8 +20,8 @@ from raytrace.cli.paths import PICTURES, picture_file
 from raytrace.io import read_lens
 from raytrace.maths.pupil import hexapolar
 from raytrace.plotting.analysis import distortion_curves
-from raytrace.tracing.ray_failures import LOST, STATUS, losses
-from raytrace.tracing.ray_hits import arrivals
+from raytrace.tracing.ray_failures import LOST, STATUS, ray_failures
+from raytrace.tracing.spot import arrivals
 from raytrace.words import did_you_mean
 
 #: Options whose form differs between commands, and why.
@@ -141,7 +141,7 @@ def test_fates_of_a_ray_table_are_those_that_rays_are_counted_by():
     lens = read_lens(find_lens("cooke_triplet"))
     field = torch.tensor([[0.0, 0.0], [80.0, 25.0]], dtype=torch.float64)
     points, weights = hexapolar(4)
-    found, lost = arrivals(lens, points, weights, fields=field), losses(lens, points, fields=field)
+    found, lost = arrivals(lens, points, weights, fields=field), ray_failures(lens, points, fields=field)
     for place, name in enumerate(LOST):
         counted = (found.status == STATUS.index(name)).sum(-1)
         assert counted.tolist() == lost.lost[place].sum(0).tolist(), name

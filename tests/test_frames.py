@@ -10,7 +10,7 @@ import raytrace as rt
 from raytrace.maths.pupil import fan
 from raytrace.plotting import outline
 from raytrace.system.surface import sag_at
-from raytrace.tracing.frames import frames
+from raytrace.tracing.geometry import frames
 
 
 def folded(tilt_y: float = 0.0) -> rt.Lens:

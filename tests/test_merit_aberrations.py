@@ -12,7 +12,7 @@ from problems import fields
 import raytrace as rt
 from raytrace.files import shipped
 from raytrace.optimization.context import BadRow
-from raytrace.optimization.conventions import Readings
+from raytrace.optimization.conventions import Conventions
 from raytrace.optimization.lens_model import Model
 from raytrace.optimization.merit_rows import Evaluation
 from raytrace.optimization.operands.aberrations import OF_WAVEFRONT
@@ -140,13 +140,13 @@ def test_other_readings():
     """Each by its own definition from the first choice."""
     lens = lens_of("colours").at(fields=[0.0, 20.0])
     rows = [Row("AXCL"), Row("LACL"), *(Row(operand) for operand in SUMS), Row("DIST", (2, 0))]
-    readings = Readings(colour="second", seidel="wavefront", f_theta="axis included")
-    first, other = told_of(lens, rows), Evaluation(Model(lens), rows, readings=readings)(np.zeros(0)).values
+    conventions = Conventions(colour="second", seidel="wavefront", f_theta="axis included")
+    first, other = told_of(lens, rows), Evaluation(Model(lens), rows, conventions=conventions)(np.zeros(0)).values
     assert first / other == pytest.approx([-1, -1, *OF_WAVEFRONT], rel=1e-12)
     theta = np.deg2rad(20.0) * np.arange(1, 30) / 29
     y = told_of(lens, [Row("REAY", (8, 2), (0.0, k / 29, 0.0, 0.0)) for k in range(1, 30)])
     off = 100 * np.abs(y / (theta * (y @ theta) / (theta @ theta)) - 1).max()
-    told = Evaluation(Model(lens), [Row("DISC", (0, 2))], readings=readings)(np.zeros(0)).values
+    told = Evaluation(Model(lens), [Row("DISC", (0, 2))], conventions=conventions)(np.zeros(0)).values
     assert told == pytest.approx([off], rel=1e-10)
 
 

@@ -9,9 +9,8 @@ from raytrace.optimization.default_merit import rows_of
 from raytrace.optimization.lens_model import Model, with_numbers_of
 from raytrace.optimization.merit_rows import Evaluation
 from raytrace.optimization.variables import freedom
-from raytrace.tracing.launch import rays_of_field
+from raytrace.tracing.launch import rays_of_field, vignette
 from raytrace.tracing.trace import trace_lens
-from raytrace.tracing.vignetting import vignette
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

@@ -16,9 +16,8 @@ from raytrace.optimization.lens_model import Model
 from raytrace.optimization.merit_rows import Evaluation
 from raytrace.optimization.operands.custom import Measure
 from raytrace.system.optimization_data import Row, Solve, Vary
-from raytrace.tracing.focus import image_rays
 from raytrace.tracing.scene import scene
-from raytrace.tracing.spot import spot_of, spot_of_points
+from raytrace.tracing.spot import image_rays, spot_of, spot_of_points
 from raytrace.tracing.wavefront import rms, wavefront_of, without
 
 FIELD = (0.0, 0.7)
@@ -337,7 +336,7 @@ def test_an_optimisation_follows_a_function_of_the_lens(tmp_path):
     assert told["operand"] == "sharpness"
     assert told["after"] == pytest.approx(float(sharpness(found.lens)), rel=1e-9)
     assert "sharpness" in str(found)
-    with pytest.warns(LensFileWarning, match="what is to be optimised"):
+    with pytest.warns(LensFileWarning, match="the optimisation data"):
         rt.write_lens(found.lens, tmp_path / "found.zmx")
-    row = rt.read_lens(tmp_path / "found.zmx").intent.merit[0]
+    row = rt.read_lens(tmp_path / "found.zmx").optimization_data.merit[0]
     assert (row.operand, row.text) == ("BLNK", "sharpness: a function of the lens, target 1, weight 1")

@@ -11,7 +11,7 @@ from problems import values
 import raytrace as rt
 from raytrace.analysis.pupil_autocorrelation import Fit, layout_of, otf
 from raytrace.optimization.lens_model import Model
-from raytrace.optimization.lens_state import Moment
+from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.merit_rows import Evaluation
 from raytrace.system.optimization_data import Row, Vary
 
@@ -38,7 +38,7 @@ def few(monkeypatch):
     def refuse(*_, **__):
         raise AssertionError("a wave by torch")
 
-    monkeypatch.setattr(Moment, "through_torch", refuse)
+    monkeypatch.setattr(LensState, "through_torch", refuse)
 
 
 def vignetted() -> rt.Lens:

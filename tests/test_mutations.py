@@ -34,8 +34,8 @@ from raytrace.materials.glass import ImplausibleWavelength, InvalidIndex
 from raytrace.maths.arrays import ArrayError, read_npy, read_npz
 from raytrace.system.configurations import count
 from raytrace.wave_optics.element import Pixels, Rings
-from raytrace.wave_optics.exchange import FORMATS as HEIGHTS
-from raytrace.wave_optics.exchange import HeightMapError, read_heights, write_heights
+from raytrace.wave_optics.height_maps import FORMATS as HEIGHTS
+from raytrace.wave_optics.height_maps import HeightMapError, read_heights, write_heights
 
 ROOT = Path(__file__).parents[1]
 

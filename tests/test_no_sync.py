@@ -200,7 +200,7 @@ def test_search_of_an_asphere_reads_nothing_back_off_the_cpu(monkeypatch):
 def test_search_of_an_asphere_needs_no_numbers_off_the_cpu():
     shapes = {"foot": (3, 5), "direction": (3, 5), "curvature": (), "conic": (), "coefficients": (3,)}
     given = {name: torch.empty(shape, dtype=torch.float64, device="meta") for name, shape in shapes.items()}
-    t, met = search.search(**given, kind="even asphere", numbers=[], departure="", rim=9.0)
+    t, met = search.search(**given, kind="even asphere", numbers=[], sag_terms="", rim=9.0)
     assert t.shape == met.shape == (5,)
 
 

@@ -19,7 +19,7 @@ from raytrace.optimization.lens_model import Model
 from raytrace.optimization.problem import Condition, NoProblem, Problem, Recovery
 from raytrace.optimization.variables import freedom, name_of
 from raytrace.plotting.optimize import optimize_report
-from raytrace.system.optimization_data import Intent, Row, Vary
+from raytrace.system.optimization_data import OptimizationData, Row, Vary
 from raytrace.system.poses import Pose
 from raytrace.system.surface import Surface
 
@@ -195,7 +195,7 @@ def test_a_merit_in_inches_ends_at_the_same_lens(triplet):
     variables = tuple(Vary(k, "curvature") for k in (1, 2, 3))
     ends = []
     for unit in (1.0, 25.4):
-        told = dataclasses.replace(triplet, intent=Intent(variables, (), rows, unit=unit))
+        told = dataclasses.replace(triplet, optimization_data=OptimizationData(variables, (), rows, unit=unit))
         ends.append(rt.optimize(told))
     assert ends[0].merit_after == pytest.approx(25.4 * ends[1].merit_after, rel=1e-9)
     assert torch.allclose(ends[0].variables_after, ends[1].variables_after, rtol=1e-6)
@@ -250,11 +250,11 @@ def test_a_merit_that_is_no_sum_of_squares_is_descended_by_its_gradient(triplet)
 
 
 def test_bounds_stay_with_the_lens(triplet, tmp_path):
-    lens = dataclasses.replace(triplet, intent=None)
+    lens = dataclasses.replace(triplet, optimization_data=None)
     found = rt.optimize(lens, merit="spot", vary="curvature:1 thickness:1,2", bounds="thickness_1:1..", cycles=1).lens
-    assert [one.bounds for one in found.intent.variables] == [(), (1.0, float("inf")), ()]
+    assert [one.bounds for one in found.optimization_data.variables] == [(), (1.0, float("inf")), ()]
     rt.write_lens(found, tmp_path / "lens.zmx")
-    assert rt.read_lens(tmp_path / "lens.zmx").intent.variables == found.intent.variables
+    assert rt.read_lens(tmp_path / "lens.zmx").optimization_data.variables == found.optimization_data.variables
 
 
 # -- lost rays ---------------------------------------------------------------------------------------------------------

@@ -30,7 +30,7 @@ from raytrace.optimization.least_squares import Sides, State, least_squares
 from raytrace.optimization.merit import merit_for
 from raytrace.optimization.problem import NoProblem
 from raytrace.optimization.variables import freedom
-from raytrace.system.optimization_data import Intent, Solve, Vary
+from raytrace.system.optimization_data import OptimizationData, Solve, Vary
 from raytrace.tracing.compiled import prepare
 
 NONE = np.zeros(0)
@@ -177,7 +177,9 @@ def test_which_glasses_vary(triplet):
     pickup = (Solve(6, "glass", "pickup", source=1),)
     for kept, expected in (((), (1, 3, 6)), (substitute, (1,)), (pickup, (1, 3))):
         lens = rt.read_lens("cooke_triplet")
-        lens = dataclasses.replace(lens, intent=Intent(variables=(Vary(1, "curvature"),), kept=kept))
+        lens = dataclasses.replace(
+            lens, optimization_data=OptimizationData(variables=(Vary(1, "curvature"),), kept=kept)
+        )
         free, surfaces = without_glass(freedom(lens, "glass"), "glass")
         assert surfaces == expected
         assert free.variables == (Vary(1, "curvature"),)
@@ -187,8 +189,8 @@ def test_which_glasses_vary(triplet):
 
 def test_a_glass_that_is_picked_up_follows(triplet):
     """The last element has the first one's glass at every step."""
-    intent = Intent(kept=(Solve(6, "glass", "pickup", source=1),))
-    lens = dataclasses.replace(triplet, intent=intent)
+    optimization_data = OptimizationData(kept=(Solve(6, "glass", "pickup", source=1),))
+    lens = dataclasses.replace(triplet, optimization_data=optimization_data)
     found = rt.optimize(lens, merit="spot", vary="curvature sensor glass", hold="efl=100", cycles=6, **BOUNDS)
     assert found.lens.surfaces[6].glass.name == found.lens.surfaces[1].glass.name
     assert {step.surface for step in found.glasses} <= {0, 1, 3}

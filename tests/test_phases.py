@@ -50,7 +50,7 @@ def test_the_path_at_the_vertex_is_the_constant_of_the_terms():
         assert abs(found - terms * 0.55e-3) < 1e-15, name
 
 
-@pytest.mark.parametrize("engine", ["eager", "fused"])
+@pytest.mark.parametrize("engine", ["eager", "compiled"])
 def test_a_wave_of_piston_is_a_wave_of_path_with_its_derivative(engine):
     """Zernike's first fringe term: λ times the order, along every ray, in both engines."""
 
@@ -201,7 +201,7 @@ def test_facets_bend_as_the_surface_above_the_plane():
     assert end.valid.all()
 
 
-@pytest.mark.parametrize("engine", ["eager", "fused"])
+@pytest.mark.parametrize("engine", ["eager", "compiled"])
 @pytest.mark.parametrize("index", [(1.0, 1.5), (1.5, 1.0)])
 def test_beyond_the_edge_of_its_conic_a_fresnel_lens_loses_light_and_has_no_derivative(engine, index, monkeypatch):
     monkeypatch.setenv("RAYTRACE_TRACE", engine)
@@ -228,7 +228,7 @@ def rays_of(rays, count):
     return start(rays.position[:, :count].detach(), rays.direction[:, :count], real(0.0))
 
 
-@pytest.mark.parametrize("engine", ["eager", "fused"])
+@pytest.mark.parametrize("engine", ["eager", "compiled"])
 def test_facets_of_a_mirror_reflect_as_the_mirror_above_the_plane(engine, monkeypatch):
     """A parabola in facets: light along the axis crosses it at half the radius, 20 mm, less what the plane is lower."""
     monkeypatch.setenv("RAYTRACE_TRACE", engine)
@@ -259,7 +259,7 @@ def test_derivatives_by_every_number_of_a_phase(name):
     assert torch.autograd.gradgradcheck(lambda *n: trace(*n)[0][:, 3], leaves, atol=1e-4, fast_mode=True)
 
 
-@pytest.mark.parametrize("engine", ["eager", "fused"])
+@pytest.mark.parametrize("engine", ["eager", "compiled"])
 def test_the_path_of_an_ideal_lens_is_smooth_in_both_powers(engine):
     """By one power alone, at equal ones, a derivative is that of differences: the path has no jump there."""
 

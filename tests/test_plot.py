@@ -22,9 +22,9 @@ from raytrace.plotting.curve import focus_rays
 from raytrace.plotting.spots import field_spots, shares_of
 from raytrace.system.lens import Fields, Lens, SystemAperture, with_object_distance, with_sensor_distance
 from raytrace.system.surface import Aperture, Surface, sag
-from raytrace.tracing.focus import focus_of_rms, image_rays
+from raytrace.tracing.focus import focus_of_rms
 from raytrace.tracing.paraxial import first_order, paraxial_image_distance
-from raytrace.tracing.spot import spot_of_points
+from raytrace.tracing.spot import image_rays, spot_of_points
 
 LENSES = Path(__file__).parents[1] / "lenses"
 NANOMETRE = 1e-6

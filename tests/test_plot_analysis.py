@@ -20,7 +20,7 @@ from raytrace.plotting import style
 from raytrace.plotting.analysis import curvature_curves, illumination_curve
 from raytrace.plotting.spots import even_hexapolar, field_spots
 from raytrace.plotting.style import field_colours
-from raytrace.tracing.focus import image_rays
+from raytrace.tracing.spot import image_rays
 
 LENSES = Path(__file__).parents[1] / "lenses"
 LONG = "A lens whose name is so long that no figure of one panel is as wide as it, f = 57.6 m, F/24, of two mirrors"

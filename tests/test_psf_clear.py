@@ -6,8 +6,8 @@ import pytest
 import torch
 from problems import double_gauss, lens, scalar, surface, vector
 
+from raytrace.psf_models.drt import trace_clearances
 from raytrace.psf_models.pupil_clearance import between, clear_arms, rays_of_search
-from raytrace.psf_models.rays import trace_clearances
 from raytrace.system.surface import Aperture
 from raytrace.tracing.scene import Scene, scene
 

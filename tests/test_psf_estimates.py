@@ -16,8 +16,7 @@ from problems import number
 from raytrace.io import read_lens
 from raytrace.maths.grid import grid
 from raytrace.maths.value import to
-from raytrace.psf_models import NotConverged, diffraction, fourier, psf
-from raytrace.psf_models import drt as raymap
+from raytrace.psf_models import NotConverged, drt, fourier, psf, wave
 from raytrace.psf_models.pixels import gaussian_pixels
 from raytrace.psf_models.pupil_clearance import between, clear_arms
 from raytrace.psf_models.result import Kernels, polychromatic
@@ -137,9 +136,9 @@ def reference(model: str, lens: Lens, options: dict):
             found = dense_gaussian(batch, window)
         elif model == "drt":
             nothing = number([0.0]).expand(3, *batch.shape)
-            found = Kernels(raymap.reference(batch, window), window, nothing[:2], nothing, 0)
+            found = Kernels(drt.reference(batch, window), window, nothing[:2], nothing, 0)
         else:
-            found = {"fourier": fourier, "wave": diffraction}[model].kernels(batch, window, order=9)
+            found = {"fourier": fourier, "wave": wave}[model].kernels(batch, window, order=9)
         return polychromatic(found, options["wavelength_weights"], model)
 
 

@@ -13,8 +13,8 @@ from raytrace.maths.grid import Grid, grid
 from raytrace.maths.pupil import gauss_rings, sobol
 from raytrace.psf_models import gaussian
 from raytrace.psf_models import pixels as rules
+from raytrace.psf_models.drt import trace_clearances
 from raytrace.psf_models.pixels import gaussian_pixels
-from raytrace.psf_models.rays import trace_clearances
 from raytrace.system.lens import Lens, with_sensor_distance
 from raytrace.system.surface import Aperture
 from raytrace.tracing.scene import beam_share, scene, trace_scene

@@ -13,8 +13,7 @@ from raytrace.files import shipped
 from raytrace.io import read_lens
 from raytrace.maths import pupil
 from raytrace.system.surface import Aperture
-from raytrace.tracing.focus import image_rays
-from raytrace.tracing.spot import spot_of
+from raytrace.tracing.spot import image_rays, spot_of
 
 TRIPLET = read_lens(shipped("lenses") / "cooke_triplet.zmx")
 

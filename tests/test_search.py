@@ -14,7 +14,7 @@ import torch
 import raytrace as rt
 from raytrace.materials.glass import is_air
 from raytrace.optimization.constraints import conditions_of
-from raytrace.optimization.conventions import readings_of
+from raytrace.optimization.conventions import conventions_of
 from raytrace.optimization.default_merit import rows_of
 from raytrace.optimization.journal import BadSearch, Ended, Journal, Stopped
 from raytrace.optimization.least_squares import Manner, least_squares
@@ -28,7 +28,7 @@ from raytrace.optimization.starts import length_of, space_of
 from raytrace.optimization.variables import bounds_of, freedom
 
 PLANE = float("inf")
-PLAIN = {"unit": 1.0, "skip_unknown": False, "readings": readings_of(None)}  # of a problem
+PLAIN = {"unit": 1.0, "skip_unknown": False, "conventions": conventions_of(None)}  # of a problem
 HOW = {"merit": "spot", "vary": "curvature thickness", "glass_thickness": "2:8", "edge": 1.0, "rings": 2}
 
 

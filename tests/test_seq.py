@@ -168,7 +168,7 @@ def test_a_stored_distance_that_is_not_the_paraxial_one_is_solved_and_told():
     wrong = ACHROMAT.replace("95.95194415183156", "0")
     lens, report = of(wrong)
     assert float(lens.surfaces[-2].thickness) == pytest.approx(95.95194415183156, rel=1e-12)
-    assert "PIM puts the image to 95.9519442 mm, where 0 mm is stored" in report.warnings[0]
+    assert "PIM puts the image at 95.9519442 mm, where 0 mm is stored" in report.warnings[0]
     with pytest.raises(LensFileError, match="PIM"):
         of(wrong, strict=True)
 
@@ -446,7 +446,7 @@ def test_a_catalog_beside_the_file_is_found_by_its_name(tmp_path):
     path.write_text(SINGLET.replace("NBK7_SCHOTT", "MY1_MINE"))
     lens, report = read_lens_with_report(path)
     assert (lens.surfaces[1].glass.name, float(index(lens.surfaces[1].glass, 0.5))) == ("MY-1", 1.6)
-    assert any("Mine.agf beside the lens" in note for note in report.notes)
+    assert any("Mine.agf in the folder of the lens" in note for note in report.notes)
     write_lens(lens, tmp_path / "again.seq")
     assert leaves(read_lens(tmp_path / "again.seq")) == leaves(lens)
     with pytest.raises(UnknownGlass, match="MY1_MINE"):
@@ -543,7 +543,7 @@ REFUSED = {
     "RET S1": "RET (return to an earlier surface)",
     "GLB S1": "GLB (global coordinates)",
     "NSS": "NSS (non-sequential surfaces)",
-    "XOD 1": "XOD (centre of a tilt beside the vertex)",
+    "XOD 1": "XOD (centre of a tilt off the vertex)",
     "IN other.seq": "IN (another file)",
     "AUT": "AUT (optimisation)",
     "NA 0.25": "NA (numerical aperture in image space)",

@@ -14,9 +14,7 @@ from raytrace.files import shipped
 from raytrace.io import read_lens
 from raytrace.maths import pupil
 from raytrace.system.rays import Rays
-from raytrace.tracing.focus import image_rays
-from raytrace.tracing.ray_hits import chief_reference
-from raytrace.tracing.spot import EmptySpot, spot_of, spot_of_points
+from raytrace.tracing.spot import EmptySpot, chief_reference, image_rays, spot_of, spot_of_points
 
 ROUNDING = 2.0**-53
 

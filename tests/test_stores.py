@@ -33,7 +33,7 @@ from raytrace.stores import (
 )
 from raytrace.wave_optics.element import Element, Rings
 from raytrace.wave_optics.element_files import read_label, write_element
-from raytrace.wave_optics.exchange import HeightMapError
+from raytrace.wave_optics.height_maps import HeightMapError
 
 #: What JSON can hold that no store expects, as it is written.
 STRANGE = {

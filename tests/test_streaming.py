@@ -24,14 +24,15 @@ from raytrace.tracing import streaming
 from raytrace.tracing.launch import launch
 from raytrace.tracing.scene import scene
 from raytrace.tracing.spot import EmptySpot, spot_of
-from raytrace.tracing.streamed_gradient import mean_square_gradient, stream_gradient
 from raytrace.tracing.streaming import (
     Moments,
     chunk_size,
+    mean_square_gradient,
     merge,
     moments,
     pupil_chunks,
     shot,
+    stream_gradient,
     stream_spot,
     stream_spots,
 )
@@ -395,7 +396,7 @@ from problems import double_gauss, aspheric_singlet, vector
 from raytrace.tracing import streaming
 from raytrace.maths.grid import grid
 from raytrace.psf_models import psf
-from raytrace.tracing.streamed_gradient import mean_square_gradient
+from raytrace.tracing.streaming import mean_square_gradient
 import dataclasses
 
 def peak():

@@ -10,10 +10,9 @@ from problems import double_gauss, fields, vector
 from raytrace.files import shipped
 from raytrace.io import read_lens
 from raytrace.maths import pupil
-from raytrace.tracing.launch import launch
+from raytrace.tracing.launch import launch, vignette
 from raytrace.tracing.spot import spot_of
 from raytrace.tracing.trace import trace_lens
-from raytrace.tracing.vignetting import vignette
 
 POINTS, _ = pupil.hexapolar(2)
 CENTRE = torch.zeros(2, 1, dtype=torch.float64)

@@ -23,7 +23,7 @@ from raytrace.wave_optics.element import (
     period,
     wrapped,
 )
-from raytrace.wave_optics.exchange import FORMATS, HeightMapError, read_heights, write_heights
+from raytrace.wave_optics.height_maps import FORMATS, HeightMapError, read_heights, write_heights
 
 EXACT = (".npy", ".csv")
 PICTURES = (".png", ".tif", ".tiff")

@@ -11,9 +11,9 @@ from test_wave_propagation import PLASTIC, R, lens, relative, scene
 
 from raytrace.psf_models.dft import Aliased, integrate
 from raytrace.wave_optics import pupil
+from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Zernike
 from raytrace.wave_optics.plan import ENGINES, AliasedSampling, blur, plan
-from raytrace.wave_optics.psf import psf
 
 TILTED = Element(Zernike(vector(0, 0, 0, 0, 0, 0, 1e-4)), scalar(R), PLASTIC)
 

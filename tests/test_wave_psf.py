@@ -12,10 +12,10 @@ from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import InvalidIndex, OutOfRange, sellmeier
 from raytrace.maths.value import to
 from raytrace.psf_models.dft import phasor
-from raytrace.tracing.memo import Memo
+from raytrace.tracing.scene import Memo
+from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.element import Element, EvenPowers, Pixels, Rings, Zernike
 from raytrace.wave_optics.plan import plan
-from raytrace.wave_optics.psf import psf
 
 
 def random(*shape, scale=2e-4):

@@ -15,12 +15,10 @@ from problems import number
 from test_formats import damaged, leaves, read_damaged
 
 import raytrace as rt
-from raytrace.io import LensFileError, UnsupportedSurface
+from raytrace.io import FORMATS, LensFileError, UnsupportedSurface
 from raytrace.io.source import Place, decode
-from raytrace.io.zemax import read as zemax_read
 from raytrace.io.zemax import write as zemax_write
-from raytrace.io.zemax.numbers import inverse, spelled_inverse
-from raytrace.io.zemax.surface_types import types
+from raytrace.io.zemax.surfaces import inverse, spelled_inverse, types
 from raytrace.system.rays import start
 from raytrace.tracing.trace import media, steps
 
@@ -94,7 +92,7 @@ def file(second: str, unit: str = "MM", *more: str) -> str:
 
 
 def read(content: str, **options):
-    return zemax_read.read(content, "lens.zmx", **options)
+    return FORMATS[".zmx"].read(content, "lens.zmx", **options)
 
 
 def again(lens) -> tuple[rt.Lens, str]:

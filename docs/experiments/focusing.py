@@ -30,8 +30,8 @@ from raytrace.cli.run import present
 from raytrace.cli.settings import SEED, add_options
 from raytrace.cli.wave_options import camera, feature, light, pixels
 from raytrace.imaging.image import blur, visible
-from raytrace.imaging.phase_variables import PhaseVariables
 from raytrace.imaging.pictures import Pictures, crop, dead_leaves
+from raytrace.imaging.variables import PhaseVariables
 from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import index
 from raytrace.maths.grid import grid
@@ -42,14 +42,14 @@ from raytrace.plotting.wave import framed
 from raytrace.psf_models.dft import phasor
 from raytrace.settings import Settings
 from raytrace.shards import torch_threads
-from raytrace.tracing.memo import Memo
+from raytrace.tracing.scene import Memo
+from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import Aim, aim, ideal
 from raytrace.wave_optics.element import Element, Pixels, height
 from raytrace.wave_optics.element_files import write_element
-from raytrace.wave_optics.exchange import FORMATS
+from raytrace.wave_optics.height_maps import FORMATS
 from raytrace.wave_optics.plan import Plan
 from raytrace.wave_optics.plan import plan as plan_of
-from raytrace.wave_optics.psf import psf
 from raytrace.wave_optics.pupil import disc_cells
 from raytrace.wave_optics.scene import WaveScene, millimetres, residual
 

@@ -34,7 +34,7 @@ from raytrace.experiments import publish
 from raytrace.files import table as csv
 from raytrace.imaging.image import blur_layers, depth_masks
 from raytrace.imaging.pictures import Pictures, dead_leaves, draws, split
-from raytrace.imaging.restoration import blind_filter, psnr, restore
+from raytrace.imaging.restoration import depth_invariant_wiener, psnr, restore
 from raytrace.imaging.wave_camera import (
     FILTERS,
     Judged,
@@ -232,7 +232,7 @@ def flat(
     found: dict[str, dict[str, tuple[np.ndarray, float]]] = {}
     for name, own in elements.items():
         H = transfer(kernels(own, world), size)
-        G = blind_filter(H, S, world.noise)
+        G = depth_invariant_wiener(H, S, world.noise)
         found[name] = {}
         for d in (0, len(H) // 2, len(H) - 1):
             estimate = torch.fft.ifft2(torch.fft.fft2(torch.fft.ifft2(torch.fft.fft2(picture) * H[d]).real + noise) * G)
@@ -261,7 +261,7 @@ def deep(elements: Mapping[str, Sequence[Element]], world: WaveCameraConfig, *, 
         haze = (1 - found.energy.mean(0))[:, None, None] * picture.mean((-2, -1), keepdim=True)
         image = blur_layers(picture, masks, found.kernel) + haze
         image = image + noise_like(image, world, seed)
-        G = blind_filter(transfer(found, picture.shape[-1]), S, world.noise)
+        G = depth_invariant_wiener(transfer(found, picture.shape[-1]), S, world.noise)
         estimate = restore(image, G, boundary="taper")
         seen[name] = shown(image)
         back[name] = shown(estimate), float(psnr((estimate - truth).square().mean()))

@@ -47,7 +47,7 @@ from raytrace.cli.wave_design_run import learn
 from raytrace.experiments import Store, cases, publish, published
 from raytrace.files import table
 from raytrace.imaging.pictures import Pictures, draws
-from raytrace.imaging.restoration import blind_error, blind_filter, psnr, wiener
+from raytrace.imaging.restoration import depth_invariant_error, depth_invariant_wiener, psnr, wiener
 from raytrace.imaging.wave_camera import (
     FILTERS,
     WAVELENGTH,
@@ -185,7 +185,7 @@ def errors_of(H: Tensor, world: WaveCameraConfig, bank: Bank) -> Errors:
     """Of each picture at every depth in every colour, expected over noise, of transfer functions H (D, W, n, n)."""
     at_design = H[world.depths.index(world.design)]
     gamma = best_gamma(H, bank.spectrum, world.noise, at_design)
-    filters = {"wiener": wiener(at_design, gamma), "blind": blind_filter(H, bank.spectrum, world.noise)}
+    filters = {"wiener": wiener(at_design, gamma), "blind": depth_invariant_wiener(H, bank.spectrum, world.noise)}
     return {name: errors_of_pictures(H, G, world.noise, bank.powers) for name, G in filters.items()}
 
 
@@ -288,7 +288,7 @@ def best_strengths(noises: Sequence[float], S: Tensor) -> dict[float, float]:
     found = {}
     for strength in STRENGTHS:
         H = transfer(kernels(baseline("cubic-refractive", made_for, strength=strength), world), S.shape[-1])
-        found[strength] = {noise: float(blind_error(H, S, noise).mean()) for noise in noises}
+        found[strength] = {noise: float(depth_invariant_error(H, S, noise).mean()) for noise in noises}
     return {noise: min(STRENGTHS, key=lambda own: found[own][noise]) for noise in noises}
 
 

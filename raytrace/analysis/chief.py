@@ -19,10 +19,9 @@ from raytrace.maths.numerics import dot_2, safe_divide, safe_sqrt
 from raytrace.maths.result import masked
 from raytrace.maths.value import value
 from raytrace.system.lens import Lens
-from raytrace.tracing.axis import is_bent
-from raytrace.tracing.focus import image_rays
+from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.launch import is_at_infinity
-from raytrace.tracing.ray_hits import chief_points, keeps_coordinates, unclipped
+from raytrace.tracing.spot import chief_points, image_rays, keeps_coordinates, unclipped
 
 _NEAR_AXIS = 1e-4  # of the field: its chief ray gives the scale of the image; it leaves 1e-8 of the distortion
 _NEAR_CHIEF = 1e-3  # of the pupil: close rays leave 1e-6 of the spherical aberration

@@ -13,11 +13,10 @@ from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.result import Result, axis, number, numbers
 from raytrace.maths.value import value
 from raytrace.psf_models.compute import PIXEL, SIZE, psf
-from raytrace.psf_models.convergence import NotConverged
-from raytrace.psf_models.models import MODELS, Model
+from raytrace.psf_models.models import MODELS, Model, NotConverged
 from raytrace.psf_models.result import Psf
 from raytrace.system.lens import Lens, SystemAperture, with_sensor_distance, with_wavelengths
-from raytrace.tracing.axis import need_axis
+from raytrace.tracing.aiming import need_axis
 from raytrace.tracing.focus import NoImage, focused, real_image_distance
 from raytrace.tracing.paraxial import first_order, largest_field
 from raytrace.tracing.trace import media

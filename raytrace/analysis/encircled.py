@@ -22,8 +22,8 @@ from raytrace.maths.value import value
 from raytrace.psf_models.dft import phasor
 from raytrace.system.lens import Lens, vector
 from raytrace.tracing.f_number import axial_f_number
-from raytrace.tracing.focus import image_rays
 from raytrace.tracing.scene import Scene
+from raytrace.tracing.spot import image_rays
 
 _RAYS = 4096
 _RINGS_PER_STEP = 16

@@ -16,9 +16,8 @@ from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.result import axis, cell, masked
 from raytrace.maths.value import value
 from raytrace.system.lens import Lens, with_wavelengths
-from raytrace.tracing.launch import is_at_infinity
-from raytrace.tracing.ray_hits import chief_points
-from raytrace.tracing.stop_filling import warn_of_filling
+from raytrace.tracing.launch import is_at_infinity, warn_of_filling
+from raytrace.tracing.spot import chief_points
 
 _NEAR_AXIS = 1e-4  # of the largest field: its rays give the scale of the image; they leave 1e-8 of the distortion
 

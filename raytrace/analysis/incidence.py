@@ -8,9 +8,10 @@ from raytrace.analysis.setting import Numbers, Points, primary_wavelength, setti
 from raytrace.maths.numerics import dot
 from raytrace.maths.result import masked
 from raytrace.maths.value import value
+from raytrace.system.intersection import normal
 from raytrace.system.lens import Lens
 from raytrace.system.poses import Gap, direction_in
-from raytrace.system.surface import Surface, gap_behind, normal
+from raytrace.system.surface import Surface, gap_behind
 from raytrace.tracing.launch import launch
 from raytrace.tracing.trace import lens_steps
 

@@ -9,9 +9,9 @@ from raytrace.maths.numerics import safe_divide
 from raytrace.maths.result import axis, masked
 from raytrace.maths.value import value
 from raytrace.system.lens import Lens, with_wavelengths
-from raytrace.tracing.axis import need_axis
-from raytrace.tracing.focus import image_rays
-from raytrace.tracing.stop_filling import warn_of_filling
+from raytrace.tracing.aiming import need_axis
+from raytrace.tracing.launch import warn_of_filling
+from raytrace.tracing.spot import image_rays
 
 _NEAR_AXIS = 1e-4  # of the pupil: the ray that stands for the centre leaves 1e-8 of the spherical aberration
 

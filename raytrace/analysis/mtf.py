@@ -27,9 +27,8 @@ from raytrace.maths.value import value
 from raytrace.psf_models.dft import TooManyPoints, phasor, rings_and_arms
 from raytrace.system.lens import Lens, vector, with_sensor_distance
 from raytrace.tracing.f_number import axial_f_number
-from raytrace.tracing.focus import image_rays
 from raytrace.tracing.scene import Scene
-from raytrace.tracing.spot import spot_of
+from raytrace.tracing.spot import image_rays, spot_of
 
 _LEAST_RINGS, _MOST_RAYS = 24, 100_000
 _FREQUENCIES, _DISTANCES = 41, 21  # that are told where none are asked for

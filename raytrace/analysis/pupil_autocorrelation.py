@@ -33,7 +33,7 @@ from raytrace.maths.value import value
 from raytrace.psf_models.dft import TooManyPoints, phasor
 from raytrace.system.apertures import stands_inside
 from raytrace.system.lens import name_of_field
-from raytrace.tracing.axis import is_bent
+from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.scene import Scene, beam_share
 from raytrace.tracing.wavefront import Wavefront, wavefront_of
 

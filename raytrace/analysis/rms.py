@@ -13,8 +13,7 @@ from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.result import cell
 from raytrace.maths.value import value
 from raytrace.system.lens import FIELD_UNITS, Lens, name_of_field
-from raytrace.tracing.focus import image_rays
-from raytrace.tracing.spot import spot_of, spot_of_points
+from raytrace.tracing.spot import image_rays, spot_of, spot_of_points
 from raytrace.tracing.wavefront import rms, wavefront_of
 
 _RINGS = 10, 40

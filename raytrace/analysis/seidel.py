@@ -22,7 +22,7 @@ from raytrace.maths.result import cell
 from raytrace.maths.value import value
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.surface import Surface, is_even, vertex_curvature
-from raytrace.tracing.axis import need_axis
+from raytrace.tracing.aiming import need_axis
 from raytrace.tracing.launch import paraxial_field
 from raytrace.tracing.paraxial import FirstOrder, first_order, largest_field, marginal_ray, signed
 from raytrace.tracing.trace import media
@@ -108,7 +108,7 @@ def seidel(lens: Lens, *, fields: Points = None, kind: str = "coefficients") -> 
     need_axis(lens, "Seidel's theory", instead)
     for number, surface in enumerate(lens.surfaces):
         if not is_even(surface):
-            what = "has a departure" if surface.departure is not None else f"is {with_article(surface.kind)}"
+            what = "has added sag terms" if surface.sag_terms is not None else f"is {with_article(surface.kind)}"
             what = what if surface.phase is None else f"is {named(surface.phase)}"
             raise ValueError(f"surface {number} {what}: Seidel's theory is of even powers of r; {instead}")
     paraxial = first_order(lens)

@@ -13,7 +13,7 @@ from raytrace.maths import zernike
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.result import cell
 from raytrace.maths.value import value
-from raytrace.psf_models.diffraction import strehl
+from raytrace.psf_models.wave import strehl
 from raytrace.system.lens import Lens
 from raytrace.tracing.scene import Scene
 from raytrace.tracing.wavefront import peak_to_valley, rms, wavefront_of, zernike_coefficients

@@ -21,7 +21,7 @@ from raytrace.shards import torch_threads
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.rays import Rays
 from raytrace.tracing.compiled import prepare, trace_engine
-from raytrace.tracing.memo import Memo, trace_bundle
+from raytrace.tracing.scene import Memo, trace_bundle
 from raytrace.tracing.trace import trace_lens
 
 SKEW = 1e-12  # degrees: off the axis by less than rounding, but not on it
@@ -69,7 +69,7 @@ def measure(sizes, *, repeats: int, progress: Callable[[str], object] = nothing)
 def cases(sizes) -> list[Case]:
     """All of them (sizes: `speed.Sizes`); nothing is traced before a case is called. Without a compiler those of the
     compiled trace lack."""
-    engines = ["fused", "eager"] if prepare() == "fused" else ["eager"]
+    engines = ["compiled", "eager"] if prepare() == "compiled" else ["eager"]
     found = [Case(what, engine, *pair) for engine in engines for what, pair in _traced(sizes.less).items()]
     others = _kernel_cases(sizes.distances) | _launched(sizes.less)
     return [*found, *(Case(what, "auto", *pair) for what, pair in sorted(others.items(), key=_kind))]

@@ -46,7 +46,7 @@ from raytrace.system.rays import Rays
 from raytrace.tracing.compiled import NoCompiler, prepare
 from raytrace.tracing.focus import spot_parabola
 from raytrace.tracing.launch import rays_of_field
-from raytrace.tracing.memo import Memo, trace_bundle
+from raytrace.tracing.scene import Memo, trace_bundle
 from raytrace.tracing.trace import trace_lens
 
 _PIECE = 2**16

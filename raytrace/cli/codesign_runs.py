@@ -32,10 +32,10 @@ from raytrace.imaging.codesign import (
     run_model,
     variables,
 )
-from raytrace.imaging.limits import Limits
 from raytrace.imaging.network import PRESETS, RedNet, RedNetShape
 from raytrace.imaging.pictures import Pictures, dead_leaves, digest, split
 from raytrace.imaging.training import NotFinite, Record, read_json
+from raytrace.imaging.variables import Limits
 from raytrace.io import FORMATS, read_lens, write_lens
 from raytrace.maths.result import Result, plain
 from raytrace.settings import CodesignSettings

@@ -19,10 +19,10 @@ def merit(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--reading",
-        dest="readings",
+        dest="conventions",
         metavar="NAME=CHOICE",
         nargs="+",
-        help="where the meaning of an operand is open, another reading than by default: opd_tilt=common, "
+        help="where the meaning of an operand is open, another convention than the default: opd_tilt=common, "
         "opd_chief=primary, opd_sign=shorter, boundary=largest, behind_mirrors=signed, focal_length=in-air, "
         "total_track=sum, colour=second, seidel=wavefront, f_theta=axis-included",
     )

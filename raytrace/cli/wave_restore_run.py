@@ -9,7 +9,7 @@ from torch import Tensor
 
 from raytrace.cli.door import CommandError, catalogs, say
 from raytrace.imaging.image import blur
-from raytrace.imaging.restoration import blind_filter, power_law, psnr, restore
+from raytrace.imaging.restoration import depth_invariant_wiener, power_law, psnr, restore
 from raytrace.imaging.wave_camera import WaveCameraConfig, kernels, transfer
 from raytrace.io.pictures import read_channels, write_picture
 from raytrace.maths.result import Result
@@ -54,7 +54,7 @@ def restored(
     shape = tuple(extent + config.size - 1 for extent in image.shape[-2:])
     H = transfer(kernels(parts, config), shape)
     spectrum = power_law(shape, mean=float(image.mean()), deviation=max(float(image.std()), config.noise))
-    return image, restore(image, blind_filter(H, spectrum, config.noise), boundary="taper")
+    return image, restore(image, depth_invariant_wiener(H, spectrum, config.noise), boundary="taper")
 
 
 def restore_files(arguments: argparse.Namespace) -> Restored:

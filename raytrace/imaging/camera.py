@@ -1,16 +1,16 @@
-"""Camera: a lens with variables, a sensor, and a network that restores its pictures, as one module.
+"""Camera: a lens with variables, a sensor and a restoration network as one module.
 
-A step of learning lens and network together:
+A training step of lens and network:
 
     camera = rt.Camera(rt.Variables(lens, "curvature:1-4 sensor"), rt.RedNet())
     optimizer = torch.optim.Adam(camera.parameters(), 1e-3)
-    distances = 10e3 + 40e3 * torch.rand(len(pictures))     # mm, one each
+    distances = 10e3 + 40e3 * torch.rand(len(pictures))     # mm, one per image
     restored = camera(pictures, distances)                  # blurred, noisy, restored
     loss = (restored - camera.target(pictures)).abs().mean() + camera.variables.violation()
     optimizer.zero_grad()
     loss.backward()
     optimizer.step()
-    camera.variables.project()                              # within the bounds, if there are any
+    camera.variables.project()                              # onto the bounds, if there are any
 """
 
 import dataclasses
@@ -26,26 +26,25 @@ from raytrace.imaging.variables import Variables
 from raytrace.maths.grid import Grid, grid
 from raytrace.psf_models import MODELS, NotConverged, psf
 from raytrace.system.lens import Lens, field_points
-from raytrace.tracing.memo import Memo
-from raytrace.tracing.scene import chief_landing, scene
-from raytrace.tracing.stop_filling import warn_of_filling
+from raytrace.tracing.launch import warn_of_filling
+from raytrace.tracing.scene import Memo, chief_landing, scene
 from raytrace.words import named_value
 
-_LARGEST = 2.0  # of a picture in [0, 1] whose resampling overshoots
+_LARGEST = 2.0  # allowed value of an image in [0, 1]: resampling overshoots
 
 
 class Camera(nn.Module):
-    """Pictures (B, H, W) in [0, 1], each at its own object distance, as a lens, a sensor and a network give them back.
+    """Simulated capture and restoration of images (B, H, W) in [0, 1], each at its own object distance.
 
-    variables: what of the lens is learned; network: (B, 1, h, w) -> the same; model: a PSF model.
-    object_distances: smallest and largest, mm; fields: (2, F), or a list of y or (x, y), in the lens's kind
-    of field, on the axis by default.
-    pixels: the window of the PSF, 21 × 21 of 5 µm by default; normalise: "window" or "energy", as for `psf`.
-    noise: standard deviation of the sensor's noise. tol: what the kernels may err by: the order of the PSF model is
-    chosen once, for the lens as it is at the first call (`plan`). rho: of the paraxial model.
-    network_dtype: torch.bfloat16 runs the network alone in it (autocast); the optics keep the lens's dtype.
-    The object is taken to be flat at one distance, and upright: magnification and its sign change no loss.
-    Warns UnfilledStop, once, of the lens as it is when the camera is made.
+    variables: of the lens; network: (B, 1, h, w) -> the same; model: a PSF model.
+    object_distances: smallest and largest, mm; fields: (2, F), or a list of y or (x, y), in the lens's kind of field,
+    on the axis by default.
+    pixels: the PSF window, 21 × 21 of 5 µm by default; normalise: "window" or "energy", as for `psf`.
+    noise: standard deviation of the sensor noise. tol: allowed error of the kernels: the order of the PSF model is
+    chosen once, for the lens at the first call (`plan`). rho: of the paraxial model.
+    network_dtype: torch.bfloat16 runs the network in it (autocast); the optics keep the dtype of the lens.
+    The object is planar and upright; image inversion and magnification are ignored.
+    Warns UnfilledStop once, for the lens at construction.
     """
 
     def __init__(
@@ -79,11 +78,11 @@ class Camera(nn.Module):
 
     @property
     def margin(self) -> int:
-        """By how many rows and columns a picture shrinks: the PSF needs them."""
+        """Rows and columns by which the PSF window shrinks an image."""
         return self.pixels.rows - 1
 
     def use(self, model: str) -> None:
-        """Simulate with another PSF model from now on."""
+        """Simulate with another PSF model."""
         self.model, self._order = model, None
 
     @torch.no_grad()
@@ -92,7 +91,7 @@ class Camera(nn.Module):
         near, far = self.range
         distances = self.fields.new_tensor([near, 2 / (1 / near + 1 / far), far])
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotConverged)  # the finest order is the best there is
+            warnings.simplefilter("ignore", NotConverged)  # the finest order is used
             self._order = self._psf(distances, self.fields, tol=self.tol).order
         return self._order
 
@@ -102,8 +101,8 @@ class Camera(nn.Module):
         return self._psf(object_distances, self.fields[:, field : field + 1], order=order).kernel[:, 0]
 
     def _psf(self, distances: Tensor, fields: Tensor, **work):
-        # These know of a field only where its image lies: about their own chief ray it is the image on the axis, while
-        # the traced chief ray is as far from it as the lens distorts.
+        # First-order models have the same PSF at every field, about the paraxial chief ray, which differs from the
+        # traced one by the distortion.
         fields = fields if MODELS[self.model].traces else torch.zeros_like(fields)
         lens, distances = self.variables(), distances.to(self.fields.dtype)
         return psf(
@@ -119,23 +118,23 @@ class Camera(nn.Module):
         )
 
     def _window(self, lens: Lens, fields: Tensor, distances: Tensor) -> Grid:
-        """The pixels around the chief ray: they follow it with its derivatives, for where a picture lies is no loss."""
+        """The pixels around the chief ray; they follow it in the derivatives, because image position is no error."""
         if bool((fields == 0).all()):
             return self.pixels
         chief = chief_landing(scene(lens, fields, distances, lens.primary[None], self._memo))[..., 0]
         return dataclasses.replace(self.pixels, centre=self.pixels.centre[:, None, None] + chief)
 
     def image(self, picture: Tensor, object_distances: Tensor, field: int = 0) -> Tensor:
-        """What falls on the sensor, without noise: (B, H - margin, W - margin).
+        """The noise-free sensor image, (B, H - margin, W - margin).
 
-        picture: (B, H, W), or one (H, W) for all distances (B,), in [0, 1]; integers of 8 or 16 bits become that.
-        Raises ValueError for other shapes, as those of colour pictures, and other ranges, as 0 to 255.
+        picture: (B, H, W), or (H, W) for all distances (B,), in [0, 1]; integers of 8 or 16 bits are scaled to that.
+        Raises ValueError for other shapes, as of colour images, and other ranges, as 0 to 255.
         """
         picture = _grey(picture, object_distances)
         return blur(picture, self.kernels(object_distances, field).to(picture.dtype))
 
     def restore(self, image: Tensor) -> Tensor:
-        """The network's answer (B, h, w) to a noisy image."""
+        """The network's estimate (B, h, w) from a noisy image."""
         with torch.autocast(image.device.type, self.network_dtype, enabled=self.network_dtype is not None):
             image = as_picture(image, "image")
             like = next((p.dtype for p in self.network.parameters() if p.is_floating_point()), image.dtype)
@@ -151,14 +150,14 @@ class Camera(nn.Module):
         noise: Tensor | None = None,
         generator: torch.Generator | None = None,
     ) -> Tensor:
-        """Blur, add noise, restore. noise: (B, h, w) of deviation 1 to use instead of drawing it."""
+        """Blur, add noise, restore. noise: (B, h, w) of unit deviation, instead of random noise."""
         image = self.image(picture, object_distances, field)
         if noise is None:
             return self.restore(add_noise(image, self.noise, generator=generator))
         return self.restore(image + self.noise * noise)
 
     def target(self, picture: Tensor) -> Tensor:
-        """What a perfect camera gives: the picture without its margin."""
+        """The ideal output: the image without its margin."""
         picture = as_picture(picture)
         rows, columns = self.pixels.rows // 2, self.pixels.columns // 2
         bottom, right = self.pixels.rows - 1 - rows, self.pixels.columns - 1 - columns

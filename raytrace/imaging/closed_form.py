@@ -17,8 +17,9 @@ from raytrace.imaging.restoration import power_spectrum as periodogram
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings
 from raytrace.system.lens import Lens, with_object_distance
-from raytrace.tracing.focus import best_focus, focus_moments, image_rays, real_image_distance
+from raytrace.tracing.focus import best_focus, focus_moments, real_image_distance
 from raytrace.tracing.paraxial import paraxial_image_distance
+from raytrace.tracing.spot import image_rays
 
 #: Length of the first step, mm of thickness or of sag. L-BFGS-B takes 1 of its own units, and a sensor moved by 1 mm
 #: lands behind the next optimum: where windows hold but the middle of a blur.

@@ -30,12 +30,11 @@ from raytrace.imaging.closed_form import (
     power_spectrum,
 )
 from raytrace.imaging.descent import NoOptimum
-from raytrace.imaging.limits import parse_range
 from raytrace.imaging.network import RedNet, RedNetShape
 from raytrace.imaging.pictures import Pictures, crop, draws
 from raytrace.imaging.plain_rays import PlainRays, points_of_models
 from raytrace.imaging.training import DamagedRun, Record, Run, Share, train
-from raytrace.imaging.variables import Variables, parse_bounds
+from raytrace.imaging.variables import Variables, parse_bounds, parse_range
 from raytrace.io import write_lens
 from raytrace.maths.grid import grid
 from raytrace.maths.result import plain

@@ -1,4 +1,4 @@
-"""Networks that restore pictures: RED-Net.
+"""RED-Net, a convolutional network for image restoration.
 
 Mao, Shen and Yang, "Image Restoration Using Very Deep Convolutional Encoder-Decoder Networks with Symmetric Skip
 Connections", NIPS 2016 (arXiv:1606.08921).
@@ -15,24 +15,24 @@ from raytrace.imaging.image import as_picture
 
 @dataclasses.dataclass(frozen=True)
 class RedNetShape:
-    """depth: layers of the encoder and of the decoder together, even; width: maps of every layer between."""
+    """depth: layers of encoder and decoder together, even; width: feature maps of the inner layers."""
 
     depth: int = 10
     width: int = 32
 
 
-#: By name: what the comparison was made with, and what two processor cores train in minutes.
+#: By name: the size of the published comparison, and one that two CPU cores train in minutes.
 PRESETS = {"paper": RedNetShape(30, 64), "cpu": RedNetShape(10, 32)}
 
 
 class RedNet(nn.Module):
-    """Residual encoder-decoder: depth/2 convolutions 3 × 3, as many deconvolutions, and symmetric skips.
+    """Residual encoder-decoder: depth/2 convolutions 3 × 3, as many deconvolutions, and symmetric skip connections.
 
         x + D_n(… D_1(E_n(… E_1(x)))),   after D_i: ReLU(D_i + E_(n-i)),   i = 1, 3, 5 … < n = depth/2
 
-    Every layer keeps the size of the picture. A deconvolution of stride 1 is the convolution with the weights turned by
-    half a turn, and computed so: on processors its gradient takes a third of the time. The last layer starts from zero,
-    so that an untrained network returns the picture as it is.
+    Every layer keeps the image size. A deconvolution of stride 1 is computed as the convolution with weights rotated by
+    180°: its gradient takes a third of the time on a CPU. The last layer starts from zero: an untrained network returns
+    its input.
     """
 
     def __init__(self, shape: RedNetShape = PRESETS["cpu"], *, seed: int = 0):
@@ -47,14 +47,14 @@ class RedNet(nn.Module):
         generator = torch.Generator().manual_seed(seed)
         with torch.no_grad():
             for layer in [*self.encoder, *self.decoder]:
-                # He et al., ICCV 2015: keeps the variance behind a ReLU; 9 weights for every map that comes in.
+                # He et al., ICCV 2015: preserves the variance after a ReLU; 9 weights for every input map.
                 scale = (2 / (9 * layer.in_channels)) ** 0.5
                 layer.weight.copy_(scale * torch.randn(layer.weight.shape, generator=generator))
                 layer.bias.zero_()
             self.decoder[-1].weight.zero_()
 
     def forward(self, picture: Tensor) -> Tensor:
-        """picture: (B, 1, H, W); returns the restored one of the same shape. Raises ValueError for other shapes."""
+        """picture: (B, 1, H, W); returns the restored images of the same shape. Raises ValueError for other shapes."""
         picture = as_picture(picture)
         if picture.dim() != 4 or picture.shape[1] != 1:
             raise ValueError(

@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from raytrace.imaging.image import transfer_functions
-from raytrace.imaging.restoration import blind_density
+from raytrace.imaging.restoration import depth_invariant_density
 from raytrace.maths.grid import grid
 from raytrace.psf_models.radial import radii_of_waves, reach, unfold
-from raytrace.wave_optics import propagation as radial
+from raytrace.wave_optics import propagation
 from raytrace.wave_optics.plan import Plan
 from raytrace.wave_optics.scene import WaveScene, spheres
 
@@ -32,9 +32,9 @@ class Octant:
     """
 
     def __init__(self, scene: WaveScene, plan: Plan, size: int, *, dtype: torch.dtype = torch.float64):
-        order, cutoff = radial.order_of(scene, plan.nodes), radial.cutoff(scene)
+        order, cutoff = propagation.order_of(scene, plan.nodes), propagation.cutoff(scene)
         half, _ = radii_of_waves(scene.grid, 0.5 * cutoff, order)
-        self._r, bessel = radial.to_radii(scene, half, plan.samples)
+        self._r, bessel = propagation.to_radii(scene, half, plan.samples)
         self._sphere, self._bessel = spheres(scene, self._r * self._r), bessel.to(dtype)
         rows, pitch = scene.grid.rows, float(scene.grid.pitch)
         self._between = _between(radii_of_waves(scene.grid, cutoff, order)[0] / (pitch * reach(scene.grid)), len(half))
@@ -45,7 +45,7 @@ class Octant:
 
     def transfer(self, scene: WaveScene) -> Tensor:
         """H (D, W, F), real, of the frequencies of the octant; light that misses the window is haze, at the first."""
-        rays = torch.view_as_real(radial.phasors(scene, self._r, self._sphere)).permute(1, 2, 0, 3)  # (W, J, D, 2)
+        rays = torch.view_as_real(propagation.phasors(scene, self._r, self._sphere)).permute(1, 2, 0, 3)  # (W, J, D, 2)
         field = self._between @ (self._bessel @ rays.flatten(2).to(self._bessel.dtype))
         light = field.unflatten(-1, (-1, 2)).square().sum(-1).permute(2, 0, 1)
         found = light.flatten(0, 1) @ self._to_octant.T
@@ -56,7 +56,7 @@ class Octant:
         """Mean square error behind the best blind filter, for pictures of S (size, size) that are their own mirror
         images; mean over colours."""
         both = torch.stack([spectrum[self._rows, self._columns], spectrum[self._columns, self._rows]])
-        density = blind_density(self.transfer(scene)[:, :, None], both, noise)
+        density = depth_invariant_density(self.transfer(scene)[:, :, None], both, noise)
         return (self._weight * density).sum((-2, -1)).mean()
 
 

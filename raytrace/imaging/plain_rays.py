@@ -15,7 +15,7 @@ from raytrace.imaging.camera import Camera
 from raytrace.maths import pupil
 from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide
-from raytrace.psf_models import gaussian, rays
+from raytrace.psf_models import drt, gaussian
 from raytrace.psf_models.pixels import gaussian_pixels
 from raytrace.settings import CodesignSettings
 from raytrace.tracing.scene import Scene, beam_share, scene, symmetry, trace_scene
@@ -87,7 +87,7 @@ def _gaussian(light: Scene, window: Grid, disc: Tensor) -> Tensor:
 
 
 def _drt(light: Scene, window: Grid, disc: Tensor) -> Tensor:
-    return rays.kernels_of_points(light, window, disc, torch.full_like(disc[0], 1 / disc.shape[1]), width=_BLUR).kernel
+    return drt.kernels_of_points(light, window, disc, torch.full_like(disc[0], 1 / disc.shape[1]), width=_BLUR).kernel
 
 
 def _is_mirrored(disc: Tensor) -> bool:

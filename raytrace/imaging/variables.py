@@ -1,4 +1,10 @@
-"""Variables: which numbers of a lens are learned, how far one step moves them, and what keeps the lens buildable.
+"""Limits: how thin and how thick glass and air may be, and how far a lens is from keeping to it.
+
+limits = limits_of(lens, glass=(2, 15), edge=1)
+violation(lens, limits)          # Σ (what a thickness lacks, or has too much of)², mm²; 0 is buildable
+
+
+Variables: which numbers of a lens are learned, how far one step moves them, and what keeps the lens buildable.
 
 variables = Variables(lens, "sensor thickness:5,6 curvature:1-4")
 changed = variables()          # the lens with its variables, differentiable
@@ -10,29 +16,137 @@ Held: one number of a lens solved for, so that the focal length stays whatever e
 The power φ of a lens is linear in the curvature and the thickness of each of its surfaces (Gauss's brackets), and so in
 any one such number v: φ(0) + v [φ(1) - φ(0)] = |n′|/f. The one that holds f is found at once, with its derivatives. A
 power is finite where the lens is afocal, as a singlet is without its one bent surface.
-"""
+
+
+Phase variables: the heights of a thin element as parameters of a module."""
 
 import dataclasses
 import json
 import math
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
 
-from raytrace.imaging.limits import limits_of, violation
 from raytrace.io import as_lens
-from raytrace.system.identity import identity, other_lens
+from raytrace.materials.glass import Glass, is_air
+from raytrace.system.identity import digest, identity, other_lens
 from raytrace.system.lens import Lens
-from raytrace.system.parameter_paths import BadVariables, Place, counted, number_at, place_named, sensor, with_number
+from raytrace.system.parameter_paths import BadLimits as BadLimits
+from raytrace.system.parameter_paths import (
+    BadVariables,
+    ParameterPath,
+    counted,
+    number_at,
+    parameter_path,
+    sensor,
+    with_number,
+)
 from raytrace.system.parameter_paths import parse_bounds as parse_bounds
-from raytrace.system.surface import Surface, sag_at
+from raytrace.system.parameter_paths import parse_range as parse_range
+from raytrace.system.surface import Surface, sag, sag_at
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.trace import media
+from raytrace.wave_optics.element import Element
+
+#: Least thickness over the largest diameter of the lens, where none is given: of glass at its centre (a 50 mm lens:
+#: 1 mm) and at its edge, and of air. A phone's cover glass is as thin; who knows the workshop gives its numbers.
+_GLASS, _EDGE, _AIR = 1 / 50, 1 / 100, 1 / 2000
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """Least and greatest thickness at the axis in mm, of glass and of air; edge: least of glass at its edge."""
+
+    glass: tuple[float, float]
+    air: tuple[float, float]
+    edge: float
+
+
+def limits_of(
+    lens: Lens,
+    *,
+    glass: tuple[float, float] | None = None,
+    air: tuple[float, float] | None = None,
+    edge: float | None = None,
+) -> Limits:
+    """Limits, mm; what is None goes with the lens: of its largest diameter glass 1/50 at least, at its edge 1/100, air
+    between elements 1/2000, and nothing at most. A lens without semi-diameters gets 0."""
+    diameter = 2 * max((surface.semi_diameter or 0.0) for surface in lens.surfaces[1:-1])
+    return Limits(
+        glass=(_GLASS * diameter, math.inf) if glass is None else glass,
+        air=(_AIR * diameter, math.inf) if air is None else air,
+        edge=_EDGE * diameter if edge is None else edge,
+    )
+
+
+def violation(lens: Lens, limits: Limits | None = None) -> Tensor:
+    """Σ (what a thickness lacks or has too much of)² in mm², over all elements and air spaces; 0 is buildable.
+
+    limits: `limits_of(lens)` by default. An air space reaches from element to element, across a stop and other surfaces
+    with air on both sides: elements touch neither at the axis nor at the rim, and a stop stands where its own rim is
+    free (it may be inside the bulge of an element). The space before the image has no greatest thickness.
+    """
+    limits = limits_of(lens) if limits is None else limits
+    total = torch.zeros_like(lens.surfaces[-2].thickness)
+    for lack in _lacks(lens, limits):
+        total = total + lack.clamp_min(0).square()
+    return total
+
+
+def _lacks(lens: Lens, limits: Limits) -> Iterator[Tensor]:
+    """What each thickness lacks, at the axis and at the edge; negative where it has more than enough."""
+    surfaces, media = lens.surfaces, _media(lens)
+    air = [is_air(medium) for medium in media]
+    bodies = [k for k in range(1, len(surfaces) - 1) if surfaces[k].is_mirror or not (air[k - 1] and air[k])]
+    last, side = len(surfaces) - 1, 1
+    start = None  # the element before the air space at hand
+    for k in range(1, last):
+        side = -side if surfaces[k].is_mirror else side
+        before, after = surfaces[k], surfaces[k + 1]
+        if k in bodies:
+            start = k
+        if not air[k]:
+            yield from _outside(side * before.thickness, *limits.glass)
+            yield from _edge(before, after, side, limits.edge)
+            continue
+        yield from _edge(before, after, side, 0.0)
+        if start is None or k + 1 not in (*bodies, last):
+            continue
+        gap = torch.stack([surface.thickness for surface in surfaces[start : k + 1]]).sum()
+        yield from _outside(side * gap, limits.air[0], limits.air[1] if k + 1 < last else math.inf)
+        if start < k:
+            yield from _edge(dataclasses.replace(surfaces[start], thickness=gap), after, side, 0.0)
+
+
+def _media(lens: Lens) -> list[Glass]:
+    """The medium behind every surface: behind a mirror, the one before it."""
+    found: list[Glass] = []
+    for surface in lens.surfaces:
+        found.append(found[-1] if surface.is_mirror and found else surface.glass)
+    return found
+
+
+def _outside(thickness: Tensor, least: float, most: float) -> Iterator[Tensor]:
+    yield least - thickness
+    if math.isfinite(most):
+        yield thickness - most
+
+
+def _edge(before: Surface, after: Surface, side: int, least: float) -> Iterator[Tensor]:
+    if before.semi_diameter and after.semi_diameter:
+        yield least - side * edge_thickness(before, after)
+
+
+def edge_thickness(before: Surface, after: Surface) -> Tensor:
+    """Thickness in mm between two surfaces at the smaller of their semi-diameters."""
+    height = before.thickness.new_tensor(min(before.semi_diameter, after.semi_diameter)) ** 2
+    return before.thickness + sag(after, height) - sag(before, height)
+
 
 KEY = "_extra_state"  # what torch calls a module's state that is no parameter
 
@@ -164,7 +278,7 @@ class Variable:
     surface: int
     start: float
     unit: float
-    place: Place
+    place: ParameterPath
 
     @property
     def name(self) -> str:
@@ -175,7 +289,7 @@ class Variables(Owned):
     """The variables of a lens as parameters: 0 at the start, in units of `Variable.unit`.
 
     vary: "sensor", and lists like "thickness:5,6,10 curvature:1-4 a4:3", of the file's surface numbers; beside
-        thickness, curvature and conic every number that the surface has by its kind (`places.places`).
+        thickness, curvature and conic every number that the surface has by its kind (`parameter_paths`).
     bounds: by name ("sensor", "curvature_3"), smallest and largest number of the lens; `project` keeps them.
     hold: "efl" keeps the focal length of the lens, "efl=100" that one in mm: the last variable of `vary` that changes
         it is then no parameter but solved for (`held`), and its bounds count in `violation`.
@@ -334,14 +448,14 @@ def parse(lens: Lens, vary: str) -> tuple[Variable, ...]:
 
 
 def _variable(lens: Lens, kind: str, number: int, word: str) -> Variable:
-    place, surface = place_named(lens, kind, number, word), lens.surfaces[number]
+    place, surface = parameter_path(lens, kind, number, word), lens.surfaces[number]
     start = number_at(surface, place)
     start = torch.zeros_like(surface.thickness) if start is None else start.detach()
     unit = 1.0 if place.path == ("thickness",) else 1 / _sag_moved(lens, surface, kind, place, start, word)
     return Variable(kind, number, float(start), unit, place)
 
 
-def _sag_moved(lens: Lens, surface: Surface, kind: str, place: Place, start: Tensor, word: str) -> float:
+def _sag_moved(lens: Lens, surface: Surface, kind: str, place: ParameterPath, start: Tensor, word: str) -> float:
     """How far the surface moves at its semi-diameter with one unit of a number, by the first term of the series
 
     z ≈ c r²/2 + (1 + k) c³ r⁴/8 + …
@@ -365,3 +479,75 @@ def _sag_moved(lens: Lens, surface: Surface, kind: str, place: Place, start: Ten
         why = "is flat, and a conic constant" if kind == "conic" else "has a number that"
         raise BadVariables(f"{word!r}: the surface {why} changes nothing there")
     return moved
+
+
+class PhaseVariables(Owned):
+    """An element whose numbers are learned, alone or with others in contact.
+
+        numbers = start + unit · B c      c = `change`, from zero;   without a basis B = 1
+
+    element: where it starts; unit: mm of a change of 1, a micrometre by default, so that rates of learning read in µm.
+    basis: (numbers..., K), what the K changes add to its heights or coefficients: `radial_powers`, say.
+    others: elements in contact that stay as they are. tolerance: heights err by up to so many mm, evenly, by `draw`.
+    `state_dict` carries the element that the changes are of, and loads into that one alone (`Owned`).
+    """
+
+    def __init__(
+        self,
+        element: Element,
+        *,
+        unit: float = 1e-3,
+        basis: Tensor | None = None,
+        others: Sequence[Element] = (),
+        tolerance: float = 0.0,
+    ):
+        super().__init__()
+        self.element, self.unit, self.others, self.tolerance = element, unit, tuple(others), tolerance
+        self.start = element.numbers
+        self.basis = basis
+        shape = self.start.shape if basis is None else basis.shape[-1:]
+        if basis is not None and basis.shape[:-1] != self.start.shape:
+            raise ValueError(
+                f"a basis of {tuple(basis.shape)} for numbers of {tuple(self.start.shape)}: expected "
+                f"{(*self.start.shape, 'K')}"
+            )
+        self.change = nn.Parameter(torch.zeros(shape, dtype=self.start.dtype, device=self.start.device))
+
+    def identity(self) -> dict:
+        """The element: its profile, shape, glass, aperture in mm, the unit in mm; digests of where its numbers start,
+        of the basis, of its glass and of the elements in contact."""
+        return {
+            "profile": type(self.element.profile).__name__,
+            "numbers": list(self.start.shape),
+            "glass": self.element.glass.name,
+            "aperture": 2 * float(self.element.radius.detach()),
+            "unit": self.unit,
+            "start": digest(self.start),
+            "basis": digest(self.basis),
+            "material": digest(self.element.glass),
+            "others": digest(self.others),
+        }
+
+    def difference(self, before: dict) -> str:
+        """How a stored identity differs from this one, "" where it does not."""
+        for name, value in self.identity().items():
+            stored = before.get(name)
+            numbers = isinstance(stored, float) and isinstance(value, float)
+            if not (math.isclose(stored, value, rel_tol=1e-6) if numbers else stored == value):
+                is_digest = name in ("start", "basis", "material", "others")
+                words = f"other {name}" if is_digest else f"{name} {stored}, not {value}"
+                return f"an element of {words}"
+        return ""
+
+    def numbers(self) -> Tensor:
+        """Heights or coefficients as they are now, mm."""
+        change = self.change if self.basis is None else self.basis @ self.change
+        return self.start + self.unit * change
+
+    def forward(self, *, draw: torch.Generator | None = None) -> tuple[Element, ...]:
+        """The element as it is now, and those in contact; draw: errors of fabrication are drawn from it."""
+        numbers = self.numbers()
+        if draw is not None and self.tolerance:
+            error = torch.rand(numbers.shape, generator=draw, dtype=numbers.dtype, device=numbers.device)
+            numbers = numbers + self.tolerance * (2 * error - 1)
+        return (self.element.with_numbers(numbers), *self.others)

@@ -20,13 +20,13 @@ from raytrace.imaging.descent import NoOptimum, minimise
 from raytrace.imaging.image import transfer_functions
 from raytrace.imaging.octant import Octant, fits
 from raytrace.imaging.pictures import Pictures, draws
-from raytrace.imaging.restoration import blind_error, blind_filter, power_spectrum, psnr, wiener
+from raytrace.imaging.restoration import depth_invariant_error, depth_invariant_wiener, power_spectrum, psnr, wiener
 from raytrace.maths.grid import grid
 from raytrace.maths.result import Result
-from raytrace.tracing.memo import Memo
+from raytrace.tracing.scene import Memo
+from raytrace.wave_optics.compute import ElementPsf, psf
 from raytrace.wave_optics.element import Element, Rings
 from raytrace.wave_optics.plan import plan
-from raytrace.wave_optics.psf import ElementPsf, psf
 from raytrace.wave_optics.scene import WaveScene, is_round
 
 FILTERS = ("wiener", "blind")  # of restoration
@@ -135,7 +135,7 @@ def errors_of_pictures(H: Tensor, G: Tensor, noise: float, powers: Tensor) -> Te
 
 def expected_error(H: Tensor, S: Tensor, noise: float) -> Tensor:
     """Mean square error behind the best blind filter, in closed form, mean over colours."""
-    return blind_error(H, S, noise).mean()
+    return depth_invariant_error(H, S, noise).mean()
 
 
 class ClosedForm:
@@ -203,7 +203,7 @@ def quality(
     else:
         at_design = transfer(kernels(elements, world, depths=[world.design]), size)[0]
     gamma = best_gamma(H, S, world.noise, at_design)
-    filters = {"wiener": wiener(at_design, gamma), "blind": blind_filter(H, S, world.noise)}
+    filters = {"wiener": wiener(at_design, gamma), "blind": depth_invariant_wiener(H, S, world.noise)}
     powers = torch.stack([power(picture) for picture in test])
     by_depth, by_colour, of_pictures = {}, {}, {}
     for name, G in filters.items():

@@ -18,10 +18,10 @@ from torch import Tensor, nn
 
 from raytrace.files import write_atomically
 from raytrace.imaging.network import RedNet, RedNetShape
-from raytrace.imaging.phase_variables import PhaseVariables
 from raytrace.imaging.pictures import Pictures, crop, draws
-from raytrace.imaging.restoration import blind_filter, towards_measurement
+from raytrace.imaging.restoration import depth_invariant_wiener, towards_measurement
 from raytrace.imaging.training import DamagedRun, Record, Run, Share, read_state, train
+from raytrace.imaging.variables import PhaseVariables
 from raytrace.imaging.wave_camera import (
     ClosedForm,
     WaveCameraConfig,
@@ -35,10 +35,10 @@ from raytrace.materials.catalogs import find_glass
 from raytrace.materials.glass import index
 from raytrace.maths.value import detached
 from raytrace.settings import DesignSettings
+from raytrace.wave_optics.compute import psf
 from raytrace.wave_optics.designs import aim, converging
 from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike, as_rings
 from raytrace.wave_optics.etching import Process, matched
-from raytrace.wave_optics.psf import psf
 
 _NETWORK = RedNetShape(6, 16)  # behind the blind filter, the same for every colour
 _NETWORK_RATE = 1e-3
@@ -80,7 +80,7 @@ class WaveCamera(nn.Module):
     def filter(self, H: Tensor) -> Tensor:
         """G (W, n, n)."""
         if self.restoration != "towards":
-            return blind_filter(H, self.spectrum, self.world.noise)
+            return depth_invariant_wiener(H, self.spectrum, self.world.noise)
         at_target = dataclasses.replace(scene(self.variables(), self.world), depths=1e3 * self.t.square().reshape(1))
         found = psf(at_target, plan=self.expected.plan)
         return towards_measurement(transfer(found, self.spectrum.shape[-1])[0], self.v.square())

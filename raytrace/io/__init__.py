@@ -1,4 +1,15 @@
-"""Lens files: the suffix of a file names its format; reading gives a Lens, writing brings every number back exactly."""
+"""Lens files: the suffix of a file selects its format; reading gives a Lens, writing brings every number back exactly.
+
+    io/source.py        text, numbers, records, errors with file, line and surface
+    io/report.py        requested glass substitutes, the report of every keyword
+    io/materials.py     glasses by name
+    io/assembly.py      a neutral draft of a lens, checked once for all readers
+    io/zemax, codev, oslo, ray_optics, table        a format each: keyword tables, reader, writer
+    io/frames.py, ray_tables.py, pictures.py        pandas tables, tables of rays, images
+
+A new format is a row of FORMATS and a folder with a reader: text -> records with places -> LensDraft -> `assemble`.
+Tests: tests/test_formats.py for all formats, and a file for each format.
+"""
 
 import dataclasses
 import os
@@ -9,19 +20,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 from raytrace.files import shipped, write_atomically
-from raytrace.io.codev import read as seq_read
-from raytrace.io.codev import write as seq_write
+from raytrace.io.codev import read as codev_read
+from raytrace.io.codev import write as codev_write
 from raytrace.io.oslo import read as oslo_read
-from raytrace.io.ray_optics import parts as roa_parts
-from raytrace.io.ray_optics import read as roa_read
+from raytrace.io.ray_optics import read as ray_optics_read
+from raytrace.io.report import NONE, Draft, Substitutes, Varied, operand_uses, substitutes_of
+from raytrace.io.report import BadSubstitute as BadSubstitute
 from raytrace.io.report import ImportReport as ImportReport
-from raytrace.io.report import Varied, operand_uses
 from raytrace.io.source import LensFileError as LensFileError
 from raytrace.io.source import LensFileWarning as LensFileWarning
-from raytrace.io.source import Place, decode, read_text, shown
+from raytrace.io.source import Place, decode, read_content, read_text, shown
 from raytrace.io.source import UnsupportedSurface as UnsupportedSurface
-from raytrace.io.substitutes import BadSubstitute as BadSubstitute
-from raytrace.io.substitutes import substitutes_of
 from raytrace.io.table import read as table_read
 from raytrace.io.table import write as table_write
 from raytrace.io.zemax import archive as zemax_archive
@@ -34,40 +43,69 @@ from raytrace.maths.value import value
 from raytrace.system.configurations import count
 from raytrace.system.lens import Lens, check_media
 from raytrace.system.lens import check as check_lens
-from raytrace.system.optimization_data import Intent
+from raytrace.system.optimization_data import OptimizationData
 from raytrace.words import calling_level, named_value
 
-#: Other glasses for those of a file: {"SSK4": "SSK4A"}, words like "SSK4=SSK4A", "nearest" for every unknown one.
+#: Substitutes for glasses of a file: {"SSK4": "SSK4A"}, words like "SSK4=SSK4A", "nearest" for every unknown glass.
 Substitute = Mapping[str, str] | str | Sequence[str] | None
 
 
 class Format(NamedTuple):
-    """read(text, file, catalogs, strict, substitutes) -> (Lens, ImportReport); write(lens, file, catalogs) -> content.
+    """A format of lens files.
 
-    write: None for a format that is only read. load: what of a file's content is read, its text. configurations:
-    whether a file may hold several, of which `read` takes the number of one.
+    name: in the report; parse: (content, file, report, catalogs) -> Lens; write: (lens, file, catalogs) -> content,
+    None for a format that is only read; load: path -> content, text or bytes; configurations: whether a file may hold
+    several, of which `parse` takes the number.
     """
 
-    read: Callable[..., tuple[Lens, ImportReport]]
+    name: str
+    parse: Callable[..., Lens]
     write: Callable[..., bytes] | None = None
     load: Callable[[Path], str | bytes] = read_text
     configurations: bool = False
 
+    def read(
+        self,
+        content: str | bytes,
+        file: str,
+        *,
+        catalogs: Sequence[Path] = (),
+        strict: bool = False,
+        substitutes: Substitutes = NONE,
+        **options,
+    ) -> tuple[Lens, ImportReport]:
+        """The lens of a content and the report of its import.
+
+        file: its name, for messages and for the catalogs in its folder. catalogs: further glass catalogs (.agf).
+        strict: every warning is an error. Raises LensFileError, UnsupportedSurface and UnknownGlass.
+        """
+        report = Draft(file, self.name, substitutes)
+        lens = self.parse(content, file, report, tuple(catalogs), **options)
+        return lens, report.finished(strict=strict)
+
+
+_TEXT_TABLE = Format("table", table_read.read, partial(table_write.write, separator="\t"))
 
 #: The formats by suffix, in lower case.
 FORMATS = {
-    ".zmx": Format(zemax_read.read, zemax_write.write, configurations=True),
-    ".zar": Format(zemax_archive.read, load=zemax_archive.load, configurations=True),
-    ".seq": Format(seq_read.read, seq_write.write),
-    ".len": Format(oslo_read.read),
-    ".roa": Format(roa_read.read, load=roa_parts.load),
-    ".csv": Format(table_read.read, table_write.write),
-    ".tsv": Format(table_read.read, partial(table_write.write, separator="\t")),
-    ".txt": Format(table_read.read, partial(table_write.write, separator="\t")),
+    ".zmx": Format("zmx", zemax_read.read, zemax_write.write, configurations=True),
+    ".zar": Format("zar", zemax_archive.read, load=zemax_archive.load, configurations=True),
+    ".seq": Format("seq", codev_read.read, codev_write.write),
+    ".len": Format("len", oslo_read.read),
+    ".roa": Format("roa", ray_optics_read.read, load=read_content),
+    ".csv": Format("table", table_read.read, table_write.write),
+    ".tsv": _TEXT_TABLE,
+    ".txt": _TEXT_TABLE,
 }
 
-#: The suffixes of those that are written too.
+#: The suffixes of formats that are written too.
 WRITTEN = tuple(suffix for suffix, form in FORMATS.items() if form.write)
+
+#: The folder of the lenses that come with the package.
+_LENSES = shipped("lenses")
+
+
+# -- reading ----------------------------------------------------------------------------------------------------------
 
 
 def read_lens(
@@ -82,31 +120,31 @@ def read_lens(
     table.
 
     path: of a file, or the name of a shipped lens, as "double_gauss". catalogs: further glass catalogs (.agf), searched
-    as `raytrace.materials.catalogs.find_glass` does; a catalog that the file names and that lies beside it, or in it,
-    is found by itself. strict: raise where the file holds something unknown or something has
-    to be assumed; otherwise that is one LensFileWarning. configuration: which one of a multi-configuration file, from
-    1; by default the one that was active when it was saved. `lens.configurations` are all of them.
-    substitute: other glasses for those of the file, each reported in a warning: {"SSK4": "SSK4A"}, or "nearest" for
-    every one that no catalog holds, by the nd and Vd that the file has for it (`io.substitutes`).
+    as `raytrace.materials.catalogs.find_glass` does; a catalog that the file names is found in its folder, or in it.
+    strict: raise where the file holds an unknown keyword or an assumption is needed, instead of one LensFileWarning.
+    configuration: of a multi-configuration file, from 1; by default the one that was active when it was saved.
+    `lens.configurations` are all of them. substitute: glasses in place of those of the file, each reported in a
+    warning: {"SSK4": "SSK4A"}, or "nearest" for every unknown glass, by the nd and Vd of the file (`io.report`).
     Raises LensFileError, its subclass UnsupportedSurface, and UnknownGlass, each naming file, line and surface; and
     BadSubstitute.
     """
-    how = {"catalogs": catalogs, "strict": strict, "configuration": configuration, "substitute": substitute}
-    lens, report = read_lens_with_report(path, **how)
+    lens, report = read_lens_with_report(
+        path, catalogs=catalogs, strict=strict, configuration=configuration, substitute=substitute
+    )
     if report.warnings:
         warnings.warn("; ".join(report.warnings), LensFileWarning, stacklevel=calling_level())
     return lens
 
 
-def as_lens(given: Lens | str | os.PathLike, verb: str) -> Lens:
-    """A lens as it is, or that of a path or of a shipped name. Raises TypeError, which names the verb, for no lens."""
-    if isinstance(given, Lens):
-        return given
-    if isinstance(given, (str, os.PathLike)):
-        return read_lens(given)
-    hint = "; it has one, as its `lens`" if isinstance(getattr(given, "lens", None), Lens) else ""
+def as_lens(lens: Lens | str | os.PathLike, verb: str) -> Lens:
+    """A lens unchanged, or that of a path or of a shipped name. Raises TypeError, naming the function, for others."""
+    if isinstance(lens, Lens):
+        return lens
+    if isinstance(lens, (str, os.PathLike)):
+        return read_lens(lens)
+    hint = "; it has one, as its `lens`" if isinstance(getattr(lens, "lens", None), Lens) else ""
     expected = "a Lens, the path of a lens file or the name of a shipped lens"
-    raise TypeError(f"{verb}: `lens` is {named_value(given)}; expected {expected}{hint}")
+    raise TypeError(f"{verb}: `lens` is {named_value(lens)}; expected {expected}{hint}")
 
 
 def read_lens_with_report(
@@ -118,23 +156,24 @@ def read_lens_with_report(
     substitute: Substitute = None,
     evaluated: Collection[str] | None = None,
 ) -> tuple[Lens, ImportReport]:
-    """As `read_lens`, with the report of what became of every keyword; its warnings are in it, and not issued.
+    """As `read_lens`, with the report of every keyword; its warnings are in it, and not issued.
 
-    evaluated: the names of merit operands that are evaluated, to be told from those that are only known.
+    evaluated: the names of merit operands that are evaluated, as distinct from those that are only known.
     """
     path = Path(path)
     if not path.exists():
         path = shipped_lens(path) or path
-    form = _format(path)
-    asked = {"configuration": configuration} if form.configurations else {}
-    asked["substitutes"] = substitutes_of(substitute)
-    lens, report = form.read(form.load(path), str(path), catalogs=tuple(catalogs), strict=strict, **asked)
+    form, file = _format(path), str(path)
+    options = {"configuration": configuration} if form.configurations else {}
+    substitutes = substitutes_of(substitute)
+    lens, report = form.read(
+        form.load(path), file, catalogs=catalogs, strict=strict, substitutes=substitutes, **options
+    )
     if configuration is not None and configuration != lens.current_configuration:
-        there = "a file of this format holds one"
-        raise LensFileError(f"has no configuration {configuration}; {there}", Place(str(path)))
-    _refuse_no_wavelengths(lens, path)
+        message = f"has no configuration {configuration}; a file of this format holds one"
+        raise LensFileError(message, Place(file))
     varied = [Varied(str(operand), tuple(operand.values())) for operand in lens.operands if operand.name != "MOFF"]
-    intent = Intent() if lens.intent is None else lens.intent
+    data = OptimizationData() if lens.optimization_data is None else lens.optimization_data
     report = dataclasses.replace(
         report,
         surfaces=len(lens.surfaces),
@@ -143,11 +182,34 @@ def read_lens_with_report(
         wavelengths=tuple(lens.wavelengths.tolist()),
         ray_aiming=lens.ray_aiming,
         configurations=tuple(varied),
-        **{name: tuple(map(str, getattr(intent, name))) for name in ("variables", "solves", "kept")},
-        operands=operand_uses(intent.merit, evaluated),
-        tolerances=len(intent.tolerances),
+        variables=tuple(map(str, data.variables)),
+        solves=tuple(map(str, data.solves)),
+        kept=tuple(map(str, data.kept)),
+        operands=operand_uses(data.merit, evaluated),
+        tolerances=len(data.tolerances),
     )
     return lens, report
+
+
+def shipped_lens(name: str | os.PathLike) -> Path | None:
+    """The file of a shipped lens, with or without its folder and .zmx; None if there is none."""
+    path = Path(name)
+    if not path.name or path.parent not in (Path(), Path("lenses"), Path("lenses/examples")):
+        return None
+    candidates = [_LENSES / part / file for part in ("", "examples") for file in (path.name, f"{path.name}.zmx")]
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
+
+
+def _format(path: Path, known: Sequence[str] = tuple(FORMATS)) -> Format:
+    suffix = path.suffix.lower()
+    if suffix not in known:
+        message = f"the suffix {path.suffix!r} is that of no format" if suffix else "has no suffix to select its format"
+        message = f"a {suffix} file is read, but not written" if suffix in FORMATS else f"{message} of lens files"
+        raise LensFileError(f"{message}; expected one of {', '.join(known)}", Place(str(path)))
+    return FORMATS[suffix]
+
+
+# -- checking and conversion ------------------------------------------------------------------------------------------
 
 
 def check(
@@ -159,10 +221,10 @@ def check(
     substitute: Substitute = None,
     evaluated: Collection[str] | None = None,
 ) -> ImportReport:
-    """What was read from a lens file, what was not, and where each glass came from.
+    """The report of a lens file: keywords that were read and left out, the source of each glass, notes and warnings.
 
-    strict: raise where something was assumed. configuration: which one has to be such that it can be traced. evaluated:
-    as for `read_lens_with_report`. Raises as `read_lens`, and LensFileError for what cannot be traced.
+    strict: raise where something was assumed. configuration: that which must be traceable. evaluated: as for
+    `read_lens_with_report`. Raises as `read_lens`, and LensFileError for a lens that cannot be traced.
     """
     return checked(path, catalogs, strict, configuration, substitute, evaluated)[1]
 
@@ -206,37 +268,35 @@ def convert(
     substitute: Substitute = None,
 ) -> Conversion:
     """Read a lens file and write it in the format of the suffix of `target`; as `read_lens` and `write_lens`."""
-    how = {"catalogs": catalogs, "strict": strict, "configuration": configuration, "substitute": substitute}
-    lens, report = read_lens_with_report(source, **how)
+    lens, report = read_lens_with_report(
+        source, catalogs=catalogs, strict=strict, configuration=configuration, substitute=substitute
+    )
     for warning in report.warnings:
         warnings.warn(warning, LensFileWarning, stacklevel=calling_level())
     write_lens(lens, target, catalogs=catalogs)
     return Conversion(report.file, str(target), len(lens.surfaces))
 
 
-def shipped_lens(name: str | os.PathLike) -> Path | None:
-    """The file of a lens that travels with the package, with or without its folder and .zmx; None if there is none."""
-    path, folder = Path(name), shipped("lenses")
-    if not path.name or path.parent not in (Path(), Path("lenses"), Path("lenses/examples")):
-        return None
-    candidates = [folder / part / file for part in ("", "examples") for file in (path.name, f"{path.name}.zmx")]
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+# -- writing ----------------------------------------------------------------------------------------------------------
 
 
 def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | Path] = ()) -> None:
     """Write a lens in the format of the suffix. The file is replaced as a whole or not at all.
 
-    catalogs: the glass catalogs (.agf) that the lens was read with. Raises LensFileError for what the format cannot
-    hold, for what would not be read again, and where the file cannot be written. Warns LensFileWarning of a text that
-    a .zmx file does not bring back, such as blanks around it.
+    catalogs: the glass catalogs (.agf) that the lens was read with. Raises LensFileError for a lens that the format
+    cannot hold or that could not be read again, and where the file cannot be written. Warns LensFileWarning of texts
+    and other data that the file does not bring back.
     """
     path = Path(path)
-    _refuse_no_wavelengths(lens, path)
+    try:
+        check_unit(lens.wavelengths, believed=lens.wavelengths)  # refuses wavelengths that are not above 0
+    except ValueError as error:
+        raise LensFileError(str(error), Place(str(path))) from error
     form = _format(path, WRITTEN)
     content = form.write(lens, str(path), catalogs=tuple(catalogs))
-    changed = _changed_texts(lens, content, form, path, tuple(catalogs))
+    changed = _changes(lens, content, form, path, catalogs)
     if changed:
-        message = f"{path}: {', '.join(changed)}: not brought back as it is by a {path.suffix} file"
+        message = f"{path}: {', '.join(changed)}: not preserved by a {path.suffix} file"
         warnings.warn(message, LensFileWarning, stacklevel=calling_level())
     try:
         write_atomically(path, lambda file: file.write(content))
@@ -244,60 +304,33 @@ def write_lens(lens: Lens, path: str | os.PathLike, *, catalogs: Sequence[str | 
         raise LensFileError(error.strerror or str(error), Place(str(path))) from error
 
 
-def _refuse_no_wavelengths(lens: Lens, path: Path) -> None:
-    """Raises LensFileError for what is not above 0; the unit of a file is believed."""
-    try:
-        check_unit(lens.wavelengths, believed=lens.wavelengths)
-    except ValueError as error:
-        raise LensFileError(str(error), Place(str(path))) from error
-
-
-def _changed_texts(lens: Lens, content: bytes, form: Format, path: Path, catalogs: tuple) -> list[str]:
-    """The texts of a lens that the content of its file does not bring back. Raises LensFileError if it is not read."""
+def _changes(lens: Lens, content: bytes, form: Format, path: Path, catalogs: Sequence[Path]) -> list[str]:
+    """The texts and optimisation data that the content does not bring back. Raises LensFileError if it is not read."""
     try:
         again, _ = form.read(decode(content, Place(str(path))), str(path), catalogs=catalogs)
-    except UnknownGlass:  # of a catalog that is not at hand
+    except UnknownGlass:  # of a catalog that is unavailable
         return []
     except LensFileError as error:
-        found = str(error).removeprefix(f"{Place(error.file, error.line, error.surface)}: ")
-        message = f"the file would not be read again: {found}"
+        reason = str(error).removeprefix(f"{Place(error.file, error.line, error.surface)}: ")
+        message = f"the file would not be read again: {reason}"
         raise LensFileError(message, Place(str(path), None, error.surface)) from error
     pairs = [("the title", lens.name, again.name), ("a note", lens.notes, again.notes)]
-    lost = [name for name in lens.catalogs if name not in again.catalogs]
-    pairs += [(f"the catalog {name}", name, "") for name in lost]
-    comments = zip(lens.surfaces, again.surfaces, strict=True)
-    pairs += [(f"the comment of surface {k}", a.comment, b.comment) for k, (a, b) in enumerate(comments)]
+    pairs += [(f"the catalog {name}", name, "") for name in lens.catalogs if name not in again.catalogs]
+    surfaces = zip(lens.surfaces, again.surfaces, strict=True)
+    pairs += [(f"the comment of surface {k}", a.comment, b.comment) for k, (a, b) in enumerate(surfaces)]
     if count(lens.operands) != count(again.operands):
         pairs.append((f"the other configurations, {count(lens.operands)} in all", lens.current_configuration, 0))
     else:
         pairs += [(str(a), a.values(), b.values()) for a, b in zip(lens.operands, again.operands, strict=False)]
-    if unbound := _unbound(lens.intent, again.intent):
-        pairs.append(("bounds of variables, of which it holds those of thicknesses alone", ", ".join(unbound), ""))
-        again = dataclasses.replace(again, intent=dataclasses.replace(again.intent, variables=lens.intent.variables))
-    if _asks(lens.intent) and again.intent != lens.intent:
-        pairs.append(("what is to be optimised", f"{len(lens.intent.merit)} rows of a merit function", ""))
-    return [f"{what} ({shown(str(before))})" for what, before, after in pairs if before != after]
-
-
-def _asks(intent: Intent | None) -> bool:
-    """Whether an intent says more than which semi-diameters are given."""
-    return intent is not None and any((intent.variables, intent.solves, intent.merit, intent.tolerances, intent.kept))
-
-
-def _format(path: Path, known: Sequence[str] = tuple(FORMATS)) -> Format:
-    suffix = path.suffix.lower()
-    if suffix not in known:
-        found = f"the suffix {path.suffix!r} names no format" if suffix else "has no suffix to name its format"
-        found = f"a {suffix} file is read, but not written" if suffix in FORMATS else f"{found} of lens files"
-        raise LensFileError(f"{found}; expected one of {', '.join(known)}", Place(str(path)))
-    return FORMATS[suffix]
-
-
-def _unbound(intent: Intent | None, again: Intent | None) -> list[str]:
-    """Variables whose bounds are not those that they were written with, where nothing else of them is another."""
-    if intent is None or again is None:
-        return []
-    free = [[dataclasses.replace(one, bounds=()) for one in told.variables] for told in (intent, again)]
-    pairs = zip(intent.variables, again.variables, strict=False)
-    bare = [f"{a.quantity} of surface {a.surface}" for a, b in pairs if a.bounds and not b.bounds]
-    return bare if free[0] == free[1] else []
+    data, read_again = lens.optimization_data, again.optimization_data
+    if data is not None and any((data.variables, data.solves, data.merit, data.tolerances, data.kept)):
+        if read_again is not None:
+            free = [[dataclasses.replace(v, bounds=()) for v in data.variables] for data in (data, read_again)]
+            both = zip(data.variables, read_again.variables, strict=False)
+            unbound = [f"{a.quantity} of surface {a.surface}" for a, b in both if a.bounds and not b.bounds]
+            if unbound and free[0] == free[1]:
+                pairs.append(("bounds of variables other than thicknesses", ", ".join(unbound), ""))
+                read_again = dataclasses.replace(read_again, variables=data.variables)
+        if read_again != data:
+            pairs.append(("the optimisation data", f"{len(data.merit)} rows of a merit function", ""))
+    return [f"{quantity} ({shown(str(before))})" for quantity, before, after in pairs if before != after]

@@ -1,4 +1,4 @@
-"""Results and prescriptions as pandas tables. This module alone of the library loads pandas."""
+"""Results and prescriptions as pandas tables; with `ray_tables` the only modules of the library that load pandas."""
 
 from collections.abc import Sequence
 from os import PathLike

@@ -1,4 +1,4 @@
-"""Pictures in files, decoded with care."""
+"""Image files, decoded within limits of size."""
 
 import io
 import warnings
@@ -11,39 +11,36 @@ from raytrace.files import read_bytes, write_atomically
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 
-#: A file is decoded up to so many bytes and pixels, and to so many pixels a byte: what deflate can pack, and no more.
+#: Limits of bytes, of pixels, and of pixels per byte, which is that of deflate.
 _MOST_BYTES, _MOST_PIXELS, _PIXELS_PER_BYTE = 2**28, 10**8, 1032
-#: So many pixels cost nothing, however well they are packed.
+#: Pixels that are decoded at any ratio.
 _FEW_PIXELS = 2**22
 
 
 class PictureError(ValueError):
-    """A file that is no picture, damaged, or larger than any that is meant; one line."""
+    """A file that is not an image, damaged, or too large; one line."""
 
 
 def read_grey(path: str | Path) -> np.ndarray:
-    """A picture as (H, W) luma of 8 bits (ITU-R BT.601). Raises PictureError naming a file that is none."""
+    """An image as (H, W) luma of 8 bits (ITU-R BT.601). Raises PictureError naming the file."""
     try:
         return np.asarray(decoded(read_bytes(path, _MOST_BYTES)).convert("L"))
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+        reason = (isinstance(error, OSError) and error.strerror) or " ".join(str(error).split())
         message = f"{path}: cannot be read as a picture ({reason}); remove it or convert it"
         raise PictureError(message) from error
 
 
 def decoded(content: bytes) -> Image.Image:
-    """The picture in the bytes of a file of `SUFFIXES`; its size is judged before it is decoded.
-
-    Raises PictureError saying why there is none.
-    """
+    """The image in the bytes of a file of `SUFFIXES`; its size is checked before it is decoded. Raises PictureError."""
     try:
         with warnings.catch_warnings(action="ignore"):
             picture = Image.open(io.BytesIO(content), formats=("JPEG", "PNG", "BMP", "TIFF"))
             width, height = picture.size
             count = width * height
             if count > _MOST_PIXELS or count > max(_FEW_PIXELS, _PIXELS_PER_BYTE * len(content)) or count < 1:
-                found = f"{width} × {height} pixels in {len(content)} bytes"
-                raise PictureError(f"{found}: damaged, or more than the {_MOST_PIXELS:.0e} that are read")
+                size = f"{width} × {height} pixels in {len(content)} bytes"
+                raise PictureError(f"{size}: damaged, or more than the {_MOST_PIXELS:.0e} that are read")
             picture.load()
     except PictureError:
         raise

@@ -1,4 +1,4 @@
-"""Tables of rays, to be traced: x, y, z, l, m, n and perhaps wavelength of each."""
+"""Tables of rays to be traced: x, y, z, l, m, n and optionally the wavelength of each ray."""
 
 import dataclasses
 import difflib
@@ -15,19 +15,19 @@ from raytrace.files import read_bytes
 from raytrace.system.lens import Lens, check_media
 from raytrace.system.rays import COLUMNS, TRACED, Rays, start
 
-#: Bytes of a table of rays, some two million of them; more are traced from Python, or in several tables.
+#: Limit of bytes, some two million rays.
 LARGEST = 256 * 2**20
 
 
 class RayTableError(ValueError):
-    """A file that is no table of rays; the message names it, with line and column."""
+    """A file that is not a table of rays; the message has file, line and column."""
 
 
 def read_rays(path: str | os.PathLike, lens: Lens) -> Rays:
     """Rays (3, P) in front of surface 1 of a CSV file, with their wavelengths if it has any, which the lens must take.
 
-    Columns of words and those that `trace` itself writes are left out; any other is an error: a misspelt wavelength
-    must not become the primary one. Raises RayTableError naming file, line and column.
+    Columns of words and those that `trace` writes are left out; others are errors: a misspelt wavelength must not
+    become the primary one. Raises RayTableError naming file, line and column.
     """
     table = _parsed(path)
     _refuse_columns(table, path)
@@ -65,7 +65,7 @@ def _parsed(path: str | os.PathLike) -> pandas.DataFrame:
 
 
 def _refuse_columns(table: pandas.DataFrame, path: str | os.PathLike) -> None:
-    """Refuse a table without the columns of rays, a column that stands twice, and one of numbers that is not known."""
+    """Refuse a table without the columns of rays, a repeated column, and a column of numbers that is not known."""
     known, names = (*COLUMNS, "wavelength", *TRACED), list(table.columns)
     expected = f"{','.join(COLUMNS)}[,wavelength]"
     for name in COLUMNS:
@@ -75,21 +75,21 @@ def _refuse_columns(table: pandas.DataFrame, path: str | os.PathLike) -> None:
             )
     for k, name in enumerate(names):
         if name in names[:k]:
-            raise RayTableError(f"{path}:1: column {name[:40]!r} stands twice")
+            raise RayTableError(f"{path}:1: column {name[:40]!r} occurs twice")
         if name not in known and np.isfinite(_floats(table.iloc[:, k])).any():
             near = difflib.get_close_matches(name, known, n=1) or ["wavelength"] * name.startswith(("wave", "λ", "lam"))
-            meant = f"is {near[0]!r} meant?" if near else f"expected {expected}"
+            meant = f"did you mean {near[0]!r}?" if near else f"expected {expected}"
             raise RayTableError(f"{path}:1: column {name[:40]!r} is not known; {meant}")
 
 
 def _refuse_values(values: np.ndarray, words: pandas.DataFrame, path: str | os.PathLike) -> None:
-    """Refuse what is no finite number, no direction and no wavelength, by its line."""
+    """Refuse entries that are not finite, directions of length 0 and wavelengths not above 0, by their lines."""
     lines = words.index.to_numpy() + 2
     for row, column in np.argwhere(~np.isfinite(values))[:1]:
         word = words.iloc[row, column]
-        found = repr(word) if isinstance(word, str) else "nothing"
+        entry = repr(word) if isinstance(word, str) else "nothing"
         where = f"{path}:{lines[row]}: column {words.columns[column]}"
-        raise RayTableError(f"{where}: expected a finite number, found {found}")
+        raise RayTableError(f"{where}: expected a finite number, found {entry}")
     for row in np.flatnonzero((values[:, 3:6] == 0).all(1))[:1]:
         raise RayTableError(f"{path}:{lines[row]}: the direction l,m,n is 0,0,0; expected direction cosines")
     for row in np.flatnonzero(~(values[:, 6:] > 0).all(1))[:1]:

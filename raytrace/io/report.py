@@ -1,32 +1,94 @@
-"""The import report: what a reader did with every keyword of a lens file."""
+"""The import of a lens file: glass substitutes that were requested, and the report of every keyword.
 
-from collections.abc import Collection, Iterable, Sequence
+A glass is never replaced without request. `substitute` is a mapping {"SSK4": "SSK4A"}, or words as on the command line,
+"SSK4=SSK4A". "nearest" requests the glass of smallest
+
+    d² = Δn_d² + (0.01 ΔV_d)²
+
+relative to the nd and Vd stored in the file: for one unknown glass by name, or, alone, for every unknown glass.
+"formula" accepts, for a glass of CODE V known by nd and Vd or by a few indices, indices at other wavelengths that a
+formula estimates with an error above 1e-4.
+"""
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 
 import torch
 from torch import Tensor
 
 from raytrace.io.source import LensFileError, Place
-from raytrace.io.substitutes import NONE, Substitutes
 from raytrace.maths.result import Result
 from raytrace.maths.value import value
 from raytrace.system.conditions import RAY_AIMING
 from raytrace.system.dimensions import DIMENSION
 from raytrace.system.optimization_data import Row
 
+# -- substitutes ------------------------------------------------------------------------------------------------------
+
+NEAREST, FORMULA = "nearest", "formula"
+
+
+class BadSubstitute(ValueError):
+    """A malformed substitute; the message has the value found and the value expected."""
+
+
+@dataclass(frozen=True)
+class Substitutes:
+    """Requested substitutes: glass names by the name, in capitals, that they replace.
+
+    nearest: replace every unknown glass; formula: accept estimated indices of every glass.
+    """
+
+    named: Mapping[str, str] = field(default_factory=dict)
+    nearest: bool = False
+    formula: bool = False
+
+    def of(self, name: str) -> str | None:
+        """The substitute of a glass: a name, NEAREST or FORMULA; None where none was requested."""
+        return self.named.get(name.upper())
+
+    def takes_formula(self, name: str) -> bool:
+        """Whether estimated indices of a glass are accepted."""
+        return self.formula or self.of(name) == FORMULA
+
+
+NONE = Substitutes()
+
+
+def substitutes_of(requested: Mapping[str, str] | str | Sequence[str] | None) -> Substitutes:
+    """Substitutes of a mapping, or of words like SSK4=SSK4A and "nearest". Raises BadSubstitute."""
+    if requested is None:
+        return NONE
+    if isinstance(requested, Mapping):
+        pairs = list(requested.items())
+    else:
+        words = requested.split() if isinstance(requested, str) else list(requested)
+        pairs = [tuple(word.partition("=")[::2]) for word in words]
+    named, general = {}, {name for name, other in pairs if name in (NEAREST, FORMULA) and other == ""}
+    for name, other in pairs:
+        if other == "" and name in general:
+            continue
+        if not (isinstance(name, str) and isinstance(other, str) and name.strip() and other.strip()):
+            raise BadSubstitute(f"`substitute`: {name!r} for {other!r}; expected GLASS=OTHER, {NEAREST} or {FORMULA}")
+        named[name.strip().upper()] = other.strip()
+    return Substitutes(named, NEAREST in general, FORMULA in general)
+
+
+# -- the report -------------------------------------------------------------------------------------------------------
+
 READ, IGNORED, UNKNOWN = "read", "ignored", "unknown"
 _TITLES = {READ: "read", IGNORED: "known and ignored", UNKNOWN: "unknown"}
 
-#: A keyword met a thousand times is listed with its first lines only.
+#: How many lines and surfaces of a keyword the report lists.
 _LISTED = 8
 
 
 @dataclass(frozen=True)
 class Keyword:
-    """What was done with one keyword (or column, or header line) of a file.
+    """The treatment of one keyword (or column, or header line) of a file.
 
     status: "read", "ignored" (known, and left out for `reason`) or "unknown".
-    count: how often it was met; lines: the first of them; surfaces: the first surfaces that carry it.
+    count: number of occurrences; lines, surfaces: the first of them.
     """
 
     name: str
@@ -47,7 +109,7 @@ class Keyword:
 
 @dataclass(frozen=True)
 class GlassSource:
-    """Where the medium behind a surface came from: a catalog, or "model glass", "MIL code", "constant index"."""
+    """The source of the medium behind a surface: a catalog, or "model glass", "MIL code", "constant index"."""
 
     surface: int
     name: str
@@ -59,24 +121,28 @@ class GlassSource:
 
 @dataclass(frozen=True)
 class Varied:
-    """What differs between the configurations of a lens: the operand, "THIC 6", and its value in each."""
+    """A multi-configuration operand, "THIC 6", and its value in each configuration."""
 
     operand: str
     values: tuple
 
     def __str__(self) -> str:
-        return f"{self.operand:<12} " + " ".join(f"{_short(one):>14}" for one in self.values)
+        cells = (
+            f"{cell:.9g}" if isinstance(cell, float) else "-" if cell is None else str(cell)[:14] or '""'
+            for cell in self.values
+        )
+        return f"{self.operand:<12} " + " ".join(f"{cell:>14}" for cell in cells)
 
 
-#: What becomes of an operand of a merit function.
+#: Status of an operand of a merit function.
 EVALUATED, KNOWN, UNKNOWN_OPERAND = "evaluated", "known, not evaluated", "unknown"
 
 
 @dataclass(frozen=True)
 class OperandUse:
-    """How often an operand stands in the merit function of a file, with a weight and in all, and what becomes of it.
+    """Occurrences of an operand in the merit function of a file, all and those with a weight, and its status.
 
-    status: "evaluated", "known, not evaluated" or "unknown"; of a file whose operands nobody evaluates "known".
+    status: "evaluated", "known, not evaluated" or "unknown"; "known" where the evaluated operands were not specified.
     """
 
     name: str
@@ -89,42 +155,34 @@ class OperandUse:
 
 
 def operand_uses(merit: Sequence[Row], evaluated: Collection[str] | None) -> tuple[OperandUse, ...]:
-    """The operands of a merit function by name; evaluated: the names of those that are."""
-    found: dict[str, list[Row]] = {}
+    """The operands of a merit function by name; evaluated: names of those that are evaluated."""
+    rows_by_name: dict[str, list[Row]] = {}
     for row in merit:
-        found.setdefault(row.operand, []).append(row)
-    return tuple(
-        OperandUse(name, len(rows), sum(row.weight != 0 for row in rows), _status(name, evaluated))
-        for name, rows in found.items()
-    )
+        rows_by_name.setdefault(row.operand, []).append(row)
+    uses = []
+    for name, rows in rows_by_name.items():
+        status = KNOWN if evaluated is not None else "known"
+        if evaluated is not None and name in evaluated:
+            status = EVALUATED
+        elif name not in DIMENSION:
+            status = UNKNOWN_OPERAND
+        uses.append(OperandUse(name, len(rows), sum(row.weight != 0 for row in rows), status))
+    return tuple(uses)
 
 
-def _status(name: str, evaluated: Collection[str] | None) -> str:
-    if evaluated is not None and name in evaluated:
-        return EVALUATED
-    if name not in DIMENSION:
-        return UNKNOWN_OPERAND
-    return KNOWN if evaluated is not None else "known"
-
-
-def _short(one: object) -> str:
-    return f"{one:.9g}" if isinstance(one, float) else "-" if one is None else str(one)[:14] or '""'
-
-
-#: Keys that a document has only where there is something to say.
-_WHERE_THERE_ARE_SOME = ("configurations", "variables", "solves", "kept", "operands", "tolerances", "geometry")
+#: Keys that a document has only where they are not empty.
+_OPTIONAL_KEYS = ("configurations", "variables", "solves", "kept", "operands", "tolerances", "geometry")
 
 
 @value
 class ImportReport(Result):
-    """What became of a lens file: every keyword met, where each glass came from, notes and warnings.
+    """The treatment of a lens file: every keyword, the source of each glass, notes and warnings.
 
-    A note says what was done where the file leaves a choice; a warning says what was assumed or lost, and is an
-    error when the file is read with `strict=True`. surfaces, stop_surface, primary_wavelength (its
-    number, from 1), wavelengths (µm), ray_aiming: of the lens that was read.
-    configurations: what differs between those of a multi-configuration file.
-    variables, solves, kept: of `Lens.intent`, in words; operands: those of its merit function; tolerances: its lines.
-    geometry: surfaces and gaps that cannot be made.
+    A note reports a choice that the file leaves open; a warning reports an assumption or a loss, and is an error when
+    the file is read with `strict=True`. surfaces, stop_surface, primary_wavelength (its number, from 1), wavelengths
+    (µm), ray_aiming: of the lens that was read. configurations: values of multi-configuration operands.
+    variables, solves, kept: of `Lens.optimization_data`, in words; operands: of its merit function; tolerances: number
+    of its lines. geometry: surfaces and gaps that cannot be fabricated.
     """
 
     file: str
@@ -147,12 +205,13 @@ class ImportReport(Result):
     geometry: tuple[str, ...] = ()
 
     def document(self) -> dict:
-        return {name: one for name, one in asdict(self).items() if one or name not in _WHERE_THERE_ARE_SOME}
+        return {name: part for name, part in asdict(self).items() if part or name not in _OPTIONAL_KEYS}
 
     def columns(self) -> dict[str, Tensor]:
         """A row for each keyword."""
         statuses = [list(_TITLES).index(keyword.status) for keyword in self.keywords]
-        columns = {"keyword": range(len(statuses)), "status": statuses, "count": [one.count for one in self.keywords]}
+        counts = [keyword.count for keyword in self.keywords]
+        columns = {"keyword": range(len(statuses)), "status": statuses, "count": counts}
         return {name: torch.tensor([*column]) for name, column in columns.items()}
 
     def words(self) -> dict[str, list[str]]:
@@ -162,37 +221,36 @@ class ImportReport(Result):
         lines = [f"{self.file} ({self.format})"]
         lines += [f"  warning: {warning}" for warning in (*self.warnings, *self.geometry)]
         lines += [f"  note: {note}" for note in self.notes]
-        lines += self._conventions()
+        if self.wavelengths:
+            chosen, count = self.primary_wavelength, len(self.wavelengths)
+            lines += [
+                f"  primary wavelength: number {chosen} of {count}, {self.wavelengths[chosen - 1]:g} µm",
+                f"  ray aiming: {self.ray_aiming} ({RAY_AIMING[self.ray_aiming]})",
+            ]
         for status, title in _TITLES.items():
             chosen = [str(keyword) for keyword in self.keywords if keyword.status == status]
             listed = _wrapped(chosen) if status == READ else [f"    {keyword}" for keyword in chosen]
             lines += [f"  {title}:", *listed] if chosen else []
         if self.configurations:
             numbers = " ".join(f"{k:>14}" for k in range(1, len(self.configurations[0].values) + 1))
-            lines += ["  configurations:", f"    {'':<12} {numbers}", *(f"    {one}" for one in self.configurations)]
-        lines += self._intent()
+            rows = [f"    {operand}" for operand in self.configurations]
+            lines += ["  configurations:", f"    {'':<12} {numbers}", *rows]
+        lines += self._optimization_data()
         lines += ["  glasses:", *(f"    {use}" for use in self.glasses)] if self.glasses else []
         return "\n".join(lines)
 
-    def _conventions(self) -> list[str]:
-        """The primary wavelength and the ray aiming of the lens."""
-        if not self.wavelengths:
-            return []
-        chosen, count = self.primary_wavelength, len(self.wavelengths)
-        return [
-            f"  primary wavelength: number {chosen} of {count}, {self.wavelengths[chosen - 1]:g} µm",
-            f"  ray aiming: {self.ray_aiming} ({RAY_AIMING[self.ray_aiming]})",
-        ]
-
-    def _intent(self) -> list[str]:
-        """What the lens is to become, and the operands of its merit function by what becomes of them."""
-        titled = {f"{len(self.variables)} variables": self.variables, "solves and pickups": self.solves}
-        titled["rules that are kept and not followed"] = self.kept
-        lines = [line for title, one in titled.items() if one for line in (f"  {title}:", *_wrapped(one))]
+    def _optimization_data(self) -> list[str]:
+        """Variables, solves, and the operands of the merit function by status."""
+        titled = {
+            f"{len(self.variables)} variables": self.variables,
+            "solves and pickups": self.solves,
+            "solves that are kept and not followed": self.kept,
+        }
+        lines = [line for title, part in titled.items() if part for line in (f"  {title}:", *_wrapped(part))]
         if self.operands:
-            lines.append(f"  merit function of {sum(one.count for one in self.operands)} lines:")
-        for status in dict.fromkeys(one.status for one in self.operands):
-            lines += [f"    {status}:", *_wrapped([str(one) for one in self.operands if one.status == status])]
+            lines.append(f"  merit function of {sum(use.count for use in self.operands)} lines:")
+        for status in dict.fromkeys(use.status for use in self.operands):
+            lines += [f"    {status}:", *_wrapped([str(use) for use in self.operands if use.status == status])]
         return [*lines, *([f"  tolerances: {self.tolerances} lines, kept"] if self.tolerances else [])]
 
 
@@ -208,9 +266,9 @@ def _wrapped(words: Iterable[str], width: int = 100) -> list[str]:
 
 @dataclass
 class Draft:
-    """A report being written by a reader; `finished` makes the value.
+    """The report while a reader fills it; `finished` makes the value.
 
-    substitutes: of glasses, as asked for; substituted: the names of those that were, in capitals.
+    substitutes: as requested; substituted: names, in capitals, that were replaced.
     """
 
     file: str
@@ -222,51 +280,55 @@ class Draft:
     glasses: list[GlassSource] = field(default_factory=list)
     _met: dict[tuple[str, str], list[tuple[Place, str]]] = field(default_factory=dict)
 
-    def again(self) -> "Draft":
-        """A new report of the same file, for what is read once more."""
-        return Draft(self.file, self.format, self.substitutes, self.substituted)
+    def again(self, file: str = "") -> "Draft":
+        """An empty report with the same substitutes."""
+        return Draft(file or self.file, self.format, self.substitutes, self.substituted)
+
+    def append(self, other: "Draft") -> None:
+        """Add the contents of another report."""
+        self.notes += other.notes
+        self.warnings += other.warnings
+        self.glasses += other.glasses
+        for key, met in other._met.items():
+            self._met.setdefault(key, []).extend(met)
 
     def met(self, name: str, status: str, place: Place, reason: str = "") -> None:
         """Count one keyword."""
         self._met.setdefault((name, status), []).append((place, reason))
 
     def note(self, text: str) -> None:
-        """Say what was done, with nothing lost."""
+        """Report a choice by which nothing is lost."""
         if text not in self.notes:
             self.notes.append(text)
 
     def warn(self, text: str, place: Place) -> None:
-        """Say what was assumed or lost at a place."""
+        """Report an assumption or a loss at a place."""
         self.warnings.append((text, place))
 
     def glass(self, surface: int, name: str, source: str) -> None:
-        """Say where a medium came from."""
+        """Report the source of a medium."""
         self.glasses.append(GlassSource(surface, name, source))
 
     def finished(self, *, strict: bool) -> ImportReport:
         """The report. Raises LensFileError for the first warning if `strict`."""
-        keywords = [_keyword(name, status, met) for (name, status), met in self._met.items()]
-        for one in keywords:
-            if one.status == UNKNOWN:
-                times = "" if one.count == 1 else f" ({one.count} times)"
-                place = Place(self.file, one.lines[0] if one.lines else None)
-                what = one.name if one.name.startswith("member ") else f"keyword {one.name}"
-                self.warn(f"unknown {what}{times}: left out", place)
+        keywords = []
+        for (name, status), met in self._met.items():
+            lines = [place.line for place, _ in met if place.line is not None]
+            surfaces = dict.fromkeys(place.surface for place, _ in met if place.surface is not None)
+            count, (place, reason) = len(met), met[0]
+            keywords.append(Keyword(name, status, count, tuple(lines[:_LISTED]), tuple(surfaces)[:_LISTED], reason))
+            if status == UNKNOWN:
+                times = "" if count == 1 else f" ({count} times)"
+                label = name if name.startswith("member ") else f"keyword {name}"
+                self.warn(f"unknown {label}{times}: left out", place._replace(surface=None))
         for name in self.substitutes.named:
             if name not in self.substituted:
-                self.warn(
-                    f"a substitute for the glass {name} was asked for, which the file does not name", Place(self.file)
-                )
+                message = f"a substitute for the glass {name} was requested, which is not in the file"
+                self.warn(message, Place(self.file))
         if strict and self.warnings:
             text, place = self.warnings[0]
             more = len(self.warnings) - 1
             also = f" (and {more} more warning{'s' if more > 1 else ''})" if more else ""
-            raise LensFileError(f"{text}{also}; refused because strict reading was asked for", place)
+            raise LensFileError(f"{text}{also}; refused because strict reading was requested", place)
         warnings = tuple(f"{place}: {text}" for text, place in self.warnings)
         return ImportReport(self.file, self.format, tuple(keywords), tuple(self.glasses), tuple(self.notes), warnings)
-
-
-def _keyword(name: str, status: str, met: list[tuple[Place, str]]) -> Keyword:
-    lines = [place.line for place, _ in met if place.line is not None]
-    surfaces = dict.fromkeys(place.surface for place, _ in met if place.surface is not None)
-    return Keyword(name, status, len(met), tuple(lines[:_LISTED]), tuple(surfaces)[:_LISTED], met[0][1])

@@ -1,15 +1,15 @@
-"""Glass catalogs: find a glass by its name, and say what came near on a miss.
+"""Glass catalogs: a glass by its name.
 
-A name is never replaced by a similar one. `find_glass` looks, in this order and nowhere else, in
+A name is never replaced by a similar one. `find_glass` searches, in this order,
 
 1. the catalogs of the user: files given by the caller, then those in the environment variable RAYTRACE_CATALOGS;
-2. the catalogs the lens file names, in its order: those that came with it, else the shipped ones of these names;
-3. the other shipped catalogs, in the order of SHIPPED (a warning tells where two of them disagree on the name);
+2. the catalogs that the lens file lists, in its order: those supplied with it, else the shipped ones of these names;
+3. the other shipped catalogs, in the order of SHIPPED (with a warning if two of them define the name differently);
 4. the alias table glass_catalogs/ALIASES.csv: other spellings of the same glass, each with its reason;
 
-and otherwise raises `UnknownGlass`. Names are compared letter by letter; only upper and lower case are not told apart,
-because the programs that write lens files store names in capitals (no shipped catalog has two names that differ in
-case alone). The Glass that comes back carries the name as asked for, its catalog, and that catalog's own spelling.
+and otherwise raises `UnknownGlass`. Names are compared without regard to case: programs store them in capitals, and no
+shipped catalog has two names that differ in case alone. The Glass has the requested name, its catalog, and the
+catalog's spelling.
 """
 
 import csv
@@ -36,8 +36,8 @@ from raytrace.materials.agf import write_agf as write_agf
 from raytrace.materials.glass import LINES, Glass, refractive_index
 from raytrace.words import calling_level
 
-#: Shipped catalogs in the order they are searched: the makers by how often lens files name them, then collections,
-#: then the makers of few glasses; BIREFRINGENT last, for its names stand for one ray of a crystal.
+#: Shipped catalogs in search order: makers by their frequency in lens files, then collections, then makers of few
+#: glasses; BIREFRINGENT last, as its entries are single rays of a crystal.
 SHIPPED = (
     *("SCHOTT", "OHARA", "HOYA", "CDGM", "HIKARI", "SUMITA", "LZOS", "CORNING", "INFRARED", "MISC", "HERAEUS", "TOPAS"),
     *("ZEON", "ARTON", "LIGHTPATH", "RPO", "UMICORE", "ISUZU", "ARCHER", "RAD_HARD", "BIREFRINGENT"),
@@ -46,18 +46,18 @@ SHIPPED = (
 CATALOG_NAMES = {"NIKON": "HIKARI", "NIKON-HIKARI": "HIKARI", "NIKON_HIKARI": "HIKARI"}
 #: Environment variable: paths of AGF files, separated as in PATH.
 ENVIRONMENT = "RAYTRACE_CATALOGS"
-#: Glasses of an older edition than lens files of 2023 use: the newer edition, and how far its indices lie from ours
-#: from 0.42 to 0.46 µm. Its coefficients are in no source that we could compare.
+#: Glasses of an older edition than that of lens files of 2023: the newer edition, and the largest difference of its
+#: indices from ours from 0.42 to 0.46 µm. No source of its coefficients could be compared.
 OLDER_EDITIONS = {
     ("CDGM", "H-ZBAF20"): ("CDGM of 2023-09", 5.3e-5),
     ("CDGM", "H-ZBAF1"): ("CDGM of 2023-09", 3.0e-5),
 }
-#: Two catalogs whose indices differ by more than this mean two glasses by one name.
+#: Glasses of one name whose indices differ by more than this are different glasses.
 SAME_INDEX = 1e-6
 
 
 class AmbiguousGlass(UserWarning):
-    """A name stands for different glasses in two catalogs, and the lens file does not say which."""
+    """Two catalogs define a name differently, and the lens file does not specify the catalog."""
 
 
 def _at(where: str) -> str:
@@ -65,10 +65,7 @@ def _at(where: str) -> str:
 
 
 class UnknownGlass(LookupError):
-    """No catalog holds the name. Carries `name`, `where` and `suggestions`, a tuple of (glass, catalog).
-
-    searched: the names of the catalogs; hint: what else helps.
-    """
+    """No catalog has the name; `suggestions`: (glass, catalog) of similar names, `searched`: names of the catalogs."""
 
     def __init__(
         self,
@@ -91,12 +88,11 @@ class UnknownGlass(LookupError):
 def find_glass(
     name: str, *, catalogs: Sequence[str | Catalog] = (), user: Sequence[str | Path] = (), where: str = ""
 ) -> Glass:
-    """The glass of a name, by the rule at the head of this file.
+    """The glass of a name, searched in the order of the module's docstring.
 
-    catalogs: those of the lens file in its order: names, one of which that is not shipped is passed over (report it
-    with `missing_catalogs`), and catalogs that came with it. user: AGF files that go before all others. where: the
-    place to name in messages, as "lens.zmx:31, surface 2". Raises UnknownGlass; CatalogError for a bad user catalog;
-    warns AmbiguousGlass.
+    catalogs: those of the lens file in its order: names (those not shipped are ignored: see `missing_catalogs`) and
+    catalogs supplied with it; user: AGF files, searched first; where: the location for messages, as "lens.zmx:31,
+    surface 2". Raises UnknownGlass, and CatalogError for a bad user catalog; warns AmbiguousGlass.
     """
     wanted = name.strip()
     own = [load(path) for path in user_catalogs(user)]
@@ -120,31 +116,30 @@ def find_glass(
 
 
 def edition(glass: Glass) -> tuple[str, ...]:
-    """What is known of the edition of a glass's coefficients, a sentence each; empty for a glass of no catalog.
+    """Statements on the edition of a glass's coefficients; empty for a glass of no catalog.
 
-    The shipped catalogs are not a maker's edition but coefficients that agree in several public sources, which the
-    glass's comment names; a user's catalog tells in its own comment, if at all.
+    Shipped catalogs hold coefficients on which several public sources, listed in the glass's comment, agree.
     """
     if not glass.catalog:
         return ()
     parts = [part.strip() for part in glass.comment.split(";")]
-    told = [part for part in parts if "sources agree" in part or "deviate by" in part]
-    if not told:
+    sources = [part for part in parts if "sources agree" in part or "deviate by" in part]
+    if not sources:
         own = f": {glass.comment}" if glass.comment else " does not state its edition"
         return (glass.catalog + own,)
     newer = OLDER_EDITIONS.get((glass.catalog, glass.listed_name or glass.name))
     older = [f"older than {newer[0]}, whose indices differ by up to {newer[1]:.1e}"] if newer else []
-    return ("date not stated; " + "; ".join(told), *older)
+    return ("date not stated; " + "; ".join(sources), *older)
 
 
 def missing_catalogs(catalogs: Sequence[str], *, user: Sequence[str | Path] = ()) -> tuple[str, ...]:
-    """Those catalog names of a lens file that are neither shipped nor the name of a user catalog's file."""
+    """The catalog names of a lens file that are neither shipped nor the file name of a user catalog."""
     own = {path.stem.upper() for path in user_catalogs(user)}
     return tuple(name for name in catalogs if not _shipped_name(name) and name.upper() not in own)
 
 
 def nearest_names(name: str, *, user: Sequence[str | Path] = (), count: int = 5) -> tuple[tuple[str, str], ...]:
-    """Up to `count` (glass, catalog) whose names look like `name`, the nearest first; hyphens do not count."""
+    """Up to `count` (glass, catalog) of similar names, the nearest first; hyphens are ignored."""
     return _nearest(name, [load(path) for path in user_catalogs(user)], count)
 
 
@@ -173,11 +168,8 @@ def plain_names(
 
 
 def same_catalog(one: str, other: str) -> bool:
-    """Whether two names of a catalog mean the same one, as NIKON and HIKARI do."""
+    """Whether two names denote the same catalog, as NIKON and HIKARI do."""
     return one.upper() == other.upper() or (_shipped_name(one) or one) == (_shipped_name(other) or other)
-
-
-# -- where the catalogs are -------------------------------------------------------------------------------------------
 
 
 def user_catalogs(user: Sequence[str | Path] = ()) -> tuple[Path, ...]:
@@ -187,7 +179,7 @@ def user_catalogs(user: Sequence[str | Path] = ()) -> tuple[Path, ...]:
 
 
 def shipped_folder() -> Path:
-    """The folder of the shipped catalogs: inside the installed package, or beside it in a checkout."""
+    """The folder of the shipped catalogs: inside the installed package, or next to it in a checkout."""
     folder = shipped("glass_catalogs")
     if not (folder / f"{SHIPPED[0]}.AGF").is_file():
         raise CatalogError(f"{folder}: no glass catalogs here; reinstall raytrace")
@@ -209,9 +201,9 @@ def shipped_catalog(name: str) -> Catalog:
 
 
 def load(path: str | Path, *, listed: bool = False) -> Catalog:
-    """The catalog of an AGF file, parsed again only when the file has changed. Raises CatalogError.
+    """The catalog of an AGF file, parsed again only after a change of the file. Raises CatalogError.
 
-    listed: a glass is parsed when it is asked for, and raises then.
+    listed: each glass is parsed at its first use, and raises then.
     """
     path = Path(path)
     try:
@@ -241,9 +233,6 @@ def aliases() -> dict[str, Alias]:
         return {row.pop("alias").upper(): Alias(**row) for row in csv.DictReader(file)}
 
 
-# -- the rest ---------------------------------------------------------------------------------------------------------
-
-
 @lru_cache(maxsize=64)
 def _shipped_names(catalog: str) -> dict[str, str]:
     """Capitals -> name of the glasses of a shipped catalog, without parsing their figures."""
@@ -262,7 +251,7 @@ def _of_shipped(name: str, catalog: str) -> Glass | None:
 
 
 def shipped_difference(glass: Glass) -> float:
-    """How far the indices of a glass lie from those of the shipped catalog of the same name; 0 where it has none."""
+    """Largest index difference of a glass from that of the same name in the shipped catalog; 0 if there is none."""
     shipped = _of_shipped(glass.listed_name, glass.catalog)
     return _difference(glass, shipped) if shipped else 0.0
 

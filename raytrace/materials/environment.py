@@ -1,18 +1,16 @@
-"""Environment: indices at a temperature and a pressure, as OpticStudio has them.
+"""Environment: refractive indices at a temperature and a pressure, as in OpticStudio.
 
-Air has the index 1 in files, catalogs and traces alike, but each means its own air: a lens that of its temperature T
-and pressure P, a catalog that of its reference temperature T0 and 1 atm. Wavelengths are lengths in the air at hand.
-From a wavelength λ of the lens to the index of a glass beside the lens's air:
+Indices and wavelengths refer to air: those of a lens to air at its temperature T and pressure P, those of a catalog to
+air at its reference temperature T0 and 1 atm. From a wavelength λ of the lens to the index n relative to its air:
 
-    λ0 = λ a(T, P)/a(T0, 1),   a = n of air beside vacuum, at λ
+    λ0 = λ a(T, P)/a(T0, 1),   a = n of air relative to vacuum, at λ
     n0 = f(λ0)                 the catalog's formula
-    N = n0 a(T0, 1) + Δn       beside vacuum; Δn by the coefficients of the catalog, at λ0
+    N = n0 a(T0, 1) + Δn       relative to vacuum; Δn by the coefficients of the catalog, at λ0
     n = N/a(T, P)
 
-Which wavelength stands where is settled by a figure that OpticStudio stored for a doublet at 100 °C: so it is met to
-2e-13 mm, and any other choice misses by 3e-9 mm or more. A medium told by numbers (a constant index, nd and Vd, a
-six-digit code) has no reference of its own: it keeps its index beside the air around it. Lengths are not changed here:
-radii and thicknesses expand only where somebody says so.
+This assignment of λ and λ0 reproduces a value that OpticStudio stored for a doublet at 100 °C to 2e-13 mm; any other
+misses it by 3e-9 mm or more. A constant index, a model glass (nd, Vd) and a six-digit code have no reference
+temperature: they keep their index relative to the surrounding air. Radii and thicknesses are not expanded here.
 """
 
 from typing import NamedTuple
@@ -25,7 +23,7 @@ from raytrace.materials.glass import Glass, is_air, refractive_index
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.value import value
 
-#: °C and atm of a catalog that does not say otherwise, and of a lens that says only one of the two.
+#: Default temperature in °C and pressure in atm of a catalog, and of a lens that specifies only one of them.
 REFERENCE = (20.0, 1.0)
 
 #: °C above which the formula of air has a density: its pole is at -272.5.
@@ -33,7 +31,7 @@ COLDEST = -272.0
 
 
 class NoThermalCoefficients(UserWarning):
-    """A glass is used at another temperature than its catalog's, and how it changes is not known."""
+    """A glass without thermal coefficients is used at another temperature than its catalog's."""
 
 
 @value
@@ -45,8 +43,8 @@ class Environment:
 
 
 class Thermal(NamedTuple):
-    """How the index of a glass changes with temperature (SCHOTT TIE-19): coefficients in 1/K, 1/K², 1/K³, µm²/K,
-    µm²/K², the wavelength λ_TK in µm, and the reference temperature in °C."""
+    """Thermal coefficients of a glass (SCHOTT TIE-19) in 1/K, 1/K², 1/K³, µm²/K, µm²/K², the wavelength λ_TK in µm,
+    and the reference temperature in °C."""
 
     D0: float
     D1: float
@@ -58,23 +56,23 @@ class Thermal(NamedTuple):
 
     @property
     def is_known(self) -> bool:
-        """Whether there are coefficients: where none is known, catalogs write zeros."""
+        """Whether there are coefficients: catalogs write zeros for unknown ones."""
         return any(self[:5])
 
 
 def thermal(glass: Glass) -> Thermal:
-    """The thermal figures that its catalog lists for a glass (TD), zeros at 20 °C where it lists none."""
+    """The thermal coefficients that a catalog lists for a glass (TD), zeros at 20 °C if it lists none."""
     listed = dict(glass.records).get("TD", ())
     return Thermal(*listed[:7], *(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, REFERENCE[0])[len(listed) :])
 
 
-def is_told_by_numbers(glass: Glass) -> bool:
-    """Whether a medium is a constant index, a model glass or a six-digit code, and not one of a catalog's formulas."""
+def is_model(glass: Glass) -> bool:
+    """Whether a medium is a constant index, a model glass or a six-digit code, without a catalog's formula."""
     return glass.formula in FORMULAS and FORMULAS[glass.formula].number is None
 
 
 def air_index(wavelength: Tensor, temperature: Tensor | float, pressure: Tensor | float) -> Tensor:
-    """n of air beside vacuum at wavelengths (...) µm, temperature in °C and pressure in atm, in float64.
+    """n of air relative to vacuum at wavelengths (...) µm, temperature in °C and pressure in atm, in float64.
 
         n - 1 = (n_15 - 1) P/(1 + 3.4785e-3 (T - 15)),
         (n_15 - 1) 10⁸ = 6432.8 + 2949810 λ²/(146 λ² - 1) + 25540 λ²/(41 λ² - 1)
@@ -89,11 +87,11 @@ def air_index(wavelength: Tensor, temperature: Tensor | float, pressure: Tensor 
 
 
 def index_change(glass: Glass, wavelength: Tensor, temperature: Tensor, index: Tensor) -> Tensor:
-    """Δn beside vacuum from the catalog's reference temperature T0 to T, of an index n at T0:
+    """Δn relative to vacuum from the catalog's reference temperature T0 to T, of an index n at T0:
 
         Δn = (n² - 1)/(2n) (D0 ΔT + D1 ΔT² + D2 ΔT³ + (E0 ΔT + E1 ΔT²)/(λ² - S λ_TK²)),   S = sign(λ_TK)
 
-    SCHOTT TIE-19, with n beside air; a negative λ_TK, which a few catalogs list, counts as a resonance below 0.
+    SCHOTT TIE-19, with n relative to air; a negative λ_TK, which a few catalogs list, is a resonance below 0.
     """
     D0, D1, D2, E0, E1, resonance, reference = thermal(glass)
     warmer = temperature - reference
@@ -102,15 +100,15 @@ def index_change(glass: Glass, wavelength: Tensor, temperature: Tensor, index: T
 
 
 def index_in(glass: Glass, wavelength: Tensor, air: Environment, own: Environment | None = None) -> Tensor:
-    """n (...) of a medium beside the air of a lens, for wavelengths (...) µm in that air; 0 where it has no index.
+    """n (...) of a medium relative to the air of a lens, for wavelengths (...) µm in that air; 0 where undefined.
 
-    own: the medium's own environment, where that is not the lens's: another temperature of the glass, or a gap with
-    another gas than the lens's air. Differentiable by temperature and pressure. Without checks, as `refractive_index`.
+    own: the medium's environment if it is not that of the lens: another temperature of the glass, or of the air in a
+    gap. Differentiable in temperature and pressure. Without checks, as `refractive_index`.
     """
     exact = wavelength.double()
-    place = _beside(air if own is None else own, exact)
-    around = air_index(exact, *_beside(air, exact))
-    if is_told_by_numbers(glass):
+    place = _like(air if own is None else own, exact)
+    around = air_index(exact, *_like(air, exact))
+    if is_model(glass):
         n = refractive_index(glass, exact)
         return (n if own is None else n * (air_index(exact, *place) / around)).to(wavelength.dtype)
     of_catalog = air_index(exact, thermal(glass).reference, REFERENCE[1])
@@ -122,17 +120,17 @@ def index_in(glass: Glass, wavelength: Tensor, air: Environment, own: Environmen
     return torch.where(exists, absolute / around, 0.0).to(wavelength.dtype)
 
 
-def _beside(place: Environment, like: Tensor) -> tuple[Tensor, Tensor]:
+def _like(place: Environment, like: Tensor) -> tuple[Tensor, Tensor]:
     return place.temperature.to(like), place.pressure.to(like)
 
 
 def dn_dt(glass: Glass, wavelength: Tensor, air: Environment) -> tuple[Tensor, Tensor]:
-    """dn/dT (...) in 1/K at wavelengths (...) µm: beside air that warms with the glass, and beside vacuum.
+    """dn/dT (...) in 1/K at wavelengths (...) µm: relative to air at the glass's temperature, and to vacuum.
 
-    A line keeps its wavelength in vacuum: in air that warms its length changes, as that of a real line does.
+    The vacuum wavelength of a line is constant; its wavelength in air changes with the temperature.
     """
     exact = wavelength.double()
-    temperature, pressure = _beside(air, exact)
+    temperature, pressure = _like(air, exact)
     in_vacuum = exact * air_index(exact, temperature, pressure)
 
     def indices(temperature: Tensor) -> tuple[Tensor, Tensor]:
@@ -144,7 +142,7 @@ def dn_dt(glass: Glass, wavelength: Tensor, air: Environment) -> tuple[Tensor, T
 
 
 def objection(place: Environment) -> str:
-    """What is wrong with a temperature or a pressure, and "" where nothing is."""
+    """The error of a temperature or a pressure out of range, else ""."""
     temperature, pressure = _numbers(place)
     if not COLDEST < temperature < torch.inf:
         return f"`temperature={temperature:g}`: expected degrees Celsius above {COLDEST:g}"
@@ -153,8 +151,8 @@ def objection(place: Environment) -> str:
     return ""
 
 
-def told(place: Environment) -> str:
-    """An environment in words."""
+def in_words(place: Environment) -> str:
+    """An environment as text."""
     return "{:g} °C and {:g} atm".format(*_numbers(place))
 
 
@@ -163,17 +161,17 @@ def _numbers(place: Environment) -> tuple[float, float]:
 
 
 def unknown_change(glass: Glass, place: Environment) -> str:
-    """What is not known of a glass in an environment, in words; "" where everything is, and of air and mirrors."""
+    """A warning if the index of a glass in an environment is not known, else ""; "" for air and mirrors."""
     if glass.formula == "mirror" or is_air(glass):
         return ""
     temperature, pressure = _numbers(place)
     name = glass.name or f"the medium of index {float(refractive_index(glass, torch.tensor(0.5875618))):.6g}"
-    if is_told_by_numbers(glass) and (temperature, pressure) != REFERENCE:
-        return f"{name} is told by numbers, not by a catalog: its index stays as told beside the air of {told(place)}"
-    if not is_told_by_numbers(glass) and not thermal(glass).is_known and temperature != thermal(glass).reference:
-        found = f"{name} ({glass.catalog})" if glass.catalog else name
+    if is_model(glass) and (temperature, pressure) != REFERENCE:
+        return f"{name} is not of a catalog: its index is kept, relative to air of {in_words(place)}"
+    if not is_model(glass) and not thermal(glass).is_known and temperature != thermal(glass).reference:
+        source = f"{name} ({glass.catalog})" if glass.catalog else name
         return (
-            f"{found} has no thermal coefficients: at {temperature:g} °C it has the index of "
-            f"{thermal(glass).reference:g} °C beside vacuum"
+            f"{source} has no thermal coefficients: at {temperature:g} °C it keeps its index relative to vacuum of "
+            f"{thermal(glass).reference:g} °C"
         )
     return ""

@@ -1,4 +1,4 @@
-"""Figures of a glass: what is known of it, and its indices."""
+"""Properties of a glass: catalog data, indices and thermal changes, the result of `rt.glass`."""
 
 import re
 import warnings
@@ -14,9 +14,9 @@ from raytrace.materials.environment import (
     Environment,
     NoThermalCoefficients,
     dn_dt,
+    in_words,
     index_in,
     objection,
-    told,
     unknown_change,
 )
 from raytrace.materials.glass import (
@@ -38,8 +38,8 @@ from raytrace.words import calling_level
 class GlassFigures(Result):
     """A glass and its indices (W,) at wavelengths (W,) µm.
 
-    environment: where the indices and wavelengths are those beside its air, None for the catalog's own; and there
-    dn_dt, dn_dt_absolute: (W,) 1/K, beside air that warms with the glass and beside vacuum.
+    environment: that whose air the indices and wavelengths refer to, None for the catalog's reference air; dn_dt,
+    dn_dt_absolute: (W,) 1/K, relative to air at the glass's temperature and relative to vacuum.
     """
 
     glass: Glass
@@ -66,18 +66,16 @@ class GlassFigures(Result):
             "vd": number(abbe_number(glass)),
             "wavelengths": self.wavelengths.tolist(),
             "indices": self.indices.tolist(),
-            **self._document_of_environment(),
-        }
-
-    def _document_of_environment(self) -> dict:
-        if self.environment is None:
-            return {}
-        return {
-            "temperature": number(self.environment.temperature),
-            "pressure": number(self.environment.pressure),
-            "dn_dt": self.dn_dt.tolist(),
-            "dn_dt_absolute": self.dn_dt_absolute.tolist(),
-        }
+        } | (
+            {}
+            if self.environment is None
+            else {
+                "temperature": number(self.environment.temperature),
+                "pressure": number(self.environment.pressure),
+                "dn_dt": self.dn_dt.tolist(),
+                "dn_dt_absolute": self.dn_dt_absolute.tolist(),
+            }
+        )
 
     def __str__(self) -> str:
         glass, span = self.glass, self.glass.wavelength_range
@@ -95,10 +93,10 @@ class GlassFigures(Result):
         ]
         if self.environment is not None:
             lines.append(
-                f"  at       {told(self.environment)}, beside the air there; dn/dT beside it, and beside vacuum"
+                f"  at       {in_words(self.environment)}, relative to air; dn/dT relative to air, and to vacuum"
             )
             changes = torch.stack([self.dn_dt, self.dn_dt_absolute], -1).mul(1e6).round(decimals=3).tolist()
-            slopes = (f"   {beside_air:8.3f} {absolute + 0.0:8.3f} e-6/K" for beside_air, absolute in changes)
+            slopes = (f"   {relative:8.3f} {absolute + 0.0:8.3f} e-6/K" for relative, absolute in changes)
             shown = [line + slope for line, slope in zip(shown, slopes, strict=True)]
         return "\n".join([*lines, *shown])
 
@@ -111,24 +109,24 @@ def glass(
     temperature: float | Tensor | None = None,
     pressure: float | Tensor | None = None,
 ) -> GlassFigures:
-    """What is known of a glass by its name, as in a lens file, or by a six-digit MIL code.
+    """Properties of a glass by its name, as in a lens file, or by a six-digit MIL code.
 
-    wavelengths: µm, by default the lines F, d and C. catalogs: AGF files that go before all others.
-    temperature: °C, pressure: atm: where one is given, 20 °C and 1 atm by default, the indices beside the air there,
-    and the wavelengths in it; n_d and V_d stay those of the catalog.
+    wavelengths: µm, by default the lines F, d and C; catalogs: AGF files, searched first; temperature: °C, pressure:
+    atm: if either is given (defaults 20 °C, 1 atm), indices and wavelengths refer to air in that state; n_d and V_d
+    remain those of the catalog.
     Raises UnknownGlass, ImplausibleWavelength, InvalidIndex, ValueError; warns OutOfRange, NoThermalCoefficients.
     """
-    found = mil_glass(name) if re.fullmatch(r"\d{6}", name) else find_glass(name, user=catalogs)
-    asked = [LINES[line] for line in "FdC"] if wavelengths is None else wavelengths
-    asked = torch.as_tensor(asked, dtype=torch.float64).reshape(-1)
-    check_unit(asked, [found])
-    check_wavelengths(found, asked)
+    medium = mil_glass(name) if re.fullmatch(r"\d{6}", name) else find_glass(name, user=catalogs)
+    waves = [LINES[line] for line in "FdC"] if wavelengths is None else wavelengths
+    waves = torch.as_tensor(waves, dtype=torch.float64).reshape(-1)
+    check_unit(waves, [medium])
+    check_wavelengths(medium, waves)
     if temperature is None and pressure is None:
-        return GlassFigures(found, asked, refractive_index(found, asked))
-    given = [normal if one is None else one for one, normal in zip((temperature, pressure), REFERENCE, strict=True)]
-    air = Environment(*(torch.as_tensor(one, dtype=torch.float64) for one in given))
+        return GlassFigures(medium, waves, refractive_index(medium, waves))
+    state = (REFERENCE[0] if temperature is None else temperature, REFERENCE[1] if pressure is None else pressure)
+    air = Environment(*(torch.as_tensor(number, dtype=torch.float64) for number in state))
     if wrong := objection(air):
         raise ValueError(f"{name}: {wrong}")
-    if unknown := unknown_change(found, air):
+    if unknown := unknown_change(medium, air):
         warnings.warn(unknown, NoThermalCoefficients, stacklevel=calling_level())
-    return GlassFigures(found, asked, index_in(found, asked, air), air, *dn_dt(found, asked, air))
+    return GlassFigures(medium, waves, index_in(medium, waves, air), air, *dn_dt(medium, waves, air))

@@ -1,4 +1,4 @@
-"""Plan: what the rows of a merit function need, found once; `Now` gives it at variables.
+"""Plan: what the rows of a merit function need, found once; `EvaluationContext` gives it at variables.
 
 An operand is a row of a table (`operands.OPERANDS`); all rows of one operand in one configuration are evaluated
 together.
@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raytrace.optimization.conventions import Readings
+from raytrace.optimization.conventions import Conventions
 from raytrace.optimization.lens_model import Model, View
-from raytrace.optimization.lens_state import Moment
+from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.ray_bundle import Bundle, Hits
 from raytrace.system.optimization_data import Row
 
@@ -62,8 +62,8 @@ class Found(NamedTuple):
     sides: tuple = ()
 
 
-#: Values of rows at a moment; rows of arithmetic take those found so far, by their number.
-Evaluate = Callable[["Now"], Found]
+#: Values of rows at a state; rows of arithmetic take those found so far, by their number.
+Evaluate = Callable[["EvaluationContext"], Found]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,8 +71,8 @@ class Operand:
     """One operand of merit functions.
 
     plan: from its rows in one configuration and a `Planner` to their `Evaluate`. text: what it is, with its arguments.
-    length: the power of length in its unit, as -1 of a curvature; values are in mm, and become those of `Intent.unit`.
-    reading: where the field's own program is not settled, which reading is taken.
+    length: power of length of its unit, as -1 of a curvature; values are in mm, given in `OptimizationData.unit`.
+    convention: where the field's own program is not settled, which convention is taken.
     takes: what the two integers of its rows are, keys of `arguments.ARGUMENTS`; "" for what is not looked at.
     refers: of an operand of arithmetic, the numbers of the rows that a row takes values of, among all rows.
     bounds: of an operand that is its target where a boundary is kept, the relation to it: ">=" or "<=".
@@ -81,7 +81,7 @@ class Operand:
     plan: Callable[[Sequence[Line], "Planner"], Evaluate]
     text: str
     length: int = 0
-    reading: str = ""
+    convention: str = ""
     takes: tuple[str, str] = ("", "")
     refers: Callable[[Line, Sequence[Row]], Sequence[int]] | None = None
     bounds: str = ""
@@ -90,9 +90,9 @@ class Operand:
 class Planner:
     """What operands may ask for, of a lens in one configuration."""
 
-    def __init__(self, view: View, primary: int, readings: Readings, unit: float = 1.0, rows: Sequence[Row] = ()):
+    def __init__(self, view: View, primary: int, conventions: Conventions, unit: float = 1.0, rows: Sequence[Row] = ()):
         """unit: mm in the unit of length of the rows; rows: of the whole merit function."""
-        self.view, self.lens, self.primary, self.readings = view, view.lens, primary, readings
+        self.view, self.lens, self.primary, self.conventions = view, view.lens, primary, conventions
         self.unit, self.rows = unit, rows
         self.bundles: dict[tuple[int, bool], Bundle] = {}
         self._shared: dict = {}
@@ -136,11 +136,11 @@ class Planner:
         return self._shared[kind]
 
 
-class Now:
-    """The lens in one configuration at given variables: its moment and its rays, traced when they are first needed."""
+class EvaluationContext:
+    """The lens in one configuration at given variables: its state and its rays, traced when they are first needed."""
 
-    def __init__(self, planner: Planner, moment: Moment, values: dict[int, object]):
-        self.planner, self.moment, self.values = planner, moment, values
+    def __init__(self, planner: Planner, state: LensState, values: dict[int, object]):
+        self.planner, self.state, self.values = planner, state, values
         self._hits: dict[tuple[int, bool], Hits] = {}
         self._once: dict = {}
 
@@ -155,16 +155,21 @@ class Now:
         """Rays by their numbers behind a surface, the image by default; clips: as they were asked for."""
         at = self.planner.image if surface is None else surface, clips
         if at not in self._hits:
-            self._hits[at] = self.planner.bundles[at].hits(self.moment)
+            self._hits[at] = self.planner.bundles[at].hits(self.state)
         return self._hits[at].at(rays)
 
     def starts(self, rays: np.ndarray, *, surface: int | None = None) -> Hits:
         """The same rays where they set out, before surface 1 and in its axes."""
         last = self.planner.image if surface is None else surface
-        return self.planner.bundles[last, False].starts(self.moment).at(rays)
+        return self.planner.bundles[last, False].starts(self.state).at(rays)
 
 
 def planner_of(
-    model: Model, configuration: int, primary: int, readings: Readings, unit: float = 1.0, rows: Sequence[Row] = ()
+    model: Model,
+    configuration: int,
+    primary: int,
+    conventions: Conventions,
+    unit: float = 1.0,
+    rows: Sequence[Row] = (),
 ) -> Planner:
-    return Planner(model.views[configuration - 1], primary, readings, unit, rows)
+    return Planner(model.views[configuration - 1], primary, conventions, unit, rows)

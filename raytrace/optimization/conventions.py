@@ -1,4 +1,4 @@
-"""Readings: how operands are taken whose meaning the field's own program leaves open."""
+"""Conventions: how operands are taken whose meaning the field's own program leaves open."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -8,8 +8,8 @@ from raytrace.words import did_you_mean
 
 
 @dataclasses.dataclass(frozen=True)
-class Readings:
-    """Which reading of an operand counts; the first choice of each is the default. Raises ValueError for another.
+class Conventions:
+    """Which convention of an operand counts; the first choice of each is the default. Raises ValueError for another.
 
     opd_tilt: of OPDX, whether a tilt is fitted for every wavelength of a field, or one that all have in common.
     opd_chief: whose chief ray the reference sphere is about, that of the row's own wavelength or of the primary one.
@@ -39,10 +39,10 @@ class Readings:
     def __post_init__(self):
         for name, known in CHOICES.items():
             if getattr(self, name) not in known:
-                raise ValueError(f"reading `{name}` {getattr(self, name)!r}: expected one of {', '.join(known)}")
+                raise ValueError(f"convention `{name}` {getattr(self, name)!r}: expected one of {', '.join(known)}")
 
 
-#: The readings of each name, the one that is taken by itself first.
+#: The conventions of each name, the one that is taken by itself first.
 CHOICES = {
     "opd_tilt": ("per wavelength", "common"),
     "opd_chief": ("own", "primary"),
@@ -57,9 +57,9 @@ CHOICES = {
 }
 
 
-def readings_of(words: "Readings | str | Sequence[str] | None") -> Readings:
-    """Readings as words name them: "opd_tilt=common focal_length=in-air"; by default all as they are by themselves."""
-    if isinstance(words, Readings):
+def conventions_of(words: "Conventions | str | Sequence[str] | None") -> Conventions:
+    """Conventions from words, "opd_tilt=common focal_length=in-air"; None gives the defaults."""
+    if isinstance(words, Conventions):
         return words
     given = {}
     for word in joined(words or "").split():
@@ -67,7 +67,7 @@ def readings_of(words: "Readings | str | Sequence[str] | None") -> Readings:
         if name not in CHOICES or not sign:
             known = ", ".join(CHOICES)
             raise ValueError(
-                f"`readings`: {word!r}: expected one of {known}, = and a choice{did_you_mean(name, CHOICES)}"
+                f"`conventions`: {word!r}: expected one of {known}, = and a choice{did_you_mean(name, CHOICES)}"
             )
         given[name] = choice.replace("-", " ")
-    return Readings(**given)
+    return Conventions(**given)

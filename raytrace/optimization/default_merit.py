@@ -17,7 +17,7 @@ import numpy as np
 from raytrace.maths.pupil import gauss_legendre
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row
-from raytrace.tracing.axis import is_round_about_axis
+from raytrace.tracing.aiming import is_round_about_axis
 from raytrace.words import did_you_mean
 
 #: More rows than any merit function is worth: each is a ray, with its derivatives by all variables.

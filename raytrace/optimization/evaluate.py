@@ -9,14 +9,14 @@ from torch import Tensor
 
 from raytrace.maths.result import Result, cell, rows
 from raytrace.maths.value import value
-from raytrace.optimization.conventions import Readings, readings_of
+from raytrace.optimization.conventions import Conventions, conventions_of
 from raytrace.optimization.lens_model import Model
 from raytrace.optimization.merit import Merit, arguments, configurations_of, merit_for
 from raytrace.optimization.merit_rows import Evaluation
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import Row
-from raytrace.tracing.stop_filling import warn_of_filling
+from raytrace.tracing.launch import warn_of_filling
 
 _WHOLE = 40  # rows that are listed one by one
 _TOGETHER = 3  # rows of one field that share a line in longer tables
@@ -146,7 +146,7 @@ def evaluate(
     air_thickness: tuple[float, float] | str | None = None,
     edge: float | None = None,
     skip_unknown: bool = False,
-    readings: Readings | str | Sequence[str] | None = None,
+    conventions: Conventions | str | Sequence[str] | None = None,
     configuration: int | None = None,
     each: bool = False,
 ) -> MeritResult:
@@ -155,8 +155,8 @@ def evaluate(
     merit: `Merit`, rows, or the name of a default one ("spot", "wavefront", "angular", "mtf"); by default the file's.
     rings, arms (even), reference ("centroid", "chief"), frequencies (cycles/mm, of "mtf"), field_weights,
     wavelength_weights: of a default one. glass_thickness, air_thickness: least and greatest in mm, edge: least of glass
-    at its edge: rows beside the others. skip_unknown: leave rows of operands that are not known out. readings: where
-    the meaning of an operand is open, as "opd_tilt=common" (`Readings`). configuration: its rows alone. each: list
+    at its edge: rows beside the others. skip_unknown: leave rows of operands that are not known out. conventions: where
+    the meaning of an operand is open, as "opd_tilt=common" (`Conventions`). configuration: its rows alone. each: list
     every row in the text. Raises BadMerit, UnknownOperand.
     """
     function = merit_for(
@@ -170,7 +170,11 @@ def evaluate(
         apart = {number: 0.0 for number, at in enumerate(where, 1) if at != configuration}
         function = function.with_weights(apart)
     planned = Evaluation(
-        Model(lens), function.rows, unit=function.unit, skip_unknown=skip_unknown, readings=readings_of(readings)
+        Model(lens),
+        function.rows,
+        unit=function.unit,
+        skip_unknown=skip_unknown,
+        conventions=conventions_of(conventions),
     )
     shown = [
         k for k, row in enumerate(function) if row.operand in OPERANDS and where[k] in (configuration or where[k],)

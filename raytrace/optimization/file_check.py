@@ -5,8 +5,7 @@ from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 
-from raytrace import io as formats
-from raytrace.io import ImportReport, Substitute
+from raytrace.io import ImportReport, Substitute, checked
 from raytrace.optimization.context import SETTINGS
 from raytrace.optimization.operands.table import OPERANDS
 from raytrace.tracing.geometry import defects
@@ -27,5 +26,5 @@ def check(
     substitute: as for `read_lens`. Raises as that, and LensFileError for what cannot be traced.
     """
     evaluated = (*OPERANDS, *SETTINGS)
-    lens, report = formats.checked(path, catalogs, strict, configuration, substitute, evaluated)
+    lens, report = checked(path, catalogs, strict, configuration, substitute, evaluated)
     return dataclasses.replace(report, geometry=tuple(map(str, defects(lens))))

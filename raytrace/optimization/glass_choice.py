@@ -164,7 +164,7 @@ def without_glass(free: Freedom, vary: str | Sequence | None) -> tuple[Freedom, 
     if differing or not chosen:
         which = f"of surface {differing[0]} differs between the configurations" if differing else "follows another"
         raise NoProblem(f"`vary=glass`: the glass {which}")
-    own = () if free.lens.intent is None else free.lens.intent.variables
+    own = () if free.lens.optimization_data is None else free.lens.optimization_data.variables
     others = _others(free.variables, chosen) or _others(own, chosen)
     if not others:
         raise NoProblem("`vary=glass`: nothing but glasses varies; name what follows them, as 'curvature glass'")
@@ -182,7 +182,7 @@ def _others(variables: Sequence[Vary], chosen: set[int]) -> tuple[Vary, ...]:
 def _marked(lens: Lens, vary: str | Sequence | None, surfaces: set[int]) -> set[int]:
     """Of the surfaces whose glasses vary those that the file marks as exchangeable, unless words name surfaces."""
     words = vary if isinstance(vary, str) else " ".join(one for one in vary or () if isinstance(one, str))
-    kept = () if lens.intent is None else lens.intent.kept
+    kept = () if lens.optimization_data is None else lens.optimization_data.kept
     told = {one.surface for one in kept if (one.quantity, one.kind) == ("glass", "substitute")}
     all_meant = "glass" in words.split()
     return (told & surfaces or surfaces) if all_meant else surfaces
@@ -190,7 +190,7 @@ def _marked(lens: Lens, vary: str | Sequence | None, surfaces: set[int]) -> set[
 
 def followers(lens: Lens) -> dict[int, int]:
     """Surfaces whose glass is that of another, and which one's."""
-    rules = () if lens.intent is None else (*lens.intent.solves, *lens.intent.kept)
+    rules = () if lens.optimization_data is None else (*lens.optimization_data.solves, *lens.optimization_data.kept)
     return {
         one.surface: one.source
         for one in rules
@@ -199,7 +199,7 @@ def followers(lens: Lens) -> dict[int, int]:
 
 
 def _differs(lens: Lens, surface: int) -> bool:
-    return any(place.path[:3] == ("surfaces", surface, "glass") for one in lens.operands for place in one.places)
+    return any(place.path[:3] == ("surfaces", surface, "glass") for one in lens.operands for place in one.paths)
 
 
 def with_glasses(lens: Lens, glasses: dict[int, Glass]) -> Lens:

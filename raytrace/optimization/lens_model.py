@@ -1,7 +1,7 @@
 """Model: the numbers of a lens, in all its configurations, as functions of the variables of an optimisation.
 
 What a variable moves, what follows by a solve or a pickup, and where the tables of the compiled trace hold it, is found
-once; a `Moment` is the lens at given variables.
+once; a `LensState` is the lens at given variables.
 """
 
 import dataclasses
@@ -13,16 +13,16 @@ import torch
 from torch import Tensor
 
 from raytrace.materials.glass import is_air
-from raytrace.optimization.lens_state import Moment
+from raytrace.optimization.lens_state import LensState
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Solve, Vary
-from raytrace.system.parameter_paths import Place, number_at, places, with_number
+from raytrace.system.parameter_paths import ParameterPath, number_at, parameter_paths, with_number
 from raytrace.system.phases import power_of
 from raytrace.system.surface import Surface, gap_behind, vertex_curvature
-from raytrace.tracing.axis import is_round_about_axis
+from raytrace.tracing.aiming import is_round_about_axis
 from raytrace.tracing.compiled.structure import structure_of
 from raytrace.tracing.paraxial import signed
-from raytrace.tracing.sequence import media, sequence_of
+from raytrace.tracing.trace import media, sequence_of
 
 #: A number of a lens: of which surface, and which.
 Address = tuple[int, str]
@@ -41,22 +41,24 @@ class UnknownNumber(ValueError):
     """A variable, solve or pickup of a number that the lens does not have."""
 
 
-def place_of(surface: Surface, quantity: str, where: str = "") -> Place:
+def path_of(surface: Surface, quantity: str, where: str = "") -> ParameterPath:
     """Where a surface holds a number. Raises UnknownNumber."""
-    known = {"thickness": Place(("thickness",)), **places(surface)}
+    known = {"thickness": ParameterPath(("thickness",)), **parameter_paths(surface)}
     if surface.glass.formula in ("model", "constant") and not is_air(surface.glass):
         entries = list(GLASS.items())[: surface.glass.coefficients.numel()]
-        known |= {name: Place(("glass", "coefficients"), entry) for name, entry in entries}
+        known |= {name: ParameterPath(("glass", "coefficients"), entry) for name, entry in entries}
     if quantity not in known:
         raise UnknownNumber(f"{where}no {quantity!r}; it has {', '.join(known)}")
     return known[quantity]
 
 
-def with_numbers_of(lens: Lens, numbers: dict[Address, Tensor], known: dict[Address, Place] | None = None) -> Lens:
+def with_numbers_of(
+    lens: Lens, numbers: dict[Address, Tensor], known: dict[Address, ParameterPath] | None = None
+) -> Lens:
     """The lens with other numbers of its surfaces; known: their places, where they have been looked up before."""
     surfaces = list(lens.surfaces)
     for (surface, quantity), number in numbers.items():
-        place = known[surface, quantity] if known else place_of(surfaces[surface], quantity, f"surface {surface}: ")
+        place = known[surface, quantity] if known else path_of(surfaces[surface], quantity, f"surface {surface}: ")
         surfaces[surface] = with_number(surfaces[surface], place, number)
     return dataclasses.replace(lens, surfaces=tuple(surfaces))
 
@@ -65,8 +67,8 @@ def with_numbers_of(lens: Lens, numbers: dict[Address, Tensor], known: dict[Addr
 class Model:
     """A lens whose variables move.
 
-    lens: as it is at the start; variables, solves: of `Intent`; opening: the part of the pupil and of the field that
-    rays of a merit function go through. Raises UnknownNumber for numbers that it does not have.
+    lens: as it is at the start; variables, solves: of `OptimizationData`; opening: the fraction of pupil and field that
+    the rays of a merit function fill. Raises UnknownNumber for numbers that it does not have.
     """
 
     lens: Lens
@@ -103,8 +105,8 @@ class Model:
         held = number_at(self.lens.surfaces[one.surface], self._place(one))
         return 0.0 if held is None else float(held)
 
-    def _place(self, one: Vary | Solve) -> Place:
-        return place_of(self.lens.surfaces[one.surface], one.quantity, f"surface {one.surface}: ")
+    def _place(self, one: Vary | Solve) -> ParameterPath:
+        return path_of(self.lens.surfaces[one.surface], one.quantity, f"surface {one.surface}: ")
 
     def lens_at(self, variables: np.ndarray) -> Lens:
         """The lens with its variables there, and with all that follows from them."""
@@ -118,7 +120,7 @@ class Model:
                 operands[k] = dataclasses.replace(operands[k], numbers=numbers)
         lens = dataclasses.replace(lens, operands=tuple(operands)) if operands else lens
         current = self.views[lens.current_configuration - 1]
-        numbers = current.moment(np.asarray(variables, dtype=float)).numbers
+        numbers = current.state(np.asarray(variables, dtype=float)).numbers
         there = {at: like.new_tensor(float(n), dtype=torch.float64) for at, n in numbers.items()}
         return with_numbers_of(lens, there)
 
@@ -146,12 +148,12 @@ class View:
         self.lens = _modelled(lens, self.moved)
         self.stored = {at: self.number(at) for at in self.moved}
         surfaces = self.lens.surfaces
-        self._held = {(k, quantity): place_of(surfaces[k], quantity) for k, quantity in self.moved}
+        self._held = {(k, quantity): path_of(surfaces[k], quantity) for k, quantity in self.moved}
 
     def _is_idle(self, one: Solve, lens: Lens) -> bool:
         """Whether a pickup is of a number that does not vary, and that the lens does not model, for it is 0."""
         at = [(one.source, one.quantity_of_source or one.quantity), (one.surface, one.quantity)]
-        known = all(quantity in ("thickness", *places(lens.surfaces[surface])) for surface, quantity in at)
+        known = all(quantity in ("thickness", *parameter_paths(lens.surfaces[surface])) for surface, quantity in at)
         return one.kind == "pickup" and not known and at[0] not in self.variables
 
     @cached_property
@@ -184,7 +186,7 @@ class View:
     def number(self, at: Address) -> float:
         """A number of the lens as it is stored."""
         surface, quantity = at
-        held = number_at(self.lens.surfaces[surface], place_of(self.lens.surfaces[surface], quantity))
+        held = number_at(self.lens.surfaces[surface], path_of(self.lens.surfaces[surface], quantity))
         return 0.0 if held is None else float(held)
 
     @cached_property
@@ -286,8 +288,8 @@ class View:
         rows = [torch.broadcast_to(n[..., 0] if n.dim() else n, wavelength.shape[:1]) for n in table]
         return surfaces, structure, torch.stack(rows, -1)
 
-    def moment(self, variables) -> Moment:
-        return Moment(self, variables)
+    def state(self, variables) -> LensState:
+        return LensState(self, variables)
 
 
 def _of_operands(model: Model, configuration: int) -> dict[Address, tuple[int, float, float]]:
@@ -295,7 +297,7 @@ def _of_operands(model: Model, configuration: int) -> dict[Address, tuple[int, f
     operands that pick up the number of another configuration."""
     found = {}
     for operand, (number, scale, offset) in followed(model, configuration).items():
-        for place in model.lens.operands[operand].places:
+        for place in model.lens.operands[operand].paths:
             if place.path[0] == "surfaces":
                 surface = model.lens.surfaces[place.path[1]]
                 linear = number, place.factor * scale, place.factor * offset + place.offset
@@ -320,7 +322,9 @@ def followed(model: Model, configuration: int) -> dict[int, tuple[int, float, fl
             if source in moved and at not in moved:
                 number, scale, offset = moved[source]
                 added = (
-                    one.offset * model.lens.intent.unit ** _POWERS.get(one.quantity, 0) if model.lens.intent else 0.0
+                    one.offset * model.lens.optimization_data.unit ** _POWERS.get(one.quantity, 0)
+                    if model.lens.optimization_data
+                    else 0.0
                 )
                 moved[at] = number, one.scale * scale, one.scale * offset + added
     return {operand: linear for (operand, at), linear in moved.items() if at == configuration}
@@ -360,7 +364,7 @@ def _overridden(lens: Lens) -> set[Address]:
     """What operands of the configurations hold: there the surface's own variable or solve is void."""
     found = set()
     for operand in lens.operands:
-        for place in operand.places:
+        for place in operand.paths:
             if place.path[0] == "surfaces" and operand.numbers is not None:
                 found |= {(place.path[1], name) for name in names_at(lens.surfaces[place.path[1]], place.path[2:])}
     return found
@@ -368,7 +372,7 @@ def _overridden(lens: Lens) -> set[Address]:
 
 def names_at(surface: Surface, path: tuple) -> list[str]:
     """The names by which a surface's number at a path of `configurations` is known."""
-    known = {"thickness": Place(("thickness",)), **places(surface)}
+    known = {"thickness": ParameterPath(("thickness",)), **parameter_paths(surface)}
     entry = path[-1] if isinstance(path[-1], tuple) else None
     fields = path[:-1] if entry is not None else path
     flat = None if entry is None else entry[0] if len(entry) == 1 else None

@@ -1,4 +1,4 @@
-"""Moment: a lens in one configuration at given variables: its numbers and first-order data, with their derivatives.
+"""LensState: a lens in one configuration at given variables: its numbers and first-order data, with their derivatives.
 
 Numbers are plain ones, or dual ones (`maths.dual`) where derivatives are asked for; the formulas are the same.
 
@@ -20,51 +20,49 @@ from raytrace.system.lens import Lens, index_behind
 from raytrace.system.optimization_data import Solve
 from raytrace.system.rays import Rays
 from raytrace.system.surface import sag_at, vertex_curvature
-from raytrace.tracing.launch import rays_of_field
+from raytrace.tracing.launch import rays_of_field, vignette
 from raytrace.tracing.paraxial import brackets, power, signed
-from raytrace.tracing.sequence import media, sequence_of
-from raytrace.tracing.trace import trace_surfaces
-from raytrace.tracing.vignetting import vignette
+from raytrace.tracing.trace import media, sequence_of, trace_surfaces
 
 #: Through which points of the pupil light reaches furthest from the vertex of a surface.
 ENDS = ((0.0, 1.0), (0.0, -1.0), (1.0, 0.0), (-1.0, 0.0))
 
 
-def _ray_before(moment, surface: int):
+def _ray_before(state, surface: int):
     """(y, ω) of the paraxial marginal ray in front of a surface."""
-    y, omega = moment.marginal_height, moment.marginal_height * moment.vergence
+    y, omega = state.marginal_height, state.marginal_height * state.vergence
     if surface == 1:
         return y, omega
-    A, B, C, D = moment.matrix(1, surface - 1, moment.primary, to_next=True)
+    A, B, C, D = state.matrix(1, surface - 1, state.primary, to_next=True)
     return A * y + B * omega, C * y + D * omega
 
 
-def _pickup(moment, solve: Solve):
-    return solve.scale * moment.number(solve.source, solve.quantity_of_source or solve.quantity) + solve.offset
+def _pickup(state, solve: Solve):
+    return solve.scale * state.number(solve.source, solve.quantity_of_source or solve.quantity) + solve.offset
 
 
-def _bent_to(moment, solve: Solve, omega_behind):
+def _bent_to(state, solve: Solve, omega_behind):
     """The curvature behind which the marginal ray has ω′: c = (ω - ω′ - K y)/(y (n′ - n)), K the power beside it."""
-    k, n = solve.surface, moment.index(moment.primary)
-    y, omega = _ray_before(moment, k)
-    return ((omega - omega_behind) / y - moment.further_power(k, moment.primary)) / (n[k] - n[k - 1])
+    k, n = solve.surface, state.index(state.primary)
+    y, omega = _ray_before(state, k)
+    return ((omega - omega_behind) / y - state.further_power(k, state.primary)) / (n[k] - n[k - 1])
 
 
-def _marginal_angle(moment, solve: Solve):
-    return _bent_to(moment, solve, moment.index(moment.primary)[solve.surface] * solve.numbers[0])
+def _marginal_angle(state, solve: Solve):
+    return _bent_to(state, solve, state.index(state.primary)[solve.surface] * solve.numbers[0])
 
 
-def _f_number(moment, solve: Solve):
-    return _bent_to(moment, solve, -abs(moment.index(moment.primary)[solve.surface]) / (2 * solve.numbers[0]))
+def _f_number(state, solve: Solve):
+    return _bent_to(state, solve, -abs(state.index(state.primary)[solve.surface]) / (2 * solve.numbers[0]))
 
 
-def _marginal_height(moment, solve: Solve):
+def _marginal_height(state, solve: Solve):
     """t = n′ (h - y)/ω′ behind the surface, of the paraxial ray, or of the real one through a part of the pupil."""
     if any(solve.numbers[1:]):
-        return moment.through_torch(lambda lens: [_real_height(lens, solve)])[0]
-    k, primary = solve.surface, moment.primary
-    y, omega = _ray_before(moment, k)
-    return moment.index(primary)[k] * (solve.numbers[0] - y) / (omega - moment.power(k, primary) * y)
+        return state.through_torch(lambda lens: [_real_height(lens, solve)])[0]
+    k, primary = solve.surface, state.primary
+    y, omega = _ray_before(state, k)
+    return state.index(primary)[k] * (solve.numbers[0] - y) / (omega - state.power(k, primary) * y)
 
 
 def _real_height(lens: Lens, solve: Solve) -> Tensor:
@@ -80,9 +78,9 @@ def _real_height(lens: Lens, solve: Solve) -> Tensor:
     return torch.where(crosses, thickness, torch.nan).reshape(())
 
 
-def _edge_thickness(moment, solve: Solve):
+def _edge_thickness(state, solve: Solve):
     """t = e + z - z′ of both surfaces at one height, by default the semi-diameter of the first."""
-    return moment.through_torch(lambda lens: [_edge(lens, solve)])[0]
+    return state.through_torch(lambda lens: [_edge(lens, solve)])[0]
 
 
 def _edge(lens: Lens, solve: Solve) -> Tensor:
@@ -93,15 +91,17 @@ def _edge(lens: Lens, solve: Solve) -> Tensor:
 
 
 def semi_diameter(lens: Lens, k: int) -> Tensor:
-    """mm (): as given, or where the light of all fields and wavelengths reaches, with the margin of `Intent`."""
-    intent, own = lens.intent, lens.surfaces[k].semi_diameter
-    if own and (intent is None or k in intent.semi_diameters):
+    """mm: given, or the extent of the rays of all fields and wavelengths, with the margin of `OptimizationData`."""
+    optimization_data, own = lens.optimization_data, lens.surfaces[k].semi_diameter
+    if own and (optimization_data is None or k in optimization_data.semi_diameters):
         return lens.wavelengths.new_tensor(own)
     field = torch.stack([lens.fields.x, lens.fields.y])[:, None, :, None]
     points = lens.wavelengths.new_tensor(ENDS).T[:, None, None]
     rays = _behind(lens, k, field, vignette(lens, field, points), lens.wavelengths[:, None, None])
     height = torch.where(rays.valid, rays.position[0].square() + rays.position[1].square(), 0.0).amax().sqrt()
-    percent, length = (0.0, 0.0) if intent is None or k == lens.stop else intent.semi_diameter_margin
+    percent, length = (
+        (0.0, 0.0) if optimization_data is None or k == lens.stop else optimization_data.semi_diameter_margin
+    )
     return (1 + percent / 100) * height + length
 
 
@@ -111,20 +111,20 @@ def _behind(lens: Lens, k: int, field: Tensor, pupil: Tensor, wavelength: Tensor
     return trace_surfaces(sequence_of(lens)[:k], rays, indices=media(lens, wavelength)[: k + 1], wavelength=wavelength)
 
 
-def _power(moment, solve: Solve):
+def _power(state, solve: Solve):
     """c = P/(n′ - n) of the power that a surface has by its curvature."""
-    k, n = solve.surface, moment.index(moment.primary)
+    k, n = solve.surface, state.index(state.primary)
     return solve.numbers[0] / (n[k] - n[k - 1])
 
 
-def _position(moment, solve: Solve):
+def _position(state, solve: Solve):
     """The thickness with which those from surface `source` to this one, or from this one on to `source`, have a sum."""
     k, source = solve.surface, solve.source
     others = range(source, k) if source <= k else range(k + 1, source)
-    return solve.numbers[0] - sum(moment.thickness[j] for j in others)
+    return solve.numbers[0] - sum(state.thickness[j] for j in others)
 
 
-#: How a number is found, by the kind of its solve: of a moment and the solve.
+#: How a number is found, by the kind of its solve: of a state and the solve.
 SOLVES = {
     "pickup": _pickup,
     "marginal_angle": _marginal_angle,
@@ -166,7 +166,7 @@ class Gaussian(NamedTuple):
         return self.n_object * self.front[1] / self.front[0]
 
 
-class Moment:
+class LensState:
     """view: `model.View`; variables: (n,) numbers, or a Dual of them."""
 
     def __init__(self, view, variables):
@@ -184,9 +184,9 @@ class Moment:
         """How many variables there are derivatives by; 0 where none are asked for."""
         return len(self.variables.slope) if isinstance(self.variables, Dual) else 0
 
-    def fixed(self) -> "Moment":
-        """The same moment without derivatives."""
-        return Moment(self.view, value_of(self.variables)) if self.count else self
+    def fixed(self) -> "LensState":
+        """The same state without derivatives."""
+        return LensState(self.view, value_of(self.variables)) if self.count else self
 
     def number(self, surface: int, quantity: str):
         """A number of a surface, solved, picked up, varied or as it is stored."""
@@ -266,7 +266,7 @@ class Moment:
         return self._gaussian[wavelength]
 
     def kept(self, function: Callable, *arguments):
-        """What a function makes of the moment and arguments, found once."""
+        """What a function makes of the state and arguments, found once."""
         key = function, *arguments
         if key not in self._kept:
             self._kept[key] = function(self, *arguments)

@@ -32,9 +32,9 @@ class Merit:
     @classmethod
     def of(cls, lens: Lens) -> "Merit":
         """That of the lens's file. Raises BadMerit where it has none."""
-        if lens.intent is None or not lens.intent.merit:
+        if lens.optimization_data is None or not lens.optimization_data.merit:
             raise BadMerit("the lens has no merit function of its own: choose one by `merit=spot`")
-        return cls(lens.intent.merit, lens.intent.unit)
+        return cls(lens.optimization_data.merit, lens.optimization_data.unit)
 
     @classmethod
     def default(cls, lens: Lens, kind: str = "spot", **how) -> "Merit":

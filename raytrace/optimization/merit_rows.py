@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from raytrace.maths.dual import Dual, slope_of, value_of
-from raytrace.optimization.context import SETTINGS, Evaluate, Found, Line, Now, Planner, planner_of
-from raytrace.optimization.conventions import Readings
+from raytrace.optimization.context import SETTINGS, Evaluate, EvaluationContext, Found, Line, Planner, planner_of
+from raytrace.optimization.conventions import Conventions
 from raytrace.optimization.lens_model import Model
 from raytrace.optimization.operands.arguments import need, need_all
 from raytrace.optimization.operands.arithmetic import in_order
@@ -59,11 +59,11 @@ class Evaluation:
         *,
         unit: float = 1.0,
         skip_unknown: bool = False,
-        readings: Readings | None = None,
+        conventions: Conventions | None = None,
     ):
-        """unit: mm in the unit of length of the rows; readings: where operands are open. Raises UnknownOperand."""
+        """unit: mm in the unit of length of the rows; conventions: where operands are open. Raises UnknownOperand."""
         self.model, self.rows, self.unit = model, tuple(rows), unit
-        self.readings = readings or Readings()
+        self.conventions = conventions or Conventions()
         self.groups: list[tuple[Planner, tuple[Line, ...], Evaluate]] = []
         self.planners: list[tuple[int, Planner]] = []
         self.needed: frozenset[int] = frozenset()
@@ -92,7 +92,7 @@ class Evaluation:
             settings, line = placed[number]
             operand = OPERANDS[line.row.operand]
             if settings not in planners:
-                planners[settings] = planner_of(self.model, *settings, self.readings, self.unit, self.rows)
+                planners[settings] = planner_of(self.model, *settings, self.conventions, self.unit, self.rows)
             need_all(line, operand, planners[settings].lens)
             groups.setdefault((settings, line.row.operand, number if operand.refers else 0), []).append(line)
         for (settings, name, _), lines in groups.items():
@@ -158,13 +158,16 @@ class Evaluation:
         x = Dual(np.asarray(variables, dtype=float), np.eye(count)) if derivatives else np.asarray(variables, float)
         values, residuals, slopes, of_row = np.full(len(self.rows), np.nan), [], [], []
         found, sides = {}, []
-        moments = {configuration: self.model.views[configuration - 1].moment(x) for configuration, _ in self.planners}
-        now = {id(planner): Now(planner, moments[configuration], found) for configuration, planner in self.planners}
+        states = {configuration: self.model.views[configuration - 1].state(x) for configuration, _ in self.planners}
+        contexts = {
+            id(planner): EvaluationContext(planner, states[configuration], found)
+            for configuration, planner in self.planners
+        }
         for planner, lines, evaluate in self.groups:
             if not (shown or any(line.number in self.counted for line in lines)):
                 continue
             places = np.array([line.number - 1 for line in lines])
-            told = evaluate(now[id(planner)])
+            told = evaluate(contexts[id(planner)])
             units = self.units[places]
             sides += self._sides(told, places, units, count if derivatives else None)
             told = Found(told.values / units, tuple(part / units for part in told.parts))

@@ -33,13 +33,13 @@ from raytrace.optimization.checkpoint import (
     resumed,
 )
 from raytrace.optimization.constraints import conditions_of
-from raytrace.optimization.conventions import Readings, readings_of
+from raytrace.optimization.conventions import Conventions, conventions_of
 from raytrace.optimization.glass_choice import Choice, catalogs_of, pool_of, without_glass
 from raytrace.optimization.least_squares import Cycle, Manner, least_squares
 from raytrace.optimization.lens_model import Model
 from raytrace.optimization.merit import Merit, in_unit, merit_for
 from raytrace.optimization.merit_rows import Evaluated
-from raytrace.optimization.problem import Condition, NoProblem, Problem, intent_of, typical_of
+from raytrace.optimization.problem import Condition, NoProblem, Problem, optimization_data_of, typical_of
 from raytrace.optimization.result import Optimized
 from raytrace.optimization.variables import Freedom, bounds_of, freedom, name_of
 from raytrace.system.identity import digest, identity
@@ -47,7 +47,7 @@ from raytrace.system.lens import Lens, field_points
 from raytrace.system.optimization_data import Row, Vary
 from raytrace.tracing.compiled import prepare
 from raytrace.tracing.geometry import warn_of_defects
-from raytrace.tracing.stop_filling import warn_of_filling
+from raytrace.tracing.launch import warn_of_filling
 from raytrace.words import calling_level
 
 #: Parts of the pupil and of the field, in the order in which they are opened.
@@ -136,7 +136,7 @@ def optimize(
     seconds: float | None = None,
     paths: int = 1,
     skip_unknown: bool = False,
-    readings: Readings | str | Sequence[str] | None = None,
+    conventions: Conventions | str | Sequence[str] | None = None,
     catalog: Sequence[str | PathLike] = (),
     log: str | PathLike | None = None,
     checkpoint: str | PathLike | None = None,
@@ -153,7 +153,7 @@ def optimize(
     "thickness:2,15"; hold: what is met exactly, as "efl=50 total_track<=80" (`optimization.constraints`). cycles,
     seconds: after
     which it ends, by default 500 cycles a path; paths: how many ways of damping are tried. skip_unknown: leave rows of
-    unknown operands out; readings: where an operand is open (`Readings`). catalog: names of shipped catalogs, or AGF
+    unknown operands out; conventions: of operands (`Conventions`). catalog: names of shipped catalogs, or AGF
     files, for glasses that vary, by default those of the lens, else SCHOTT (`optimization.glass_choice`). log: a file
     with a
     line for every cycle; checkpoint: a file (.json) that keeps all that decides the next cycle; resume: one of the same
@@ -191,7 +191,7 @@ def optimize(
         wavelength_weights=wavelength_weights, glass_thickness=glass_thickness, air_thickness=air_thickness, edge=edge,
     )  # fmt: skip
     conditions = _conditions(lens, hold, function.unit)
-    of_rows = {"unit": function.unit, "skip_unknown": skip_unknown, "readings": readings_of(readings)}
+    of_rows = {"unit": function.unit, "skip_unknown": skip_unknown, "conventions": conventions_of(conventions)}
     problem = Problem(model, function.rows, conditions, **of_rows)
     of |= {"merit": digest([repr(row) for row in function.rows], of_rows), "hold": digest(repr(conditions))}
     kept = Kept(model.start, {}) if resume is None else resumed(resume, of, names)
@@ -299,7 +299,7 @@ def _timed(evaluate: Callable):
 def _freedom(lens: Lens, vary: str | Sequence[str | Vary] | None) -> Freedom:
     if vary is None or isinstance(vary, str) or all(isinstance(one, str) for one in vary):
         return freedom(lens, vary)
-    return Freedom(lens, tuple(vary), () if lens.intent is None else lens.intent.solves)
+    return Freedom(lens, tuple(vary), () if lens.optimization_data is None else lens.optimization_data.solves)
 
 
 def _conditions(lens: Lens, hold: str | Sequence[str | Condition] | None, unit: float) -> tuple[Condition, ...]:
@@ -376,7 +376,7 @@ def _optimized(
 
     history = [[c.merit, c.missed, c.step, c.damping, c.seconds] for c in found.history]
     return Optimized(
-        lens=_with_intent(model.lens_at(x), model, rows, unit),
+        lens=_with_optimization_data(model.lens_at(x), model, rows, unit),
         before=lens,
         merit=rows,
         names=names,
@@ -420,16 +420,18 @@ def _contributions(found: Evaluated, rows: int) -> np.ndarray:
     return squares / max(squares.sum(), 1e-300)
 
 
-def _with_intent(lens: Lens, model: Model, rows: tuple[Row, ...], unit: float) -> Lens:
+def _with_optimization_data(lens: Lens, model: Model, rows: tuple[Row, ...], unit: float) -> Lens:
     """The lens with what it was optimised for, where its file says nothing of it."""
-    if lens.intent is not None:
+    if lens.optimization_data is not None:
         return lens
-    return dataclasses.replace(lens, intent=intent_of(model, rows, unit))
+    return dataclasses.replace(lens, optimization_data=optimization_data_of(model, rows, unit))
 
 
 def _with_bounds(lens: Lens, variables: Sequence[Vary], lower: np.ndarray, upper: np.ndarray) -> Lens:
-    """The lens whose variables, where its intent has them, have the bounds that held."""
+    """The lens whose variables, where its optimisation data has them, have the bounds that held."""
     ends = zip(map(float, lower), map(float, upper), strict=True)
     held = {name_of(one): pair for one, pair in zip(variables, ends, strict=True) if not np.isinf(pair).all()}
-    told = tuple(dataclasses.replace(one, bounds=held.get(name_of(one), one.bounds)) for one in lens.intent.variables)
-    return dataclasses.replace(lens, intent=dataclasses.replace(lens.intent, variables=told))
+    told = tuple(
+        dataclasses.replace(one, bounds=held.get(name_of(one), one.bounds)) for one in lens.optimization_data.variables
+    )
+    return dataclasses.replace(lens, optimization_data=dataclasses.replace(lens.optimization_data, variables=told))

@@ -20,14 +20,14 @@ import numpy as np
 
 from raytrace.maths.dual import Dual, slope_of, value_of
 from raytrace.optimization.constraints import Condition as Condition
-from raytrace.optimization.conventions import Readings
+from raytrace.optimization.conventions import Conventions
 from raytrace.optimization.least_squares import Sides, State
 from raytrace.optimization.lens_model import Model
-from raytrace.optimization.lens_state import Moment
+from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.merit_rows import LOST, Evaluated, Evaluation
 from raytrace.optimization.ray_bundle import Bundle, Ray
 from raytrace.system.lens import Lens
-from raytrace.system.optimization_data import Intent, Row
+from raytrace.system.optimization_data import OptimizationData, Row
 from raytrace.system.surface import is_posed
 
 #: How much a miss of 1 weighs beside the loss itself, and how far inside a ray is brought back.
@@ -50,9 +50,9 @@ class Recovery:
         variables = Dual(np.asarray(x, float), np.eye(len(x))) if derivatives else np.asarray(x, float)
         missed, slopes, behind = np.zeros(len(rows)), np.zeros((len(rows), len(x))), np.zeros(len(rows))
         for view, wanted in self._by_view(rows).items():
-            moment = view.moment(variables)
+            state = view.state(variables)
             with np.errstate(all="ignore"):
-                found = [*self._missed(view, moment, wanted)]
+                found = [*self._missed(view, state, wanted)]
             for place, number, left in found:
                 behind[place], slope = left, slope_of(number, len(x))
                 if np.isfinite(value_of(number)) and np.isfinite(slope).all():  # else the ray runs along the surface
@@ -69,21 +69,21 @@ class Recovery:
                 found.setdefault(planner.view, []).append((place, ray))
         return found
 
-    def _missed(self, view, moment: Moment, wanted: list[tuple[int, Ray]]):
+    def _missed(self, view, state: LensState, wanted: list[tuple[int, Ray]]):
         """(place, how far it misses, surfaces left) of every ray that is lost on its way to the image."""
         rays = tuple(dict.fromkeys(ray for _, ray in wanted))
-        ended, traced = self._ends(view, moment, rays), {}
+        ended, traced = self._ends(view, state, rays), {}
         for place, ray in wanted:
             surface = ended.get(ray)
             if surface is None or is_posed(view.lens.surfaces[surface]):
                 continue
-            before = self._before(view, moment, rays, ray, surface, traced)
-            yield place, _miss(moment, surface, ray.wavelength, *before), len(view.lens.surfaces) - 1 - surface
+            before = self._before(view, state, rays, ray, surface, traced)
+            yield place, _miss(state, surface, ray.wavelength, *before), len(view.lens.surfaces) - 1 - surface
 
-    def _ends(self, view, moment: Moment, rays: tuple[Ray, ...]) -> dict[Ray, int]:
+    def _ends(self, view, state: LensState, rays: tuple[Ray, ...]) -> dict[Ray, int]:
         """The surface at which each ray is lost."""
         ended: dict[Ray, int] = {}
-        plain = view.moment(value_of(moment.variables))
+        plain = view.state(value_of(state.variables))
         for k in range(1, len(view.lens.surfaces)):
             bundle, numbers = self._bundle(view, k, rays)
             valid = bundle.hits(plain).at(numbers).valid
@@ -99,27 +99,27 @@ class Recovery:
             self._bundles[key] = bundle, np.array([bundle.ask(*ray) for ray in rays])
         return self._bundles[key]
 
-    def _before(self, view, moment: Moment, rays: tuple[Ray, ...], ray: Ray, surface: int, traced: dict):
+    def _before(self, view, state: LensState, rays: tuple[Ray, ...], ray: Ray, surface: int, traced: dict):
         """Position and direction of a ray before a surface, in the axes of its vertex; traced: all rays by surface."""
         number = rays.index(ray)
         if surface == 1:
             bundle, numbers = self._bundle(view, 1, rays)
-            position, direction, *_ = bundle.launched(moment)
+            position, direction, *_ = bundle.launched(state)
             at = int(bundle._places[0][numbers[number]])
             flat = [part.reshape(-1)[at] for part in (*position, *direction)]
             return flat[:3], flat[3:]
         bundle, numbers = self._bundle(view, surface - 1, rays)
         if surface not in traced:
-            traced[surface] = bundle.hits(moment)
+            traced[surface] = bundle.hits(state)
         hit = traced[surface].at(numbers[number : number + 1])
         x, y, z = (hit.position[k][0] for k in range(3))
-        return (x, y, z - moment.thickness[surface - 1]), tuple(hit.direction[k][0] for k in range(3))
+        return (x, y, z - state.thickness[surface - 1]), tuple(hit.direction[k][0] for k in range(3))
 
 
-def _miss(moment: Moment, surface: int, wavelength: int, position, direction):
+def _miss(state: LensState, surface: int, wavelength: int, position, direction):
     """How far a ray misses a surface, or passes its critical angle."""
     (x, y, z), (L, M, N) = position, direction
-    c, k = moment.curvature[surface], moment.number(surface, "conic") if _has_conic(moment, surface) else 0.0
+    c, k = state.curvature[surface], state.number(surface, "conic") if _has_conic(state, surface) else 0.0
     A = c * (1 + k * N * N)
     B = c * (x * L + y * M + (1 + k) * z * N) - N
     C = c * (x * x + y * y + (1 + k) * z * z) - 2 * z
@@ -130,13 +130,13 @@ def _miss(moment: Moment, surface: int, wavelength: int, position, direction):
     t = C / (-B + np.where(value_of(B) < 0, 1.0, -1.0) * root)
     x, y, z = x + t * L, y + t * M, z + t * N
     steep = (c * x) ** 2 + (c * y) ** 2 + (c * (1 + k) * z - 1) ** 2
-    n = np.abs(moment.index(wavelength))
+    n = np.abs(state.index(wavelength))
     beyond = (value_of(n[surface - 1]) / value_of(n[surface])) ** 2 * (1 - inside / steep) - 1
     return beyond if value_of(beyond) > 0 else c * c * (x * x + y * y)
 
 
-def _has_conic(moment: Moment, surface: int) -> bool:
-    return (surface, "conic") in moment.numbers or moment.lens.surfaces[surface].conic is not None
+def _has_conic(state: LensState, surface: int) -> bool:
+    return (surface, "conic") in state.numbers or state.lens.surfaces[surface].conic is not None
 
 
 #: Signs by which a relation is a limit ≤ 0; equalities have none.
@@ -158,16 +158,16 @@ class Problem:
         *,
         unit: float = 1.0,
         skip_unknown: bool = False,
-        readings: Readings | None = None,
+        conventions: Conventions | None = None,
     ):
         """unit: mm in the unit of length of rows and conditions. Raises NoProblem and UnknownOperand."""
         held = tuple(_held(model.lens, rows, conditions))
         self._again = lambda model: Problem(
-            model, rows, conditions, unit=unit, skip_unknown=skip_unknown, readings=readings
+            model, rows, conditions, unit=unit, skip_unknown=skip_unknown, conventions=conventions
         )
         self.model, self.rows, self.unit, self.conditions = model, tuple(rows), unit, tuple(conditions)
         self.evaluation = Evaluation(
-            model, (*rows, *(row for row, _ in held)), unit=unit, skip_unknown=skip_unknown, readings=readings
+            model, (*rows, *(row for row, _ in held)), unit=unit, skip_unknown=skip_unknown, conventions=conventions
         )
         weights = self.evaluation.weights
         if not len(model.variables):
@@ -239,10 +239,10 @@ class Problem:
         return float(np.sqrt(own @ own))
 
 
-def intent_of(model: Model, rows: Sequence[Row], unit: float) -> Intent:
+def optimization_data_of(model: Model, rows: Sequence[Row], unit: float) -> OptimizationData:
     """What a lens is optimised for, where its file says nothing of it; all semi-diameters that it has stay given."""
     given = tuple(k for k, surface in enumerate(model.lens.surfaces) if surface.semi_diameter)
-    return Intent(model.variables, model.solves, tuple(rows), unit, semi_diameters=given)
+    return OptimizationData(model.variables, model.solves, tuple(rows), unit, semi_diameters=given)
 
 
 def _held(lens: Lens, rows: Sequence[Row], conditions: Sequence[Condition]) -> Iterator[tuple[Row, int]]:
@@ -259,8 +259,8 @@ def _held(lens: Lens, rows: Sequence[Row], conditions: Sequence[Condition]) -> I
 
 def typical_of(model: Model) -> np.ndarray:
     """How much (n,) of every variable is a lot: for beams h wide h in thickness, 1/10h in curvature; or inf."""
-    moment = model.views[model.lens.current_configuration - 1].moment(model.start)
-    h = 0.5 * float(moment.entrance_pupil_diameter)
+    state = model.views[model.lens.current_configuration - 1].state(model.start)
+    h = 0.5 * float(state.entrance_pupil_diameter)
     return np.array([_typical(one.quantity, h) for one in model.variables])
 
 

@@ -25,25 +25,23 @@ from torch.autograd import forward_ad
 
 from raytrace.maths.dual import Dual, slope_of, value_of
 from raytrace.optimization.lens_model import GLASS, unbent
-from raytrace.optimization.lens_state import Moment
+from raytrace.optimization.lens_state import LensState
 from raytrace.system.lens import Lens
 from raytrace.system.rays import Rays
-from raytrace.tracing.axis import aiming_of, is_bent
+from raytrace.tracing.aiming import aiming_of, is_bent
 from raytrace.tracing.compiled.run import Pushed, Task
 from raytrace.tracing.compiled.structure import is_expressible, rows_of
 from raytrace.tracing.jacobian import ends, pushed, pushed_everywhere
-from raytrace.tracing.launch import rays_of_field
-from raytrace.tracing.sequence import media, sequence_of
-from raytrace.tracing.trace import trace_surfaces
-from raytrace.tracing.vignetting import vignette
+from raytrace.tracing.launch import rays_of_field, vignette
+from raytrace.tracing.trace import media, sequence_of, trace_surfaces
 
 
-def launched(moment: Moment, field: np.ndarray, pupil: np.ndarray):
+def launched(state: LensState, field: np.ndarray, pupil: np.ndarray):
     """Rays through the paraxial entrance pupil, as `tracing.launch` starts them: position, direction and path."""
-    data = moment.gaussian(moment.primary)
-    kind, distance = moment.lens.fields.kind, moment.thickness[0]
-    index = np.abs(moment.view.indices[:, :1])
-    radius, depth = 0.5 * moment.entrance_pupil_diameter, data.entrance_pupil_position
+    data = state.gaussian(state.primary)
+    kind, distance = state.lens.fields.kind, state.thickness[0]
+    index = np.abs(state.view.indices[:, :1])
+    radius, depth = 0.5 * state.entrance_pupil_diameter, data.entrance_pupil_position
     at_infinity = np.isinf(value_of(distance))
     if kind == "angle":
         slope = np.tan(np.deg2rad(field))
@@ -51,7 +49,7 @@ def launched(moment: Moment, field: np.ndarray, pupil: np.ndarray):
     elif kind == "object_height":
         x, y = field
     else:
-        scale = -data.C / data.n_object if at_infinity else (data.C + data.D * moment.vergence) / moment.vergence
+        scale = -data.C / data.n_object if at_infinity else (data.C + data.D * state.vergence) / state.vergence
         x, y = (scale * part for part in field)
     aim = radius * pupil[0], radius * pupil[1], depth
     if at_infinity:
@@ -80,32 +78,32 @@ _STEPS = 12
 _CLOSE = 1e-9  # of the radius of the stop: one more step ends at rounding
 
 #: The hits (x, y) on the stop of rays through pupil points (2, W, R), and which arrive.
-AtStop = Callable[[Moment, tuple], tuple]
+AtStop = Callable[[LensState, tuple], tuple]
 
 
-def aimed(moment: Moment, at_stop: AtStop, target: np.ndarray, radius, last: np.ndarray):
+def aimed(state: LensState, at_stop: AtStop, target: np.ndarray, radius, last: np.ndarray):
     """Pupil points, two of (W, R), as numbers or dual ones, and which rays were found.
 
-    moment: with or without derivatives; target: (2, W, R), of the stop; radius: mm, signed; last: where to begin.
+    state: with or without derivatives; target: (2, W, R), of the stop; radius: mm, signed; last: where to begin.
     """
-    fixed = moment.fixed()
+    fixed = state.fixed()
     goal = target * value_of(radius)
     points, found, inverse = _root(fixed, at_stop, goal, abs(value_of(radius)), last)
-    if not moment.count:
+    if not state.count:
         return tuple(points), found, points
-    (x, y), _ = at_stop(moment, tuple(points))
+    (x, y), _ = at_stop(state, tuple(points))
     missed = [target[0] * radius - x, target[1] * radius - y]
-    slopes = [part.full() if isinstance(part, Dual) else np.zeros((moment.count, *target.shape[1:])) for part in missed]
+    slopes = [part.full() if isinstance(part, Dual) else np.zeros((state.count, *target.shape[1:])) for part in missed]
     moved = [inverse[k][0] * slopes[0] + inverse[k][1] * slopes[1] for k in range(2)]
     return tuple(Dual(at, np.where(found, by, 0.0)) for at, by in zip(points, moved, strict=True)), found, points
 
 
-def _root(moment: Moment, at_stop: AtStop, goal: np.ndarray, size: float, start: np.ndarray):
+def _root(state: LensState, at_stop: AtStop, goal: np.ndarray, size: float, start: np.ndarray):
     """Points (2, W, R), which were found, and the inverse of ∂s/∂a there, by components."""
     points, done = start.copy(), False
     for _ in range(_STEPS):
         moving = tuple(Dual(part, np.eye(2)[:, k, None, None] * np.ones_like(part)) for k, part in enumerate(points))
-        (x, y), arrives = at_stop(moment, moving)
+        (x, y), arrives = at_stop(state, moving)
         missed = goal - np.stack([x.value, y.value])
         (xx, xy), (yx, yy) = x.full(), y.full()
         determinant = xx * yy - xy * yx
@@ -122,9 +120,9 @@ def _root(moment: Moment, at_stop: AtStop, goal: np.ndarray, size: float, start:
 
 
 def rays_by_torch(
-    moment: Moment, function: Callable[[Lens], Rays], shape: tuple[int, int], *, backward: bool = False
+    state: LensState, function: Callable[[Lens], Rays], shape: tuple[int, int], *, backward: bool = False
 ) -> tuple[list, np.ndarray]:
-    """x, y, z, L, M, N and path (W, R) of the rays that a function takes from the lens at a moment; and validity.
+    """x, y, z, L, M, N and path (W, R) of the rays that a function takes from the lens at a state; and validity.
 
     backward: derivatives of every ray, one by one, where the function takes forward derivatives of its own (rays aimed
     about a base ray), which do not nest.
@@ -136,43 +134,43 @@ def rays_by_torch(
         return [part.expand(shape) for part in parts], rays.valid.expand(shape)
 
     with torch.no_grad():
-        parts, valid = told(moment.view.leaves(_values(moment))[1])
+        parts, valid = told(state.view.leaves(_values(state))[1])
         values, valid = [part.numpy().copy() for part in parts], valid.numpy().copy()
-    if not moment.count:
+    if not state.count:
         return values, valid
-    slopes = (_backward if backward else _forward)(moment, lambda lens: told(lens)[0], valid)
+    slopes = (_backward if backward else _forward)(state, lambda lens: told(lens)[0], valid)
     return [Dual(value, np.where(valid, slope, 0.0)) for value, slope in zip(values, slopes, strict=True)], valid
 
 
-def _values(moment: Moment) -> dict:
-    return {at: value_of(number) for at, number in moment.numbers.items()}
+def _values(state: LensState) -> dict:
+    return {at: value_of(number) for at, number in state.numbers.items()}
 
 
-def _forward(moment: Moment, told, valid: np.ndarray) -> np.ndarray:
-    slopes = np.zeros((7, moment.count, *valid.shape))
-    numbers = {at: torch.tensor(float(n), dtype=torch.float64) for at, n in _values(moment).items()}
-    for variable in range(moment.count):
+def _forward(state: LensState, told, valid: np.ndarray) -> np.ndarray:
+    slopes = np.zeros((7, state.count, *valid.shape))
+    numbers = {at: torch.tensor(float(n), dtype=torch.float64) for at, n in _values(state).items()}
+    for variable in range(state.count):
         with forward_ad.dual_level():
             moved = {
                 at: forward_ad.make_dual(numbers[at], numbers[at].new_tensor(float(number.slope[variable])))
-                for at, number in moment.numbers.items()
+                for at, number in state.numbers.items()
                 if isinstance(number, Dual)
             }
-            for part, number in zip(slopes, told(moment.view.held(numbers | moved)), strict=True):
+            for part, number in zip(slopes, told(state.view.held(numbers | moved)), strict=True):
                 tangent = forward_ad.unpack_dual(number).tangent
                 if tangent is not None:
                     part[variable] = tangent.numpy()
     return slopes
 
 
-def _backward(moment: Moment, told, valid: np.ndarray) -> np.ndarray:
-    slopes = np.zeros((7, moment.count, valid.size))
+def _backward(state: LensState, told, valid: np.ndarray) -> np.ndarray:
+    slopes = np.zeros((7, state.count, valid.size))
     with torch.enable_grad():
-        leaves, lens = moment.view.leaves(_values(moment))
+        leaves, lens = state.view.leaves(_values(state))
         for part, number in zip(slopes, told(lens), strict=True):
             for ray in np.flatnonzero(valid) if number.requires_grad else ():
-                part[:, ray] = moment.chained(number.reshape(-1)[ray], leaves).slope
-    return slopes.reshape(7, moment.count, *valid.shape)
+                part[:, ray] = state.chained(number.reshape(-1)[ray], leaves).slope
+    return slopes.reshape(7, state.count, *valid.shape)
 
 
 class Ray(NamedTuple):
@@ -331,36 +329,36 @@ class Bundle:
         found.ask(self.view.lens.primary_wavelength - 1, (0.0, 0.0), (0.0, 1.0 / self._opening))
         return found
 
-    # -- at a moment ---------------------------------------------------------------------------------------------------
+    # -- at a state ---------------------------------------------------------------------------------------------------
 
-    def hits(self, moment: Moment) -> Hits:
+    def hits(self, state: LensState) -> Hits:
         """All rays on surface `last`, in the order in which they were asked for; 0: in front of surface 1."""
         if self.last == 0:
-            return self._at_object(moment)
+            return self._at_object(state)
         if not self.is_expressible:
-            return self._hits_by_torch(moment)
-        return self._told(*self._traced(moment, *self.launched(moment)))
+            return self._hits_by_torch(state)
+        return self._told(*self._traced(state, *self.launched(state)))
 
-    def _at_object(self, moment: Moment) -> Hits:
+    def _at_object(self, state: LensState) -> Hits:
         """The rays as they leave the object: on its plane, or nowhere where that is at infinity."""
-        position, direction, opl, valid = self.launched(moment)
-        if np.isinf(value_of(moment.thickness[0])):
-            return self._as_hits(moment, (*[np.full(valid.shape, np.nan)] * 3, *direction, opl), valid)
-        step = (-moment.thickness[0] - position[2]) / direction[2]
+        position, direction, opl, valid = self.launched(state)
+        if np.isinf(value_of(state.thickness[0])):
+            return self._as_hits(state, (*[np.full(valid.shape, np.nan)] * 3, *direction, opl), valid)
+        step = (-state.thickness[0] - position[2]) / direction[2]
         x, y = (position[k] + step * direction[k] for k in range(2))
-        return self._as_hits(moment, (x, y, 0 * step, *direction, opl), valid)
+        return self._as_hits(state, (x, y, 0 * step, *direction, opl), valid)
 
-    def marks(self, moment: Moment) -> Marks:
+    def marks(self, state: LensState) -> Marks:
         """All rays on all surfaces from 1 to `last`, in the order in which they were asked for."""
         if self.is_expressible:
-            surfaces, task, changes, start, count = self._task(moment, *self.launched(moment))
+            surfaces, task, changes, start, count = self._task(state, *self.launched(state))
             found = pushed_everywhere(surfaces, task, changes[: count or 0], start)
             if found is not None:
                 return self._marked(found, rows_of(task.structure, surfaces), count)
-        hits = [bundle.hits(moment) for bundle in self._each]
+        hits = [bundle.hits(state) for bundle in self._each]
         parts = [[hit.position[k] for hit in hits] for k in range(2)]
         values = (np.stack([value_of(one) for one in part]) for part in parts)
-        slopes = (np.stack([slope_of(one, moment.count) for one in part]) for part in parts if moment.count)
+        slopes = (np.stack([slope_of(one, state.count) for one in part]) for part in parts if state.count)
         return Marks(*values, np.stack([hit.valid for hit in hits]), *slopes)
 
     @cached_property
@@ -380,33 +378,33 @@ class Bundle:
         by = () if count is None else map(picked, found.by_position[:2])
         return Marks(*map(picked, found.position[:2]), picked(found.valid), *by)
 
-    def _traced(self, moment: Moment, position, direction, opl, valid: np.ndarray):
+    def _traced(self, state: LensState, position, direction, opl, valid: np.ndarray):
         """Rays behind surface `last` as a table, and by how many variables they change, if any."""
-        surfaces, task, changes, start, count = self._task(moment, position, direction, opl, valid)
+        surfaces, task, changes, start, count = self._task(state, position, direction, opl, valid)
         return (ends(surfaces, task) if count is None else pushed(surfaces, task, changes, start)), count
 
-    def _task(self, moment: Moment, position, direction, opl, valid: np.ndarray):
+    def _task(self, state: LensState, position, direction, opl, valid: np.ndarray):
         """Surfaces, what to trace, how table and rays change, and by how many variables, if any."""
         surfaces, structure, *_ = self._template
-        table, changes = self.table(moment)
+        table, changes = self.table(state)
         moving = [part for part in (*position, *direction, opl) if isinstance(part, Dual)]
         given = [np.stack([value_of(p) for p in part]) for part in (position, direction)] + [value_of(opl)]
         given = [torch.from_numpy(np.ascontiguousarray(part)) for part in given]
         task = Task(structure, torch.from_numpy(valid), (*given, torch.from_numpy(table)))
-        count = moment.count or max((len(part.slope) for part in moving), default=0)
+        count = state.count or max((len(part.slope) for part in moving), default=0)
         if not count:
             return surfaces, task, torch.from_numpy(changes), None, None
         start = self._start(count, position, direction, opl) if moving else None
-        changes = changes if moment.count else np.zeros((count, *table.shape))
+        changes = changes if state.count else np.zeros((count, *table.shape))
         return surfaces, task, torch.from_numpy(changes), start, count
 
-    def starts(self, moment: Moment) -> Hits:
+    def starts(self, state: LensState) -> Hits:
         """All rays where they set out, before surface 1 and in its axes, in the order in which they were asked for."""
-        position, direction, opl, valid = self.launched(moment)
-        return self._as_hits(moment, (*position, *direction, opl), valid)
+        position, direction, opl, valid = self.launched(state)
+        return self._as_hits(state, (*position, *direction, opl), valid)
 
-    def _as_hits(self, moment: Moment, parts, valid: np.ndarray) -> Hits:
-        slopes = [slope_of(part, moment.count) for part in parts] if moment.count else None
+    def _as_hits(self, state: LensState, parts, valid: np.ndarray) -> Hits:
+        slopes = [slope_of(part, state.count) for part in parts] if state.count else None
         return Hits([value_of(part) for part in parts], slopes, valid, self._places[0])
 
     def _start(self, count: int, position, direction, opl) -> tuple[Tensor, Tensor, Tensor]:
@@ -426,59 +424,59 @@ class Bundle:
             slopes = [*end.by_position.numpy(), *end.by_direction.numpy(), end.by_opl.numpy()]
         return Hits(parts, slopes, end.valid.numpy(), self._places[0])
 
-    def table(self, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
-        """The table (W, K) of the lens at a moment, and its derivatives (n, W, K)."""
+    def table(self, state: LensState) -> tuple[np.ndarray, np.ndarray]:
+        """The table (W, K) of the lens at a state, and its derivatives (n, W, K)."""
         _, _, stored, columns = self._template
         if columns is None:
-            return self._table_by_torch(moment)
+            return self._table_by_torch(state)
         table = stored.copy()
-        changes = np.zeros((moment.count, *table.shape))
-        for at, number in moment.numbers.items():
+        changes = np.zeros((state.count, *table.shape))
+        for at, number in state.numbers.items():
             if at not in columns:
                 continue
             table[:, columns[at]] = value_of(number)
             if isinstance(number, Dual):
                 changes[:, :, columns[at]] = number.slope[:, None, None]
-        for surface, index in moment.media.items():
+        for surface, index in state.media.items():
             if surface in columns:
                 table[:, columns[surface]] = value_of(index)[:, None]
                 if isinstance(index, Dual):
                     changes[:, :, columns[surface]] = index.slope[:, :, None]
         return table, changes
 
-    def _table_by_torch(self, moment: Moment) -> tuple[np.ndarray, np.ndarray]:
+    def _table_by_torch(self, state: LensState) -> tuple[np.ndarray, np.ndarray]:
         with torch.enable_grad():
-            leaves, lens = self.view.leaves({at: value_of(n) for at, n in moment.numbers.items()})
+            leaves, lens = self.view.leaves({at: value_of(n) for at, n in state.numbers.items()})
             table = self.view.table_of(self.last, lens)[2]
-            by = _by_leaves(table, leaves) if moment.count else {}
-        changes = np.zeros((moment.count, *table.shape))
+            by = _by_leaves(table, leaves) if state.count else {}
+        changes = np.zeros((state.count, *table.shape))
         for at, derivative in by.items():
-            if isinstance(moment.numbers[at], Dual):
-                changes += moment.numbers[at].slope[:, None, None] * derivative
+            if isinstance(state.numbers[at], Dual):
+                changes += state.numbers[at].slope[:, None, None] * derivative
         return table.detach().numpy(), changes
 
-    def launched(self, moment: Moment):
+    def launched(self, state: LensState):
         """Position and direction (three of (W, R) each), path (W, R) and validity of the rays before surface 1."""
         if not self._launches_itself:
-            return self._launched_by_torch(moment)
+            return self._launched_by_torch(state)
         if not self._aims:
-            return self._through(moment, self.pupil)
-        pupil, found = self._aimed(moment)
-        *rays, valid = self._through(moment, pupil)
+            return self._through(state, self.pupil)
+        pupil, found = self._aimed(state)
+        *rays, valid = self._through(state, pupil)
         return *rays, valid & found
 
-    def _through(self, moment: Moment, pupil):
+    def _through(self, state: LensState, pupil):
         shape = self.field.shape[1:]
-        position, direction, opl = launched(moment, self.field, pupil)
+        position, direction, opl = launched(state, self.field, pupil)
         filled = [part + np.zeros(shape) for part in (*position, *direction, opl)]
         return filled[:3], filled[3:6], filled[6], np.ones(shape, dtype=bool)
 
-    def _aimed(self, moment: Moment):
+    def _aimed(self, state: LensState):
         """Pupil points, two of (W, R), whose rays pass the stop where the pupil points say, and which were found."""
         stop, shape = self._at_stop, self.field.shape[1:]
 
-        def at_stop(moment: Moment, pupil):
-            end, count = stop._traced(moment, *self._through(moment, pupil))
+        def at_stop(state: LensState, pupil):
+            end, count = stop._traced(state, *self._through(state, pupil))
             x, y = end.position[:2].numpy()
             if count is None:
                 return (x, y), end.valid.numpy()
@@ -487,37 +485,37 @@ class Bundle:
 
         last = self.__dict__.get("_last")
         begin = self.pupil if last is None else last
-        radius = self._stop_radius(moment)
-        pupil, found, points = aimed(moment, at_stop, self.pupil, radius, begin)
+        radius = self._stop_radius(state)
+        pupil, found, points = aimed(state, at_stop, self.pupil, radius, begin)
         if not found.all() and last is not None:
-            pupil, found, points = aimed(moment, at_stop, self.pupil, radius, self.pupil)
+            pupil, found, points = aimed(state, at_stop, self.pupil, radius, self.pupil)
         self._last = np.where(found, points, self.pupil)
         return tuple(part + np.zeros(shape) for part in pupil), found
 
-    def _stop_radius(self, moment: Moment):
+    def _stop_radius(self, state: LensState):
         """mm, negative where the entrance pupil is an inverted image of the stop."""
         lens = self.view.lens
-        paraxial = 0.5 * moment.entrance_pupil_diameter * moment.gaussian(moment.primary).front[0]
+        paraxial = 0.5 * state.entrance_pupil_diameter * state.gaussian(state.primary).front[0]
         if lens.aperture.kind == "float_by_stop":
             return float(lens.aperture.value) * np.sign(value_of(paraxial))
         if lens.ray_aiming == "paraxial":
             return paraxial
         marginal = self._marginal
-        hits = marginal._told(*marginal._traced(moment, *marginal._through(moment, marginal.pupil)))
+        hits = marginal._told(*marginal._traced(state, *marginal._through(state, marginal.pupil)))
         height = hits.position[1][np.array([0])]
         real = np.abs(height) * np.sign(value_of(paraxial))
         return real[0] if hits.valid[0] else paraxial
 
-    def _launched_by_torch(self, moment: Moment):
+    def _launched_by_torch(self, state: LensState):
         def start(lens) -> Rays:
             field, pupil = torch.from_numpy(self.field), torch.from_numpy(self.pupil)
             return rays_of_field(lens, field, pupil, wavelength=lens.wavelengths[:, None])
 
         bent = self._aims and is_bent(self.view.lens)
-        parts, valid = rays_by_torch(moment, start, self.field.shape[1:], backward=bent)
+        parts, valid = rays_by_torch(state, start, self.field.shape[1:], backward=bent)
         return parts[:3], parts[3:6], parts[6], valid
 
-    def _hits_by_torch(self, moment: Moment) -> Hits:
+    def _hits_by_torch(self, state: LensState) -> Hits:
         def end(lens) -> Rays:
             field, pupil, wavelength = torch.from_numpy(self.field), torch.from_numpy(self.pupil), lens.wavelengths
             rays = rays_of_field(lens, field, pupil, wavelength=wavelength[:, None])
@@ -525,8 +523,8 @@ class Bundle:
             return trace_surfaces(sequence_of(lens)[: self.last], rays, indices=indices, wavelength=wavelength[:, None])
 
         bent = self._aims and is_bent(self.view.lens)
-        parts, valid = rays_by_torch(moment, end, self.field.shape[1:], backward=bent)
-        slopes = [part.full() for part in parts] if moment.count else None
+        parts, valid = rays_by_torch(state, end, self.field.shape[1:], backward=bent)
+        slopes = [part.full() for part in parts] if state.count else None
         return Hits([value_of(part) for part in parts], slopes, valid, self._places[0])
 
 

@@ -37,7 +37,7 @@ from raytrace.optimization.search_result import Minima, Minimum
 from raytrace.optimization.search_settings import FOLLOW, LONG, Asked, Stage, descended
 from raytrace.optimization.variables import Freedom
 from raytrace.system.lens import Lens
-from raytrace.system.optimization_data import Intent, Row, Solve, Vary
+from raytrace.system.optimization_data import OptimizationData, Row, Solve, Vary
 from raytrace.system.parameter_paths import sensor
 from raytrace.system.surface import Surface, is_posed
 
@@ -71,7 +71,7 @@ def _objection(free: Freedom, k: int) -> str:
     if not 1 <= k <= sensor(lens):
         return f"is none before the image: this lens has surfaces 1 to {sensor(lens)}"
     surface, before = lens.surfaces[k], lens.surfaces[k - 1]
-    shaped = (surface.conic, surface.coefficients, surface.departure, surface.phase)
+    shaped = (surface.conic, surface.coefficients, surface.sag_terms, surface.phase)
     if surface.is_mirror or before.is_mirror or any(part is not None for part in shaped) or is_posed(surface):
         return "is no centred sphere that refracts"
     if before.is_break or is_air(before.glass) == is_air(surface.glass):
@@ -94,8 +94,8 @@ def enlarged(lens: Lens, asked: Asked, k: int) -> Asked:
     quantities = list(dict.fromkeys(one.quantity for one in (*new, *old)))
     variables = tuple(sorted(own, key=lambda one: (quantities.index(one.quantity), one.surface)))
     solves = tuple(_moved(one, k) for one in free.solves)
-    if lens.intent is not None:
-        made = replace(made, intent=_intent(lens.intent, k, variables, solves))
+    if lens.optimization_data is not None:
+        made = replace(made, optimization_data=_optimization_data(lens.optimization_data, k, variables, solves))
     return replace(
         asked,
         free=Freedom(made, variables, solves),
@@ -170,16 +170,18 @@ def _split(row: Row, k: int, part: float) -> list[Row]:
     return found or [replace(row, weight=0.0)]
 
 
-def _intent(intent: Intent, k: int, variables: tuple[Vary, ...], solves: tuple[Solve, ...]) -> Intent:
+def _optimization_data(
+    optimization_data: OptimizationData, k: int, variables: tuple[Vary, ...], solves: tuple[Solve, ...]
+) -> OptimizationData:
     """What the file means, by the new numbers of its surfaces; lines of tolerances, which name surfaces, are left."""
     return dataclasses.replace(
-        intent,
+        optimization_data,
         variables=variables,
         solves=solves,
-        merit=tuple(_row(row, k) for row in intent.merit),
+        merit=tuple(_row(row, k) for row in optimization_data.merit),
         tolerances=(),
-        semi_diameters=tuple(_behind(one, k) for one in intent.semi_diameters),
-        kept=tuple(_moved(one, k) for one in intent.kept),
+        semi_diameters=tuple(_behind(one, k) for one in optimization_data.semi_diameters),
+        kept=tuple(_moved(one, k) for one in optimization_data.kept),
     )
 
 

@@ -18,7 +18,7 @@ from raytrace.io import LensFileWarning, write_lens
 from raytrace.maths.result import Result, called, cell
 from raytrace.maths.value import value
 from raytrace.optimization.journal import Ended
-from raytrace.optimization.problem import NoProblem, Problem, intent_of
+from raytrace.optimization.problem import NoProblem, Problem, optimization_data_of
 from raytrace.system.lens import Lens
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.spot_diagram import spot
@@ -216,5 +216,5 @@ def _named(lens: Lens, problem: Problem, x: np.ndarray, number: int) -> Lens:
     """The lens there, with its number behind its name, and with what it was searched for."""
     model = problem.model
     found = model.lens_at(x)
-    intent = found.intent or intent_of(model, problem.rows, problem.unit)
-    return replace(found, name=f"{lens.name}, minimum {number}".removeprefix(", "), intent=intent)
+    optimization_data = found.optimization_data or optimization_data_of(model, problem.rows, problem.unit)
+    return replace(found, name=f"{lens.name}, minimum {number}".removeprefix(", "), optimization_data=optimization_data)

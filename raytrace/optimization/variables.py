@@ -32,7 +32,15 @@ from raytrace.optimization.lens_model import GLASS, Address, names_at
 from raytrace.system.configurations import same
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Solve, Vary
-from raytrace.system.parameter_paths import BadVariables, counted, joined, modelled, parse_bounds, places, sensor
+from raytrace.system.parameter_paths import (
+    BadVariables,
+    counted,
+    joined,
+    modelled,
+    parameter_paths,
+    parse_bounds,
+    sensor,
+)
 from raytrace.words import calling_level, did_you_mean
 
 #: Words for several numbers at once.
@@ -76,11 +84,11 @@ def freedom(lens: Lens, vary: str | Sequence[str] | None = None) -> Freedom:
     Solves of the file hold where no word says otherwise: a number that is named varies, and one that belongs to no
     surface's name ("curvature") varies where no solve holds. Raises BadVariables.
     """
-    own = () if lens.intent is None else lens.intent.solves
+    own = () if lens.optimization_data is None else lens.optimization_data.solves
     if vary is None:
-        if lens.intent is None or not lens.intent.variables:
+        if lens.optimization_data is None or not lens.optimization_data.variables:
             raise BadVariables("the file tells no variables: `vary` names them, as 'curvature thickness'")
-        return Freedom(lens, lens.intent.variables, own)
+        return Freedom(lens, lens.optimization_data.variables, own)
     words = _words(joined(vary))
     told = tuple(solve for word in words if "=" in word for solve in _solves(lens, word))
     found: dict[str, Vary] = {}
@@ -212,7 +220,7 @@ def _refuse_kind(lens: Lens, kind: str, of_surfaces: bool, word: str) -> None:
     if (kind == "sensor" and of_surfaces) or kind in _INSTEAD:
         meant = f"; did you mean {_INSTEAD[kind]}?" if kind in _INSTEAD else " without surfaces"
         raise BadVariables(f"{word!r}: expected {kind if kind == 'sensor' else 'a number of a lens'}{meant}")
-    own = (name for surface in lens.surfaces for name in places(modelled(surface, kind)))
+    own = (name for surface in lens.surfaces for name in parameter_paths(modelled(surface, kind)))
     known = dict.fromkeys(["thickness", "sensor", *MEDIA, *GROUPS, *own])
     if kind not in known:
         raise BadVariables(f"{word!r}: no {kind!r}; this lens has {', '.join(known)}{did_you_mean(kind, known)}")
@@ -227,7 +235,7 @@ def _makes_sense(lens: Lens, kind: str, k: int) -> bool:
         return k == sensor(lens) or bool(surface.thickness != 0)
     if kind in MEDIA:
         return not (surface.is_mirror or surface.is_break or is_air(surface.glass))
-    present = places(surface)
+    present = parameter_paths(surface)
     if kind == "conic":
         return surface.conic is not None
     return any(quantity in present for quantity in GROUPS.get(kind, (kind,)))
@@ -257,11 +265,11 @@ def _quantities(lens: Lens, kind: str, k: int, word: str) -> list[str]:
             raise BadVariables(f"{word!r}: behind surface {k} there is no glass")
         return [kind]
     wanted = GROUPS.get(kind, (kind,))
-    known = {"thickness", *(name for quantity in wanted for name in places(modelled(surface, quantity)))}
+    known = {"thickness", *(name for quantity in wanted for name in parameter_paths(modelled(surface, quantity)))}
     if surface.is_break and kind in ("curvature", "conic"):
         raise BadVariables(f"{word!r}: surface {k} is a coordinate break")
     if missing := [quantity for quantity in wanted if quantity not in known]:
-        there = ", ".join(["thickness", *places(surface)])
+        there = ", ".join(["thickness", *parameter_paths(surface)])
         raise BadVariables(f"{word!r}: surface {k} has no {missing[0]}; it has {there}")
     return list(wanted)
 
@@ -269,9 +277,9 @@ def _quantities(lens: Lens, kind: str, k: int, word: str) -> list[str]:
 def _each(lens: Lens, k: int, quantity: str) -> list[Vary]:
     """A number of a surface, or where it differs between the configurations one for each of them."""
     for position, operand in enumerate(lens.operands):
-        for place in operand.places if operand.numbers is not None else ():
+        for place in operand.paths if operand.numbers is not None else ():
             if place.path[:2] == ("surfaces", k) and quantity in names_at(lens.surfaces[k], place.path[2:]):
-                own = operand.places[0].path  # which other places of the operand follow
+                own = operand.paths[0].path  # which other places of the operand follow
                 first = names_at(lens.surfaces[own[1]], own[2:])[0] if own[0] == "surfaces" else ""
                 at = (own[1], first) if first else (k, quantity)
                 return [Vary(*at, number, position) for number in range(1, len(operand.numbers) + 1)]

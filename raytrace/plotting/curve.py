@@ -15,9 +15,9 @@ from raytrace.plotting.spots import shares_of
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.rays import Rays
 from raytrace.tracing.f_number import axial_f_number
-from raytrace.tracing.focus import along_normal, focus_moments, image_rays, through_focus
-from raytrace.tracing.focusing import Focus
+from raytrace.tracing.focus import Focus, along_normal, focus_moments, through_focus
 from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.spot import image_rays
 
 _SAMPLES = 401
 

@@ -14,10 +14,10 @@ from torch import Tensor
 from raytrace.maths.pupil import fan
 from raytrace.plotting.style import array
 from raytrace.system.apertures import reach
+from raytrace.system.intersection import intersect
 from raytrace.system.lens import Lens
-from raytrace.system.surface import Surface, intersect, sag_at
-from raytrace.tracing.frames import Frame, frames
-from raytrace.tracing.geometry import edge_radius
+from raytrace.system.surface import Surface, sag_at
+from raytrace.tracing.geometry import Frame, edge_radius, frames
 from raytrace.tracing.launch import launch, stop_radius
 from raytrace.tracing.trace import lens_steps, media
 
@@ -232,10 +232,10 @@ def ray_paths(
     A path ends at the image or at the surface where the ray is lost: a vignetted or totally reflected one at its hit,
     one that misses in the surface's vertex plane. Surfaces that do not bend light are no corners of a path.
     """
-    corners, fate, ends = _corners(lens, pupil, fields, wavelength, z_start)
+    corners, endings, ends = _corners(lens, pupil, fields, wavelength, z_start)
     bends, seen = _bends(lens, wavelength), [2, UPWARD[view]]
     paths = []
-    for f, row in enumerate(fate):
+    for f, row in enumerate(endings):
         paths.append([])
         for p, (status, last) in enumerate(row):
             if last == 0:  # lost before surface 1: no aim was found
@@ -263,7 +263,7 @@ def _corners(lens: Lens, pupil: Tensor, fields: Tensor, wavelength: Tensor, z_st
     rays = launch(lens, pupil, fields=fields, wavelengths=wavelength.reshape(1))
     placed, corners, alive = frames(lens), [_start(lens, rays, z_start)], rays.valid
     position, direction = rays.position, rays.direction
-    fate = [[("miss", 0)] * pupil.shape[1] for _ in range(fields.shape[1])]
+    endings = [[("miss", 0)] * pupil.shape[1] for _ in range(fields.shape[1])]
     ends: dict[tuple[int, int], np.ndarray] = {}
     for k, crossing in enumerate(lens_steps(lens, rays, wavelength), start=1):
         frame = placed[k]
@@ -280,13 +280,13 @@ def _corners(lens: Lens, pupil: Tensor, fields: Tensor, wavelength: Tensor, z_st
             ("vignetted", crossing.clipped),
         ):
             for f, p in np.argwhere(array(alive & lost)[:, 0]):
-                fate[f][p], ends[f, p] = (status, k), here[:, f, p]
+                endings[f][p], ends[f, p] = (status, k), here[:, f, p]
         alive = crossing.rays.valid
         position, direction = frame.outside(crossing.rays.position), frame.along(crossing.rays.direction)
         corners.append(here)
     for f, p in np.argwhere(array(alive)[:, 0]):
-        fate[f][p] = ("ok", len(lens.surfaces) - 1)
-    return corners, fate, ends
+        endings[f][p] = ("ok", len(lens.surfaces) - 1)
+    return corners, endings, ends
 
 
 def _start(lens: Lens, rays, z_start: float) -> np.ndarray:

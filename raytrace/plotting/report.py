@@ -13,7 +13,7 @@ from raytrace.plotting.layout import draw_layout
 from raytrace.plotting.spots import airy_radius, draw_spot_to_scale, field_spots, panel_size, wavelength_handles
 from raytrace.system.lens import Lens, with_object_distance
 from raytrace.system.rays import Rays
-from raytrace.tracing.focusing import Focus
+from raytrace.tracing.focus import Focus
 from raytrace.tracing.paraxial import first_order, paraxial_image_distance
 
 _MOST_SPOTS = 5  # columns of spots that stay legible

@@ -14,7 +14,7 @@ from raytrace.plotting import outline, style
 from raytrace.system.apertures import reach
 from raytrace.system.lens import Lens
 from raytrace.system.surface import Surface, sag_at
-from raytrace.tracing.frames import Frame, frames
+from raytrace.tracing.geometry import Frame, frames
 from raytrace.tracing.trace import media
 
 _RINGS, _ARMS = 6, 48  # of the mesh of a surface

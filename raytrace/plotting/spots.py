@@ -17,10 +17,8 @@ from raytrace.maths.pupil import gauss_rings, hexapolar, with_rim
 from raytrace.plotting import style
 from raytrace.system.lens import Lens
 from raytrace.tracing.f_number import axial_f_number
-from raytrace.tracing.focus import image_rays
 from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.ray_hits import chief_reference
-from raytrace.tracing.spot import Spot, spot_of_points
+from raytrace.tracing.spot import Spot, chief_reference, image_rays, spot_of_points
 from raytrace.tracing.spot_diagram import Spots
 
 _DOT_RINGS = 12  # 469 dots of a wavelength

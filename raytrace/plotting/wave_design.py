@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 from raytrace.imaging.wave_camera import Judged, WaveCameraConfig, depth_text
 from raytrace.plotting.style import FIELD_COLOURS, array, new_figure, styled, wavelength_colours
+from raytrace.wave_optics.compute import ElementPsf
 from raytrace.wave_optics.element import Element, height
-from raytrace.wave_optics.psf import ElementPsf
 
 _MARGIN = 1e-5  # of the brightest pixel, shown black
 

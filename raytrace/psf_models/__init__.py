@@ -16,9 +16,9 @@
 from raytrace.psf_models.closeup import CloseUp as CloseUp
 from raytrace.psf_models.closeup import close_up as close_up
 from raytrace.psf_models.compute import psf as psf
-from raytrace.psf_models.convergence import NotConverged as NotConverged
 from raytrace.psf_models.models import MODELS as MODELS
+from raytrace.psf_models.models import NotConverged as NotConverged
 from raytrace.psf_models.result import EmptyPsf as EmptyPsf
 from raytrace.psf_models.result import Kernels as Kernels
 from raytrace.psf_models.result import Psf as Psf
-from raytrace.tracing.memo import Memo as Memo
+from raytrace.tracing.scene import Memo as Memo

@@ -13,10 +13,10 @@ from raytrace.maths.grid import Grid
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_rings, sobol
 from raytrace.maths.value import value
+from raytrace.psf_models.drt import histogram
 from raytrace.psf_models.pixels import gaussian_pixels
 from raytrace.psf_models.pupil_clearance import between, clear_arms, rays_of_search
 from raytrace.psf_models.result import Kernels
-from raytrace.psf_models.splat import histogram
 from raytrace.system.apertures import stands_inside
 from raytrace.tracing.scene import Scene, beam_share, symmetry, trace_scene
 

@@ -12,7 +12,7 @@ from raytrace.psf_models.pixels import gaussian_pixels
 from raytrace.psf_models.result import Kernels
 from raytrace.system.lens import Lens
 from raytrace.system.surface import is_round
-from raytrace.tracing.axis import Bent, is_bent, need_axis
+from raytrace.tracing.aiming import Bent, is_bent, need_axis
 from raytrace.tracing.base_ray import base_ray
 from raytrace.tracing.launch import object_field
 from raytrace.tracing.paraxial import first_order, signed, system_matrix

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from raytrace.maths.numerics import safe_divide
 from raytrace.maths.pupil import gauss_legendre
-from raytrace.psf_models.rays import trace_apertures
+from raytrace.psf_models.drt import trace_apertures
 from raytrace.system.apertures import clearance
 from raytrace.tracing.scene import Scene
 

@@ -1,11 +1,12 @@
-"""Search: the first crossing of a ray with a surface that is more than a conic, found robustly.
+"""Intersection of rays with a surface: point, normal and exact derivatives, and the first crossing of an asphere.
 
-A strong asphere may be crossed several times (gull wings), and Newton's method alone can settle on a wrong crossing
-or on none. `first_crossing` runs Newton from the base conic, accepts by a residual relative to the size of the terms,
-and sends the few rays that fail to a bracketed search. It is one opaque operator, so that `torch.func` and
-`torch.compile` accept the data-dependent search inside; derivatives are attached by the caller.
+Planes and conics have closed forms. A strong asphere may be crossed several times (gull wings), and Newton's method
+alone may settle on a wrong crossing or on none: `first_crossing` runs it from the base conic, accepts by a residual
+relative to the size of the terms, and passes the few rays that fail to a bracketed search. Roots are found outside the
+graph and in float64, also of float32 rays: within 1e-7 of the edge of a surface rounding would decide between a hit and
+a miss. Derivatives are attached by one step: see `_step`.
 
-Roots: where a ray meets a conic, in closed form, found outside the graph and in float64.
+Functions take and return components, triples of (...), in the frame of the surface's vertex.
 """
 
 from collections.abc import Sequence
@@ -14,9 +15,191 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from raytrace.maths.numerics import broadcast_shape, dot, with_batch_axes
-from raytrace.system.freeform import Form
-from raytrace.system.shapes import EVEN, KINDS, Relief, sag_and_derivatives, size_of_terms
+from raytrace.maths.numerics import broadcast_shape, differentiating, dot, with_batch_axes
+from raytrace.system.phases import kind_of
+from raytrace.system.sag_terms import Sag
+from raytrace.system.shapes import EVEN, KINDS, Form, Relief, relief, sag_and_derivatives, size_of_terms
+from raytrace.system.surface import Surface, freeform_sag, is_freeform, is_searched, round_sag
+
+
+def intersect(surface: Surface, position: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+    """Where rays cross the surface in their own direction of propagation; the path to it may be negative.
+
+    position: (3, ...) mm, anywhere on the ray, in the frame of this surface's vertex; direction: (3, ...) unit.
+    Returns the hit point (3, ...) mm and whether there is one (...). Of two crossings it is the one on the vertex
+    sheet whose normal looks along the ray's own z direction. A ray that misses comes back at the vertex.
+    First and second derivatives are exact: see `_step`.
+    """
+    meeting = meet(surface, position.unbind(0), direction.unbind(0))
+    hit = torch.stack(torch.broadcast_tensors(*meeting.hit, meeting.met)[:3])
+    return torch.where(meeting.met, hit, 0.0), meeting.met
+
+
+class Meeting(NamedTuple):
+    """Rays at a surface, by components.
+
+    hit: (x, y, z) mm, each (...); where a ray misses, finite and at the vertex, or on the vertex plane of a plane.
+    cosine: (...) n·d with the normal n of `normal`, n_z > 0 at the vertex; finite where a ray misses.
+    met: (...) bool, whether there is a crossing.
+    normal: that of `normal` and its squared length where they are known already, else None.
+    exact: of rays in float32 the hit and the direction in float64, each a triple, from which it is decided whether
+        light passes: within 1e-7 of the critical angle rounding would. None of rays in float64.
+    """
+
+    hit: tuple[Tensor, Tensor, Tensor]
+    cosine: Tensor
+    met: Tensor
+    normal: tuple | None = None
+    exact: tuple[Sequence[Tensor], Sequence[Tensor]] | None = None
+
+
+def meet(surface: Surface, position: Sequence[Tensor], direction: Sequence[Tensor]) -> Meeting:
+    """`intersect` by components, with the cosine that comes with it; arguments are triples of (...)."""
+    if surface.phase is not None and kind_of(surface.phase).flat:
+        meeting = _meet_plane(position, direction)
+        return meeting._replace(met=meeting.met & _within(surface, *meeting.hit[:2]))
+    if surface.is_plane:
+        return _meet_plane(position, direction)
+    if is_searched(surface):
+        return _meet_searched(surface, position, direction)
+    return _meet_conic(surface, position, direction)
+
+
+def normal(surface: Surface, hit: Sequence[Tensor]) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor | float]:
+    """A normal at a point on the surface by components, not normalised, z > 0 at the vertex; its squared length.
+
+    Conic: (-c x, -c y, 1 - (1+k) c z), squared length 1 - k c² r² on the surface (1 for a sphere): no square root.
+    """
+    x, y, z = hit
+    if surface.phase is not None and kind_of(surface.phase).flat:
+        within = _within(surface, x, y)
+        return _sloped_normal(surface, torch.where(within, x, 0.0), torch.where(within, y, 0.0), None)
+    if surface.is_plane:
+        return (torch.zeros_like(x), torch.zeros_like(x), torch.ones_like(x)), 1.0
+    if is_searched(surface):
+        return _sloped_normal(surface, x, y, None if surface.sag_terms is None else relief(surface.sag_terms))
+    c = surface.curvature
+    if surface.conic is None:
+        return (-c * x, -c * y, 1 - c * z), 1.0
+    # In this order no product of a backward derivative leaves the range of numbers: c² c̄ and r² c̄ would.
+    k = surface.conic
+    return (-c * x, -c * y, 1 - (1 + k) * c * z), 1 - k * (c * (c * (x * x + y * y)))
+
+
+def _within(surface: Surface, x: Tensor, y: Tensor) -> Tensor:
+    """Whether there is a facet: one above the edge of a closed conic has no slope."""
+    c = x.new_zeros(()) if surface.curvature is None else surface.curvature
+    shape = 1.0 if surface.conic is None else 1 + surface.conic
+    return (shape * c * c * (x * x + y * y)).detach() < 1
+
+
+def _meet_plane(position, direction) -> Meeting:
+    x, y, z = position
+    L, M, N = direction
+    # A ray along the plane misses it, and so does one that meets it further away than numbers go.
+    reach = z.detach() / N.detach()
+    met = reach * reach < float("inf")
+    N = torch.where(met, N, 1.0)
+    t = z / N
+    hit = torch.addcmul(x, t, L, value=-1), torch.addcmul(y, t, M, value=-1), z.new_zeros(())
+    exact = None if N.dtype == torch.float64 else (doubles(hit), doubles(direction))
+    return Meeting(hit, N, met, exact=exact)
+
+
+def _meet_conic(surface: Surface, position, direction) -> Meeting:
+    """F(t) = c/2 (x² + y² + (1+k) z²) - z = 0 along the ray: F' and F'' are as simple as F, and F' = -n·d.
+
+    In float32 the root comes from float64 and a step would only add rounding: there only its derivatives are kept.
+    """
+    c = surface.curvature
+    shape = None if surface.conic is None else 1 + surface.conic
+    foot, slide = foot_of(position, direction)
+    way = way_of(position, direction, foot, slide)
+    root, met = conic_root(way.foot, way.direction, double(c), double(shape))
+    t, exact = way.back(root, met)
+    L, M, N = direction
+    N = torch.where(met, N, 1.0)
+    x, y, z = (torch.addcmul(torch.where(met, p, 0.0), t, d) for p, d in zip(foot, (L, M, N), strict=True))
+    shaped = z if shape is None else shape * z
+    dF = c * torch.addcmul(x * L + y * M, shaped, N) - N
+    polish = t.dtype == torch.float64
+    if not (polish or differentiating()):
+        return Meeting((x, y, z), -dF, met, exact=exact)
+    shaped = z if shape is None else shape * z
+    F = (0.5 * c) * torch.addcmul(x * x + y * y, shaped, z) - z
+    d2F = c if shape is None else c * torch.addcmul(L * L + M * M, shape * N, N)
+    step = _step(F, dF, d2F, polish)
+    hit = tuple(torch.addcmul(a, step, d, value=-1) for a, d in zip((x, y, z), (L, M, N), strict=True))
+    return Meeting(hit, d2F * step - dF, met, exact=exact)
+
+
+def _meet_searched(surface: Surface, position, direction) -> Meeting:
+    """F(t) = z - S(x² + y²) - D(x, y) = 0 along the ray; the root itself is found outside the graph."""
+    c, k, a = surface.curvature, surface.conic, surface.coefficients
+    bumps = None if surface.sag_terms is None else relief(surface.sag_terms)
+    zero = position[0].new_zeros((), dtype=torch.float64)
+    foot, slide = foot_of(position, direction)
+    way = way_of(position, direction, foot, slide)
+    root, met = first_crossing(
+        torch.stack(torch.broadcast_tensors(*way.foot)),
+        torch.stack(torch.broadcast_tensors(*way.direction)),
+        zero if c is None else double(c),
+        zero if k is None else double(k),
+        zero[None] if a is None else double(a),
+        float("inf") if surface.semi_diameter is None else surface.semi_diameter,
+        kind=surface.kind,
+        relief=bumps,
+    )
+    t, exact = way.back(root, met)
+    L, M, N = (torch.where(met, d, at) for d, at in zip(direction, (0.0, 0.0, 1.0), strict=True))
+    x, y, z = (torch.addcmul(torch.where(met, p, 0.0), t, d) for p, d in zip(foot, (L, M, N), strict=True))
+    if is_freeform(surface):
+        F, dF, d2F = _less((z, N, torch.zeros_like(N)), freeform_sag(surface, x, y, 2), L, M)
+    else:
+        radial = x * L + y * M
+        S, dS, d2S = round_sag(surface, x * x + y * y, 2, radial)
+        F, dF, d2F = z - S, N - 2 * dS * radial, -(4 * d2S + 2 * dS * (L * L + M * M))
+    if bumps is not None:
+        F, dF, d2F = _less((F, dF, d2F), bumps.sag(x, y), L, M)
+    step = _step(F, dF, d2F, t.dtype == torch.float64)
+    hit = tuple(torch.addcmul(a, step, d, value=-1) for a, d in zip((x, y, z), (L, M, N), strict=True))
+    n, norm_squared = _sloped_normal(surface, *hit[:2], bumps)
+    return Meeting(hit, dot(n, (L, M, N)), met, (n, norm_squared), exact)
+
+
+def _less(F: Sequence[Tensor], D: Sag, L: Tensor, M: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """F, F', F'' along a ray, less those of a sag."""
+    turn = D.xx * L * L + 2 * D.xy * L * M + D.yy * M * M
+    return F[0] - D.z, F[1] - (D.x * L + D.y * M), F[2] - turn
+
+
+def _sloped_normal(surface: Surface, x: Tensor, y: Tensor, bumps: Relief | None):
+    """`normal` by the slopes of the sag: (-z_x, -z_y, 1)."""
+    if is_freeform(surface):
+        base = freeform_sag(surface, x, y, 1)
+        n_x, n_y = -base.x, -base.y
+    else:
+        slope = 2 * round_sag(surface, x * x + y * y, 1)[1]
+        n_x, n_y = -slope * x, -slope * y
+    if bumps is not None:
+        D = bumps.sag(x, y, highest=1)
+        n_x, n_y = n_x - D.x, n_y - D.y
+    return (n_x, n_y, torch.ones_like(n_x)), 1 + n_x * n_x + n_y * n_y
+
+
+def _step(F: Tensor, dF: Tensor, d2F: Tensor, polish: bool) -> Tensor:
+    """One step of Chebyshev's method from a root t found outside the graph: it carries its derivatives and polishes t.
+
+    With F(t, p) = 0 and δ = F/F', the step t - δ - (F''/2F') δ² has, at δ = 0, the first derivative -F_p/F_t of the
+    implicit function and, because δ² has no first but a second derivative, also its second derivative: the last term
+    supplies -(F_tt/F_t) t_p t_q, which one Newton step lacks. F'' itself need not be differentiated. The value of F at
+    the root is rounding: it polishes t (unless polish is False), but must not leak into derivatives through F'.
+    """
+    if not differentiating():
+        return F / dF if polish else F.new_zeros(())
+    step = (F - F.detach()) / dF
+    step = torch.addcmul(step, (0.5 * d2F / dF).detach() * step, step)
+    return step + (F / dF).detach() if polish else step
 
 
 def foot_of(position, direction) -> tuple[list[Tensor], Tensor]:
@@ -107,7 +290,7 @@ _ACCEPTED_RESIDUAL = 64.0  # units of the rounding error of the terms of F
 torch.library.define(
     "raytrace::first_crossing",
     "(Tensor foot, Tensor direction, Tensor curvature, Tensor conic, Tensor coefficients, str kind, Tensor[] numbers,"
-    " str departure, float rim) -> (Tensor, Tensor)",
+    " str sag_terms, float rim) -> (Tensor, Tensor)",
 )
 
 
@@ -128,30 +311,30 @@ def first_crossing(
     within which the first crossing is wanted (inf: the whole sag); a crossing outside the rim is taken only if there is
     none in it. Worked in float64 also for float32 rays; not differentiated: hand it detached tensors.
     """
-    numbers, departure = ([], "") if relief is None else ([number.detach() for number in relief.numbers], relief.kind)
+    numbers, sag_terms = ([], "") if relief is None else ([number.detach() for number in relief.numbers], relief.kind)
     find = torch.ops.raytrace.first_crossing
-    return find(foot, direction, curvature, conic, coefficients, kind, numbers, departure, rim)
+    return find(foot, direction, curvature, conic, coefficients, kind, numbers, sag_terms, rim)
 
 
 @torch.library.register_fake("raytrace::first_crossing")
-def _(foot, direction, curvature, conic, coefficients, kind, numbers, departure, rim):
+def _(foot, direction, curvature, conic, coefficients, kind, numbers, sag_terms, rim):
     batch = broadcast_shape(foot.shape[1:], direction.shape[1:], curvature.shape, conic.shape, coefficients.shape[1:])
     return foot.new_empty(batch), foot.new_empty(batch, dtype=torch.bool)
 
 
 @torch.library.register_vmap("raytrace::first_crossing")
-def _(info, in_dims, foot, direction, curvature, conic, coefficients, kind, numbers, departure, rim):
-    """Move the mapped axis in front of the batch axes; departures that differ are gone through one by one."""
+def _(info, in_dims, foot, direction, curvature, conic, coefficients, kind, numbers, sag_terms, rim):
+    """Move the mapped axis in front of the batch axes; sag terms that differ are taken one by one."""
     tensors, find = (foot, direction, curvature, conic, coefficients), torch.ops.raytrace.first_crossing
-    dims = in_dims[6] if departure else []
+    dims = in_dims[6] if sag_terms else []
     if all(dim is None for dim in dims):
-        return find(*_aligned(tensors, in_dims[:5]), kind, numbers, departure, rim), (0, 0)
+        return find(*_aligned(tensors, in_dims[:5]), kind, numbers, sag_terms, rim), (0, 0)
 
     def part(given, dims, i: int) -> list[Tensor]:
         return [x if dim is None else x.select(dim, i) for x, dim in zip(given, dims, strict=True)]
 
     each = [
-        find(*part(tensors, in_dims[:5], i), kind, part(numbers, dims, i), departure, rim)
+        find(*part(tensors, in_dims[:5], i), kind, part(numbers, dims, i), sag_terms, rim)
         for i in range(info.batch_size)
     ]
     return tuple(torch.stack(found) for found in zip(*each, strict=True)), (0, 0)
@@ -165,11 +348,11 @@ def search(
     coefficients: Tensor,
     kind: str,
     numbers: Sequence[Tensor],
-    departure: str,
+    sag_terms: str,
     rim: float,
 ) -> tuple[Tensor, Tensor]:
     """What the operator does, outside of transforms."""
-    relief = Relief(departure, numbers) if departure else None
+    relief = Relief(sag_terms, numbers) if sag_terms else None
     batch = broadcast_shape(foot.shape[1:], direction.shape[1:], curvature.shape, conic.shape, coefficients.shape[1:])
     p, d = _expand(foot.double(), batch).reshape(3, -1), _expand(direction.double(), batch).reshape(3, -1)
     c, k = curvature.double().expand(batch).reshape(-1), conic.double().expand(batch).reshape(-1)

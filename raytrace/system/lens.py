@@ -24,7 +24,7 @@ from raytrace.system.conditions import APERTURE_KINDS as APERTURE_KINDS
 from raytrace.system.conditions import FIELD_UNITS as FIELD_UNITS
 from raytrace.system.conditions import RAY_AIMING, Fields, SystemAperture
 from raytrace.system.configurations import Operand
-from raytrace.system.optimization_data import Intent
+from raytrace.system.optimization_data import OptimizationData
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface
 from raytrace.words import calling_level, did_you_mean
@@ -46,7 +46,7 @@ class Lens:
     environment: temperature and pressure of the lens and the air around it; None: every glass as its catalog has it.
     operands: what differs from one configuration to the next; current_configuration: which one this is, from 1.
         `lens.configurations` are all of them, `lens.configuration(2)` is one.
-    intent: which numbers vary and follow, and the merit function, as the file has them; None where it says nothing.
+    optimization_data: variables, solves and the merit function of the file; None without any.
     """
 
     surfaces: tuple[Surface, ...]
@@ -63,7 +63,7 @@ class Lens:
     environment: Environment | None = None
     operands: tuple[Operand, ...] = ()
     current_configuration: int = 1
-    intent: Intent | None = None
+    optimization_data: OptimizationData | None = None
 
     with_configurations = multiple.made
     configuration = multiple.chosen

@@ -1,7 +1,7 @@
-"""Intent: what a designer means a lens to become: numbers that vary, numbers that follow, and the merit function.
+"""Optimisation data of a lens: variables, solves, pickups and the merit function.
 
 A lens file stores solved values beside the rule that made them. The numbers of a `Lens` are always those values; the
-rules stand here, and hold while the lens is optimised. None of it is a tensor: two intents are equal where their parts
+rules stand here, and hold while the lens is optimised. None of it is a tensor: two sets are equal where their parts
 are.
 """
 
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 class Vary:
     """A number that an optimisation may change.
 
-    surface: of the file; quantity: "thickness", "curvature", or another name of `places.places`, as "conic", "a4",
+    surface: of the file; quantity: "thickness", "curvature", or another name of `parameter_paths`, as "conic", "a4",
     "tilt_x"; "index", "abbe_number", "partial_dispersion" of a model glass.
     configuration, operand: of a number that differs from one configuration to the next, which (from 1), and which of
     `lens.operands` (from 0) it belongs to; surface and quantity are those of the operand. 0 and None: the lens's own.
@@ -52,14 +52,14 @@ class Solve:
 
     "pickup" of a "glass": it is that of surface `source`, whatever varies of it.
 
-    All at the primary wavelength, in the order of surfaces. numbers: in mm. Kinds that are only kept (`Intent.kept`):
+    All at the primary wavelength, in the order of surfaces. numbers: in mm. Kinds only stored (`kept`):
 
     "substitute" of a "glass": it may be exchanged; "pickup" and "maximum" of a "semi_diameter", the latter: over the
         configurations.
     others, named as the file has them.
 
     configuration, operand: as for `Vary`. A "pickup" of those follows configuration `source`, there operand numbers[0];
-        its offset is in `Intent.unit`.
+        its offset is in `OptimizationData.unit`.
     """
 
     surface: int
@@ -99,7 +99,7 @@ class Row:
         one) or rows; Hx, Hy, Px, Py or data.
     target, weight: the merit is the weighted mean square of value - target; a weight of 0 shows the value alone.
     text: what a line of text says, and words behind the numbers; further: numbers behind those.
-    Lengths in `Intent.unit`: a merit of lengths and pure numbers depends on the unit, so rows stay as written.
+    Lengths in `OptimizationData.unit`: a merit of lengths and pure numbers depends on the unit: rows stay as written.
     """
 
     operand: str | Callable
@@ -119,7 +119,7 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
-class Intent:
+class OptimizationData:
     """Everything that a lens file says about how the lens is to be optimised.
 
     variables, solves: of the numbers of the lens, in the order of surfaces; kept: rules that are kept with the file and

@@ -25,26 +25,26 @@ from raytrace.words import did_you_mean
 _POSED = ("x", "y", "z", "tilt_x", "tilt_y", "tilt_z")
 
 
-class Place(NamedTuple):
+class ParameterPath(NamedTuple):
     """Where a surface holds a number: the fields from it down, and which entry of a tensor of several."""
 
     path: tuple[str, ...]
     entry: int | None = None
 
 
-def places(surface: Surface) -> dict[str, Place]:
-    """Every number by its name: curvature, conic, a4 (of r⁴) …, and the fields of a departure, a phase and the poses.
+def parameter_paths(surface: Surface) -> dict[str, ParameterPath]:
+    """Every number by its name: curvature, conic, a4 (of r⁴) …, and the fields of sag terms, a phase and the poses.
 
     Entries of a tensor are counted from 1, coefficients by the power of r, or of y, that they belong to. The pose
     behind the surface has its names with "_after", as tilt_x_after.
     """
-    found: dict[str, Place] = {}
+    found: dict[str, ParameterPath] = {}
     for field in dataclasses.fields(Surface):
         part = getattr(surface, field.name)
         if field.name == "coefficients":
             found |= _coefficients(part, KINDS[surface.kind])
         elif field.name in SHAPE and field.type == Tensor | None:
-            found[field.name] = Place((field.name,))
+            found[field.name] = ParameterPath((field.name,))
         elif field.name in (*SHAPE, "phase", "before", "after") and dataclasses.is_dataclass(part):
             behind = "_after" if field.name == "after" else ""
             for own in dataclasses.fields(part):
@@ -52,33 +52,33 @@ def places(surface: Surface) -> dict[str, Place]:
     return found
 
 
-def _coefficients(part: Tensor | None, kind: Kind) -> dict[str, Place]:
+def _coefficients(part: Tensor | None, kind: Kind) -> dict[str, ParameterPath]:
     if part is None:
         return {}
-    return {kind.name_of(entry): Place(("coefficients",), entry) for entry in range(part.numel())}
+    return {kind.name_of(entry): ParameterPath(("coefficients",), entry) for entry in range(part.numel())}
 
 
-def _entries(path: tuple[str, ...], part: Tensor | None, name: str) -> dict[str, Place]:
+def _entries(path: tuple[str, ...], part: Tensor | None, name: str) -> dict[str, ParameterPath]:
     if not isinstance(part, Tensor):
         return {}
     if part.dim() == 0:
-        return {name: Place(path)}
-    return {f"{name}{entry + 1}": Place(path, entry) for entry in range(part.numel())}
+        return {name: ParameterPath(path)}
+    return {f"{name}{entry + 1}": ParameterPath(path, entry) for entry in range(part.numel())}
 
 
-def number_at(part, place: Place) -> Tensor | None:
+def number_at(part, place: ParameterPath) -> Tensor | None:
     """The number in its place; None where it is not modelled."""
     for name in place.path:
         part = getattr(part, name)
     return part if place.entry is None else part.reshape(-1)[place.entry]
 
 
-def with_number(part, place: Place, number: Tensor):
+def with_number(part, place: ParameterPath, number: Tensor):
     """The surface with another number in that place."""
     name, *rest = place.path
     old = getattr(part, name)
     if rest:
-        number = with_number(old, Place(tuple(rest), place.entry), number)
+        number = with_number(old, ParameterPath(tuple(rest), place.entry), number)
     elif place.entry is not None:
         flat = old.reshape(-1)
         number = torch.cat([flat[: place.entry], number[None], flat[place.entry + 1 :]]).reshape(old.shape)
@@ -94,7 +94,7 @@ def modelled(surface: Surface, name: str) -> Surface:
     zero = torch.zeros_like(surface.thickness)
     if name in ("curvature", "conic"):
         return surface if getattr(surface, name) is not None else dataclasses.replace(surface, **{name: zero})
-    if name in places(surface):
+    if name in parameter_paths(surface):
         return surface
     term = re.fullmatch(r"a(\d+)", name)
     if term and surface.kind == EVEN and 2 <= int(term[1]) <= 2 * KINDS[EVEN].parameters and not int(term[1]) % 2:
@@ -139,11 +139,11 @@ def counted(word: str, numbers: str, what: str = "surface") -> list[int]:
     return found
 
 
-def place_named(lens: Lens, kind: str, number: int, word: str) -> Place:
+def parameter_path(lens: Lens, kind: str, number: int, word: str) -> ParameterPath:
     """Where a surface holds a number of that name; "sensor" is a thickness. Raises BadVariables."""
     if not 1 <= number <= len(lens.surfaces) - 2:
         raise BadVariables(f"{word!r}: surface {number}; this lens has surfaces 1 to {len(lens.surfaces) - 2} to vary")
-    known = {"thickness": Place(("thickness",)), **places(lens.surfaces[number])}
+    known = {"thickness": ParameterPath(("thickness",)), **parameter_paths(lens.surfaces[number])}
     wanted = "thickness" if kind == "sensor" else kind
     if wanted not in known:
         meant = did_you_mean(kind, known)

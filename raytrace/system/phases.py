@@ -118,7 +118,7 @@ class IdealLens:
 
     power_x, power_y: 1/mm. vergence: 1/s, s mm from the point that is imaged sharply, in the direction of light, to the
     lens: light from there has the same path along every ray (of unequal powers only near the axis); None, or 0, for a
-    point at infinity. A lens that is traced as a whole finds it out itself: see `tracing.sequence`.
+    point at infinity. A lens that is traced as a whole finds it out itself: see `tracing.trace.sequence_of`.
     opd_mode: how OpticStudio counts the path, 0 to 3; kept for the file.
     """
 

@@ -1,32 +1,42 @@
-"""Ray aiming: the rays that pass given points of the stop, and the chief rays that meet given points of the image.
+"""Ray aiming: rays through given points of the stop, chief rays to given image points, and whether the axis bends.
 
-Both are roots of what a trace tells, found by Newton's method from the paraxial rays; where it fails, they are followed
-from the axis to the full field. Every root is its own: it does not depend on those that are sought beside it.
+Roots of traced residuals are found by Newton's method from the paraxial rays; where it fails, by continuation from the
+axis to the full field. Each root is independent of the others of a batch.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import islice
 
 import torch
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
+from torch.utils import _pytree as pytree
 
 from raytrace.maths.numerics import broadcast_shape, safe_divide, with_batch_axes
+from raytrace.maths.value import detached
 from raytrace.system.lens import Lens
+from raytrace.system.phases import kind_of
 from raytrace.system.rays import Rays
-from raytrace.tracing.trace import media, steps
+from raytrace.system.surface import Surface, is_posed, is_round
+from raytrace.tracing.trace import lens_steps, media, steps
+from raytrace.words import named
 
-_STAGES = 1, 20  # the field in one go, and for rays that fail in 20 parts, each started from those before it
+_STAGES = 1, 20  # the full field at once; rays that fail in 20 steps of the field, each started from those before
 _STEPS = 8  # Newton steps at each stage
 _TOLERANCE = 1e-7  # of the radius of the stop and of the height of the image, in float64
-_FEW = 1000  # rays that cost less to trace in copies than to trace back more than once
-_LOST = 1e-2  # a root missed by more at one stage is not sought at those that follow
-_CLOSE = 1e-3  # of the tolerance: one more step, the attached one, ends at rounding
+_FEW = 1000  # rays that cost less to trace in copies than to differentiate more than once
+_LOST = 1e-2  # a root missed by more at one stage is abandoned
+_CLOSE = 1e-3  # of the tolerance: the last, attached step then ends at rounding
 
-#: Residuals (n, ...) of unknowns (n, ...) at a fraction of the field, and where rays reach what is aimed at.
+_length = partial(torch.linalg.vector_norm, dim=0)
+
+#: Residuals (n, ...) of unknowns (n, ...) at a fraction of the field, and whether the rays reach the target surface.
 Residual = Callable[[Tensor, float], tuple[Tensor, Tensor]]
 
 
 def at_stop(lens: Lens, rays: Rays, wavelength: Tensor) -> tuple[Tensor, Tensor]:
-    """Where rays in front of surface 1 meet the stop, (2, ...) mm, and whether they do: a vignetted ray does."""
+    """Where rays in front of surface 1 meet the stop, (2, ...) mm, and whether they do (vignetted rays included)."""
     (stop,), arrives = _crossings(lens, rays, wavelength, (lens.stop,))
     return stop, arrives
 
@@ -41,10 +51,10 @@ def aim_at_stop(
 ) -> tuple[Tensor, Tensor]:
     """Entrance pupil points (2, ...) whose rays pass the stop at `target` times `radius`; and whether found (...).
 
-    pupil: (2, ...), where to begin: the points that the targets have the name of; radius: mm, negative where the
-    entrance pupil is an inverted image of the stop; through(pupil, fraction): rays of a fraction of the field.
+    pupil: (2, ...), initial points; radius: mm, negative where the entrance pupil is an inverted image of the stop;
+    through(pupil, fraction): rays of a fraction of the field.
     """
-    # An axis of object distances, which pupil points may not have.
+    # The radius may have an axis of object distances that pupil points lack.
     pupil, target = (with_batch_axes(points, radius.dim()) for points in (pupil, target))
 
     def missed(aim: Tensor, fraction: float) -> tuple[Tensor, Tensor]:
@@ -58,9 +68,9 @@ def aim_at_stop(
 def aim_at_middle(
     lens: Lens, through: Callable[[Tensor], Rays], start: Tensor, wavelength: Tensor, size: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Points (2, ...) whose rays pass the middle of the stop, and whether found (...): where they are not, the start.
+    """Points (2, ...) whose rays pass the centre of the stop, else the start; and whether found (...).
 
-    through(points): rays; size: () mm, by which it is judged how near that is. Second derivatives are exact too.
+    through(points): rays; size: () mm, the scale of the residual. Second derivatives are exact too.
     """
 
     def missed(point: Tensor, fraction: float) -> tuple[Tensor, Tensor]:
@@ -77,8 +87,8 @@ def aim_at_image(
 ) -> tuple[Tensor, Tensor]:
     """Fields (2, ...) whose chief rays, at the primary wavelength, meet the image at `height`; and whether found (...).
 
-    A field is 0 where not found. through(field, pupil): rays; height: (2, ...) mm; estimate: (2, ...), where to begin;
-    radius: of the stop, whose centre the chief ray passes, or None where it passes that of the paraxial entrance pupil.
+    A field is 0 where not found. through(field, pupil): rays; height: (2, ...) mm; estimate: (2, ...), initial field;
+    radius: of the stop, whose centre the chief ray passes, or None if it passes that of the paraxial entrance pupil.
     """
     wavelength = lens.primary
     size = torch.linalg.vector_norm(height.detach(), dim=0)
@@ -97,26 +107,26 @@ def aim_at_image(
 
 
 def _crossings(lens: Lens, rays: Rays, wavelength: Tensor, numbers: tuple[int, ...]) -> tuple[list[Tensor], Tensor]:
-    """Where rays meet the surfaces of those rising numbers, (2, ...) mm each, and whether they reach the last."""
-    found, arrives, last = [], rays.valid, numbers[-1]
+    """Where rays meet the surfaces of these ascending numbers, (2, ...) mm each, and whether they reach the last."""
+    points, arrives, last = [], rays.valid, numbers[-1]
     indices = media(lens, wavelength)[: last + 1]
     surfaces = lens.surfaces[1 : last + 1]
     for number, crossing in enumerate(steps(surfaces, rays, indices=indices, wavelength=wavelength), 1):
         arrives = arrives & ~(crossing.missed | crossing.totally_reflected)
-        found += [crossing.rays.position[:2]] * numbers.count(number)
-    return found, arrives
+        points += [crossing.rays.position[:2]] * numbers.count(number)
+    return points, arrives
 
 
 def _root(residual: Residual, start: Tensor, *, origin: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
     """Unknowns (n, ...) where the residuals (n, ...) of the full field vanish, and whether found (...).
 
-    The last step is attached, so first derivatives are exact. origin: from the start at a field to the root on axis.
+    The last step is attached: first derivatives are exact. origin: from the initial point to the root on axis.
     """
     with torch.no_grad():
         batch = broadcast_shape(residual(start, 1.0)[0].shape[1:], start.shape[1:])
     start = torch.stack([part.expand(batch) for part in start.detach()])
     tolerance = _TOLERANCE if start.dtype == torch.float64 else 1e-4
-    # What is not found is evaluated on the axis, where every derivative is finite.
+    # Roots not found are evaluated on the axis, where every derivative is finite.
     root, found = origin(start), torch.zeros(batch, dtype=torch.bool, device=start.device)
     for stages in _STAGES:
         followed = _followed(residual, start, origin(start), stages, _CLOSE * tolerance)
@@ -131,10 +141,10 @@ def _root(residual: Residual, start: Tensor, *, origin: Callable[[Tensor], Tenso
 
 
 def _followed(residual: Residual, start: Tensor, origin: Tensor, stages: int, close: float) -> Tensor:
-    """The roots at the full field, followed from the axis in so many stages.
+    """The roots at the full field, by continuation from the axis in `stages` steps.
 
-    Each stage starts where the two before it point to, or where the last one ended if that is nearer. A Newton step
-    that loses the ray or leads away is shortened, and not taken; a root within `close` moves no more.
+    Each stage starts from the extrapolation of the two before it or, if better, from the last root. A Newton step that
+    loses the ray or increases the residual is shortened and rejected; a root within `close` is final.
     """
     before, root = origin, origin + (start - origin) / stages
     sought = torch.ones_like(root[0], dtype=torch.bool)
@@ -157,7 +167,10 @@ def _followed(residual: Residual, start: Tensor, origin: Tensor, stages: int, cl
             error, rows, arrives = _error_and_jacobian(residual, root - share * step, fraction)
             better = moving & arrives & (_length(error) < size)
             root = torch.where(better, root - share * step, root)
-            size, step = torch.where(better, _length(error), size), torch.where(better, _solve(rows, error), step)
+            size, step = (
+                torch.where(better, _length(error), size),
+                torch.where(better, _solve(rows, error), step),
+            )
             share = torch.where(better, 1.0, share / 4)
         sought = sought & (size <= _LOST)
         if not bool(sought.any()):
@@ -168,14 +181,14 @@ def _followed(residual: Residual, start: Tensor, origin: Tensor, stages: int, cl
 def _error_and_jacobian(residual: Residual, point: Tensor, fraction: float) -> tuple[Tensor, list[Tensor], Tensor]:
     """r(p) (n, ...), the rows ∂r_i/∂p, each (n, ...), of each entry's own Jacobian, and whether its ray arrives.
 
-    All outside the graph. A few rays are traced in n copies, one for every row: one way back costs less than n.
+    Outside the graph. A few rays are traced in n copies, one for every row: one backward pass costs less than n.
     """
     count = len(point)
     if point[0].numel() <= _FEW:
         copies = point[:, None].expand(count, count, *point.shape[1:])
         value, pull, arrives = _pulled_back(lambda p: residual(p, fraction), copies)
-        one = torch.eye(count, dtype=value.dtype, device=value.device)
-        jacobian = pull(one.reshape(count, count, *(1,) * (point.dim() - 1)).expand_as(value).contiguous())
+        units = torch.eye(count, dtype=value.dtype, device=value.device)
+        jacobian = pull(units.reshape(count, count, *(1,) * (point.dim() - 1)).expand_as(value).contiguous())
         return value[:, 0], list(jacobian.unbind(1)), arrives[0]
     value, pull, arrives = _pulled_back(lambda p: residual(p, fraction), point)
     rows = []
@@ -187,21 +200,17 @@ def _error_and_jacobian(residual: Residual, point: Tensor, fraction: float) -> t
 
 
 def _pulled_back(function: Callable, point: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor], Tensor]:
-    """f(p), the map from v to vᵀ ∂f/∂p, and what f says beside; outside the graph.
+    """f(p), the map from v to vᵀ ∂f/∂p, and the second result of f; outside the graph.
 
-    `torch.func` only where its transforms are under way: its first call loads a library of computer algebra, 1.4 s.
+    `torch.func` only inside its transforms: its first call imports sympy, 1.4 s.
     """
     if torch._C._are_functorch_transforms_active():
-        value, pull, beside = torch.func.vjp(function, point, has_aux=True)
-        return value.detach(), lambda v: pull(v)[0].detach(), beside
+        value, pull, arrives = torch.func.vjp(function, point, has_aux=True)
+        return value.detach(), lambda v: pull(v)[0].detach(), arrives
     with torch.enable_grad():
         point = point.detach().requires_grad_()
-        value, beside = function(point)
-    return value.detach(), lambda v: torch.autograd.grad(value, point, v, retain_graph=True)[0], beside
-
-
-def _length(vector: Tensor) -> Tensor:
-    return torch.linalg.vector_norm(vector, dim=0)
+        value, arrives = function(point)
+    return value.detach(), lambda v: torch.autograd.grad(value, point, v, retain_graph=True)[0], arrives
 
 
 def _solve(rows: list[Tensor], error: Tensor) -> Tensor:
@@ -220,3 +229,70 @@ def _solve(rows: list[Tensor], error: Tensor) -> Tensor:
     usable = ((singular == 0) & torch.isfinite(trial).all(-1).all(-1))[..., None, None]
     safe = torch.where(usable, matrix, torch.eye(len(rows), dtype=matrix.dtype, device=matrix.device))
     return torch.linalg.solve_ex(safe, torch.where(usable, error, 0.0))[0][..., 0].movedim(-1, 0)
+
+
+_STRAIGHT = 1e-9  # mm and direction cosines: smaller deviations of an axial ray are ignored
+
+
+def is_round_about_axis(lens: Lens) -> bool:
+    """Whether the lens is rotationally symmetric, by the kinds and poses of its surfaces, whatever their values."""
+    return all(is_round(surface) and not is_posed(surface) for surface in lens.surfaces)
+
+
+def is_bent(lens: Lens) -> bool:
+    """Whether the axis bends: a surface is tilted or decentred, a coordinate break, or deflects the axial ray."""
+    return _bends(lens, lens.surfaces)
+
+
+def aiming_of(lens: Lens) -> str:
+    """The ray aiming of a lens, "off", "paraxial" or "real".
+
+    "auto" resolves to "real" if a surface in front of the stop bends the axis, or the stop is tilted or decentred (the
+    straightened entrance pupil is then no image of the stop), and else to "off".
+    """
+    if lens.ray_aiming != "auto":
+        return lens.ray_aiming
+    stop = lens.surfaces[lens.stop]
+    moved = stop.is_break or stop.before is not None
+    return "real" if moved or _bends(lens, lens.surfaces[: lens.stop]) else "off"
+
+
+def _bends(lens: Lens, surfaces: Sequence[Surface]) -> bool:
+    """Whether the first surfaces of a lens, which these are, bend its axis."""
+    if any(map(is_posed, surfaces)):
+        return True
+    if all(map(is_round, surfaces)):
+        return False
+    if any(isinstance(n, Tensor) and is_functorch_wrapped_tensor(n) for n in pytree.tree_leaves(lens)):
+        # Values are hidden inside a transform.
+        phases = [kind_of(surface.phase) for surface in surfaces if surface.phase is not None]
+        return any(not kind.is_round and not kind.slopes for kind in phases)
+    with torch.no_grad():
+        lens = detached(lens)
+        axis = lens.surfaces[-2].thickness.new_tensor([0.0, 0.0, 1.0])
+        off = [0 * axis[:2]]
+        for crossing in islice(lens_steps(lens, Rays(0 * axis, axis, axis[2] > 0), lens.primary), len(surfaces) - 1):
+            off += [crossing.rays.position[:2], crossing.rays.direction[:2]]
+        return bool((torch.stack(off).abs() > _STRAIGHT).any())
+
+
+class Bent(ValueError):
+    """A quantity that needs a straight axis is asked of a lens without one; the message gives the surface."""
+
+
+def need_axis(lens: Lens, what: str, instead: str = "") -> None:
+    """Raise Bent for a lens whose axis bends. what: the quantity; instead: an alternative for the message."""
+    if not is_bent(lens):
+        return
+    posed = [k for k, surface in enumerate(lens.surfaces) if is_posed(surface)]
+    other = [k for k, surface in enumerate(lens.surfaces) if not is_round(surface)]
+    reason = "it bends"
+    if posed:
+        surface = lens.surfaces[posed[0]]
+        reason = f"surface {posed[0]} is " + ("a coordinate break" if surface.is_break else "tilted or decentred")
+    elif other:
+        surface = lens.surfaces[other[0]]
+        part = surface.sag_terms if surface.phase is None else surface.phase
+        reason = f"surface {other[0]} ({named(part)}) takes light off it"
+    message = f"{what} needs one straight axis, but {reason}"
+    raise Bent(f"{message}; {instead}" if instead else message)

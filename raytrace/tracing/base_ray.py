@@ -22,8 +22,7 @@ from raytrace.system.lens import Lens
 from raytrace.system.poses import Gap, Pose, direction_in, point_in
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import Surface, gap_behind
-from raytrace.tracing.aiming import aim_at_middle
-from raytrace.tracing.axis import is_bent
+from raytrace.tracing.aiming import aim_at_middle, is_bent
 from raytrace.tracing.paraxial import cone_angle, first_order, object_distance_of
 from raytrace.tracing.trace import media, steps
 

@@ -4,10 +4,10 @@ import torch
 from torch import Tensor
 
 from raytrace.system.lens import Lens
-from raytrace.tracing.axis import is_bent
+from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.base_ray import base_ray
-from raytrace.tracing.focus import image_rays
 from raytrace.tracing.paraxial import first_order
+from raytrace.tracing.spot import image_rays
 from raytrace.tracing.trace import media
 
 

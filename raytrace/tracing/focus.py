@@ -1,62 +1,65 @@
-"""Focus: the sensor distance of least RMS spot, in closed form.
+"""Focus: the sensor distance of the smallest spot, and the verb `focus`.
 
 Rays in image space are straight: moving the sensor by s along its normal moves a hit by s·m, m = (L, M)/N. The mean
-square radius about each spot's own centroid is a parabola in s, so nothing is retraced:
+square radius about each spot's own centroid is a parabola in s, and its minimum over objects, fields and wavelengths of
+weights W needs no second trace:
 
     s = -Σ W cov(x, m) / Σ W var(m)
 """
 
+import warnings
 from collections.abc import Callable, Iterator, Sequence
+from os import PathLike
 
 import scipy.optimize
 import torch
 from torch import Tensor
 
-from raytrace.budget import RAY_BYTES, afford
+from raytrace.io import write_lens
+from raytrace.maths import pupil
 from raytrace.maths.numerics import safe_divide, safe_sqrt
 from raytrace.maths.pupil import gauss_rings
-from raytrace.system.lens import Lens, with_object_distance, with_sensor_distance
+from raytrace.maths.result import Result, number, numbers
+from raytrace.maths.value import value
+from raytrace.system.lens import (
+    FIELD_UNITS,
+    Lens,
+    field_points,
+    name_of_field,
+    vector,
+    wavelengths_of,
+    with_object_distance,
+    with_sensor_distance,
+)
 from raytrace.system.poses import direction_in
 from raytrace.system.rays import Rays
-from raytrace.tracing.axis import is_bent
+from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.base_ray import base_ray
-from raytrace.tracing.launch import launch
-from raytrace.tracing.paraxial import paraxial_image_distance
-from raytrace.tracing.sequence import sequence_of
-from raytrace.tracing.spot import EmptySpot, Spot, spot_of, spot_of_points, where_lit
-from raytrace.tracing.trace import media, trace_surfaces
+from raytrace.tracing.launch import warn_of_filling
+from raytrace.tracing.paraxial import first_order, paraxial_image_distance
+from raytrace.tracing.ray_failures import LostRays, warn_of_failures
+from raytrace.tracing.spot import EmptySpot, Spot, image_rays, spot_of, spot_of_points, where_lit
+from raytrace.words import calling_level
 
 _RINGS = 12  # of the pupil, where focus on the axis is found
 
 
 class NoImage(ValueError):
-    """An object without a real image: there is no place for a sensor."""
+    """An object without a real image."""
 
 
-def image_rays(lens: Lens, pupil: Tensor, *, fields: Tensor | None = None, wavelengths: Tensor | None = None) -> Rays:
-    """Rays (3, F, W, P) on the sensor, with their direction before it; arguments as for `launch`.
+class NoFocus(ValueError):
+    """The light of an object has no focus; the message says why and what helps."""
 
-    The sensor may touch glass: what bends rays there does not tell where they came from. Raises budget.OverBudget for
-    more rays than memory holds.
-    """
-    wavelengths = lens.wavelengths if wavelengths is None else wavelengths
-    F, W, P = lens.fields.y.numel() if fields is None else fields.shape[1], len(wavelengths), pupil.shape[-1]
-    afford(
-        RAY_BYTES * F * W * P,
-        f"{F * W * P:,} rays ({F} fields × {W} wavelengths × {P:,} of the pupil)",
-        helps="ask for fewer fields, wavelengths or pupil points",
-    )
-    indices = media(lens, wavelengths[:, None])
-    rays = launch(lens, pupil, fields=fields, wavelengths=wavelengths)
-    indices = [*indices[:-1], indices[-2]]
-    return trace_surfaces(sequence_of(lens), rays, indices=indices, wavelength=wavelengths[:, None])
+
+class VirtualImage(UserWarning):
+    """The best sensor distance is on the side that light comes from."""
 
 
 def focus_moments(rays: Rays, weights: Tensor | None = None, *, empty: str = "nan") -> tuple[Tensor, Tensor]:
-    """cov(x, m) in mm and var(m), x the hits and m = (L, M)/N the slopes, over the last axis of rays (3, ..., P).
+    """cov(x, m) in mm and var(m) of hits x and slopes m = (L, M)/N over the last axis of rays (3, ..., P).
 
-    The mean square radius on a sensor moved by s is its value at 0 plus 2 s cov + s² var. weights: (P,) or (..., P);
-    empty: what those of a spot without rays are, see `spot_of`.
+    weights: (P,) or (..., P); empty: as for `spot_of`.
     """
     points, slopes = _points_and_slopes(rays)
     weights = torch.ones_like(points[0]) if weights is None else weights.expand(points.shape[1:])
@@ -72,11 +75,9 @@ def focus_moments(rays: Rays, weights: Tensor | None = None, *, empty: str = "na
 def spot_parabola(rays: Rays, weights: Tensor | None = None, *, empty: str = "nan") -> tuple[Tensor, Tensor, Tensor]:
     """Q0 mm², Q1 mm, Q2 of the mean square radius Q0 + 2 s Q1 + s² Q2 on a sensor moved by s mm; each (...).
 
-    rays: (3, ..., P) as `image_rays` gives them. Once they are traced, a step of an optimisation of the sensor distance
-    is this polynomial, whatever the number of rays. empty: as for `spot_of`.
+    rays: (3, ..., P) of `image_rays`; empty: as for `spot_of`.
     """
-    here = spot_of(rays, weights, empty=empty)
-    return here.mean_square_radius, *focus_moments(rays, weights)
+    return spot_of(rays, weights, empty=empty).mean_square_radius, *focus_moments(rays, weights)
 
 
 def through_focus(rays: Rays, shifts: Tensor, weights: Tensor | None = None, *, empty: str = "nan") -> Spot:
@@ -94,9 +95,8 @@ def focus_of_rms(lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = "na
     """Sensor distance (scalar, mm) of least RMS spot over object distances × fields × wavelengths.
 
     pupil, weights: (2, P), (P,) of a rule in `pupil`; scene: as for `bundles`. Differentiable in every number of the
-    lens.
-    empty: "nan" leaves spots without rays out, for they are nowhere in focus; where none is left, or all rays are
-    parallel, the distance is nan with gradient 0. "error" raises EmptySpot for either.
+    lens. empty: "nan" ignores spots without rays; without any ray, or with parallel rays, the distance is nan with
+    gradient 0. "error" raises EmptySpot for either.
     """
     covariance = variance = torch.zeros_like(lens.surfaces[-2].thickness)
     for rays, share in bundles(lens, pupil, **scene):
@@ -114,9 +114,9 @@ def focus_of_rms(lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = "na
 def focus_of_mean_radius(lens: Lens, pupil: Tensor, weights: Tensor, **scene) -> Tensor:
     """Sensor distance (scalar, mm) of least mean distance of the hits from the centroid of their spot.
 
-    Arguments as for `focus_of_rms`, from where the search begins. Rays in image space are straight: they are traced
-    once, on the sensor as it stands, and what its rim clips there stays clipped. Not differentiated.
-    Raises EmptySpot where there is no focus of the rays, ValueError as `focus_of_merit`.
+    Arguments as for `focus_of_rms`, whose result starts the search. Rays are traced once, to the sensor's present
+    position; those that its rim clips there stay clipped. Not differentiable. Raises EmptySpot if the rays have no
+    focus, ValueError as `focus_of_merit`.
     """
     with torch.no_grad():
         start = focus_of_rms(lens, pupil, weights, **scene)
@@ -128,8 +128,8 @@ def focus_of_mean_radius(lens: Lens, pupil: Tensor, weights: Tensor, **scene) ->
         total = torch.zeros_like(sensor)
         for rays, share in traced:
             shift = (sensor - lens.surfaces[-2].thickness) * along_normal(lens)
-            found = through_focus(rays, shift.reshape(1), weights)
-            x, y = torch.where(found.valid, found.points - found.centroid[..., None], 0.0)
+            spots = through_focus(rays, shift.reshape(1), weights)
+            x, y = torch.where(spots.valid, spots.points - spots.centroid[..., None], 0.0)
             light = torch.where(rays.valid, weights, 0.0)
             radius = safe_divide((light * safe_sqrt(x * x + y * y)).sum(-1), light.sum(-1))
             total = total + (share * radius).sum()
@@ -141,8 +141,8 @@ def focus_of_mean_radius(lens: Lens, pupil: Tensor, weights: Tensor, **scene) ->
 def mean_rms_radius(lens: Lens, pupil: Tensor, weights: Tensor, *, empty: str = "nan", **scene) -> Tensor:
     """√ of the weighted mean of the mean square radii (scalar, mm) over object distances × fields × wavelengths.
 
-    Arguments as for `focus_of_rms`, which minimises it; spots without rays are left out, and it is nan if none is left,
-    or, with empty = "error", raises EmptySpot.
+    Arguments as for `focus_of_rms`, which minimises it. Spots without rays are ignored; without any ray it is nan or,
+    with empty = "error", raises EmptySpot.
     """
     total = sum_of_shares = torch.zeros_like(lens.surfaces[-2].thickness)
     for rays, share in bundles(lens, pupil, **scene):
@@ -169,7 +169,7 @@ def bundles(
     field_weights: Tensor | None = None,
     wavelength_weights: Tensor | None = None,
 ) -> Iterator[tuple[Rays, Tensor]]:
-    """The rays (3, F, W, P) of every object distance (mm, the lens's by default) and what their spots (F, W) count.
+    """The rays (3, F, W, P) of every object distance (mm, the lens's by default) and the weights (F, W) of their spots.
 
     fields, wavelengths: as for `launch`; weights: one for each, 1 by default.
     """
@@ -192,8 +192,7 @@ def best_focus(lens: Lens) -> Tensor:
 
 
 def along_normal(lens: Lens) -> Tensor | float:
-    """By how many mm the sensor moves along its own normal where its distance grows by 1 mm: less where it is tilted
-    in the axes that the distance is laid along."""
+    """Motion of the sensor along its own normal per mm of sensor distance: cos of the tilt of the image surface."""
     pose = lens.surfaces[-1].before
     if pose is None:
         return 1.0
@@ -204,7 +203,7 @@ def along_normal(lens: Lens) -> Tensor | float:
 def paraxial_sensor(lens: Lens, object_distances: Tensor) -> Tensor:
     """Sensor distances (D,) mm of the paraxial images of objects at distances (D,) mm, inf allowed.
 
-    Where the axis bends, that halfway between the images of both sections along the base ray; or that of one.
+    Where the axis bends: the mean of the images of both sections along the base ray, or the only one.
     """
     if not is_bent(lens):
         return paraxial_image_distance(lens, object_distances)
@@ -216,12 +215,11 @@ def paraxial_sensor(lens: Lens, object_distances: Tensor) -> Tensor:
 
 
 def real_image_distance(lens: Lens, object_distances: Tensor) -> Tensor:
-    """Sensor distances (D,) mm of the paraxial images of objects at distances (D,) mm. Raises NoImage for one that is
-    not behind the lens."""
+    """`paraxial_sensor`; raises NoImage for an image that is not behind the lens."""
     images = paraxial_sensor(lens, object_distances)
     wrong = ~(_behind(lens, images) & torch.isfinite(images))
     if bool(wrong.any()):
-        distance, image = (float(one[wrong][0]) for one in (object_distances.detach(), images.detach()))
+        distance, image = (float(part[wrong][0]) for part in (object_distances.detach(), images.detach()))
         raise NoImage(
             f"no real image of an object at {distance:g} mm: it lies within the focal length, or the lens diverges "
             f"(paraxial image at {image:g} mm)"
@@ -230,7 +228,7 @@ def real_image_distance(lens: Lens, object_distances: Tensor) -> Tensor:
 
 
 def is_behind(lens: Lens, distance: Tensor) -> bool:
-    """Whether a sensor distance (mm) is one: on the side of the last surface that the light goes to."""
+    """Whether a sensor distance (mm) lies on the side of the last surface that the light travels to."""
     return bool(_behind(lens, distance).all())
 
 
@@ -261,23 +259,19 @@ def _points_and_slopes(rays: Rays) -> tuple[Tensor, Tensor]:
 
 
 def focus_of_merit(merit: Callable[[Tensor], Tensor], start: Tensor, *, step: float = 0.1, tolerance: float = 1e-10):
-    """Sensor distance (scalar, mm) that minimises any differentiable merit of it, found by its gradient.
+    """Sensor distance (scalar, mm) that minimises a differentiable merit of it.
 
-    merit: sensor distance (scalar, mm) -> scalar, smooth near its minimum; start: mm, where the search begins, within
-    the basin of the minimum; step: mm, the first step of the search for a bracket; tolerance: mm.
-    The slope is bracketed and its zero found by Brent's method (scipy); one Newton step then attaches the implicit
-    derivative ds/dp = -∂²M/∂s∂p / ∂²M/∂s², so the result is differentiable once in all that the merit depends on.
-    Raises ValueError if the merit has no minimum within 2²⁰ steps.
+    merit: sensor distance (scalar, mm) -> scalar, smooth near its minimum; start: mm, within the basin of the minimum;
+    step: mm, the first step of the bracketing; tolerance: mm. The zero of the slope is bracketed and found by Brent's
+    method (scipy); one Newton step attaches the implicit derivative ds/dp = -∂²M/∂s∂p / ∂²M/∂s², so that the result is
+    differentiable once. Raises ValueError if the merit has no minimum within 2²⁰ steps.
     """
 
     def slope(s: Tensor, *, create_graph: bool = False) -> Tensor:
         s = s if s.requires_grad else s.detach().requires_grad_()
         return torch.autograd.grad(merit(s), s, create_graph=create_graph)[0]
 
-    def slope_at(s: float) -> float:
-        return float(slope(start.new_tensor(s)))
-
-    first = float(start)
+    first, slope_at = float(start), lambda s: float(slope(start.new_tensor(s)))
     here = slope_at(first)
     if here != 0:
         direction = -step if here > 0 else step
@@ -297,3 +291,206 @@ def focus_of_merit(merit: Callable[[Tensor], Tensor], start: Tensor, *, step: fl
     if float(bend) <= 0:
         return s.detach()
     return s.detach() - (gradient - gradient.detach()) / bend.detach()
+
+
+@value
+class Focus(Result):
+    """The refocused lens, and the sensor distances by other criteria, mm.
+
+    lens, before: with the new and the old sensor distance; paraxial: (D,) of the paraxial image of every object; rms:
+    of least RMS spot; criterion: as for `focus`. object_distances: (D,) mm, fields: (2, F), wavelengths: (W,) µm, their
+    weights (or None), and points (2, P) and weights (P,) of the pupil: those evaluated.
+    """
+
+    lens: Lens
+    before: Lens
+    paraxial: Tensor
+    rms: Tensor
+    object_distances: Tensor
+    fields: Tensor
+    wavelengths: Tensor
+    distance_weights: Tensor | None
+    field_weights: Tensor | None
+    wavelength_weights: Tensor | None
+    points: Tensor
+    weights: Tensor
+    criterion: str = "rms"
+
+    FIGURE = "plotting.report.focus_report"
+
+    @property
+    def sensor_distance(self) -> Tensor:
+        """mm from the last surface before the image; differentiable in the lens, but for the criterion "mean"."""
+        return self.lens.surfaces[-2].thickness
+
+    @property
+    def is_real(self) -> bool:
+        """Whether the image is real: behind the lens."""
+        return is_behind(self.lens, self.sensor_distance)
+
+    def rms_radius(self, sensor_distance: Tensor | float | None = None) -> Tensor:
+        """Weighted RMS radius (mm) over distances, fields and wavelengths, by default at the new sensor distance."""
+        lens = self.lens if sensor_distance is None else with_sensor_distance(self.before, sensor_distance)
+        return mean_rms_radius(
+            lens,
+            self.points,
+            self.weights,
+            object_distances=self.object_distances,
+            distance_weights=self.distance_weights,
+            fields=self.fields,
+            field_weights=self.field_weights,
+            wavelengths=self.wavelengths,
+            wavelength_weights=self.wavelength_weights,
+        )
+
+    def columns(self) -> dict[str, Tensor]:
+        sensors = torch.stack([sensor for _, sensor in self._sensors()])
+        radii = torch.stack([self.rms_radius(sensor) for sensor in sensors])
+        return {"place": torch.arange(len(sensors)), "sensor_distance": sensors, "rms_radius": radii}
+
+    def words(self) -> dict:
+        return {"place": [words for words, _ in self._sensors()]}
+
+    def units(self) -> dict[str, str]:
+        return {"sensor_distance": "mm", "rms_radius": "mm"}
+
+    def document(self) -> dict:
+        alone = len(self.object_distances) == 1
+        before = self.before.surfaces[-2].thickness
+        return {
+            "object_distance": numbers(self.object_distances)[0] if alone else numbers(self.object_distances),
+            "sensor_before": number(before),
+            "sensor_paraxial": numbers(self.paraxial)[0] if alone else numbers(self.paraxial),
+            "sensor_rms": number(self.rms),
+            "sensor_after": number(self.sensor_distance),
+            "rms_before": number(self.rms_radius(before)),
+            "rms_after": number(self.rms_radius()),
+            "is_real": self.is_real,
+        }
+
+    def __str__(self) -> str:
+        data, kind = first_order(self.before), self.before.fields.kind
+        diameter, position = float(data.entrance_pupil_diameter), float(data.entrance_pupil_position)
+        focal, back = float(data.effective_focal_length), float(data.back_focal_distance)
+        objects = ", ".join(_words(d) for d in self.object_distances.tolist())
+        fields = ", ".join(name_of_field(field) for field in self.fields.unbind(1))
+        colours = ", ".join(f"{w:g}" for w in self.wavelengths.tolist())
+        lines = [
+            self.before.name,
+            f"  effective focal length {focal:.6f} mm, F/{float(data.f_number):.4g}, back focal distance {back:.6f} mm",
+            f"  entrance pupil {diameter:.5g} mm across, {position:.5g} mm from surface 1",
+            f"  object at {objects}; field {fields} {FIELD_UNITS[kind]}; {colours} µm; criterion {self.criterion}\n",
+            f"  {'':<28} {'sensor distance':>18} {'RMS spot radius':>18}",
+        ]
+        for words, sensor in self._sensors():
+            rms = number(self.rms_radius(sensor))
+            radius = "no rays" if rms is None else f"{1000 * rms:>15.4f} µm"
+            lines.append(f"  {words:<28} {float(sensor):>15.6f} mm {radius}")
+        return "\n".join(lines)
+
+    def _sensors(self) -> list[tuple[str, Tensor]]:
+        """Sensor distances with their names."""
+        several = len(self.object_distances) > 1
+        named = [f"paraxial image of {_words(d)}" if several else "paraxial" for d in self.object_distances.tolist()]
+        both = [("before", self.before.surfaces[-2].thickness), ("after", self.sensor_distance)]
+        return [*both, *zip(named, self.paraxial, strict=True), ("best RMS", self.rms)]
+
+    def save(self, path: str | PathLike) -> None:
+        """Write the lens with its new sensor distance."""
+        write_lens(self.lens, path)
+
+
+def focus(
+    lens: Lens,
+    *,
+    object_distances: Sequence[float] | Tensor | None = None,
+    distance_weights: Sequence[float] | Tensor | None = None,
+    fields: Tensor | Sequence = (0.0,),
+    field_weights: Sequence[float] | Tensor | None = None,
+    wavelengths: Tensor | Sequence[float] | None = None,
+    wavelength_weights: Sequence[float] | Tensor | None = None,
+    criterion: str = "rms",
+    sampling: str = "gauss",
+    rings: int | None = None,
+    points: int | None = None,
+    seed: int = 0,
+) -> Focus:
+    """The lens with its sensor at the best distance for weighted objects, fields and wavelengths.
+
+    criterion: "rms", least RMS spot radius, in closed form and differentiable; "paraxial", the paraxial image, or the
+    weighted mean of those of several objects; "mean", least mean distance from the centroid.
+    object_distances: mm, inf allowed, by default the lens's; fields: y, (x, y) or (2, F), by default the axis;
+    wavelengths: µm, by default the primary one; weights: one for each, by default equal. sampling, rings, points, seed:
+    as for `pupil.sampled`. Warns LostRays and VirtualImage. Raises NoFocus, and ValueError for an unknown argument.
+    """
+    if criterion not in ("rms", "paraxial", "mean"):
+        raise ValueError(f"criterion {criterion!r}: expected one of rms, paraxial, mean")
+    distances = vector(lens.surfaces[0].thickness if object_distances is None else object_distances, like=lens)
+    fields = field_points(fields, like=lens)
+    primary = lens.primary[None]
+    wavelengths = primary if wavelengths is None else wavelengths_of(lens, wavelengths)
+    warn_of_filling(with_object_distance(lens, distances.min()), fields)
+    like = lens.surfaces[-2].thickness
+    at, weights = pupil.sampled(sampling, rings=rings, points=points, seed=seed, dtype=like.dtype, device=like.device)
+    paraxial = paraxial_sensor(lens, distances)
+    scene = {
+        "object_distances": distances,
+        "fields": fields,
+        "wavelengths": wavelengths,
+        "distance_weights": _weights(lens, distance_weights, len(distances), "`distance_weights`"),
+        "field_weights": _weights(lens, field_weights, fields.shape[1], "`field_weights`"),
+        "wavelength_weights": _weights(lens, wavelength_weights, len(wavelengths), "`wavelength_weights`"),
+    }
+    if not bool(torch.isfinite(paraxial).all()):
+        raise NoFocus("the lens is afocal for this object distance; there is no focus to find")
+    rms = focus_of_rms(lens, at, weights, **scene)
+    _check_rays(lens, at, distances, fields, wavelengths)
+    if not bool(torch.isfinite(rms)):
+        raise NoFocus("one ray, or parallel rays, have no focus; give more `rings` or `points`")
+    best = rms
+    if criterion == "mean":
+        best = focus_of_mean_radius(lens, at, weights, **scene)
+    elif criterion == "paraxial":
+        shares = scene["distance_weights"]
+        best = paraxial.mean() if shares is None else (shares * paraxial).sum() / shares.sum()
+    result = Focus(
+        with_sensor_distance(lens, best), lens, paraxial, rms, points=at, weights=weights, criterion=criterion,
+        **scene,
+    )  # fmt: skip
+    if not result.is_real:
+        message = (
+            f"the image is virtual, at {float(best):g} mm, on the side of the last surface that the light comes from"
+        )
+        warnings.warn(f"{message}: move the object further away", VirtualImage, stacklevel=calling_level())
+    return result
+
+
+def _weights(lens: Lens, weights, count: int, option: str) -> Tensor | None:
+    if weights is None:
+        return None
+    weights = vector(weights, like=lens)
+    if len(weights) != count:
+        raise ValueError(f"{option}: {len(weights)} given, expected {count}, one for each")
+    return weights
+
+
+def _check_rays(lens: Lens, points: Tensor, distances: Tensor, fields: Tensor, wavelengths: Tensor) -> None:
+    """Warn of rays that do not reach the image. Raises NoFocus if none does."""
+    arrived = []
+    for distance in distances:
+        trial = with_object_distance(lens, distance)
+        with torch.no_grad():
+            valid = image_rays(trial, points, fields=fields, wavelengths=wavelengths).valid
+        at = f"object at {float(distance):g} mm, " if len(distances) > 1 else ""
+        warn_of_failures(trial, points, ~valid.any(-1), fields=fields, wavelengths=wavelengths, at=at)
+        arrived.append(valid.double().mean())
+    lost = 1 - float(sum(arrived)) / len(arrived)
+    if lost == 1:
+        raise NoFocus("no ray reaches the image")
+    if lost > 0:
+        message = f"{lost:.2%} of the rays fail or are vignetted; the focus is that of the others"
+        warnings.warn(message, LostRays, stacklevel=calling_level())
+
+
+def _words(distance: float) -> str:
+    return "infinity" if distance == float("inf") else f"{distance:g} mm"

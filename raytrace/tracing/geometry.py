@@ -2,6 +2,9 @@
 
 A surface whose conic closes before its semi-diameter h, |c| h √(1+k) ≥ 1; a negative gap, or surfaces that cross,
 between two surfaces that refract, reflect or diffract, along the light; glass whose edge thickness is negative.
+
+
+Frames: where the vertex of every surface stands, and how it is turned, in the axes that rays start in.
 """
 
 import dataclasses
@@ -11,8 +14,9 @@ import warnings
 import torch
 from torch import Tensor
 
-from raytrace.maths.value import detached
+from raytrace.maths.value import detached, value
 from raytrace.system.lens import Lens
+from raytrace.system.poses import Pose, direction_out, point_out
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface, is_freeform, sag_at
 from raytrace.tracing.launch import launch
@@ -67,12 +71,12 @@ def warn_of_defects(lens: Lens) -> tuple[Defect, ...]:
 
 def _semi_diameters(lens: Lens) -> list[float]:
     """mm of every surface: as given, else how far the light of all fields reaches with its margin; nan: unknown."""
-    intent, last = lens.intent, len(lens.surfaces) - 1
-    given = range(last + 1) if intent is None else intent.semi_diameters
+    optimization_data, last = lens.optimization_data, len(lens.surfaces) - 1
+    given = range(last + 1) if optimization_data is None else optimization_data.semi_diameters
     found = [(s.semi_diameter or math.nan) if k in given else math.nan for k, s in enumerate(lens.surfaces)]
     if all(map(math.isfinite, found[1:last])):
         return found
-    percent, length = (0.0, 0.0) if intent is None else intent.semi_diameter_margin
+    percent, length = (0.0, 0.0) if optimization_data is None else optimization_data.semi_diameter_margin
     for k, reach in enumerate(_reaches(lens), 1):
         if math.isnan(found[k]):
             bare = k in (lens.stop, last)
@@ -184,3 +188,48 @@ def _sag(surface: Surface, x: Tensor, y: Tensor) -> Tensor:
     r = torch.hypot(x, y)
     held = torch.where(r > edge, edge / torch.where(r > edge, r, 1.0), 1.0) if math.isfinite(edge) else 1.0
     return sag_at(surface, held * x, held * y)
+
+
+@value
+class Frame:
+    """The axes of a surface: its vertex (3,) mm, and by columns (3, 3) the directions of its x, y and z."""
+
+    origin: Tensor
+    axes: Tensor
+
+    def outside(self, point: Tensor) -> Tensor:
+        """A point (3, ...) mm of the surface, told in the axes that rays start in."""
+        return self.along(point) + self.origin.reshape(3, *(1,) * (point.dim() - 1))
+
+    def along(self, direction: Tensor) -> Tensor:
+        """A direction (3, ...), told in the axes that rays start in."""
+        return torch.tensordot(self.axes, direction, dims=1)
+
+    def inside(self, point: Tensor) -> Tensor:
+        """A point (3, ...) mm, told in the axes of the surface."""
+        moved = point - self.origin.reshape(3, *(1,) * (point.dim() - 1))
+        return torch.tensordot(self.axes.T, moved, dims=1)
+
+
+def frames(lens: Lens) -> list[Frame]:
+    """The frame of every surface after its pose, in that of surface 1 before its own; the object's may be at -inf."""
+    distance = lens.surfaces[0].thickness
+    axes = torch.eye(3, dtype=distance.dtype, device=distance.device)
+    here = Frame(torch.zeros_like(axes[0]), axes)
+    found = [Frame(-distance * axes[2], axes)]
+    for surface in lens.surfaces[1:]:
+        here = _posed(here, surface.before)
+        found.append(here)
+        here = _posed(here, surface.after)
+        here = Frame(here.origin + surface.thickness * here.axes[:, 2], here.axes)
+    return found
+
+
+def _posed(frame: Frame, pose: Pose | None) -> Frame:
+    if pose is None:
+        return frame
+    one = torch.eye(3, dtype=frame.axes.dtype, device=frame.axes.device)
+    zero = list(torch.zeros_like(one[0]))
+    vertex = torch.stack(list(point_out(pose, zero)))
+    turned = torch.stack([torch.stack(list(direction_out(pose, list(axis)))) for axis in one], 1)
+    return Frame(frame.outside(vertex), frame.axes @ turned)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from raytrace.system.rays import Rays
 from raytrace.system.surface import Surface
-from raytrace.tracing.compiled.engine_choice import is_fused
+from raytrace.tracing.compiled.library import uses_compiled
 from raytrace.tracing.compiled.run import Pushed, Task, forward, push, push_everywhere, task_of
 from raytrace.tracing.compiled.structure import is_expressible, with_numbers
 from raytrace.tracing.trace import trace_surfaces
@@ -52,7 +52,7 @@ def pushed(
     surfaces: those that the task was made of.
     """
     rays = Rays(*task.given[:2], task.valid, task.given[2])
-    if is_fused(rays, changes, len(surfaces)):
+    if uses_compiled(rays, changes, len(surfaces)):
         return push(task, changes, start)
     return _pushed_by_torch(surfaces, task, changes, start)
 
@@ -62,13 +62,13 @@ def pushed_everywhere(
 ) -> Pushed | None:
     """`run.push_everywhere` where the compiled trace carries these rays; None where torch has to."""
     rays = Rays(*task.given[:2], task.valid, task.given[2])
-    return push_everywhere(task, changes, start) if is_fused(rays, task.given[3], len(surfaces)) else None
+    return push_everywhere(task, changes, start) if uses_compiled(rays, task.given[3], len(surfaces)) else None
 
 
 def ends(surfaces: Sequence[Surface], task: Task) -> Rays:
     """The rays behind the last surface alone, by the engine that is chosen."""
     position, direction, opl, table = task.given
-    if is_fused(Rays(position, direction, task.valid, opl), table, len(surfaces)):
+    if uses_compiled(Rays(position, direction, task.valid, opl), table, len(surfaces)):
         return forward(task)
     return _behind(surfaces, task, position, direction, opl, table)
 

@@ -3,6 +3,26 @@
 Rays start on the plane of the paraxial entrance pupil (at the primary wavelength), wherever it lies; an object 10¹² mm
 away costs no digits. With ray aiming they are steered until they fill the stop, whose radius is that of the paraxial or
 of the real marginal ray; where the axis bends they set out for what the stop looks like along the base ray.
+
+
+Vignetting factors: the part of the entrance pupil that a field fills, an ellipse, and how it changes over the field.
+
+The factors of a field make an affine map of the pupil, p' = V + M p. Between the fields of a lens, maps are
+interpolated:
+
+- all fields on one half-line from the axis (0, 14, 20 degrees along y): linearly in the distance from the axis, where
+  the pupil is whole if no field is listed there, and the ellipse turns with the field, as in a lens of revolution;
+- all on one line through the axis, on both sides of it: linearly along that line, at the foot of the perpendicular;
+- elsewhere: by weights 1/distance² of all fields (Shepard, 1968).
+
+Each is exact at the fields of the lens, continuous, and beyond the last field stays what it is there.
+
+
+Filling: how far the rays of each field miss the points of the stop that they stand for.
+
+Without ray aiming, rays go through the paraxial entrance pupil. Its aberrations move them on the stop: the chief ray
+leaves its centre, and marginal rays fall short of its rim or beyond it.
+
 """
 
 import dataclasses
@@ -11,17 +31,26 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
+from torch.utils import _pytree as pytree
 
 from raytrace.maths.numerics import broadcast_shape, dot, dot_2, safe_divide, safe_sqrt, unit
 from raytrace.maths.pupil import gauss_rings
-from raytrace.system.lens import RAY_AIMING, Lens, field_points, index_behind, wavelengths_of
+from raytrace.maths.value import detached, value
+from raytrace.system.lens import (
+    FIELD_UNITS,
+    RAY_AIMING,
+    Lens,
+    field_points,
+    index_behind,
+    name_of_field,
+    wavelengths_of,
+)
 from raytrace.system.rays import Rays, start
 from raytrace.system.surface import sag
-from raytrace.tracing.aiming import aim_at_image, aim_at_stop, at_stop
-from raytrace.tracing.axis import aiming_of, is_bent
+from raytrace.tracing.aiming import aim_at_image, aim_at_stop, aiming_of, at_stop, is_bent
 from raytrace.tracing.base_ray import Entrance, entrance_of
 from raytrace.tracing.paraxial import FirstOrder, first_order
-from raytrace.tracing.vignetting import vignette
 from raytrace.words import calling_level
 
 
@@ -64,7 +93,7 @@ def launch(
     """Rays of every field, wavelength and pupil point: batch shape (F, W, P).
 
     pupil: (2, P) on the unit disc; fields: (2, F) in the lens's own kind of field, by default those of the lens with
-    their vignetting factors (other fields get those that `raytrace.tracing.vignetting` interpolates);
+    their vignetting factors (other fields get those that `raytrace.tracing.launch` interpolates);
     wavelengths: (W,) µm, by default those of the lens; ray_aiming: a key of RAY_AIMING, by default the lens's.
     """
     fields = field_points(fields, like=lens)
@@ -325,3 +354,184 @@ def _field_of_real_height(lens, height: Tensor, estimate: Tensor, paraxial: Firs
 def _scaled(field: Tensor, factor: Tensor) -> Tensor:
     """field (2, ...) times factor (...): the batch axes broadcast behind the component axis."""
     return torch.stack([component * factor for component in field])
+
+
+_OFF_LINE = 1e-9  # of the largest field
+
+
+def vignette(lens: Lens, field: Tensor, pupil: Tensor) -> Tensor:
+    """Pupil points shrunk and shifted by the vignetting factors of a field: p' = V + (1 - C) p, in axes turned by VAN.
+
+    field: (2, ...) in the lens's own kind of field, pupil: (2, ...), result (2, ...) broadcast.
+    """
+    if lens.fields.vignetting is None:
+        return torch.stack([p.expand(broadcast_shape(field.shape[1:], p.shape)) for p in pupil])
+    x, y, xx, xy, yy = _map_of(lens, field)
+    return torch.stack([x + (xx * pupil[0] + xy * pupil[1]), y + (xy * pupil[0] + yy * pupil[1])])
+
+
+def _map_of(lens: Lens, field: Tensor) -> Tensor:
+    """V_x, V_y, M_xx, M_xy, M_yy (5, ...) of fields (2, ...)."""
+    listed = torch.stack([lens.fields.x, lens.fields.y]).reshape(2, -1, *(1,) * (field.dim() - 1))
+    maps = _maps(lens.fields.vignetting).reshape(5, *listed.shape[1:])
+    same = (listed == field[:, None]).all(0)
+    first = same & (same.to(torch.int64).cumsum(0) == 1)
+    own = torch.where(first, maps, 0.0).sum(1)
+    return torch.where(same.any(0), own, _between(listed, maps, field[:, None]))
+
+
+def _maps(factors: Tensor) -> Tensor:
+    """The maps (5, F) of vignetting factors (5, F): VDX, VDY, VCX, VCY, VAN."""
+    vdx, vdy, vcx, vcy, angle = factors
+    return _rotated(torch.stack([vdx, vdy, 1 - vcx, torch.zeros_like(vcx), 1 - vcy]), *_cos_sin(angle))
+
+
+def _cos_sin(degrees: Tensor) -> tuple[Tensor, Tensor]:
+    return torch.cos(torch.deg2rad(degrees)), torch.sin(torch.deg2rad(degrees))
+
+
+def _rotated(maps: Tensor, c: Tensor, s: Tensor) -> Tensor:
+    """R V and R M Rᵀ for the rotation R by the angle of cosine c and sine s."""
+    x, y, xx, xy, yy = maps
+    return torch.stack(
+        [
+            c * x - s * y,
+            s * x + c * y,
+            c * c * xx - 2 * c * s * xy + s * s * yy,
+            c * s * (xx - yy) + (c * c - s * s) * xy,
+            s * s * xx + 2 * c * s * xy + c * c * yy,
+        ]
+    )
+
+
+def _between(listed: Tensor, maps: Tensor, field: Tensor) -> Tensor:
+    """Maps (5, ...) by one of the three rules; listed: (2, F, ...), maps: (5, F, ...), field: (2, 1, ...)."""
+    radius = safe_sqrt(dot_2(listed, listed))
+    largest, place = radius.max(0, keepdim=True)
+    x, y = (safe_divide(torch.gather(part, 0, place), largest) for part in listed)
+    line = torch.stack([x, torch.where(largest > 0, y, 1.0)])
+    along, across = dot_2(line, listed), _cross(line, listed)
+    on_line = (across.abs() <= _OFF_LINE * largest).all(0)
+    one_sided = (along >= -_OFF_LINE * largest).all(0)
+    by_radius = _by_radius(radius, maps, line, field)
+    by_line = _linear(along, maps, dot_2(line, field))
+    return torch.where(on_line, torch.where(one_sided, by_radius, by_line), _by_distance(listed, maps, field))
+
+
+def _by_radius(radius: Tensor, maps: Tensor, line: Tensor, field: Tensor) -> Tensor:
+    """Linear in the distance from the axis, turned with the field; an axis that is not listed has the whole pupil."""
+    axis = torch.where((radius == 0).any(0, keepdim=True), -1.0, 0.0).to(radius.dtype)
+    whole = maps.new_tensor([0.0, 0.0, 1.0, 0.0, 1.0]).reshape(5, *(1,) * (maps.dim() - 1))
+    asked = safe_sqrt(dot_2(field, field))
+    found = _linear(torch.cat([axis, radius]), torch.cat([whole.expand(5, *axis.shape), maps], 1), asked)
+    cosine = torch.where(asked > 0, safe_divide(dot_2(line, field), asked), 1.0)
+    return _rotated(found, cosine[0], safe_divide(_cross(line, field), asked)[0])
+
+
+def _by_distance(listed: Tensor, maps: Tensor, field: Tensor) -> Tensor:
+    """Weights 1/distance², taken against the nearest so that none overflows."""
+    distance = dot_2(listed - field, listed - field)
+    weight = safe_divide(distance.amin(0).expand_as(distance), distance)
+    return safe_divide((weight * maps).sum(1), weight.sum(0))
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    return a[0] * b[1] - a[1] * b[0]
+
+
+def _linear(knots: Tensor, maps: Tensor, at: Tensor) -> Tensor:
+    """Maps (5, ...) linear between knots (F, ...) in any order, constant outside; at: (1, ...)."""
+    at = torch.minimum(torch.maximum(at, knots.amin(0)), knots.amax(0))
+    low, below = torch.where(knots <= at, knots, -torch.inf).max(0, keepdim=True)
+    high, above = torch.where(knots >= at, knots, torch.inf).min(0, keepdim=True)
+    share = safe_divide(at - low, high - low)
+    shape = (5, *below.shape)
+    first, last = (
+        torch.gather(maps.expand(5, maps.shape[1], *below.shape[1:]), 1, index.expand(shape))
+        for index in (below, above)
+    )
+    return ((1 - share) * first + share * last)[:, 0]
+
+
+#: What the beam may miss the stop by without a warning, of the stop's semi-diameter.
+TOLERANCE = 0.02
+
+MOST_FIELDS = 64  # that are measured of one call: a map of a field asks for thousands
+
+
+class UnfilledStop(UserWarning):
+    """The beam of a field misses the stop by more than TOLERANCE; the message has figures and a remedy."""
+
+    of_result = True  # said of a result: an error that ends the command stands alone
+
+
+@value
+class Filling:
+    """How far rays miss the stop, fractions of its semi-diameter; inf for a ray that does not reach it.
+
+    chief: (F,) chief ray from the centre. marginal: (F,) the worst of four marginal rays, from its point of the rim; of
+    a field with vignetting factors from the point that these leave. lost: (F,) whether no ray reaches the stop; radius:
+    () mm, semi-diameter of the stop.
+    """
+
+    chief: Tensor
+    marginal: Tensor
+    lost: Tensor
+    radius: Tensor
+
+
+@torch.no_grad()
+def filling(lens: Lens, fields: Tensor) -> Filling:
+    """How far the rays of fields (2, F) miss the stop as the lens launches them, at the primary wavelength.
+
+    Five rays a field are traced to the stop. The stop is as wide as the real marginal ray of the axial beam makes it.
+    """
+    lens, fields = detached(lens), fields.detach()
+    wavelength = lens.primary
+    five = fields.new_tensor([[0.0, 0.0, 0.0, -1.0, 1.0], [0.0, -1.0, 1.0, 0.0, 0.0]])
+    pupil = vignette(lens, fields[:, :, None], five)
+    target, radius = points_of_stop(with_ray_aiming(lens, "real"), pupil)
+    position, arrives = at_stop(lens, rays_of_field(lens, fields[:, :, None], pupil, wavelength=wavelength), wavelength)
+    missed = torch.linalg.vector_norm(position - target, dim=0) / radius
+    missed = torch.where(arrives & torch.isfinite(missed), missed, torch.inf)
+    return Filling(missed[:, 0], missed[:, 1:].amax(1), ~arrives.any(1), radius)
+
+
+def warn_of_filling(lens: Lens, fields: Tensor, *, ray_aiming: str | None = None) -> None:
+    """Warn UnfilledStop of the field of (2, F) that misses the stop most, if it does by more than TOLERANCE.
+
+    Of more than MOST_FIELDS so many are measured, evenly spread over them, and the largest one.
+    A field that loses all its rays in front of the stop is left to LostRays. Nothing is traced where rays are aimed,
+    where chief rays are parallel in object space, and in optimisation: where numbers of the lens or fields require a
+    gradient or are inside a transform of torch.func.
+    """
+    lens = with_ray_aiming(lens, ray_aiming)
+    if _is_being_optimised((lens, fields)) or lens.fields.telecentric or aiming_of(lens) != "off":
+        return
+    if fields.shape[1] > MOST_FIELDS:
+        spread = torch.linspace(0, fields.shape[1] - 1, MOST_FIELDS, dtype=torch.float64).long()
+        fields = fields[:, [*spread.tolist(), int(fields.norm(dim=0).argmax())]]
+    found = filling(lens, fields)
+    worst = torch.where(found.lost, 0.0, torch.maximum(found.chief, found.marginal))
+    if not bool((worst > TOLERANCE).any() & (found.radius > 1e-9)):  # a point has no rim
+        return
+    at = int(worst.argmax())
+    named = f"{name_of_field(fields[:, at])} {FIELD_UNITS[lens.fields.kind]}"
+    many = f" ({int((worst > TOLERANCE).sum())} of {len(worst)} fields by more than {TOLERANCE:.0%})"
+    warnings.warn(
+        f"field {named}: rays miss the stop, whose semi-diameter is {float(found.radius):.4g} mm: the chief ray "
+        f"{_words(found.chief[at], 'centre')}, marginal rays {_words(found.marginal[at], 'rim')}"
+        f"{many if len(worst) > 1 else ''}; `ray_aiming=real` aims them, in Python lens.at(ray_aiming='real')",
+        UnfilledStop,
+        stacklevel=calling_level(),
+    )
+
+
+def _words(missed: Tensor, place: str) -> str:
+    """How far from its place of the stop a ray passes, of the semi-diameter."""
+    return f"by {100 * float(missed):.3g} % of it from the {place}" if bool(missed.isfinite()) else "altogether"
+
+
+def _is_being_optimised(numbers: tuple[Lens, Tensor]) -> bool:
+    leaves = [leaf for leaf in pytree.tree_leaves(numbers) if isinstance(leaf, Tensor)]
+    return any(is_functorch_wrapped_tensor(leaf) or leaf.requires_grad for leaf in leaves)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from raytrace.materials.environment import told
+from raytrace.materials.environment import in_words
 from raytrace.materials.glass import label
 from raytrace.maths.result import Result, number, numbers
 from raytrace.maths.value import detached, value
@@ -20,12 +20,12 @@ from raytrace.system.phases import IdealLens
 from raytrace.system.poses import Pose
 from raytrace.system.shapes import EVEN, KINDS
 from raytrace.system.surface import Surface, is_posed, is_round, vertex_curvature
-from raytrace.tracing.axis import aiming_of
+from raytrace.tracing.aiming import aiming_of
 from raytrace.tracing.base_ray import base_ray
 from raytrace.tracing.f_number import working_f_number
 from raytrace.tracing.geometry import defects, warn_of_defects
+from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.paraxial import first_order
-from raytrace.tracing.stop_filling import warn_of_filling
 from raytrace.tracing.trace import media
 
 #: What phases and departures are called, with their own numbers; of others their kind stands alone.
@@ -48,7 +48,7 @@ _WORDS = {
 
 def remarks(surface: Surface) -> list[str]:
     """What a surface is beside a conic: its kind of sag, its departure, its phase, and how it stands."""
-    found = [*_kind(surface), *(_part(part) for part in (surface.departure, surface.phase) if part is not None)]
+    found = [*_kind(surface), *(_part(part) for part in (surface.sag_terms, surface.phase) if part is not None)]
     if surface.is_break:
         return [*found, "coordinate break", *_pose(surface.before)]
     for where, pose in (("before", surface.before), ("behind", surface.after)):
@@ -60,7 +60,7 @@ def remarks(surface: Surface) -> list[str]:
 def entries(surface: Surface) -> dict:
     """The same for a document: keys that only such surfaces have."""
     found: dict = {} if surface.kind == EVEN else {"kind": surface.kind}
-    for name in ("departure", "phase"):
+    for name in ("sag_terms", "phase"):
         part = getattr(surface, name)
         if part is not None:
             found[name] = {"kind": type(part).__name__, **_fields(part)}
@@ -241,7 +241,7 @@ class Info(Result):
             f"  {'ray aiming':<24} {_aiming(lens)}",
             *([f"  {'configuration':<24} {' of '.join(map(str, which.values()))}"] if which else []),
             f"  {'fields':<24} {points} {FIELD_UNITS[lens.fields.kind]}, {lens.fields.kind.replace('_', ' ')}",
-            *([f"  {'environment':<24} {told(lens.environment)}"] if lens.environment else []),
+            *([f"  {'environment':<24} {in_words(lens.environment)}"] if lens.environment else []),
             "",
             f"  {'surface':>7} {'radius':>13} {'thickness':>12} {'glass':<12} {'index':>9} {'semi-dia.':>10}  note",
         ]
@@ -420,6 +420,6 @@ def _remarks(lens: Lens, k: int) -> str:
         parts.append(f"conic {float(surface.conic):g}")
     parts += remarks(surface)
     if surface.environment is not None:
-        parts.append(f"in {told(surface.environment)}")
+        parts.append(f"in {in_words(surface.environment)}")
     parts += [f"{a.shape} {'obscuration' if a.obscures else 'aperture'}" for a in surface.apertures]
     return ", ".join(dict.fromkeys(filter(None, [*parts, surface.comment])))

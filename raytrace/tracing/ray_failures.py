@@ -68,7 +68,7 @@ class Losses:
         return f"{lost} rays lost: " + (parts[0].split(" ", 1)[1] if len(parts) == 1 else ", ".join(parts))
 
 
-def fates(lens: Lens, rays: Rays, wavelength: Tensor) -> Iterator[tuple[Crossing, Tensor]]:
+def ray_status(lens: Lens, rays: Rays, wavelength: Tensor) -> Iterator[tuple[Crossing, Tensor]]:
     """What happens at each surface in turn, as `trace.steps` tells it, and the status (...) of every ray behind it.
 
     wavelength: (...) µm; status: place in STATUS of what befell the ray first.
@@ -81,7 +81,7 @@ def fates(lens: Lens, rays: Rays, wavelength: Tensor) -> Iterator[tuple[Crossing
 
 
 @torch.no_grad()
-def losses(
+def ray_failures(
     lens: Lens,
     pupil: Tensor,
     *,
@@ -95,13 +95,13 @@ def losses(
     codes = [STATUS.index(name) for name in LOST]
     ended = [
         torch.stack([(status == code).expand(rays.shape).sum(-1) for code in codes])
-        for _, status in fates(lens, rays, wavelengths[:, None])
+        for _, status in ray_status(lens, rays, wavelengths[:, None])
     ]
     so_far = torch.stack(ended, 1)
     return Losses(so_far.diff(dim=1, prepend=torch.zeros_like(so_far[:, :1])), (~rays.valid).sum(-1), pupil.shape[-1])
 
 
-def warn_of_losses(
+def warn_of_failures(
     lens: Lens,
     pupil: Tensor,
     dark: Tensor,
@@ -120,7 +120,7 @@ def warn_of_losses(
         return
     some = dark.any(1)
     wavelengths = lens.wavelengths if wavelengths is None else wavelengths
-    found = losses(lens, pupil, fields=fields[:, some], wavelengths=wavelengths, ray_aiming=ray_aiming)
+    found = ray_failures(lens, pupil, fields=fields[:, some], wavelengths=wavelengths, ray_aiming=ray_aiming)
     for place, (field, lost) in enumerate(zip(fields[:, some].unbind(1), dark[some].tolist(), strict=True)):
         said: dict[str, list[str]] = {}
         for w, wavelength in enumerate(wavelengths.tolist()):
@@ -145,7 +145,7 @@ def check_reach(lens: Lens, fields: Tensor | None = None, *, every: bool) -> Non
     afford(RAY_BYTES * F * P, f"{F * P:,} rays that try {F:,} fields", helps="ask for fewer fields")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what follows tells itself what aiming has to say
-        found = losses(lens, pupil, fields=tried, wavelengths=primary)
+        found = ray_failures(lens, pupil, fields=tried, wavelengths=primary)
     dark = (found.arrived[:, 0] == 0).nonzero()[:, 0].tolist()
     told = [
         f"no ray of field {_named(lens, tried[:, f])} reaches the sensor: {found.words(f, 0)}; {_help(lens, fields)}"

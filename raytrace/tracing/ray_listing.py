@@ -20,10 +20,9 @@ from raytrace.maths.value import value
 from raytrace.system.lens import Lens, field_points, vector, wavelengths_of
 from raytrace.system.rays import COLUMNS, Rays
 from raytrace.tracing.launch import rays as launched
+from raytrace.tracing.launch import warn_of_filling
 from raytrace.tracing.ray_failures import STATUS, LostRays
-from raytrace.tracing.sequence import sequence_of
-from raytrace.tracing.stop_filling import warn_of_filling
-from raytrace.tracing.trace import axial_path, media, steps, trace_lens
+from raytrace.tracing.trace import axial_path, media, sequence_of, steps, trace_lens
 from raytrace.words import calling_level
 
 _OK, _VIGNETTED, _MISS, _TIR = (STATUS.index(name) for name in ("ok", "vignetted", "miss", "tir"))
@@ -73,7 +72,7 @@ class Traced(Rays, Result):
                 counts.update({(k, STATUS[status]): n for k, n in enumerate(newly, 1) if n})
         return [{"surface": k, "status": status, "rays": n} for (k, status), n in sorted(counts.items())]
 
-    def losses(self) -> list[str]:
+    def failures(self) -> list[str]:
         """The same in words."""
         words = {STATUS[status]: said for status, said in _LOST.items()}
         return [f"{one['rays']} rays {words[one['status']]} surface {one['surface']}" for one in self.lost()]

@@ -10,11 +10,9 @@ from raytrace.maths import pupil
 from raytrace.maths.result import Result, axis, cell, number, numbers
 from raytrace.maths.value import value
 from raytrace.system.lens import FIELD_UNITS, Lens, field_points, name_of_field, with_wavelengths
-from raytrace.tracing.launch import with_ray_aiming
-from raytrace.tracing.ray_failures import STATUS, LostRays, warn_of_losses
-from raytrace.tracing.ray_hits import Arrivals, arrivals, chief_reference
-from raytrace.tracing.spot import Spot, spot_of, spot_of_points
-from raytrace.tracing.stop_filling import warn_of_filling
+from raytrace.tracing.launch import warn_of_filling, with_ray_aiming
+from raytrace.tracing.ray_failures import STATUS, LostRays, warn_of_failures
+from raytrace.tracing.spot import Arrivals, Spot, arrivals, chief_reference, spot_of, spot_of_points
 from raytrace.tracing.streaming import MAX_BYTES, StreamedSpot, stream_spots
 from raytrace.words import calling_level
 
@@ -173,7 +171,7 @@ def spot(
         warnings.warn(told, LostRays, stacklevel=calling_level())
     about = None if reference == "centroid" else chief_reference(with_ray_aiming(lens, ray_aiming), fields)
     spots = spot_of(found.rays, shares, about=about)
-    warn_of_losses(lens, at, spots.rms_radius.isnan(), fields=fields, ray_aiming=ray_aiming)
+    warn_of_failures(lens, at, spots.rms_radius.isnan(), fields=fields, ray_aiming=ray_aiming)
     hits, valid = found.rays.position[:2].flatten(2), found.rays.valid.flatten(1)
     about = None if about is None else about[..., 0]
     whole = spot_of_points(hits, valid, found.weight.flatten(), about=about)
@@ -199,7 +197,7 @@ def _of_many(lens, fields, rays: int, sampling: str, progress, *, seed: int, ray
         with progress(rays * fields.shape[1] * len(lens.wavelengths), "ray") as bar:
             each, whole = stream_spots(lens, rays, fields=fields, **how, progress=bar.update)
     tried = pupil.sobol(min(rays, _TRIED))[0].to(lens.surfaces[-2].thickness)
-    warn_of_losses(lens, tried, each.rays == 0, fields=fields, ray_aiming=ray_aiming)
+    warn_of_failures(lens, tried, each.rays == 0, fields=fields, ray_aiming=ray_aiming)
     return Spots(lens, fields, each, whole)
 
 

@@ -1,9 +1,11 @@
-"""Trace rays through a sequence of surfaces: transfer, intersect, refract or reflect, clip.
+"""Sequential ray tracing: transfer, intersection, deflection and clipping at one surface after the other.
 
-The trace is a generator. To record, draw or find where a ray was lost, consume `steps`; to trace on from stored
-rays, hand them with the surfaces that are left.
+The trace is a generator: to record, draw or find where a ray failed, consume `steps`; to resume from stored rays, pass
+them with the remaining surfaces. `trace_surfaces` and `trace_lens` return the last rays only, through the compiled
+engine where that is available and pays. `media` and `sequence_of` give the indices and surfaces a lens is traced as.
 """
 
+import dataclasses
 import itertools
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -11,142 +13,34 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from raytrace.materials import glass
 from raytrace.maths.numerics import dot
-from raytrace.maths.value import to, value
+from raytrace.maths.value import value
 from raytrace.system.apertures import inside
-from raytrace.system.lens import Lens
-from raytrace.system.phases import Added, added_path, ideal_path, kind_of, path_of
+from raytrace.system.intersection import meet
+from raytrace.system.lens import Lens, index_behind
+from raytrace.system.phases import IdealLens, power_of
 from raytrace.system.poses import Gap, Turn, direction_in, point_in
 from raytrace.system.rays import Rays
-from raytrace.system.surface import Surface, gap_behind, in_double, meet, normal
-from raytrace.tracing.compiled.engine_choice import is_fused
+from raytrace.system.surface import Surface, gap_behind, vertex_curvature
+from raytrace.tracing.compiled.library import uses_compiled
 from raytrace.tracing.compiled.run import trace_compiled
 from raytrace.tracing.compiled.structure import is_expressible
-from raytrace.tracing.sequence import media, sequence_of
+from raytrace.tracing.refraction import deflect
 
 
 @value
 class Crossing:
-    """What happened to rays at one surface.
+    """Rays behind one surface, in its vertex frame, and the reasons why rays end there.
 
-    rays: Rays behind the surface, in its vertex frame.
-    missed, totally_reflected: (...) bool, the ray ends here for that reason; also one vignetted before, which goes on.
-    clipped: (...) bool, the ray was vignetted here, and not lost before.
+    missed, totally_reflected: (...) bool, also of a ray that was vignetted before, which is traced on.
+    clipped: (...) bool, the ray is vignetted here and was valid before.
     """
 
     rays: Rays
     missed: Tensor
     totally_reflected: Tensor
     clipped: Tensor
-
-
-# -- laws of light: directions and normals come by components, the normal n not normalised; cosine is n·d --------------
-
-
-def refract(direction, normal, cosine, norm_squared, n1: Tensor, n2: Tensor, b_squared: Tensor | None = None):
-    """Snell's law n1 sin θ1 = n2 sin θ2 as a vector, and whether light passes (False: total internal reflection).
-
-        d' = (n1/n2) d + sign(n·d) D/(a + b)/n2 n,   D = (n2 - n1)(n2 + n1),   a = n1 |n·d|,   b = √(a² + D |n|²)
-
-    direction: unit, by components; normal: by components, of squared length norm_squared; cosine: n·d.
-    b_squared: b² in float64 where it is known better than by these numbers; it then decides.
-    No 1 - cos² anywhere: equal indices return d exactly, and grazing rays keep their digits. The squared length of
-    d' is then brought to 1 within rounding, by a factor that is 1 identically and so is not differentiated.
-    """
-    a = n1 * cosine
-    D = (n2 - n1) * (n2 + n1)
-    passes, b_squared = _decided(torch.addcmul(D * norm_squared, a, a), b_squared)
-    b = torch.sqrt(torch.where(passes, b_squared, 1.0))
-    # An index of 0 is a medium without a real index: nothing passes into it.
-    n2 = torch.where(n2 > 0, n2, 1.0)
-    along_normal = (D / n2) / (a + torch.copysign(b, a))
-    ratio = n1 / n2
-    refracted = [torch.addcmul(ratio * d, along_normal, n) for d, n in zip(direction, normal, strict=True)]
-    return _renormalise(refracted), passes
-
-
-def reflect(direction, normal, cosine, norm_squared):
-    """Law of reflection d' = d - 2 (n·d) n / |n|²; arguments as for `refract`."""
-    twice = 2 * cosine / norm_squared
-    return _renormalise([torch.addcmul(d, twice, n, value=-1) for d, n in zip(direction, normal, strict=True)])
-
-
-def diffract(
-    direction, normal, cosine, norm_squared, n1: Tensor, n2: Tensor, added: Added, *, mirror: bool, b_squared=None
-):
-    """Snell's law or reflection with the gradient g = ∇p of a path added to q = n1 d; and whether light passes.
-
-        n2 d' = q + α n,  q = n1 d + g,  α = (s b - a)/|n|² = D/(a + s b),  a = q·n,  b = √(a² + D |n|²)
-        D = (n2 - n1)(n2 + n1) - g·(2 n1 d + g)
-
-    s is the sign of n·d, or the other one for a mirror: light keeps its side, or changes it. Where the root vanishes
-    the order is evanescent, and no light passes. Welford, Opt. Commun. 14, 322 (1975).
-    b_squared: b² in float64 where it is known better than by these numbers, as for `refract`.
-    """
-    L, M, N = direction
-    q = n1 * L + added.x, n1 * M + added.y, n1 * N
-    a, D = _across(direction, normal, cosine, n1, n2, added)
-    passes, b_squared = _decided(torch.addcmul(D * norm_squared, a, a), b_squared)
-    passes = passes & (n2 > 0)
-    b = torch.sqrt(torch.where(passes, b_squared, 1.0))
-    b = torch.where((cosine < 0) ^ mirror, -b, b)
-    alike = a * b > 0
-    along = torch.where(alike, D / torch.where(alike, a + b, 1.0), (b - a) / norm_squared)
-    n2 = torch.where(n2 > 0, n2, 1.0)
-    return _renormalise([torch.addcmul(at, along, n) / n2 for at, n in zip(q, normal, strict=True)]), passes
-
-
-def diffracted_root(direction, normal, cosine, norm_squared, n1: Tensor, n2: Tensor, added: Added) -> Tensor:
-    """b² of `diffract`."""
-    a, D = _across(direction, normal, cosine, n1, n2, added)
-    return torch.addcmul(D * norm_squared, a, a)
-
-
-def _across(direction, normal, cosine, n1: Tensor, n2: Tensor, added: Added) -> tuple[Tensor, Tensor]:
-    """a and D of `diffract`."""
-    L, M, _ = direction
-    a = torch.addcmul(n1 * cosine + added.x * normal[0], added.y, normal[1])
-    return a, (n2 - n1) * (n2 + n1) - (added.x * (2 * n1 * L + added.x) + added.y * (2 * n1 * M + added.y))
-
-
-def bend_slopes(direction, height, power, n1: Tensor, n2: Tensor):
-    """The ideal lens n2 tan θ2 = n1 tan θ1 - power · height in x and y, with -n for n where light travels backward.
-
-        d' ∝ (n1 L - φx x |N|, n1 M - φy y |N|, n2 N)
-
-    Slopes may be of any size: a ray along the plane goes on along it.
-    """
-    L, M, N = direction
-    (power_x, power_y), (x, y, _) = power, height
-    bent = [n1 * L - power_x * x * N.abs(), n1 * M - power_y * y * N.abs(), n2 * N]
-    factor = torch.rsqrt(dot(bent, bent))
-    return [component * factor for component in bent]
-
-
-def _decided(b_squared: Tensor, exact: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Whether light passes, and b² with the value of the exact one and its own derivatives."""
-    if exact is None:
-        return b_squared > 0, b_squared
-    smallest = torch.finfo(b_squared.dtype).tiny
-    return exact > 0, exact.to(b_squared.dtype).clamp_min(smallest) + (b_squared - b_squared.detach())
-
-
-def _renormalise(direction):
-    detached = [d.detach() for d in direction]
-    factor = torch.rsub(dot(detached, detached), 1.5, alpha=0.5)
-    return [d * factor for d in direction]
-
-
-# -- rays at a surface -------------------------------------------------------------------------------------------------
-
-
-def _snell_discriminant(surface: Surface, hit, direction, n1: Tensor, n2: Tensor) -> Tensor:
-    """b² of `refract` in float64, outside the graph."""
-    with torch.no_grad():
-        n, norm_squared = normal(in_double(surface), hit)
-        n1, n2 = n1.double(), n2.double()
-        a = n1 * dot(n, direction)
-        return torch.addcmul((n2 - n1) * (n2 + n1) * torch.as_tensor(norm_squared), a, a).detach()
 
 
 class _Ray(NamedTuple):
@@ -177,10 +71,9 @@ def cross(
 ) -> Crossing:
     """Carry rays over the gap before a surface and through the surface.
 
-    rays: in the frame of the surface before, or of this one, before its pose, if gap is None; gap: mm between the two
-    vertices, or what `gap_behind` says; side: σ = ±1, the axial direction of light in the gap; n1, n2: (...) indices
-    before and behind; wavelength: (...) µm, needed by surfaces with a phase.
-    If n2 is the same tensor as n1 the surface is a dummy and does not bend.
+    rays: in the frame of the surface before or, if gap is None, of this one before its pose; gap: mm between the two
+    vertices, or a `gap_behind`; side: σ = ±1, the axial direction of light in the gap; n1, n2: (...) indices before and
+    behind; wavelength: (...) µm, needed by surfaces with a phase. n2 the same tensor as n1: a dummy surface.
     """
     return _crossing(_Ray.of(rays), *_cross(surface, _Ray.of(rays), gap, side, n1, n2, wavelength))
 
@@ -196,31 +89,21 @@ def _crossing(before: _Ray, after: _Ray, met: Tensor, passes: Tensor | None, cle
 
 
 def _cross(surface: Surface, rays: _Ray, gap, side: int, n1: Tensor, n2: Tensor, wavelength: Tensor | None):
-    """Rays behind the surface, and which of those before met it, were not totally reflected, pass its apertures."""
+    """Rays behind the surface, and whether those before it meet it, are not totally reflected, pass its apertures."""
     if isinstance(gap, Gap) or surface.before is not None or surface.is_break:
-        rays, gap = _approach(surface, rays, gap, side, n1), None
+        rays, gap = _in_axes_of(surface, rays, gap, side, n1), None
         if surface.is_break:
             return rays, torch.ones_like(rays.valid), None, None
     direction = rays.direction
     x, y, z = rays.position
-    arrival = rays.position if gap is None else (x, y, z - gap)
-    hit, cosine, met, known, exact = meet(surface, arrival, direction)
-    opl = rays.opl
+    meeting = meet(surface, rays.position if gap is None else (x, y, z - gap), direction)
+    hit, met, opl = meeting.hit, meeting.met, rays.opl
     if opl is not None:
         opl = opl + n1 * _reduced_path(rays.position, hit, direction, gap, side)
-    passes = None
-    if surface.phase is not None:
-        direction, passes, added = _through_phase(surface, hit, direction, cosine, known, exact, n1, n2, wavelength)
-        opl = opl if opl is None or added is None else opl + added
-    elif surface.is_mirror or n2 is not n1:
-        n, norm_squared = normal(surface, hit) if known is None else known
-        if surface.is_mirror:
-            direction = reflect(direction, n, cosine, norm_squared)
-        else:
-            sure = None if exact is None else _snell_discriminant(surface, *exact, n1, n2)
-            direction, passes = refract(direction, n, cosine, norm_squared, n1, n2, sure)
+    direction, passes, added = deflect(surface, meeting, direction, n1, n2, wavelength)
+    opl = opl if opl is None or added is None else opl + added
     survives = met if passes is None else met & passes
-    clear = inside(surface.apertures, hit)
+    clear = inside(surface.apertures, hit) if surface.apertures else None
     valid = rays.valid & survives
     after = _Ray(
         position=[at if surface.is_plane and i == 2 else torch.where(survives, at, 0.0) for i, at in enumerate(hit)],
@@ -231,8 +114,8 @@ def _cross(surface: Surface, rays: _Ray, gap, side: int, n1: Tensor, n2: Tensor,
     return after, met, passes, clear
 
 
-def _approach(surface: Surface, rays: _Ray, gap: Tensor | Gap | None, side: int, n1: Tensor) -> _Ray:
-    """Rays told in the axes of the surface; their path less that of the gap along the axis, n1 T σ."""
+def _in_axes_of(surface: Surface, rays: _Ray, gap: Tensor | Gap | None, side: int, n1: Tensor) -> _Ray:
+    """Rays in the axes of the surface; their path less that of the axial ray in the gap, n1 T σ."""
     position, direction, opl = rays.position, rays.direction, rays.opl
     thickness = gap
     if isinstance(gap, Gap):
@@ -247,33 +130,6 @@ def _approach(surface: Surface, rays: _Ray, gap: Tensor | Gap | None, side: int,
         if isinstance(surface.before, Turn) and opl is not None:
             opl = opl - surface.before.path
     return _Ray(position, direction, rays.valid, opl)
-
-
-@torch.no_grad()
-def _diffracted_discriminant(surface: Surface, hit, direction, n1: Tensor, n2: Tensor, wavelength) -> Tensor:
-    """b² of `diffract` in float64, outside the graph, of a path with the numbers that the rays have it with."""
-    path = path_of(surface.phase, None if wavelength is None else wavelength.to(n1.dtype))
-    phase = to(surface.phase if path is None else path, dtype=torch.float64)
-    n, norm_squared = normal(in_double(surface), hit)
-    added = added_path(phase, hit[0], hit[1], wavelength)
-    return diffracted_root(direction, n, dot(n, direction), norm_squared, n1.double(), n2.double(), added)
-
-
-def _through_phase(surface: Surface, hit, direction, cosine, known, exact, n1, n2, wavelength):
-    """Direction behind a surface with a phase, whether light passes (None: all does), and the path that is added."""
-    kind, phase = kind_of(surface.phase), surface.phase
-    if kind.slopes:
-        behind = bend_slopes(direction, hit, kind.power(phase, wavelength), n1, n2)
-        return behind, None, ideal_path(phase, hit, direction, behind, n1, n2)
-    n, norm_squared = normal(surface, hit) if known is None else known
-    if kind.flat and surface.is_mirror:
-        return reflect(direction, n, dot(n, direction), norm_squared), None, None
-    if kind.flat:
-        return *refract(direction, n, dot(n, direction), norm_squared, n1, n2), None
-    added, mirror = added_path(phase, hit[0], hit[1], wavelength), surface.is_mirror
-    sure = None if exact is None else _diffracted_discriminant(surface, *exact, n1, n2, wavelength)
-    direction, passes = diffract(direction, n, cosine, norm_squared, n1, n2, added, mirror=mirror, b_squared=sure)
-    return direction, passes, added.path
 
 
 def _reduced_path(start, hit, direction, gap: Tensor | None, side: int) -> Tensor:
@@ -299,12 +155,12 @@ def steps(
     side: int = 1,
     gap: Tensor | Gap | None = None,
 ) -> Iterator[Crossing]:
-    """Yield what happens at each surface in turn.
+    """Yield the `Crossing` of each surface in turn.
 
-    rays: before surfaces[0], in its frame before its pose, or with `gap` in that of the surface before it (mm, or what
-    `surface.gap_behind` says of that one); indices: len(surfaces) + 1 media (...), the first before surfaces[0];
-    wavelength: (...) µm, which surfaces with a phase need; side: axial direction of light before surfaces[0] (-1 behind
-    an odd number of mirrors).
+    rays: before surfaces[0], in its frame before its pose or, with `gap`, in that of the surface before it (mm, or its
+    `surface.gap_behind`); indices: len(surfaces) + 1 media (...), the first before surfaces[0]; wavelength: (...) µm,
+    needed by surfaces with a phase; side: axial direction of light before surfaces[0] (-1 behind an odd number of
+    mirrors).
     """
     for before, crossed in _walk(surfaces, rays, indices, wavelength, side, gap):
         yield _crossing(before, *crossed)
@@ -330,26 +186,21 @@ def trace_surfaces(
 ) -> Rays:
     """The rays behind the last of the surfaces; arguments as for `steps`.
 
-    The compiled trace takes the runs of surfaces that it knows, where it pays: see `fused.tracing`.
+    The compiled engine traces the runs of surfaces that it supports, where it pays: see `compiled.run`.
     """
     if torch.compiler.is_compiling():
         return _eager(surfaces, rays, indices=indices, wavelength=wavelength, side=side, gap=gap)
     first = 0
     for expressible, run in itertools.groupby(surfaces, is_expressible):
         last = first + len(list(run))
-        how = {"indices": indices[first : last + 1], "wavelength": wavelength, "side": side, "gap": gap}
-        rays = (_fused if expressible else _eager)(surfaces[first:last], rays, **how)
+        arguments = {"indices": indices[first : last + 1], "wavelength": wavelength, "side": side, "gap": gap}
+        end = None
+        if expressible and uses_compiled(rays, indices[first], last - first):
+            end = trace_compiled(surfaces[first:last], rays, **arguments, eager=_eager)
+        rays = _eager(surfaces[first:last], rays, **arguments) if end is None else end
         side = -side if sum(surface.is_mirror for surface in surfaces[first:last]) % 2 else side
         gap, first = gap_behind(surfaces[last - 1]), last
     return rays
-
-
-def _fused(surfaces: Sequence[Surface], rays: Rays, **how) -> Rays:
-    if is_fused(rays, how["indices"][0], len(surfaces)):
-        end = trace_compiled(surfaces, rays, **how, eager=_eager)
-        if end is not None:
-            return end
-    return _eager(surfaces, rays, **how)
 
 
 def _eager(surfaces: Sequence[Surface], rays: Rays, *, indices, wavelength=None, side: int, gap) -> Rays:
@@ -360,15 +211,15 @@ def _eager(surfaces: Sequence[Surface], rays: Rays, *, indices, wavelength=None,
 
 
 def trace_lens(lens: Lens, rays: Rays, wavelength: Tensor) -> Rays:
-    """Trace rays from the frame of surface 1 to the image surface.
+    """Rays traced from the frame of surface 1 to the image surface, in its frame.
 
-    wavelength: µm, broadcast against the batch shape of the rays. Returns the rays in the frame of the image.
+    wavelength: µm, broadcast against the batch shape of the rays.
     """
     return trace_surfaces(sequence_of(lens), rays, indices=media(lens, wavelength), wavelength=wavelength)
 
 
 def lens_steps(lens: Lens, rays: Rays, wavelength: Tensor) -> Iterator[Crossing]:
-    """What happens to rays before surface 1 at every surface after the object; wavelength: (...) µm."""
+    """The crossings of rays before surface 1 with every surface after the object; wavelength: (...) µm."""
     return steps(sequence_of(lens), rays, indices=media(lens, wavelength), wavelength=wavelength)
 
 
@@ -379,3 +230,85 @@ def axial_path(surfaces: Sequence[Surface], indices: Sequence[Tensor], side: int
         side = -side if surface.is_mirror else side
         total = total + n * surface.thickness * side
     return total
+
+
+def sequence_of(lens: Lens) -> tuple[Surface, ...]:
+    """The surfaces after the object as they are traced: ideal lenses with the vergence of the axial object point.
+
+    It is that of the paraxial ray on the straightened axis, at the primary wavelength.
+    """
+    surfaces = lens.surfaces[1:]
+    if not any(isinstance(surface.phase, IdealLens) for surface in surfaces):
+        return surfaces
+    wavelength, side, sequence = lens.primary, 1, []
+    indices = media(lens, wavelength)
+    y, omega = torch.ones_like(indices[0]), indices[0] / lens.surfaces[0].thickness
+    for surface, n1, n2 in zip(surfaces, indices[:-1], indices[1:], strict=True):
+        behind = -side if surface.is_mirror else side
+        power = vertex_curvature(surface) * (behind * n2 - side * n1)
+        power = power if surface.phase is None else power + power_of(surface.phase, wavelength)[1]
+        if isinstance(surface.phase, IdealLens):
+            vergence = omega / (n1 * torch.where(y == 0, torch.finfo(y.dtype).tiny ** 0.5, y))
+            phase = dataclasses.replace(surface.phase, vergence=vergence)
+            surface = dataclasses.replace(surface, phase=phase)
+        sequence.append(surface)
+        omega = omega - power * y
+        y, side = y + surface.thickness * omega / (behind * n2), behind
+    return tuple(sequence)
+
+
+def media(lens: Lens, wavelength: Tensor) -> list[Tensor]:
+    """Refractive index behind every surface, object first; positive also behind a mirror.
+
+    wavelength: (...) µm; returns one tensor (...) for each surface, in the lens's dtype. A mirror or a coordinate
+    break keeps the medium. A medium that does not change is the same tensor, so that `cross` refracts nothing there.
+    """
+    dtype = lens.surfaces[-2].thickness.dtype
+    if lens.environment is not None or any(surface.environment is not None for surface in lens.surfaces):
+        return _media_in_environment(lens, wavelength, dtype)
+    glasses: list[glass.Glass] = []
+    for surface in lens.surfaces:
+        keeps = glasses and (surface.is_mirror or surface.is_break or _same(surface.glass, glasses[-1]))
+        glasses.append(glasses[-1] if keeps else surface.glass)
+    # Air lies between all elements: each medium is evaluated once.
+    distinct = {(medium.formula, id(medium.coefficients)): medium for medium in glasses}
+    indices = _refractive_indices(list(distinct.values()), wavelength)
+    by_medium = dict(zip(distinct, (n.to(dtype) for n in indices), strict=True))
+    return [by_medium[medium.formula, id(medium.coefficients)] for medium in glasses]
+
+
+def _same(a: glass.Glass, b: glass.Glass) -> bool:
+    return a is b or (a.formula == b.formula and a.coefficients is b.coefficients)
+
+
+def _media_in_environment(lens: Lens, wavelength: Tensor, dtype: torch.dtype) -> list[Tensor]:
+    """`media` of a lens at a temperature and a pressure."""
+    indices: list[Tensor] = []
+    by_medium: dict[tuple, Tensor] = {}
+    for number, surface in enumerate(lens.surfaces):
+        if indices and (surface.is_mirror or surface.is_break):
+            indices.append(indices[-1])
+            continue
+        key = (surface.glass.formula, id(surface.glass.coefficients), surface.glass.records, id(surface.environment))
+        if key not in by_medium:
+            by_medium[key] = index_behind(lens, number, wavelength).to(dtype)
+        indices.append(by_medium[key])
+    return indices
+
+
+def _refractive_indices(glasses: Sequence[glass.Glass], wavelength: Tensor) -> list[Tensor]:
+    """`refractive_index` of each glass; glasses of one formula are evaluated together."""
+    groups: dict[object, list[int]] = {}
+    for number, medium in enumerate(glasses):
+        together = medium.formula not in ("mirror", "constant") and medium.coefficients.dim() == 1
+        groups.setdefault((medium.formula, len(medium.coefficients)) if together else number, []).append(number)
+    indices: dict[int, Tensor] = {}
+    for numbers in groups.values():
+        if len(numbers) == 1:
+            indices[numbers[0]] = glass.refractive_index(glasses[numbers[0]], wavelength)
+            continue
+        stacked = torch.stack([glasses[number].coefficients for number in numbers], -1)
+        stacked = stacked.reshape(*stacked.shape, *(1,) * wavelength.dim())
+        group = dataclasses.replace(glasses[numbers[0]], coefficients=stacked)
+        indices |= dict(zip(numbers, glass.refractive_index(group, wavelength[None]).unbind(0), strict=True))
+    return [indices[number] for number in range(len(glasses))]

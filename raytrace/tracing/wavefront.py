@@ -13,7 +13,7 @@ from raytrace.maths import zernike
 from raytrace.maths.numerics import dot, safe_divide, safe_sqrt, unit
 from raytrace.maths.value import value
 from raytrace.system.rays import Rays
-from raytrace.tracing.axis import is_bent
+from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.base_ray import base_ray
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import Scene, beam_share, trace_scene

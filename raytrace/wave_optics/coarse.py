@@ -18,9 +18,9 @@ from torch import Tensor
 
 from raytrace.psf_models.dft import integrate, phasor
 from raytrace.psf_models.radial import is_centred
+from raytrace.wave_optics.compute import ElementPsf
 from raytrace.wave_optics.element import Pixels, excess_index
 from raytrace.wave_optics.plan import Plan
-from raytrace.wave_optics.psf import ElementPsf
 from raytrace.wave_optics.pupil import covered, light_of, to_pixels
 from raytrace.wave_optics.scene import WaveScene, aperture, millimetres
 

@@ -19,7 +19,7 @@ from raytrace.materials.formulas import FORMULAS
 from raytrace.materials.glass import Glass
 from raytrace.stores import Unfit, either, exactly, listed, number, parsed, record, text
 from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike, fabricated, height_range, is_flat, wrapped
-from raytrace.wave_optics.exchange import FORMATS, HeightMapError, read_heights, write_heights
+from raytrace.wave_optics.height_maps import FORMATS, HeightMapError, read_heights, write_heights
 
 #: Suffix of smooth elements, and their profiles by the name that they have there.
 SMOOTH = ".json"

@@ -26,7 +26,9 @@ from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to
 from raytrace.maths.zernike import noll
 from raytrace.psf_models.dft import integrate, nodes_per_pixel, rings_and_arms, sub_pixels
-from raytrace.psf_models.diffraction import (
+from raytrace.psf_models.radial import is_centred, radii_of_waves, unfold
+from raytrace.psf_models.result import Kernels
+from raytrace.psf_models.wave import (
     Waves,
     amplitude,
     half_spread,
@@ -35,18 +37,13 @@ from raytrace.psf_models.diffraction import (
     phase_along_radius,
     waves,
 )
-from raytrace.psf_models.radial import is_centred, radii_of_waves, unfold
-from raytrace.psf_models.result import Kernels
 from raytrace.system.lens import Fields, Lens, SystemAperture, field_points, with_object_distance
 from raytrace.system.sag_terms import GridSag, ZernikeSag, spline
 from raytrace.system.shapes import relief
 from raytrace.system.surface import Surface, sag_at
-from raytrace.tracing.launch import rays_of_field
+from raytrace.tracing.launch import rays_of_field, vignette, warn_of_filling
 from raytrace.tracing.scene import Scene, chief_landing, scene, symmetry
-from raytrace.tracing.sequence import sequence_of
-from raytrace.tracing.stop_filling import warn_of_filling
-from raytrace.tracing.trace import media, trace_surfaces
-from raytrace.tracing.vignetting import vignette
+from raytrace.tracing.trace import media, sequence_of, trace_surfaces
 from raytrace.tracing.wavefront import Wavefront, wavefront_of
 from raytrace.wave_optics.element import Element, EvenPowers, Rings, Zernike, is_flat, is_radial, path, slopes_of
 
@@ -100,7 +97,7 @@ def surfaces_of(element: Element, *, substrate: Tensor | float = 0.0) -> tuple[S
     """The plane and the height of an element, beside air; errors as `element_lens` has them.
 
     The thickness between their vertices is the substrate plus the height at the axis; even powers become those of an
-    asphere, all other profiles a departure without a height at its vertex.
+    asphere, all other profiles sag terms without a height at its vertex.
     """
     profile, radius = element.profile, float(element.radius.detach())
     if element.period is not None or isinstance(profile, Rings):
@@ -112,17 +109,17 @@ def surfaces_of(element: Element, *, substrate: Tensor | float = 0.0) -> tuple[S
     if isinstance(profile, EvenPowers):
         back = dataclasses.replace(back, coefficients=profile.coefficients)
     elif isinstance(profile, Zernike):
-        departure = ZernikeSag(profile.coefficients, element.radius)
-        centre = relief(departure).sag(zero, zero, highest=0).z
+        sag_terms = ZernikeSag(profile.coefficients, element.radius)
+        centre = relief(sag_terms).sag(zero, zero, highest=0).z
         piston = torch.nn.functional.pad(centre[None], (0, len(profile.coefficients) - 1))
-        departure = ZernikeSag(profile.coefficients - piston, element.radius)
-        back = dataclasses.replace(back, departure=departure)
+        sag_terms = ZernikeSag(profile.coefficients - piston, element.radius)
+        back = dataclasses.replace(back, sag_terms=sag_terms)
     else:
-        departure = spline(GridSag(profile.heights, profile.pitch))
-        centre = relief(departure).sag(zero, zero, highest=0).z
+        sag_terms = spline(GridSag(profile.heights, profile.pitch))
+        centre = relief(sag_terms).sag(zero, zero, highest=0).z
         # The weights of a spline sum to 1: less everywhere as at the axis. Found once, however often it is traced.
-        departure = dataclasses.replace(departure, coefficients=departure.coefficients - centre)
-        back = dataclasses.replace(back, departure=departure)
+        sag_terms = dataclasses.replace(sag_terms, coefficients=sag_terms.coefficients - centre)
+        back = dataclasses.replace(back, sag_terms=sag_terms)
     thickness = centre + torch.as_tensor(substrate, dtype=zero.dtype)
     with torch.no_grad():
         lowest = float((thickness + sag_at(back, *_disc(element.radius))).min())
@@ -169,7 +166,7 @@ def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: i
     """Wave PSFs of a scene whose lens carries elements in contact at its stop.
 
     Differentiable in the numbers of the elements and of the lens. order: as for the wave model
-    (`psf_models.diffraction`);
+    (`psf_models.wave`);
     the rays follow the phase of the lens and of the elements together. Kernels of flat pixels, rings and wrapped
     heights converge slowly in it, by the rays across a step. Moments are left out.
     Raises ValueError for a stop between other media than air, a beam wider than an element at the stop (beyond a margin
@@ -185,7 +182,7 @@ def kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, *, order: i
 
 
 def _field_kernels(scene: Scene, elements: tuple[Element, ...], grid: Grid, order: int) -> tuple[int, Tensor]:
-    """Rays and kernel (D, 1, W, rows, columns) of one field; without elements those of `psf_models.diffraction`."""
+    """Rays and kernel (D, 1, W, rows, columns) of one field; without elements those of `psf_models.wave`."""
     like = {"dtype": scene.wavelengths.dtype, "device": scene.wavelengths.device}
     probe = wavefront_of(scene, *gauss_rings(*_PROBE, **like))
     centre = grid.centre.reshape(2, *(grid.centre.shape[1:] or (1, 1, 1))) - probe.centre[:2]

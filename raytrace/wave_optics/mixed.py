@@ -2,7 +2,7 @@
 cubic plate.
 
 Steps cannot be sampled on a grid but by brute force: cells that they cut scatter light. What the window sees of the
-round part is its own field within some radius P of the axis, known exactly from one radius (`radial.field`):
+round part is its own field within some radius P of the axis, exact along one radius (`propagation.radial_field`):
 
     U_r(ρ) = ∫ F_r J₀,      F(t) = 2π/λ² ∫_0^∞ U_r(ρ) τ(ρ) J₀(2π t ρ/λ) ρ dρ
 

@@ -32,12 +32,10 @@ from torch import Tensor
 
 from raytrace.maths.pupil import gauss_rings
 from raytrace.maths.value import to, value
-from raytrace.psf_models.convergence import NotConverged
 from raytrace.psf_models.dft import Aliased, integrate, rings_and_arms
+from raytrace.psf_models.models import NotConverged
 from raytrace.psf_models.radial import is_centred, reach
-from raytrace.wave_optics import mixed, pupil
-from raytrace.wave_optics import propagation as propagate
-from raytrace.wave_optics import propagation as radial
+from raytrace.wave_optics import mixed, propagation, pupil
 from raytrace.wave_optics.element import (
     Element,
     Pixels,
@@ -249,7 +247,7 @@ def _edges(element: Element, scene: WaveScene, waves: Tensor) -> Tensor:
     if element.period is None:
         return torch.zeros_like(waves)
     alone = WaveScene((element,), *(getattr(scene, n) for n in ("sensor_distance", "depths", "wavelengths", "grid")))
-    r = radial.edges(alone)[1:-1]
+    r = propagation.edges(alone)[1:-1]
     before, behind = (height(element, r + s * 1e-6 * R, torch.zeros_like(r)) for s in (-1, 1))
     return (squares(behind - before) * r).sum(-1) * 2 / R**2
 
@@ -306,7 +304,7 @@ def setting_of(scene: WaveScene) -> Setting:
         size=max(scene.grid.shape),
         pixels=scene.grid.rows * scene.grid.columns,
         bytes=scene.sensor_distance.element_size(),
-        band=math.pi * radial.cutoff(scene) * pitch,
+        band=math.pi * propagation.cutoff(scene) * pitch,
         width=float(light.width.max()),
         core=float(core.max()),
         sharpest=float(core.min()),
@@ -406,7 +404,7 @@ def gauss_count(a: float, tol: float) -> int:
 def half_phases(scene: WaveScene, s: Setting) -> tuple[float, float]:
     """Largest half of the phase, radians, that the integrand of the radial engine turns between two steps: a bound,
     the slope at the farther one times their distance, and what it turns."""
-    edges = radial.edges(scene).detach()
+    edges = propagation.edges(scene).detach()
     r = torch.linspace(0, 1, 513, dtype=edges.dtype, device=edges.device) * edges[-1]
     bent = slopes(scene, r, torch.zeros_like(r))[0].abs().amax((0, 1)) + math.sqrt(2) * s.reach / s.distance
     turned = torch.cumsum(bent, 0) * (edges[-1] / 512)
@@ -551,7 +549,7 @@ def _mixed(scene: WaveScene, s: Setting, nodes: int, tol: float) -> Plan:
     inner = gauss_count(half, 0.1 * tol)
     error = node_error(s, nodes) + radius_error(turned, inner) + 3e-4
     D, W = s.kernels
-    K, J, n = s.size * nodes, inner * (len(radial.edges(round_part(scene))) - 1), radii_of_band(scene, band)
+    K, J, n = s.size * nodes, inner * (len(propagation.edges(round_part(scene))) - 1), radii_of_band(scene, band)
     T = 20 * n
     flops = W * n * (J + T) * (60 + 4 * D) + D * W * (K * samples**2 + K**2 * samples + 150 * samples**2)
     memory = s.bytes * (W * n * (J + T) + (2 * W + 8) * samples**2 * 4 + D * W * 8 * K**2)
@@ -567,7 +565,7 @@ def _radial(scene: WaveScene, s: Setting, *, samples: int | None, nodes: int | N
     nodes = max(base - 2, gauss_count(s.band, 0.5 * tol / 0.15)) if nodes is None else max(nodes, base - 2)
     error = node_error(s, nodes) + radius_error(turned, samples)
     D, W = s.kernels
-    J = samples * (len(radial.edges(scene)) - 1)
+    J = samples * (len(propagation.edges(scene)) - 1)
     K = math.ceil(s.band * reach(scene.grid) + 1.5 * (4 + (2 * s.band * reach(scene.grid)) ** (1 / 3)))
     flops = W * K * J * 4 * D + D * W * (K * s.pixels / 4 + 40 * J)
     return Plan("radial", samples, nodes, error + 1e-7, flops, s.bytes * (3 * W * K * J + K * s.pixels / 8))
@@ -586,7 +584,7 @@ def _transfer(scene: WaveScene, s: Setting, *, engine, samples, nodes, tol, pad,
             Aliased,
             stacklevel=calling_level(),
         )
-    size = propagate.padded(samples, pad)
+    size = propagation.padded(samples, pad)
     error = node_error(s, nodes) + min(1.0, transfer_error(s, samples, pad, band_limit))
     seen = s.diameter * (s.diameter + 2 * s.core) / (s.shortest * s.distance)
     error += max(0.0, 1 - (samples / seen) ** 2) + (0.08 * slope**2 if engine == "angular_spectrum" else 0.0)
@@ -636,13 +634,13 @@ def _pupil_kernels(scene: WaveScene, sums, plan: Plan) -> Tensor:
     return integrate(light, sums.pixel, scene.grid.pitch)
 
 
-def _radial_sums(scene: WaveScene, plan: Plan) -> radial.RadialSums:
-    return radial.prepare(scene, plan.samples, radial.order_of(scene, plan.nodes))
+def _radial_sums(scene: WaveScene, plan: Plan) -> propagation.RadialSums:
+    return propagation.prepare_radial(scene, plan.samples, propagation.order_of(scene, plan.nodes))
 
 
 def _sent(scene: WaveScene, sums: None, plan: Plan) -> Tensor:
     how = {"pad": plan.pad, "band_limit": plan.band_limit, "spectrum": plan.engine == "angular_spectrum"}
-    light, weight = propagate.intensity(scene, samples=plan.samples, nodes=plan.nodes, **how)
+    light, weight = propagation.transfer_function_intensity(scene, samples=plan.samples, nodes=plan.nodes, **how)
     return integrate(light, weight, scene.grid.pitch)
 
 
@@ -672,7 +670,7 @@ ENGINES = {
         "round elements, a window on the axis",
         "phase between two radii",
         _radial,
-        lambda scene, sums, plan: radial.kernels(scene, sums),
+        lambda scene, sums, plan: propagation.radial_kernels(scene, sums),
         _radial_sums,
     ),
     "fresnel": Engine("paraboloids", "light that wraps round, or the band limit cuts off", _transfer, _sent),

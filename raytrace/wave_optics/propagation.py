@@ -36,7 +36,7 @@ from raytrace.wave_optics.scene import WaveScene, aperture, excess, millimetres,
 _LOBES = 24  # samples on either side in the interpolation from the field's grid to the nodes of the pixels
 
 
-def intensity_of_propagate(
+def transfer_function_intensity(
     scene: WaveScene, *, samples: int, nodes: int, pad: float, band_limit: bool, spectrum: bool
 ) -> tuple[Tensor, Tensor]:
     """Light per mm² (D, W, Y, X) at the nodes of the pixels, and the weights of the nodes.
@@ -167,7 +167,7 @@ class RadialSums:
     to_pixels: Tensor
 
 
-def prepare(scene: WaveScene, nodes: int, order: int) -> RadialSums:
+def prepare_radial(scene: WaveScene, nodes: int, order: int) -> RadialSums:
     """Constants for `nodes` Gauss radii between steps, and an order of the radii on the sensor (`radii_of_waves`)."""
     rho, to_pixels = radii_of_waves(scene.grid, cutoff(scene), order)
     r, bessel = to_radii(scene, rho, nodes)
@@ -184,12 +184,12 @@ def to_radii(scene: WaveScene, rho: Tensor, nodes: int) -> tuple[Tensor, Tensor]
     return r, scale * weight * light * bessel_j0(2 * math.pi * rho[:, None] * t / wavelength)
 
 
-def kernels(scene: WaveScene, sums: RadialSums) -> Tensor:
+def radial_kernels(scene: WaveScene, sums: RadialSums) -> Tensor:
     """Energy in the pixels (D, W, rows, columns), 1 = all through the aperture."""
-    return unfold(scene.grid, intensity(scene, sums) @ sums.to_pixels.T)
+    return unfold(scene.grid, radial_intensity(scene, sums) @ sums.to_pixels.T)
 
 
-def intensity(scene: WaveScene, sums: RadialSums) -> Tensor:
+def radial_intensity(scene: WaveScene, sums: RadialSums) -> Tensor:
     """Light per mm² (D, W, K) at the radii of the sensor."""
     U = phasors(scene, sums.r, sums.sphere)
     # A real matrix on the columns Re U, Im U of all depths.
@@ -198,7 +198,7 @@ def intensity(scene: WaveScene, sums: RadialSums) -> Tensor:
     return (parts**2).sum(-1).permute(2, 0, 1)
 
 
-def field(scene: WaveScene, rho: Tensor, nodes: int) -> Tensor:
+def radial_field(scene: WaveScene, rho: Tensor, nodes: int) -> Tensor:
     """U (D, W, K) at radii rho (K,) mm on the sensor, |U|² per mm² as `intensity`."""
     r, bessel = to_radii(scene, rho, nodes)
     U = phasors(scene, r, spheres(scene, r * r))

@@ -1,8 +1,8 @@
-"""Glasses of a CODE V sequence: of a catalog, by their figures, and private ones; read and written.
+"""Glasses of a CODE V sequence: of a catalog, by index and Abbe number, and private ones; read and written.
 
 NBK7_SCHOTT is the glass of that catalog whose name is the same but for hyphens and the like, which CODE V leaves out.
-517642 and 517.642, with as many digits as one likes on either side of the point, tell n_d - 1 and V_d; so does
-1.517:64.2. PRV … END holds private glasses: indices at the wavelengths PWL, or the coefficients of a formula.
+517642 and 517.642, with any number of digits on either side of the point, give n_d - 1 and V_d; so does 1.517:64.2.
+PRV … END holds private glasses: indices at the wavelengths PWL, or the coefficients of a formula.
 """
 
 import dataclasses
@@ -16,12 +16,9 @@ from typing import NamedTuple
 import torch
 
 from raytrace.io.codev.keywords import unquoted
-from raytrace.io.materials import beside, by_figures, catalogs_at_hand, is_code, is_left_out, listed_glass
-from raytrace.io.report import Draft
-from raytrace.io.source import LensFileError, Place, shown
-from raytrace.io.spelling import double, exact, exact_list, is_number, number
-from raytrace.io.substitutes import FORMULA
-from raytrace.io.zemax.keywords import Record
+from raytrace.io.materials import by_figures, catalogs_in_folder, catalogs_of_lens, is_code, is_left_out, listed_glass
+from raytrace.io.report import FORMULA, Draft
+from raytrace.io.source import LensFileError, Place, Record, double, exact, exact_list, is_number, number, shown
 from raytrace.materials.catalogs import Catalog, UnknownGlass, find_glass, plain_names, same_catalog
 from raytrace.materials.formulas import FORMULAS
 from raytrace.materials.glass import AIR, LINES, Glass, constant, from_table, mil_glass, refractive_index
@@ -32,11 +29,11 @@ FORMULA_WORDS = {"LAU": "schott"}
 #: Terms of the formula through the indices of a table; fewer of them are met exactly.
 _TERMS = 6
 
-#: An index that a formula estimates to no better than this is refused, unless the formula was asked for.
+#: An index that a formula estimates with a larger error is refused, unless the formula was requested.
 _MOST_ERROR = 1e-4
 
-#: Between these lines, µm, an index and an Abbe number tell the dispersion.
-_TOLD = (LINES["F"] * (1 - 1e-4), LINES["C"] * (1 + 1e-4))
+#: Between these lines, µm, index and Abbe number determine the dispersion.
+_DETERMINED = (LINES["F"] * (1 - 1e-4), LINES["C"] * (1 + 1e-4))
 
 _CODE = re.compile(r"(\d{3,})\.(\d{2,})", re.ASCII)
 _PAIR = re.compile(r"([^:]+):([^:]+)")
@@ -45,8 +42,8 @@ _PAIR = re.compile(r"([^:]+):([^:]+)")
 # -- reading ----------------------------------------------------------------------------------------------------------
 
 
-class Shelf(NamedTuple):
-    """Where glasses stand: private ones by name in capitals, catalogs that came with the lens, those of the user.
+class GlassLibrary(NamedTuple):
+    """The glasses of a file: private ones by name in capitals, catalogs that came with the lens, those of the user.
 
     wavelengths: of the lens, µm.
     """
@@ -58,32 +55,32 @@ class Shelf(NamedTuple):
 
 
 def came_with(file: str, words: Sequence[str], user: Sequence[Path], report: Draft) -> list[Catalog]:
-    """The catalogs beside a file that words of glasses name, as MINE of NAME_MINE."""
-    lying = beside(file)
-    named = [name for word in words if (name := unquoted(word).rpartition("_")[2]).upper() in lying]
-    found = catalogs_at_hand(named, user, report) if named else ()
-    return [catalog for catalog in found if isinstance(catalog, Catalog)]
+    """The catalogs in the folder of a file that words of glasses name, as MINE of NAME_MINE."""
+    in_folder = catalogs_in_folder(file)
+    named = [name for word in words if (name := unquoted(word).rpartition("_")[2]).upper() in in_folder]
+    catalogs = catalogs_of_lens(named, user, report) if named else ()
+    return [catalog for catalog in catalogs if isinstance(catalog, Catalog)]
 
 
-def medium(word: str, shelf: Shelf, *, place: Place, report: Draft) -> Glass:
-    """The medium of a word. Raises UnknownGlass, and LensFileError for what is no glass."""
+def medium(word: str, library: GlassLibrary, *, place: Place, report: Draft) -> Glass:
+    """The medium of a word. Raises UnknownGlass, and LensFileError for other words."""
     name = unquoted(word)
     if report.substitutes.of(name) not in (None, FORMULA):
-        told = None if name.upper() in shelf.private else _figures(name, place)
-        numbers = None if told is None or told.formula != "model" else tuple(told.coefficients.tolist()[:2])
-        how = {"catalogs": shelf.came, "user": shelf.user, "place": place, "report": report}
-        return listed_glass(name, **how, figures=numbers)
-    if name.upper() in shelf.private:
+        glass = None if name.upper() in library.private else _figures(name, place)
+        numbers = None if glass is None or glass.formula != "model" else tuple(glass.coefficients.tolist()[:2])
+        sources = {"catalogs": library.came, "user": library.user, "place": place, "report": report}
+        return listed_glass(name, **sources, figures=numbers)
+    if name.upper() in library.private:
         report.glass(place.surface, name, "private glass of the file (PRV)")
-        return shelf.private[name.upper()]
+        return library.private[name.upper()]
     if name.upper() == "AIR" or not name:
         return AIR
     figures = _figures(name, place)
     if figures is not None:
         report.glass(place.surface, name, "nd and Vd by its digits, partial dispersion of the normal line")
-        _refuse_estimates(name, *_fictitious_error(figures, shelf.wavelengths), place=place, report=report)
+        _refuse_estimates(name, *_fictitious_error(figures, library.wavelengths), place=place, report=report)
         return figures
-    return _listed(name, shelf, place=place, report=report)
+    return _listed(name, library, place=place, report=report)
 
 
 def _figures(name: str, place: Place) -> Glass | None:
@@ -106,10 +103,10 @@ def _figures(name: str, place: Place) -> Glass | None:
 def _fictitious_error(glass: Glass, wavelengths: Sequence[float]) -> tuple[list[float], float]:
     """Wavelengths beyond the lines F and C, and by how much an index there, estimated from n_d and V_d, may err.
 
-    It is told by the difference from n² = 1 + B λ²/(λ² - C) of the same n_d and V_d. Of 1,180 glasses of four makers at
-    0.4047 µm it is 3.9e-4 (median), where the estimate errs by 1.4e-4 (median) and 1.4e-3 (95 %).
+    The error is the difference from n² = 1 + B λ²/(λ² - C) of the same n_d and V_d. For 1,180 glasses of four makers at
+    0.4047 µm its median is 3.9e-4; the estimate errs by 1.4e-4 (median) and 1.4e-3 (95 %).
     """
-    outside = [wave for wave in wavelengths if not _TOLD[0] <= wave <= _TOLD[1]]
+    outside = [wave for wave in wavelengths if not _DETERMINED[0] <= wave <= _DETERMINED[1]]
     if not outside or glass.formula != "model":
         return [], 0.0
     nd, vd, _ = glass.coefficients.tolist()
@@ -126,70 +123,69 @@ def _fictitious_error(glass: Glass, wavelengths: Sequence[float]) -> tuple[list[
 
 
 def _refuse_estimates(name: str, waves: Sequence[float], error: float, *, place: Place, report: Draft) -> None:
-    """Refuse indices at wavelengths that a formula estimates too badly, unless that was asked for; else report them."""
+    """Refuse indices that a formula estimates with too large an error, unless that was requested; else report them."""
     if not waves:
         return
     listed = ", ".join(f"{1e3 * wave:g}" for wave in waves[:5])
-    what = f"the index of {name} at {listed} nm is estimated by a formula, to about {error:.1e}"
+    estimate = f"the index of {name} at {listed} nm is estimated by a formula, to about {error:.1e}"
     if error <= _MOST_ERROR:
-        report.note(f"{place}: {what}")
+        report.note(f"{place}: {estimate}")
     elif report.substitutes.takes_formula(name):
         report.substituted.add(name.upper())
-        report.warn(f"{what}, as asked for", place)
+        report.warn(f"{estimate}, as requested", place)
     else:
         ways = f"--substitute {name}=GLASS, or {name}={FORMULA} to accept the estimate (`substitute`)"
-        raise LensFileError(
-            f"{what}; expected {_MOST_ERROR:.0e} at most: name the glass that is meant by {ways}", place
-        )
+        message = f"{estimate}; expected {_MOST_ERROR:.0e} at most: name the intended glass by {ways}"
+        raise LensFileError(message, place)
 
 
-def _listed(name: str, shelf: Shelf, *, place: Place, report: Draft) -> Glass:
+def _listed(name: str, library: GlassLibrary, *, place: Place, report: Draft) -> Glass:
     """The glass of a catalog, by NAME_CATALOG or NAME."""
     plain, _, catalog = name.rpartition("_")
     for spelled in (name, plain):
         if report.substitutes.of(spelled) is not None:
-            return listed_glass(spelled, catalogs=shelf.came, user=shelf.user, place=place, report=report)
-    hits = plain_names(plain, came=shelf.came, user=shelf.user) if plain else ()
-    found = [hit for hit in hits if same_catalog(hit[1], catalog)]
-    is_told = bool(found)
-    found = found or list(plain_names(name, came=shelf.came, user=shelf.user))
-    if not found:
-        return _by_alias(plain, catalog, name, shelf, place=place, report=report)
-    spelling, home = found[0]
-    here = {other for other, where in found[1:] if where == home and other != spelling}
+            return listed_glass(spelled, catalogs=library.came, user=library.user, place=place, report=report)
+    hits = plain_names(plain, came=library.came, user=library.user) if plain else ()
+    matches = [hit for hit in hits if same_catalog(hit[1], catalog)]
+    is_stated = bool(matches)
+    matches = matches or list(plain_names(name, came=library.came, user=library.user))
+    if not matches:
+        return _by_alias(plain, catalog, name, library, place=place, report=report)
+    spelling, home = matches[0]
+    here = {other for other, where in matches[1:] if where == home and other != spelling}
     if here:
         listed = ", ".join([spelling, *sorted(here)])
         raise LensFileError(f"{shown(name)} may be {listed} of {home}; spell it as the catalog does", place)
-    rivals = [f"{other} ({where})" for other, where in found[1:] if other != spelling]
+    rivals = [f"{other} ({where})" for other, where in matches[1:] if other != spelling]
     if rivals:
         report.warn(f"{name} is taken for {spelling} ({home}), but may be {', '.join(rivals)}", place)
-    told = [next((catalog for catalog in shelf.came if catalog.name == home), home)] if is_told or rivals else []
-    return listed_glass(spelling, catalogs=told, user=shelf.user, place=place, report=report)
+    stated = [next((catalog for catalog in library.came if catalog.name == home), home)] if is_stated or rivals else []
+    return listed_glass(spelling, catalogs=stated, user=library.user, place=place, report=report)
 
 
-def _by_alias(plain: str, catalog: str, name: str, shelf: Shelf, *, place: Place, report: Draft) -> Glass:
+def _by_alias(plain: str, catalog: str, name: str, library: GlassLibrary, *, place: Place, report: Draft) -> Glass:
     """A glass by another spelling of its catalog. Raises UnknownGlass."""
     if plain:
         try:
             with warnings.catch_warnings(action="ignore"):
-                glass = find_glass(plain, catalogs=[catalog], user=shelf.user, where=str(place))
+                glass = find_glass(plain, catalogs=[catalog], user=library.user, where=str(place))
         except UnknownGlass:
             glass = None
         if glass is not None and same_catalog(glass.catalog, catalog):
-            return listed_glass(glass.listed_name, catalogs=[catalog], user=shelf.user, place=place, report=report)
-    return listed_glass(name, catalogs=shelf.came, user=shelf.user, place=place, report=report)
+            return listed_glass(glass.listed_name, catalogs=[catalog], user=library.user, place=place, report=report)
+    return listed_glass(name, catalogs=library.came, user=library.user, place=place, report=report)
 
 
 def private_glasses(
     rows: dict[str, Record], wavelengths: Sequence[float], unnamed: Sequence[str], report: Draft
 ) -> dict[str, Glass]:
-    """The glasses between PRV and END; wavelengths: those of the lens, µm; unnamed: names that stand for none."""
-    found = {}
+    """The glasses between PRV and END; wavelengths: those of the lens, µm; unnamed: glasses without a
+    name in the lens."""
+    nameless, glasses = [word.upper() for word in unnamed], {}
     for name, row in rows.items():
         glass = _private(row, wavelengths, report)
-        is_unnamed = name in (word.upper() for word in unnamed)
-        found[name] = dataclasses.replace(glass, name="") if is_unnamed else glass
-    return found
+        glasses[name] = dataclasses.replace(glass, name="") if name in nameless else glass
+    return glasses
 
 
 def _private(row: Record, wavelengths: Sequence[float], report: Draft) -> Glass:
@@ -216,8 +212,9 @@ def _private(row: Record, wavelengths: Sequence[float], report: Draft) -> Glass:
 
 
 def micrometres(word: str, place: Place) -> float:
-    """A wavelength in nm as µm, rounded once."""
-    number(word, "wavelength", place)
+    """A wavelength in nm as µm, rounded once. Raises LensFileError unless it is above 0."""
+    if not number(word, "wavelength", place) > 0:
+        raise LensFileError(f"WL is {shown(word)}, expected a wavelength in nm", place)
     return float(Decimal(re.sub("[dD]", "e", word)).scaleb(-3))
 
 
@@ -229,7 +226,7 @@ def _table(
         message = f"private glass {shown(name)} with {len(indices)} indices at {len(waves)} wavelengths (PWL)"
         raise LensFileError(f"{message}, expected as many", row.place)
     pairs = dict(zip(waves, indices, strict=True))
-    if len(pairs) < len(waves) or min(waves) <= 0 or min(indices) <= 0:
+    if len(pairs) < len(waves) or min(indices) <= 0:
         raise LensFileError(f"private glass {shown(name)}: wavelengths and indices differ and are above 0", row.place)
     if len(set(indices)) == 1:
         return constant(indices[0], name)
@@ -240,9 +237,7 @@ def _table(
     glass = from_table(nodes, met, exact=len(lines) if len(lines) < _TERMS else 0, name=name)
     errors = (refractive_index(glass, double(nodes)) - double(met)).abs().tolist()
     if len(nodes) > _TERMS:
-        report.note(
-            f"private glass {name}: a formula for its {len(nodes)} indices, which it meets to {max(errors):.1e}"
-        )
+        report.note(f"private glass {name}: a formula for its {len(nodes)} indices, met to {max(errors):.1e}")
     if missing:
         error = max(*errors, _table_error(glass, nodes, met, missing))
         _refuse_estimates(name, missing, error, place=row.place, report=report)
@@ -252,17 +247,17 @@ def _table(
 
 
 def _table_error(glass: Glass, nodes: list[float], indices: list[float], waves: list[float]) -> float:
-    """By how much a formula through indices at nodes may err at other wavelengths: its difference from another one.
+    """The error of a formula through indices at other wavelengths, estimated by the difference from another formula.
 
-    That is of a term less; for three indices or fewer A + B/λ + C/λ^3.5, which is as good as Schott's.
+    That has a term less; for three indices or fewer it is A + B/λ + C/λ^3.5, which is as good as Schott's.
     """
     if len(nodes) > 3:
         other = refractive_index(from_table(nodes, indices, terms=min(len(nodes), _TERMS) - 1), double(waves))
     else:
         powers = (0.0, -1.0, -3.5)[: len(nodes)]
         basis = torch.stack([double(nodes) ** power for power in powers], -1)
-        found = torch.linalg.solve(basis, double(indices))
-        other = sum(c * double(waves) ** power for c, power in zip(found, powers, strict=True))
+        coefficients = torch.linalg.solve(basis, double(indices))
+        other = sum(c * double(waves) ** power for c, power in zip(coefficients, powers, strict=True))
     return float((refractive_index(glass, double(waves)) - other).abs().max())
 
 
@@ -270,7 +265,7 @@ def _table_error(glass: Glass, nodes: list[float], indices: list[float], waves: 
 
 
 def word(glass: Glass, private: dict[str, Glass], user: Sequence[Path], place: Place) -> str:
-    """How a surface names its medium; glasses that have to be private are put into `private`.
+    """The word of a surface for its medium; glasses that have to be private are put into `private`.
 
     Raises LensFileError for a medium that a .seq file cannot hold.
     """
@@ -294,7 +289,7 @@ def _by_digits(glass: Glass, place: Place) -> str:
     if figures is not None and exact_list(figures.coefficients, "model glass", place) == [nd, vd, dpgf]:
         return glass.name
     if glass.name:
-        message = f"a model glass named {glass.name!r}; a .seq file tells model glasses by their figures"
+        message = f"a model glass named {glass.name!r}; a .seq file identifies model glasses by index and Abbe number"
         raise LensFileError(f"{message}: leave out the name", place)
     return f"{nd}:{vd}"
 
@@ -303,9 +298,9 @@ def _private_name(glass: Glass, private: dict[str, Glass], place: Place) -> str:
     """The name of a private glass; one without a name gets one that is free."""
     if not glass.name:
         same = (key for key, other in private.items() if not other.name and _same(other, glass))
-        found = next(same, None) or next(n for k in range(1, 10**4) if (n := f"MEDIUM{k}") not in private)
-        private[found] = glass
-        return found
+        name = next(same, None) or next(n for k in range(1, 10**4) if (n := f"MEDIUM{k}") not in private)
+        private[name] = glass
+        return name
     if not re.fullmatch(r"[^\s'\"!;&^]+", glass.name) or glass.name.upper() in ("AIR", "REFL"):
         raise LensFileError(f"the name of the glass is {glass.name!r}, expected one word", place)
     key = glass.name.upper()
@@ -315,24 +310,24 @@ def _private_name(glass: Glass, private: dict[str, Glass], place: Place) -> str:
     return glass.name
 
 
-def _same(one: Glass, other: Glass) -> bool:
-    return one.formula == other.formula and torch.equal(one.coefficients, other.coefficients)
+def _same(a: Glass, b: Glass) -> bool:
+    return a.formula == b.formula and torch.equal(a.coefficients, b.coefficients)
 
 
 def _catalog_name(glass: Glass, user: Sequence[Path], place: Place) -> str:
     """NAME_CATALOG without hyphens, if that finds the same figures again."""
-    listed = glass.listed_name or glass.name
-    written = f"{re.sub('[^A-Za-z0-9+]', '', listed)}_{glass.catalog}".upper()
+    spelling = glass.listed_name or glass.name
+    written = f"{re.sub('[^A-Za-z0-9+]', '', spelling)}_{glass.catalog}".upper()
     try:
         with warnings.catch_warnings(action="ignore"):
             report = Draft(place.file, "seq")
-            shelf = Shelf({}, came_with(place.file, [written], user, report), user)
-            found = _listed(written, shelf, place=place, report=report)
+            library = GlassLibrary({}, came_with(place.file, [written], user, report), user)
+            listed = _listed(written, library, place=place, report=report)
     except UnknownGlass:
         if glass.catalog:
             return written
-        found = AIR
-    if found.formula != glass.formula or not torch.equal(found.coefficients, glass.coefficients.detach().cpu()):
+        listed = AIR
+    if listed.formula != glass.formula or not torch.equal(listed.coefficients, glass.coefficients.detach().cpu()):
         message = f"the figures of {glass.name!r} are not those of its catalog; a file holds its name only"
         raise LensFileError(f"{message}: use the listed glass or a model glass", place)
     return written

@@ -1,8 +1,8 @@
 """The commands of a CODE V sequence (.seq), a row each, and a text sorted by them: the system and the surfaces.
 
-A sequence is a stream of commands, one after another: `;` parts two of them on a line, `&` at the end of a line goes
-on in the next, `!` begins a comment, texts stand in ' or ". Three letters tell a command, in capitals or not; behind
-them may stand what it is of: a surface (SO, SI, Sk), a field (Fk), a wavelength (Wk), a zoom position (Zk).
+A sequence is a stream of commands: `;` separates two of them on a line, `&` at the end of a line continues it in the
+next, `!` begins a comment, texts are in ' or ". A command has three letters, in either case; it may be followed by its
+object: a surface (SO, SI, Sk), a field (Fk), a wavelength (Wk), a zoom position (Zk).
 """
 
 import re
@@ -10,11 +10,9 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from raytrace.io.report import IGNORED, READ, UNKNOWN, Draft
-from raytrace.io.source import MAX_SURFACES, LensFileError, Place, UnsupportedSurface, shown
-from raytrace.io.spelling import is_number
-from raytrace.io.zemax.keywords import Block, Record
+from raytrace.io.source import MAX_SURFACES, Block, LensFileError, Place, Record, UnsupportedSurface, is_number, shown
 
-#: Field points by what they are: the commands of x and y.
+#: Commands of x and y of the field points, by the kind of field.
 FIELD_KINDS = {
     "angle": ("XAN", "YAN"),
     "object_height": ("XOB", "YOB"),
@@ -29,10 +27,10 @@ LETTERS = "ABCDEFGHJ"
 APERTURES = {"circular": ("CIR",), "rectangular": ("REX", "REY"), "elliptic": ("ELX", "ELY")}
 APERTURE_WORDS = (*(word for words in APERTURES.values() for word in words), "ADX", "ADY", "ARO")
 
-#: Label of an obscuration that makes a ring of the clear circle beside it.
+#: Label of an obscuration that makes a ring of the clear circle of its surface.
 RING = "RING"
 
-#: What CODE V has no command for stands in comments, `!raytrace catalogs SCHOTT OHARA`.
+#: Data that CODE V has no command for are in comments, `!raytrace catalogs SCHOTT OHARA`.
 OWN = "!RAYTRACE"
 _OWN_WORDS = ("AIMING", "BREAK", "CATALOGS", "NOTE", "RADIUS", "UNNAMED")
 
@@ -40,7 +38,7 @@ _OWN_WORDS = ("AIMING", "BREAK", "CATALOGS", "NOTE", "RADIUS", "UNNAMED")
 POSE_WORDS = {"x": "XDE", "y": "YDE", "z": "ZDE", "tilt_x": "ADE", "tilt_y": "BDE", "tilt_z": "CDE"}
 LEFT_HANDED = ("ADE", "BDE")
 
-#: What follows from decentres and tilts: the axes return, bend as a mirror does, or turn back behind the surface.
+#: Types of decentres and tilts: the axes return, bend as a mirror does, or turn back behind the surface.
 POSE_TYPES = ("DAR", "BEN", "REV")
 
 
@@ -76,7 +74,7 @@ LEFT_OUT = _by_word(
         " CDC HCC CUC",
         "tolerance": "DLT DLN DLV DLF DLR DLX DLY DLZ DLA DLB DLG DLC DLS TRX TRY TRR BTX BTY DSX DSY DSZ DSR BSX BSY"
         " BSZ TIR CYD CYN IRR HOM ROL CMP SWV",
-        "coatings do not bend rays": "MFL COA CWL",
+        "coatings refract no rays": "MFL COA CWL",
         "polarisation": "POL",
         "thermal expansion": "TCE",
         "how the program finds the rays of a wide field": "WID",
@@ -88,7 +86,7 @@ LEFT_OUT = _by_word(
 #: Commands that are known and not modelled: a file with one of them is refused.
 REFUSED = _by_word(
     {
-        "centre of a tilt beside the vertex": "XOD YOD ZOD",
+        "centre of a tilt off the vertex": "XOD YOD ZOD",
         "return to an earlier surface": "RET",
         "global coordinates": "GLB",
         "toroid or cylinder": "CYL YTO XTO AAS CUX RDX KX KY AR BR CR DR AP BP CP DP",
@@ -124,7 +122,7 @@ _WORD = re.compile(r"[Ll]?'[^']*'|[Ll]?\"[^\"]*\"|[^\s'\"]+")
 
 
 def commands(text: str, file: str) -> Iterator[Record]:
-    """The commands of a text, each with the line it begins in; of comments those that are ours."""
+    """The commands of a text, each with the line it begins in; and the comments of this package."""
     waiting, start = "", 0
     for line_number, line in enumerate(text.split("\n"), 1):
         place = Place(file, line_number)
@@ -139,7 +137,7 @@ def commands(text: str, file: str) -> Iterator[Record]:
         yield from _parted(waiting + held, Place(file, start))
         waiting = ""
     if waiting:
-        raise LensFileError("the last line ends in &, which says that it goes on: file cut off?", Place(file, start))
+        raise LensFileError("the last line ends in &, which continues it: file cut off?", Place(file, start))
 
 
 def _uncommented(line: str, place: Place) -> str:
@@ -167,7 +165,7 @@ def _parted(line: str, place: Place) -> Iterator[Record]:
 
 
 def _keyword(word: str) -> str:
-    """The command a word stands for; words longer than three letters may be cut to them."""
+    """The command of a word; words longer than three letters may be cut to them."""
     capitals = word.upper()
     if capitals in _KNOWN or _SURFACE.fullmatch(capitals):
         return capitals
@@ -183,7 +181,7 @@ def unquoted(word: str) -> str:
 
 
 class Sections(NamedTuple):
-    """A file sorted: the system, one block per surface, private glasses by name, what is ours."""
+    """A file sorted: the system, one block per surface, private glasses by name, comments of this package."""
 
     system: Block
     surfaces: list[Block]
@@ -192,7 +190,7 @@ class Sections(NamedTuple):
 
 
 class Stream:
-    """The commands met so far; they are read in their order, as CODE V does."""
+    """The commands so far; they are read in their order, as CODE V does."""
 
     def __init__(self, file: str, report: Draft):
         self.file, self.report = file, report
@@ -200,7 +198,7 @@ class Stream:
         self.private: dict[str, Record] = {}
         self.own: list[Record] = []
         self.pointer: Block | None = None
-        self.slope: str | None = None  # whether S tells radii (RDY) or curvatures (CUY)
+        self.slope: str | None = None  # whether S gives radii (RDY) or curvatures (CUY)
         self.in_catalog = self.has_image = False
 
     def take(self, record: Record) -> None:
@@ -211,7 +209,7 @@ class Stream:
             self._take_glass(record)
         elif any("^" in word for word in (record.keyword, *record.words) if word[0] not in "'\""):
             raise LensFileError("variables of macros (^) are not followed; export the lens as numbers", record.place)
-        elif zoom := next((found for word in record.words[:2] if (found := _ZOOM.fullmatch(word))), None):
+        elif zoom := next((match for word in record.words[:2] if (match := _ZOOM.fullmatch(word))), None):
             self._take_zoomed(record, zoom)
         else:
             self._take_command(record)
@@ -234,11 +232,11 @@ class Stream:
         if int(zoom[1]) == 1 and record.keyword in SYSTEM_READ | SURFACE_READ:
             self._take_command(record._replace(words=words))
         else:
-            self.report.met(record.keyword[:40], IGNORED, record.place, "of another zoom position, or left out in any")
+            self.report.met(record.keyword[:40], IGNORED, record.place, "of another zoom position, or left out")
 
     def _take_command(self, record: Record) -> None:
         word = record.keyword
-        if word in REFUSED and not _says_nothing(record):
+        if word in REFUSED and not _has_no_effect(record):
             place = self._place(record)
             raise UnsupportedSurface(f"{word} ({REFUSED[word]}) is not modelled", place)
         if word in _HANDLED or _SURFACE.fullmatch(word):
@@ -259,7 +257,7 @@ class Stream:
     # -- surfaces
 
     def _surface(self, record: Record) -> None:
-        """S, SO, SI, Sk: the next surface, or one that is there already, and its first numbers."""
+        """S, SO, SI, Sk: the next surface or an earlier one, and its first numbers."""
         name = record.keyword[1:]
         number = {"O": 0, "I": None, "": None}.get(name, int(name) if name.isdigit() else None)
         count = len(self.surfaces)
@@ -273,35 +271,40 @@ class Stream:
             raise LensFileError(f"S{number} where S{count} should follow; lines lost or reordered?", record.place)
         self._first_numbers(record._replace(place=self._place(record)))
 
-    def _append(self, record: Record, what: str) -> None:
+    def _append(self, record: Record, role: str) -> None:
         count = len(self.surfaces)
         if count >= MAX_SURFACES:
             raise LensFileError(f"more than {MAX_SURFACES} surfaces; no sequential lens has so many", record.place)
         if self.has_image:
             raise LensFileError("a surface after SI, the image", record.place)
-        if (count == 0) != (what == "object"):
+        if (count == 0) != (role == "object"):
             raise LensFileError(f"{record.keyword} as surface {count}; a lens begins with SO, the object", record.place)
-        self.has_image = what == "image"
+        self.has_image = role == "image"
         self.pointer = Block(record.place._replace(surface=count))
         self.surfaces.append(self.pointer)
 
     def _first_numbers(self, record: Record) -> None:
-        """Radius or curvature, thickness, glass, and how light meets it: as commands of their own."""
+        """Radius or curvature, thickness, glass, and refract or reflect: as commands of their own."""
         words, place = record.words, record.place
         if len(words) == 1 or len(words) > 4:
             message = f"{record.keyword} with {len(words)} words, expected radius, thickness and glass"
             raise LensFileError(message, place)
-        if self.slope is None and words and is_number(words[0]) and not _says_nothing(record._replace(words=words[:1])):
-            message = "whether its first number is a radius (RDM) or a curvature (RDM N) is not said before"
+        if (
+            self.slope is None
+            and words
+            and is_number(words[0])
+            and not _has_no_effect(record._replace(words=words[:1]))
+        ):
+            message = "its first number may be a radius (RDM) or a curvature (RDM N), which is not specified before"
             raise LensFileError(f"{message}; add one of them", place)
         mirror = len(words) > 2 and unquoted(words[2]).upper() == "REFL"
-        given = (self.slope or "RDY", "THI", "RMD" if mirror else "GLA", "RMD")
-        for word, keyword in zip(words, given, strict=False):
+        keywords = (self.slope or "RDY", "THI", "RMD" if mirror else "GLA", "RMD")
+        for word, keyword in zip(words, keywords, strict=False):
             slot = "CUY" if keyword == "RDY" else keyword
             self.pointer.records.setdefault(slot, []).append(record._replace(keyword=keyword, words=(word,)))
 
     def _of_surface(self, record: Record) -> None:
-        """A command of the surface it names, else of the one at hand."""
+        """A command of the surface it names, else of the current one."""
         block, words = self.pointer, record.words
         if words and _SURFACE.fullmatch(words[0]):
             block, words = self._named(words[0], record.place), words[1:]
@@ -325,14 +328,14 @@ class Stream:
             raise LensFileError(f"{shown(word)} is no surface so far; there are {len(self.surfaces)}", place)
         return self.surfaces[number]
 
-    # -- what is done at once
+    # -- commands that act at once
 
     def _radius_mode(self, record: Record) -> None:
         self.slope = "CUY" if record.words and record.words[0][:1] in "Nn" else "RDY"
 
     def _new_lens(self, record: Record) -> None:
         if self.surfaces:
-            raise LensFileError("LEN after the surfaces of a lens: a file of several lenses; part it", record.place)
+            raise LensFileError("LEN after the surfaces of a lens: a file of several lenses; split it", record.place)
 
     def _catalog(self, record: Record) -> None:
         self.in_catalog = record.keyword == "PRV"
@@ -361,8 +364,8 @@ _HANDLED = {
 }
 
 
-def _says_nothing(record: Record) -> bool:
-    """Whether a decentre or a like number is given and 0, or what would not be modelled is switched off."""
+def _has_no_effect(record: Record) -> bool:
+    """Whether a decentre or a like number is 0, or a feature that is not modelled is switched off."""
     if [word.upper() for word in record.words] in (["N"], ["NO"]):
         return True
     numbers = [word for word in record.words if is_number(word)]

@@ -8,12 +8,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from raytrace.io.codev import glass as seq_glass
-from raytrace.io.codev import surfaces as seq_phase
+from raytrace.io.codev import glass as codev_glass
 from raytrace.io.codev.keywords import APERTURES, FIELD_KINDS, LEFT_HANDED, LETTERS, OWN, POSE_WORDS, RING
-from raytrace.io.codev.surfaces import INFINITY
-from raytrace.io.source import LensFileError, Place
-from raytrace.io.spelling import exact, exact_list, one_line, quoted, refuse_departure, word
+from raytrace.io.codev.surfaces import INFINITY, phase_lines
+from raytrace.io.source import LensFileError, Place, exact, exact_list, one_line, quoted, refuse_sag_terms, word
 from raytrace.materials.glass import Glass
 from raytrace.system.apertures import Aperture
 from raytrace.system.lens import Lens, SystemAperture
@@ -27,7 +25,7 @@ _APERTURES = {"entrance_pupil_diameter": "EPD", "image_f_number": "FNO", "object
 
 _TILTS = ("tilt_x", "tilt_y", "tilt_z")
 
-#: Characters of a line, after which a list goes on in the next.
+#: Characters of a line, after which a list continues in the next.
 _LINE = 72
 
 
@@ -35,8 +33,8 @@ def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = ()) -> bytes:
     """The content of a .seq file of the lens, in mm, its surfaces by their curvatures.
 
     file: its name, for messages. catalogs: the user's glass catalogs that the lens was read with.
-    Raises LensFileError for what a .seq file cannot hold: a batch of lenses, nan, terms of r² and beyond r²⁰, apertures
-    other than EPD, FNO and NAO, polygons, names and partial dispersion of model glasses.
+    Raises LensFileError for data that a .seq file cannot hold: a batch of lenses, nan, terms of r² and beyond r²⁰,
+    apertures other than EPD, FNO and NAO, polygons, names and partial dispersion of model glasses.
     """
     place, private = Place(file), {}
     surfaces = []
@@ -54,7 +52,7 @@ def _system(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
         )
     if fields.telecentric:
         raise LensFileError("a telecentric object space, which a .seq file does not hold here", place)
-    waves = [seq_glass.nanometres(wave) for wave in exact_list(lens.wavelengths, "wavelength", place)]
+    waves = [codev_glass.nanometres(wave) for wave in exact_list(lens.wavelengths, "wavelength", place)]
     x, y = FIELD_KINDS[fields.kind]
     return [
         "RDM N;LEN",
@@ -69,17 +67,17 @@ def _system(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
         _listed(y, exact_list(fields.y, "field", place)),
         _listed("WTF", _weights(fields.weight, "weight of a field", place)),
         *_vignetting(lens, place),
-        *map(_wrapped, seq_glass.private_lines(private, waves, place)),
+        *map(_wrapped, codev_glass.private_lines(private, waves, place)),
     ]
 
 
-def _weights(numbers: Tensor, what: str, place: Place) -> list[str]:
+def _weights(numbers: Tensor, quantity: str, place: Place) -> list[str]:
     """Whole numbers without a point."""
-    return [weight.removesuffix(".0") for weight in exact_list(numbers, what, place)]
+    return [weight.removesuffix(".0") for weight in exact_list(numbers, quantity, place)]
 
 
 def _own(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
-    """What CODE V has no command for, in comments."""
+    """Data that CODE V has no command for, in comments."""
     own = OWN.lower()
     unnamed = [key for key, glass in private.items() if not glass.name]
     return [
@@ -90,12 +88,12 @@ def _own(lens: Lens, private: dict[str, Glass], place: Place) -> list[str]:
     ]
 
 
-def _quoted(text: str, what: str, place: Place) -> str:
+def _quoted(text: str, quantity: str, place: Place) -> str:
     """A text in quotes, of the kind that is not in it."""
-    line = one_line(text, what, place)
+    line = one_line(text, quantity, place)
     mark = next((mark for mark in "'\"" if mark not in line), None)
     if mark is None:
-        raise LensFileError(f"{what} holds both kinds of quotes, of which a .seq file needs one around it", place)
+        raise LensFileError(f"{quantity} holds both kinds of quotes, of which a .seq file needs one around it", place)
     return f"{mark}{line}{mark}"
 
 
@@ -137,7 +135,7 @@ def _vignetting(lens: Lens, place: Place) -> list[str]:
 
 
 def _cut(decentre: float, compression: float) -> tuple[str, str]:
-    """What is cut off above and below, such that halves of sum and difference are these numbers bit for bit."""
+    """The fractions cut off above and below, whose half sum and half difference are these numbers bit for bit."""
     short = repr(compression - decentre), repr(compression + decentre)
     high, low = map(Fraction, short)
     if float((low - high) / 2) == decentre and float((low + high) / 2) == compression:
@@ -162,11 +160,11 @@ def _surface(
 ) -> list[str]:
     is_round = isinstance(surface.phase, RadialPhase)
     rest = dataclasses.replace(surface, before=None, after=None, is_break=False)
-    refuse_departure(dataclasses.replace(rest, phase=None) if is_round else rest, place)
+    refuse_sag_terms(dataclasses.replace(rest, phase=None) if is_round else rest, place)
     last = len(lens.surfaces) - 1
     name = {0: "SO", last: "SI"}.get(number, "S")
     curvature = "0.0" if surface.curvature is None else exact(surface.curvature, "curvature", place)
-    glass = seq_glass.word(_medium(lens, number), private, user, place)
+    glass = codev_glass.word(_medium(lens, number), private, user, place)
     label = _quoted(surface.comment, "the comment", place) if surface.comment.strip() else ""
     return [
         f"{name} {curvature} {_thickness(surface, number == last, place)} {glass}".rstrip(),
@@ -175,14 +173,10 @@ def _surface(
         f"  {OWN.lower()} break" if surface.is_break else "",
         *_poses(surface, place),
         *_shape(surface, place),
-        *(seq_phase.lines(surface.phase, _reference(lens), place) if is_round else []),
+        *(phase_lines(surface.phase, float(lens.primary), place) if is_round else []),
         *_apertures(surface.apertures, place),
         "" if surface.semi_diameter is None else f"  CIR EDG {exact(surface.semi_diameter, 'semi-diameter', place)}",
     ]
-
-
-def _reference(lens: Lens) -> float:
-    return float(lens.primary)
 
 
 def _medium(lens: Lens, number: int) -> Glass:
@@ -195,7 +189,7 @@ def _medium(lens: Lens, number: int) -> Glass:
 
 
 def _poses(surface: Surface, place: Place) -> list[str]:
-    """Decentres and tilts, and what they are for."""
+    """Decentres and tilts, and their type."""
     pose, behind = surface.before, surface.after
     if surface.is_break and behind is None and pose is not None and pose.tilts_first:
         pose, behind = None, pose
@@ -224,25 +218,25 @@ def _pose(pose: Pose, place: Place) -> list[str]:
     ]
 
 
-def _same(one: Pose, other: Pose) -> bool:
-    """Whether two poses have the same numbers; the order of what is one number alone does not count."""
+def _same(a: Pose, b: Pose) -> bool:
+    """Whether two poses have the same numbers and the same order."""
     for name in POSE_WORDS:
-        a, b = getattr(one, name), getattr(other, name)
-        if (a is None) != (b is None) or (a is not None and not torch.equal(a, b)):
+        x, y = getattr(a, name), getattr(b, name)
+        if (x is None) != (y is None) or (x is not None and not torch.equal(x, y)):
             return False
-    return one.tilts_first == other.tilts_first
+    return a.tilts_first == b.tilts_first
 
 
 def _thickness(surface: Surface, is_image: bool, place: Place) -> str:
     thickness = surface.thickness
     if place.surface == 0 and thickness.ndim == 0 and float(thickness) == torch.inf:
         return "0.1e14"
-    found = exact(thickness, "thickness", place)
-    if is_image and float(found):
-        raise LensFileError(f"the image has thickness {found}, which a .seq file takes for a defocus", place)
-    if place.surface == 0 and abs(float(found)) >= INFINITY:
-        raise LensFileError(f"the object is {found} mm away, which CODE V takes for infinity; make it inf", place)
-    return found
+    text = exact(thickness, "thickness", place)
+    if is_image and float(text):
+        raise LensFileError(f"the image has thickness {text}, which a .seq file takes for a defocus", place)
+    if place.surface == 0 and abs(float(text)) >= INFINITY:
+        raise LensFileError(f"the object is {text} mm away, which CODE V takes for infinity; make it inf", place)
+    return text
 
 
 def _shape(surface: Surface, place: Place) -> list[str]:
@@ -253,8 +247,8 @@ def _shape(surface: Surface, place: Place) -> list[str]:
         raise LensFileError(f"a .seq file has no type for an {KINDS[surface.kind].name}; write a table (.csv)", place)
     square, *terms = exact_list(surface.coefficients, "aspheric terms", place)
     if float(square) or len(terms) > len(LETTERS):
-        found = f"a term of r² ({square})" if float(square) else f"terms to r^{2 * len(terms) + 2}"
-        raise LensFileError(f"{found}; an asphere of a .seq file has r⁴ to r²⁰: write a table (.csv)", place)
+        excess = f"a term of r² ({square})" if float(square) else f"terms to r^{2 * len(terms) + 2}"
+        raise LensFileError(f"{excess}; an asphere of a .seq file has r⁴ to r²⁰: write a table (.csv)", place)
     return ["  ASP", *conic, *(f"  {letter} {term}" for letter, term in zip(LETTERS, terms, strict=False))]
 
 
@@ -269,7 +263,7 @@ def _apertures(apertures: tuple[Aperture, ...], place: Place) -> list[str]:
         if aperture.shape not in APERTURES:
             raise LensFileError(f"a {aperture.shape} as aperture, which a .seq file does not hold", place)
         if aperture.shape == "circular" and aperture.extent[0] and (aperture.obscures or len(apertures) > 1):
-            message = "a ring that obscures, or beside another aperture, which a .seq file does not hold"
+            message = "a ring that obscures, or together with another aperture, which a .seq file does not hold"
             raise LensFileError(message, place)
         of = (" OBS" if aperture.obscures else "") + (f" L'{k}'" if len(apertures) > 1 else "")
         sizes, circle = aperture.extent, aperture.shape == "circular"

@@ -1,7 +1,7 @@
-"""The commands of an OSLO lens file (.len), a row each, and a text sorted by them: system, surfaces, what follows.
+"""The commands of an OSLO lens file (.len), and its text sorted by them: system, surfaces, lines after END.
 
-A lens file is a list of commands, as one would type them: LEN NEW begins a lens, NXT goes on to the next surface, END
-ends it. Commands of the system stand before the first surface's data and after those of the last.
+A lens file is a list of commands: LEN NEW begins a lens, NXT begins the next surface, END ends the lens. Commands of
+the system precede the data of the first surface and follow those of the last.
 """
 
 import re
@@ -9,8 +9,16 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from raytrace.io.report import IGNORED, READ, UNKNOWN, Draft
-from raytrace.io.source import MAX_SURFACES, LensFileError, Place, UnsupportedSurface, shown
-from raytrace.io.zemax.keywords import Block, Record
+from raytrace.io.source import (
+    MAX_SURFACES,
+    Block,
+    LensFileError,
+    Place,
+    Record,
+    UnsupportedSurface,
+    shown,
+    warn_of_repeats,
+)
 
 
 def _words(text: str) -> frozenset[str]:
@@ -26,7 +34,7 @@ _SYSTEM_READ = _words("LEN UNI EBR FNO NAO ANG OBH WV WW SNO NXT END")
 _SYSTEM_IGNORED = _rows(
     {
         "name of the designer; not carried": "DES",
-        "setting of the program, says nothing about the lens": "CBK CALLBACK GPRT DLRS",
+        "setting of the program, independent of the lens": "CBK CALLBACK GPRT DLRS",
     }
 )
 _SYSTEM_REFUSED = _rows(
@@ -36,7 +44,7 @@ _SYSTEM_REFUSED = _rows(
         "a jump between surfaces": "GTO",
     }
 )
-#: Switches of the system that change what is traced, unless they are off.
+#: Switches of the system that change the trace, unless they are off.
 _OFF = ("OFF", "0", "NO")
 _SWITCHES = {"TELE": "telecentric object space", "WARM": "wide-angle ray aiming", "AFO": "afocal image space"}
 
@@ -51,7 +59,7 @@ _SURFACE_IGNORED = _rows(
         "name of an element": "LMN LME ELMDF1 ELMDF2",
     }
 )
-#: Commands that make a surface into what is not modelled, or not settled, and what that is.
+#: Commands of features that are not modelled, and their names.
 _SURFACE_REFUSED = _rows(
     {
         "axes of its own": "GC",
@@ -66,8 +74,7 @@ _SURFACE_REFUSED = _rows(
 #: The point that a tilt is about, unless it is the vertex.
 _PIVOTS = _words("TOX TOY TOZ")
 
-#: What follows the lens belongs to these.
-TAIL_REASON = "behind END: variables, operands, fields of analyses or configurations, not part of the lens"
+TAIL_REASON = "after END: variables, operands, fields of analyses or configurations, not part of the lens"
 
 #: µm: the wavelengths of a lens that states none.
 DEFAULT_WAVELENGTHS = (0.58756, 0.48613, 0.65627)
@@ -77,7 +84,7 @@ _NUMBERED = re.compile(r"(WV|WW|SNO)([1-9][0-9]{0,2})")
 
 
 class Commands(Block):
-    """The commands of one surface, and the wavelengths in force where its medium stands, µm."""
+    """The commands of one surface, and the wavelengths in force where its medium is defined, µm."""
 
     def __init__(self, place: Place):
         super().__init__(place)
@@ -85,7 +92,7 @@ class Commands(Block):
 
 
 class Sections(NamedTuple):
-    """A file sorted: its LEN command, the system, the surfaces, and the wavelengths of the lens (none if not told)."""
+    """A file sorted: its LEN command, the system, the surfaces, and the wavelengths of the lens, if specified."""
 
     head: Record
     system: Block
@@ -110,41 +117,34 @@ def commands(text: str, file: str) -> Iterator[Record]:
 
 def sections(text: str, file: str, report: Draft) -> Sections:
     """The commands of the first lens of a text, each of them reported. Raises LensFileError and UnsupportedSurface."""
-    found = list(commands(text, file))
-    if not found or found[0].keyword != "LEN" or [word.upper() for word in found[0].words[:1]] != ["NEW"]:
-        place = found[0].place if found else Place(file)
+    records = list(commands(text, file))
+    if not records or records[0].keyword != "LEN" or [word.upper() for word in records[0].words[:1]] != ["NEW"]:
+        place = records[0].place if records else Place(file)
         raise LensFileError("expected LEN NEW at the beginning; is it a lens file of OSLO (.len)?", place)
     system, waves, ended = Block(Place(file)), Wavelengths(), False
-    surfaces = [Commands(found[0].place._replace(surface=0))]
-    last = _last_surface(found)
-    for record in found:
+    surfaces = [Commands(records[0].place._replace(surface=0))]
+    end = next((k for k, record in enumerate(records) if record.keyword == "END"), len(records))
+    last = sum(record.keyword == "NXT" for record in records[:end])
+    for record in records:
         if ended:
-            _tail(record, report)
+            word = record.keyword[:40]
+            if word in ("LEN", "CFG"):
+                kind = "another lens" if word == "LEN" else "further configurations"
+                report.warn(f"{word} ({kind}) after END: the lens before it is read, unchanged", record.place)
+            report.met(word, IGNORED, record.place, TAIL_REASON)
             continue
         ended = record.keyword == "END"
         if record.keyword == "NXT":
-            surfaces.append(_next(record, surfaces))
+            if len(surfaces) >= MAX_SURFACES:
+                message = f"more than {MAX_SURFACES} surfaces; no sequential lens has so many"
+                raise LensFileError(message, record.place)
+            surfaces.append(Commands(record.place._replace(surface=len(surfaces))))
         _sort(record, system, surfaces[-1], waves, report, len(surfaces) - 1 in (0, last))
     if not ended:
         message = f"no END after {len(surfaces)} surfaces; file cut off?"
-        raise LensFileError(message, found[-1].place)
-    _warn_of_repeats(surfaces, report)
-    return Sections(found[0], system, surfaces, waves.lens)
-
-
-def _last_surface(found: list[Record]) -> int:
-    count = 0
-    for record in found:
-        if record.keyword == "END":
-            break
-        count += record.keyword == "NXT"
-    return count
-
-
-def _next(record: Record, surfaces: list[Commands]) -> Commands:
-    if len(surfaces) >= MAX_SURFACES:
-        raise LensFileError(f"more than {MAX_SURFACES} surfaces; no sequential lens has so many", record.place)
-    return Commands(record.place._replace(surface=len(surfaces)))
+        raise LensFileError(message, records[-1].place)
+    warn_of_repeats(surfaces, lambda word: word != "PK", report)
+    return Sections(records[0], system, surfaces, waves.lens)
 
 
 class Wavelengths:
@@ -164,17 +164,17 @@ class Wavelengths:
             return
         self.lens = self.lens or list(DEFAULT_WAVELENGTHS)
         if number > len(self.lens) + 1:
-            raise LensFileError(f"{record.keyword}, but {len(self.lens)} wavelengths stand before it", record.place)
+            raise LensFileError(f"{record.keyword}, but {len(self.lens)} wavelengths precede it", record.place)
         self.lens[number - 1 : number] = values
 
-    def now(self) -> tuple[float, ...]:
+    def in_force(self) -> tuple[float, ...]:
         """The first wavelengths, up to the first that was never set."""
         count = next(k for k in range(1, len(self.slots) + 2) if k not in self.slots) - 1
         return tuple(self.slots[k] for k in range(1, count + 1))
 
 
 def _sort(record: Record, system: Block, surface: Commands, waves: Wavelengths, report: Draft, at_end: bool) -> None:
-    """One command into the system or a surface; at_end: of the object or the image, beside which the system stands."""
+    """One command into the system or a surface; at_end: of the object or the image, or of the system."""
     numbered = _NUMBERED.fullmatch(record.keyword)
     word, number = (numbered[1], int(numbered[2])) if numbered else (record.keyword, None)
     of_surface = record._replace(place=record.place._replace(surface=surface.place.surface))
@@ -187,7 +187,7 @@ def _sort(record: Record, system: Block, surface: Commands, waves: Wavelengths, 
         report.met(word, IGNORED, record.place, _SYSTEM_IGNORED[word])
     elif word in _SURFACE_READ:
         if word == "GLA":
-            surface.wavelengths = waves.now()
+            surface.wavelengths = waves.in_force()
         surface.records.setdefault(word, []).append(of_surface)
         report.met(word, READ, of_surface.place)
     elif word in _SURFACE_IGNORED:
@@ -197,7 +197,7 @@ def _sort(record: Record, system: Block, surface: Commands, waves: Wavelengths, 
 
 
 def _beyond(of_surface: Record, record: Record, report: Draft, at_end: bool) -> None:
-    """A command that is not read: left out where it changes nothing, refused where it does or may."""
+    """A command that is not read: left out where it changes nothing, else refused."""
     word = record.keyword
     if word in _SYSTEM_REFUSED:
         raise UnsupportedSurface(f"{word} ({_SYSTEM_REFUSED[word]}) is not modelled", record.place)
@@ -213,26 +213,10 @@ def _beyond(of_surface: Record, record: Record, report: Draft, at_end: bool) -> 
     elif word == "LMO" and [text.upper() for text in record.words[:1]] in (["ELE"], ["EGR"]):
         report.met(word, IGNORED, of_surface.place, "a group of surfaces under one name")
     elif word in _SURFACE_REFUSED or word == "LMO" or re.fullmatch(r"AS\d+", word):
-        what = _SURFACE_REFUSED.get(word, "a group that is not sequential" if word == "LMO" else "a general asphere")
-        raise UnsupportedSurface(f"{word} ({what}) is not modelled", of_surface.place)
+        feature = _SURFACE_REFUSED.get(word, "a group that is not sequential" if word == "LMO" else "a general asphere")
+        raise UnsupportedSurface(f"{word} ({feature}) is not modelled", of_surface.place)
     elif at_end:
         report.met(word[:40], UNKNOWN, record.place)
     else:
         message = f"the command {shown(word)} is not known, and may change how light passes the surface"
         raise UnsupportedSurface(f"{message}; take it out where it does not", of_surface.place)
-
-
-def _tail(record: Record, report: Draft) -> None:
-    word = record.keyword[:40]
-    if word in ("LEN", "CFG"):
-        what = "another lens" if word == "LEN" else "further configurations"
-        report.warn(f"{word} ({what}) behind END: the lens before it is read, as it stands", record.place)
-    report.met(word, IGNORED, record.place, TAIL_REASON)
-
-
-def _warn_of_repeats(surfaces: list[Commands], report: Draft) -> None:
-    for surface in surfaces:
-        for word, found in surface.records.items():
-            if len(found) > 1 and word != "PK":
-                first = found[0].place.line
-                report.warn(f"{word} stands again (first in line {first}); the last is used", found[-1].place)

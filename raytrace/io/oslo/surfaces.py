@@ -1,21 +1,17 @@
-"""A surface of an OSLO lens file as a `Surface`: shape, medium and aperture.
+"""A surface of an OSLO lens file: poses, pickups, solves, shape, medium and aperture.
 
-How a surface of an OSLO lens file stands: tilts and decentres, mirrors that bend the axis, and returns from them.
+Poses: the axes of a surface are decentred by DCX, DCY, DCZ, then tilted by TLA, TLB, TLC about x, y and z in turn (DT
+1), or tilted about z, y and x and then decentred (DT -1). TLA and TLB are left-handed, TLC right-handed. The following
+surfaces are in these axes; behind a mirror with BEN, in axes that are tilted again by the same angle, so that the axis
+of the light continues along z; behind RCO, in the axes before the surface.
 
-The axes of a surface are decentred by DCX, DCY, DCZ, then tilted by TLA, TLB, TLC about x, y and z in turn (DT 1), or
-tilted about z, y and x and then decentred (DT -1). TLA and TLB count against the right hand, TLC with it. What follows
-stands in these axes; behind a mirror with BEN, in axes that are tilted once more by as much, so that the axis of the
-light goes on along z; behind RCO, in the axes that were there before.
+Sources: Lambda Research, export of OSLO's tilts to another program (the sequence and the signs); Sinclair Optics, the
+pentaprism of the user guide; the tests of Optiland, which were written from the program's reference.
 
-Sources: Lambda Research, how tilts of OSLO are told to another program (the sequence and the signs); Sinclair Optics,
-the pentaprism of the user guide; the tests of Optiland, which were written beside the program's reference.
+Pickups: PK GLA -k is the medium of the k-th surface before. CV and TH are its curvature and its thickness, to which a
+number may be added, CVM and THM those of opposite sign; with a curvature come conic and terms.
 
-Pickups of an OSLO lens file: numbers of a surface that are those of one before it.
-
-PK GLA -k is the medium of the surface k before. CV and TH are its curvature and its thickness, to which a number may be
-added, CVM and THM those with their signs changed; with a curvature go conic and terms.
-
-Solves of an OSLO lens file: curvatures and thicknesses that the file leaves to the axial ray, by the y-nu trace.
+Solves: curvatures and thicknesses that follow from the paraxial axial ray, by the y-nu trace.
 """
 
 import dataclasses
@@ -30,9 +26,7 @@ import torch
 from raytrace.io.materials import listed_glass
 from raytrace.io.oslo.keywords import POSE_NUMBERS, Commands
 from raytrace.io.report import Draft
-from raytrace.io.source import LensFileError, Place, UnsupportedSurface, shown
-from raytrace.io.spelling import double, is_number
-from raytrace.io.zemax.keywords import Record
+from raytrace.io.source import LensFileError, Place, Record, UnsupportedSurface, double, is_number, shown
 from raytrace.materials.glass import AIR, MIRROR, Glass, constant, from_table, refractive_index
 from raytrace.system.apertures import Aperture
 from raytrace.system.poses import Pose, undone
@@ -46,13 +40,9 @@ _FIELDS = {
 
 
 def poses(commands: Commands, unit: float) -> dict[str, Pose]:
-    """The poses `before` and `after` of a surface, none where it stands as the one before it.
-
-    Raises LensFileError and UnsupportedSurface.
-    """
-    told = {word: commands.last(word) for word in POSE_NUMBERS}
-    numbers = {word: record.number(0, "tilt or decentre") for word, record in told.items() if record}
-    moved = {word: number for word, number in numbers.items() if number}
+    """The poses `before` and `after` of a surface, if any. Raises LensFileError, UnsupportedSurface."""
+    records = {word: record for word in POSE_NUMBERS if (record := commands.last(word))}
+    moved = {word: number for word, record in records.items() if (number := record.number(0, "tilt or decentre"))}
     bend, back = commands.last("BEN"), commands.last("RCO")
     for record in filter(None, (bend, back)):
         if record.words:
@@ -61,40 +51,27 @@ def poses(commands: Commands, unit: float) -> dict[str, Pose]:
         return {}
     if commands.place.surface == 0:
         word = next(iter(moved))
-        raise UnsupportedSurface(f"{word} (a tilted or decentred object) is not modelled", told[word].place)
-    before = _pose(moved, _order(commands), unit)
-    if bend:
-        return {"before": before, "after": _bent(commands, moved, bend, before)}
-    return {"before": before, "after": undone(before)} if back else {"before": before}
-
-
-def _pose(moved: dict[str, float], order: int, unit: float) -> Pose:
-    fields = {}
-    for word, number in moved.items():
-        name, sign = _FIELDS[word]
-        fields[name] = double(sign * number * (1.0 if name.startswith("tilt") else unit))
-    return Pose(**fields, tilts_first=order == -1)
-
-
-def _order(commands: Commands) -> int:
+        raise UnsupportedSurface(f"{word} (a tilted or decentred object) is not modelled", records[word].place)
     record = commands.last("DT")
     order = record.integer(0, "order of tilts and decentres") if record else 1
     if order not in (1, -1):
         raise LensFileError(f"DT is {record.words[0]}, expected 1 (decentre, then tilt) or -1", record.place)
-    return order
-
-
-def _bent(commands: Commands, moved: dict[str, float], bend: Record, before: Pose) -> Pose:
-    """The tilt of a mirror once more."""
-    mirror = commands.last("RFL", "RFH")
-    if commands.last("RCO") or mirror is None or len(moved) != 1 or next(iter(moved)) not in ("TLA", "TLB"):
-        message = "BEN is modelled on a mirror that is tilted by TLA or by TLB alone, and without RCO"
-        raise UnsupportedSurface(message, bend.place)
-    return Pose(tilt_x=before.tilt_x, tilt_y=before.tilt_y)
+    fields = {}
+    for word, number in moved.items():
+        name, sign = _FIELDS[word]
+        fields[name] = double(sign * number * (1.0 if name.startswith("tilt") else unit))
+    before = Pose(**fields, tilts_first=order == -1)
+    if bend:
+        mirror = commands.last("RFL", "RFH")
+        if back or mirror is None or len(moved) != 1 or next(iter(moved)) not in ("TLA", "TLB"):
+            message = "BEN is modelled on a mirror that is tilted by TLA or by TLB alone, and without RCO"
+            raise UnsupportedSurface(message, bend.place)
+        return {"before": before, "after": Pose(tilt_x=before.tilt_x, tilt_y=before.tilt_y)}
+    return {"before": before, "after": undone(before)} if back else {"before": before}
 
 
 class Built(NamedTuple):
-    """A surface, and the commands that it was made of."""
+    """A surface and its commands."""
 
     surface: Surface
     commands: Commands
@@ -105,16 +82,11 @@ def curved(number: float) -> torch.Tensor | None:
     return double(number) if number else None
 
 
-def what(record: Record) -> str:
-    """What a pickup picks up."""
-    return record.words[0].upper() if record.words else ""
-
-
 def picked_up(commands: Commands, before: Sequence[Built], unit: float, report: Draft) -> dict:
-    """The fields of a surface that are those of one before it. Raises LensFileError and UnsupportedSurface."""
+    """The fields of a surface that are picked up from an earlier one. Raises LensFileError and UnsupportedSurface."""
     fields = {}
     for record in commands.all("PK"):
-        kind = what(record)
+        kind = record.words[0].upper() if record.words else ""
         pickup = _PICKUPS.get(kind)
         if pickup is None or len(record.words) not in (2, 2 + pickup.adds):
             message = f"PK {shown(' '.join(record.words))} (a pickup) is not modelled, but of {', '.join(_PICKUPS)}"
@@ -127,31 +99,28 @@ def picked_up(commands: Commands, before: Sequence[Built], unit: float, report: 
         added = record.number(2, "number to add", 0.0)
         fields |= pickup.fields(before[-back].surface, added, unit)
         if kind == "GLA":
-            _report_medium(record, fields["glass"], len(before) - back, report)
+            if fields["glass"].formula == "mirror":
+                message = f"PK GLA {record.words[1]} picks up a mirror, which is not modelled"
+                raise UnsupportedSurface(message, record.place)
+            report.glass(record.place.surface, fields["glass"].name, f"that of surface {len(before) - back}")
     return fields
 
 
 def _refuse_other_sources(record: Record, instead: Sequence[str], commands: Commands, source: Commands) -> None:
-    """Raise where a picked-up number is told beside the pickup, or is itself solved for."""
+    """Raise where a picked-up number is also given, or is itself solved for."""
     pickup = " ".join(record.words[:2])
     for word in instead:
         if other := commands.last(word):
             message = (
-                f"{word} in line {other.place.line} and PK {pickup} tell the same number twice; delete one of them"
+                f"{word} in line {other.place.line} and PK {pickup} give the same number twice; delete one of them"
             )
             raise LensFileError(message, record.place)
         if word in _SOLVES and source.last(_SOLVES[word]):
-            raise UnsupportedSurface(f"PK {pickup} of what is solved for there is not modelled", record.place)
+            raise UnsupportedSurface(f"PK {pickup} of a number that is solved for there is not modelled", record.place)
 
 
 #: The solve for the number of a command.
 _SOLVES = {"RD": "PU", "TH": "PY"}
-
-
-def _report_medium(record: Record, glass: Glass, surface: int, report: Draft) -> None:
-    if glass.formula == "mirror":
-        raise UnsupportedSurface(f"PK GLA {record.words[1]} picks up a mirror, which is not modelled", record.place)
-    report.glass(record.place.surface, glass.name, f"that of surface {surface}")
 
 
 def _profile(surface: Surface, added: float, unit: float, sign: float) -> dict:
@@ -166,7 +135,7 @@ def _length(surface: Surface, added: float, unit: float, sign: float) -> dict:
 
 
 class Pickup(NamedTuple):
-    """Fields of a surface from one before it, whether a number may be added, and the commands that tell the same."""
+    """Fields of a surface from an earlier one, whether a number may be added, and the commands of the same quantity."""
 
     fields: Callable[[Surface, float, float], dict]
     adds: bool
@@ -200,10 +169,10 @@ class Step:
 
 
 def solve(steps: Sequence[Step], beam: float | None, unit: float) -> None:
-    """Fill in what is solved for, from the object on.
+    """Solve curvatures and thicknesses, from the object on.
 
-    beam: mm, height of the axial ray on surface 1 where the file tells it and the object is at infinity; None where
-    only its direction is known, which a height of 0 needs alone. Raises LensFileError and UnsupportedSurface.
+    beam: mm, height of the axial ray on surface 1 where the file gives it and the object is at infinity; None where
+    only its direction is known, which suffices for a height of 0. Raises LensFileError and UnsupportedSurface.
     """
     distance = steps[0].thickness
     infinite = distance == float("inf")
@@ -212,36 +181,34 @@ def solve(steps: Sequence[Step], beam: float | None, unit: float) -> None:
     for step in steps[1:-1]:
         behind = -n if step.is_mirror else step.index * (-1 if n < 0 else 1)
         if step.slope:
-            step.curvature = _curvature_of_oslo_solves(step, n, behind, height, slope, beam)
+            step.curvature = _solved_curvature(step, n, behind, height, slope, beam)
         slope = (n * slope - height * (behind - n) * step.curvature) / behind
         if step.height:
-            step.thickness = _thickness_of_oslo_solves(step, height, slope, beam, unit)
+            step.thickness = _solved_thickness(step, height, slope, beam, unit)
         height, n = height + slope * step.thickness, behind
 
 
-def _curvature_of_oslo_solves(
-    step: Step, n: float, behind: float, height: float, slope: float, beam: float | None
-) -> float:
+def _solved_curvature(step: Step, n: float, behind: float, height: float, slope: float, beam: float | None) -> float:
     wanted, place = step.slope.number(0, "slope of the axial ray"), step.slope.place
     if beam is None:
         raise UnsupportedSurface("PU (a solve for the slope of the axial ray) is solved for a beam by EBR only", place)
     if not height * (behind - n):
-        raise LensFileError(f"PU {wanted:g}: no curvature here bends the axial ray", place)
+        raise LensFileError(f"PU {wanted:g}: no curvature here refracts the axial ray", place)
     return (n * slope - behind * wanted) / (height * (behind - n))
 
 
-def _thickness_of_oslo_solves(step: Step, height: float, slope: float, beam: float | None, unit: float) -> float:
+def _solved_thickness(step: Step, height: float, slope: float, beam: float | None, unit: float) -> float:
     wanted, place = step.height.number(0, "height of the axial ray") * unit, step.height.place
     if beam is None and wanted:
         raise UnsupportedSurface(f"PY {wanted / unit:g} is solved for a beam by EBR only; PY 0 for any", place)
-    found = (wanted - height) / slope if slope else float("inf")
-    if abs(found) > 1e12:
-        raise LensFileError(f"PY {wanted / unit:g}: the axial ray never comes to that height", place)
-    return found
+    distance = (wanted - height) / slope if slope else float("inf")
+    if abs(distance) > 1e12:
+        raise LensFileError(f"PY {wanted / unit:g}: the axial ray never reaches that height", place)
+    return distance
 
 
 def focal_length(steps: Sequence[Step]) -> float | None:
-    """mm, of the steps solved; None for an afocal lens. Its sign is that of a lens before which no mirror stands."""
+    """mm, of the steps solved; None for an afocal lens. Its sign is that of a lens without a mirror before it."""
     height, slope, n = 1.0, 0.0, steps[0].index
     for step in steps[1:-1]:
         behind = -n if step.is_mirror else step.index * (-1 if n < 0 else 1)
@@ -253,7 +220,7 @@ def focal_length(steps: Sequence[Step]) -> float | None:
 #: Lens units: an object at this distance or beyond is at infinity.
 INFINITE = 1e8
 
-#: Aspheric terms by the power of r they stand with.
+#: Aspheric terms by their power of r.
 _TERMS = {"AD": 4, "AE": 6, "AF": 8, "AG": 10}
 
 #: No medium has an index beyond these.
@@ -261,10 +228,10 @@ _SMALLEST, _LARGEST = 0.1, 6.0
 
 
 def build(commands: Commands, before: Sequence[Built], unit: float, user: Sequence[Path], report: Draft) -> Built:
-    """The surface of its commands, lengths in units of `unit` mm; what is solved for is 0 until it is solved.
+    """The surface of its commands, lengths in units of `unit` mm; solved quantities are 0 until `solve`.
 
-    before: the surfaces that it may pick up from. user: glass catalogs (.agf). Raises LensFileError, UnsupportedSurface
-    and UnknownGlass.
+    before: the surfaces from which it may pick up. user: glass catalogs (.agf).
+    Raises LensFileError, UnsupportedSurface and UnknownGlass.
     """
     note = commands.last("NOT")
     radius, aperture = _aperture(commands, unit)
@@ -286,12 +253,12 @@ def build(commands: Commands, before: Sequence[Built], unit: float, user: Sequen
     return Built(surface, commands)
 
 
-def _last_number(commands: Commands, word: str, what: str) -> float:
+def _last_number(commands: Commands, word: str, quantity: str) -> float:
     record = commands.last(word)
-    return record.number(0, what) if record else 0.0
+    return record.number(0, quantity) if record else 0.0
 
 
-def step(built: Built, primary: float, before: Step | None) -> Step:
+def step_of(built: Built, primary: float, before: Step | None) -> Step:
     """The surface as the axial ray meets it, at the primary wavelength in µm."""
     surface, commands = built
     index = before.index if surface.is_mirror else float(refractive_index(surface.glass, double(primary)))
@@ -302,57 +269,57 @@ def step(built: Built, primary: float, before: Step | None) -> Step:
 
 
 def _solves(commands: Commands) -> tuple[Record | None, Record | None]:
-    """PU and PY. Raises LensFileError where the number that they solve for is told beside them."""
+    """PU and PY. Raises LensFileError where the number that they solve for is also given."""
     solves = commands.last("PU"), commands.last("PY")
-    pickups = {what(record): record for record in commands.all("PK")}
-    told = (
+    pickups = {record.words[0].upper(): record for record in commands.all("PK") if record.words}
+    stated = (
         (commands.last("RD", "CV") or pickups.get("CV") or pickups.get("CVM")),
         (commands.last("TH") or pickups.get("TH") or pickups.get("THM")),
     )
-    for given, solved in zip(told, solves, strict=True):
+    for given, solved in zip(stated, solves, strict=True):
         if given and solved:
-            message = f"{given.keyword} in line {given.place.line} and {solved.keyword} tell the same number twice"
+            message = f"{given.keyword} in line {given.place.line} and {solved.keyword} give the same number twice"
             raise LensFileError(f"{message}; delete one of them", solved.place)
     return solves
 
 
-def solved(surface: Surface, found: Step) -> Surface:
-    """The surface with what its solves came to."""
-    if found.slope:
-        surface = dataclasses.replace(surface, curvature=double(found.curvature))
-    return dataclasses.replace(surface, thickness=double(found.thickness)) if found.height else surface
+def solved(surface: Surface, step: Step) -> Surface:
+    """The surface with the results of its solves."""
+    if step.slope:
+        surface = dataclasses.replace(surface, curvature=double(step.curvature))
+    return dataclasses.replace(surface, thickness=double(step.thickness)) if step.height else surface
 
 
 def _curvature(commands: Commands) -> float:
     """In 1/units: of RD, where 0 is a plane, or CV."""
     radius, curvature = commands.last("RD"), commands.last("CV")
     if radius and curvature:
-        raise LensFileError(f"CV, but RD in line {radius.place.line} tells the radius", curvature.place)
+        raise LensFileError(f"CV, but RD in line {radius.place.line} gives the radius", curvature.place)
     if curvature:
         return curvature.number(0, "curvature")
-    found = radius.number(0, "radius of curvature") if radius else 0.0
-    return 1 / found if found else 0.0
+    length = radius.number(0, "radius of curvature") if radius else 0.0
+    return 1 / length if length else 0.0
 
 
 def _thickness(commands: Commands, unit: float) -> float:
     record = commands.last("TH")
-    found = record.number(0, "thickness") if record else 0.0
-    if commands.place.surface == 0 and found >= INFINITE:
+    distance = record.number(0, "thickness") if record else 0.0
+    if commands.place.surface == 0 and distance >= INFINITE:
         return float("inf")
-    if abs(found) >= INFINITE:
+    if abs(distance) >= INFINITE:
         raise LensFileError(f"TH is {shown(record.words[0])}; only the object may be at infinity", record.place)
-    return found * unit
+    return distance * unit
 
 
 def _coefficients(commands: Commands, unit: float) -> torch.Tensor | None:
     """Of r², r⁴, … r¹⁰: OSLO's asphere begins with r⁴."""
-    found = {power: commands.last(word) for word, power in _TERMS.items()}
-    terms = [0.0, *(r.number(0, f"coefficient of r^{p}") / unit ** (p - 1) if r else 0.0 for p, r in found.items())]
+    records = {power: commands.last(word) for word, power in _TERMS.items()}
+    terms = [0.0, *(r.number(0, f"coefficient of r^{p}") / unit ** (p - 1) if r else 0.0 for p, r in records.items())]
     return double(terms) if any(terms) else None
 
 
 def _aperture(commands: Commands, unit: float) -> tuple[float | None, tuple[Aperture, ...]]:
-    """AP r is a semi-diameter, AP CHK r also clips rays; 0 is left to the program. The object's says its field."""
+    """AP r is a semi-diameter, AP CHK r also clips rays; 0 is left to the program. That of the object is its field."""
     record = commands.last("AP")
     if record is None or commands.place.surface == 0:
         return None, ()
@@ -367,11 +334,11 @@ def _aperture(commands: Commands, unit: float) -> tuple[float | None, tuple[Aper
 
 
 def _medium(commands: Commands, user: Sequence[Path], report: Draft) -> Glass:
-    """AIR, RFL and RFH (a mirror) or GLA: the last of them; air where none stands."""
-    found = commands.all("AIR", "RFL", "RFH", "GLA")
-    if not found:
+    """AIR, RFL and RFH (a mirror) or GLA: the last of them; air where there is none."""
+    records = commands.all("AIR", "RFL", "RFH", "GLA")
+    if not records:
         return AIR
-    record = found[-1]
+    record = records[-1]
     if record.keyword in ("RFL", "RFH"):
         return MIRROR
     return AIR if record.keyword == "AIR" else _glass(record, commands, user, report)

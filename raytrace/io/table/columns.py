@@ -1,8 +1,8 @@
-"""The columns of a prescription table: the headings that designers, programs and patents write, and what each means.
+"""The columns of a prescription table: the headings of designers, programs and patents, and the quantity of each.
 
-A column of numbers is read by its name or refused by it, never guessed and never dropped. Case counts where it tells
-apart: `nD` is the index at the sodium D line, `nd` at the helium d line; `D` is a diameter beside a named thickness,
-and the thickness where nothing else could be.
+A column of numbers is read by its name or refused by it, never guessed and never dropped. Case is significant where it
+distinguishes: `nD` is the index at the sodium D line, `nd` at the helium d line; `D` is a diameter where another column
+is named thickness, and else the thickness.
 """
 
 import functools
@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from raytrace.io.report import IGNORED, READ, UNKNOWN, Draft
-from raytrace.io.source import LensFileError, Place, shown
-from raytrace.io.spelling import MILLIMETRES
+from raytrace.io.source import MILLIMETRES, LensFileError, Place, shown
 from raytrace.materials.glass import LINES
 from raytrace.system.shapes import KINDS
 
@@ -59,14 +58,14 @@ _SPELLINGS = {
     "pressure": "pressure",
 }
 
-#: Columns that are known and tell nothing that a surface needs, with the reason.
+#: Columns that are known and left out, with the reason.
 _OTHERS = {
     "a focal length follows from the surfaces": "f, fl, efl, focal length, lens focal length, element focal length"
     ", focal length of lens, component focal length, 焦点距離, 焦距, brennweite, focale, distance focale",
     "a size of the mechanical part": "mech semidia, mechanical semidiameter, mech diam, mech dia, mechanical diameter"
     ", chip zone, edge thickness, コバ厚",
     "a setting of the program": "ccy, cuc, thc, glc, spe, id no",
-    "coatings and heat bend no rays": "coating, tce, tce x 1e6, cte, specific gravity, density, 比重",
+    "coatings and heat refract no rays": "coating, tce, tce x 1e6, cte, specific gravity, density, 比重",
 }
 
 
@@ -82,7 +81,7 @@ def _by_spelling(spellings: dict[str, str]) -> dict[str, str]:
 
 
 _HEADINGS, _IGNORED = _by_spelling(_SPELLINGS), _by_spelling(_OTHERS)
-#: Read with its case: what may be a thickness or a diameter.
+#: A thickness or a diameter; case-sensitive.
 _EITHER = {"d": "d", "D": "D"}
 
 #: Headings of the coefficient of r^n: a4, A4, r4, r^4, 4th, 4th order.
@@ -94,13 +93,13 @@ _UNITS = {"mm": "mm", "millimeter": "mm", "millimeters": "mm", "millimetre": "mm
 _UNITS |= {"mm^1": "mm", "mm1": "mm", "/mm": "mm", "in": "in", "inch": "in", "inches": "in", '"': "in", "cm": "cm"}
 _UNITS |= {"m": "m", "meter": "m", "meters": "m", "μm": "μm", "um": "μm", "micron": "μm", "microns": "μm", "nm": "nm"}
 _UNITS |= {"1/in": "in", "1/cm": "cm", "1/m": "m", "unit:mm": "mm", "unitmm": "mm", "単位mm": "mm", "单位mm": "mm"}
-#: Stands for a column whose meaning is not known: its cells may be words, but no numbers.
+#: A column of unknown meaning: its cells may be words, but not numbers.
 UNREAD = "?"
 _LENGTHS = ("radius", "thickness", "curvature", "semi_diameter", "diameter", "d", "D")
 
 
 class Heading(NamedTuple):
-    """What one heading says: a key of the spellings, "a4", "index F", "abbe e", "d", "D", "ignored"; and its unit."""
+    """The meaning of a heading: a key of _SPELLINGS, "a4", "index F", "abbe e", "d", "D", "ignored"; and its unit."""
 
     name: str
     unit: str = ""
@@ -108,14 +107,14 @@ class Heading(NamedTuple):
 
 @functools.lru_cache(4096)
 def meaning(heading: str) -> Heading | None:
-    """What a heading means by itself; None where it is not known."""
+    """The meaning of a single heading; None where it is not known."""
     text = unicodedata.normalize("NFKC", heading).strip().strip('"*')
     text = re.sub(r"\s+", " ", re.sub(r"(?<=[\u3040-\u9fff])(?=[!-~νυφ])", " ", text))
     text = re.sub(r"(?<=\s)(?:at|for|the)\s", "", text)
     bare = squeezed(text)
-    found = _named(bare) or _at_wavelength(text.replace(" ", ""))
-    if found or len(text) > 60 or text.count(" ") > 8:
-        return found
+    known = _named(bare) or _at_wavelength(text.replace(" ", ""))
+    if known or len(text) > 60 or text.count(" ") > 8:
+        return known
     if bare.casefold() in _UNITS:
         return Heading("", _UNITS[bare.casefold()])
     for separators in (r"[\[\](){}【】（）]", r"[,;/=]", r"\s(?=\S+$)", r"(?<=\S)\s"):
@@ -146,8 +145,8 @@ def _named(bare: str) -> Heading | None:
 
 def _at_wavelength(text: str) -> Heading | None:
     """An index, or a line, by its wavelength: n(587.6nm) is nd."""
-    found = _WAVELENGTH.fullmatch(text)
-    near = [name for name, place in LINES.items() if abs(1e3 * place - float(found[1])) < 0.6] if found else []
+    match = _WAVELENGTH.fullmatch(text)
+    near = [name for name, place in LINES.items() if abs(1e3 * place - float(match[1])) < 0.6] if match else []
     return Heading(f"{'index' if text[0] in 'nN' else 'line'} {near[0]}") if len(near) == 1 else None
 
 
@@ -160,7 +159,7 @@ def _at_line(kind: str, line: str, *, capital: bool) -> Heading | None:
 
 
 def _merged(parts: list[Heading | None]) -> Heading | None:
-    """One meaning of several words or symbols that say the same, as 'Abbe number (νe)' and 'R [mm]'; else None."""
+    """One meaning of several words or symbols of the same quantity, as 'Abbe number (νe)' and 'R [mm]'; else None."""
     if None in parts:
         return None
     units = {part.unit for part in parts if part.unit}
@@ -188,24 +187,24 @@ def is_header(cells: list[str], *, known: float = 0.5) -> bool:
     cells = [cell for cell in cells if cell.strip()]
     if not 2 <= len(cells) <= 200 or max(map(len, cells)) > 60:
         return False
-    found = [column for column in _without_counters(cells)[1] if column is not None]
-    names = {column.name for column in found}
+    headings = [column for column in _without_counters(cells)[1] if column is not None]
+    names = {column.name for column in headings}
     complete = names & {"thickness", "d", "D"} and names & {"curvature", "radius"}
-    return bool(complete) and len(found) >= known * len(cells)
+    return bool(complete) and len(headings) >= known * len(cells)
 
 
 def columns(cells: Sequence[str], units: str, ignored: Sequence[str], place: Place, report: Draft) -> list[str | None]:
     """The meaning of each column of a line of headings, every one reported; None for those left out, else UNREAD.
 
-    units: of the header; ignored: headings that the header tells to leave out. Raises LensFileError for two columns of
-    one meaning, for one in other units, and for what may mean two things.
+    units: of the header; ignored: headings that the header leaves out. Raises LensFileError for two columns of one
+    meaning, for a column in other units, and for an ambiguous one.
     """
-    cells, found = _without_counters(cells)
+    cells, headings = _without_counters(cells)
     for k, cell in enumerate(cells):
         if squeezed(cell).casefold() in ignored and cell.strip():
-            found[k] = Heading("ignored as the header says")
-    _check_units(cells, found, units, place)
-    names = [column.name if column else None for column in found]
+            headings[k] = Heading("ignored as the header says")
+    _check_units(cells, headings, units, place)
+    names = [column.name if column else None for column in headings]
     if names and not cells[0].strip():
         names[0] = "label"
     _settle_thickness(cells, names, place, report)
@@ -229,8 +228,8 @@ def _without_counters(cells: Sequence[str]) -> tuple[list[str], list[Heading | N
     return list(cells), [meaning(cell) for cell in cells]
 
 
-def _check_units(cells: Sequence[str], found: list[Heading | None], units: str, place: Place) -> None:
-    for cell, column in zip(cells, found, strict=True):
+def _check_units(cells: Sequence[str], headings: list[Heading | None], units: str, place: Place) -> None:
+    for cell, column in zip(cells, headings, strict=True):
         if column is None or column.name not in _LENGTHS or not column.unit:
             continue
         scale = MILLIMETRES.get(column.unit.upper())
@@ -242,7 +241,7 @@ def _check_units(cells: Sequence[str], found: list[Heading | None], units: str, 
 
 
 def _settle_thickness(cells: list[str], names: list[str | None], place: Place, report: Draft) -> None:
-    """d and D: the thickness if nothing else could be; D beside a named thickness is the diameter; else an error."""
+    """d and D: the thickness if nothing else could be; D next to a named thickness is the diameter; else an error."""
     either = [k for k, name in enumerate(names) if name in ("d", "D")]
     named = [cells[k] for k, name in enumerate(names) if name == "thickness"]
     if len(either) + len(named) > 1 and not (named and len(either) == 1 and names[either[0]] == "D"):
@@ -255,17 +254,19 @@ def _settle_thickness(cells: list[str], names: list[str | None], place: Place, r
 
 
 def _settle_lines(cells: list[str], names: list[str | None], place: Place) -> None:
-    """An index or Abbe number that does not say its line is of the d line, unless other columns are of another."""
+    """An index or Abbe number without a spectral line is of the d line, unless other columns are of another line."""
     for kind, other in (("index", "abbe"), ("abbe", "index")):
         lines = {name.split()[1] for name in names if name and name.startswith(other + " ")}
         for k, name in enumerate(names):
             if name != kind:
                 continue
-            own = {n.split()[1] for n in names if n and n.startswith(kind + " ")}
-            if (kind == "abbe" and lines and not lines & {"d", "D"}) or (kind == "index" and (lines - {"d"} or own)):
+            lines_of_kind = {n.split()[1] for n in names if n and n.startswith(kind + " ")}
+            if (kind == "abbe" and lines and not lines & {"d", "D"}) or (
+                kind == "index" and (lines - {"d"} or lines_of_kind)
+            ):
                 symbol = "n" if kind == "index" else "V"
                 fix = f"write '{symbol}d' or '{symbol}e'"
-                raise LensFileError(f"column {shown(cells[k])} does not say its spectral line; {fix}", place)
+                raise LensFileError(f"column {shown(cells[k])} does not name its spectral line; {fix}", place)
             names[k] = f"{kind} D" if lines == {"D"} else f"{kind} d"
 
 
@@ -282,12 +283,12 @@ def _refuse_repeats(cells: list[str], names: list[str | None], place: Place) -> 
 
 
 def _report(cell: str, name: str | None, place: Place, report: Draft) -> None:
-    what = f"column {cell[:40] or '(unnamed)'}"
+    label = f"column {cell[:40] or '(unnamed)'}"
     if name and name.startswith("ignored"):
-        report.met(what, IGNORED, place, name.removeprefix("ignored "))
+        report.met(label, IGNORED, place, name.removeprefix("ignored "))
     elif name:
-        report.met(what, READ, place)
+        report.met(label, READ, place)
     elif cell.strip():
-        report.met(what, UNKNOWN, place)
+        report.met(label, UNKNOWN, place)
     if name == "diameter":
         report.note(f"column {shown(cell)} is a diameter: halved")

@@ -1,15 +1,15 @@
-"""Read a prescription table as designers write them: .csv, .tsv, .txt, or any text with one row per surface.
+"""Read a prescription table: .csv, .tsv, .txt, or any text with one row per surface.
 
-The headings name the columns, in any order and many spellings (`table_columns`): curvature or radius, thickness,
+The headings name the columns, in any order and many spellings (`table.columns`): curvature or radius, thickness,
 glass, and if wanted nd and Vd, conic, semi-diameter or diameter, aspheric terms (A4 is the coefficient of r⁴),
-apertures, type, comment. Header lines '# key: value' hold the system (`table_system`). Without them the lens is read
-with what is stated in warnings: on axis, the d line, F/10 unless the stop row has a semi-diameter.
+apertures, type, comment. Header lines '# key: value' hold the system (`table.system`). Without them the lens is read
+with assumptions that are stated in warnings: on axis, the d line, F/10 unless the stop row has a semi-diameter.
 
 - An empty curvature, radius `inf` or 0 is a plane; lengths are mm unless '# units:' says otherwise.
 - A column of numbers whose heading is not known, or may mean two things, is an error; '# ignore: NAME' leaves it out.
 - Glass: empty or `air`; a catalog name; `MIRROR`; a number, the constant index; `1.5168/64.17` (nd/Vd) or
   `1.5168/64.17/0.0008` (nd/Vd/ΔPgF), a model glass; six digits, a MIL code; `NAME=1.33` or `NAME=1.5168/64.17`, the
-  same with a name. Columns of indices and Abbe numbers define the glass of a row that names none (`table_media`).
+  same with a name. Columns of indices and Abbe numbers define the glass of a row that names none.
 - The stop is the row marked in a `stop` column, or called stop, aperture, diaphragm, iris; or '# stop: 6'.
 - A first row called object, or numbered 0, is the object; otherwise the object lies at '# object distance', or at
   infinity.
@@ -28,22 +28,23 @@ from pathlib import Path
 
 import torch
 
-from raytrace.io.materials import AtHand, catalogs_at_hand
-from raytrace.io.report import Draft, ImportReport
-from raytrace.io.source import LensFileError, shown
-from raytrace.io.spelling import (
+from raytrace.io.assembly import LensDraft, assemble
+from raytrace.io.materials import AtHand, catalogs_of_lens
+from raytrace.io.report import Draft
+from raytrace.io.source import (
     MILLIMETRES,
+    LensFileError,
+    Place,
     double,
     integer,
     is_infinite,
     is_number,
     number,
     plain_text,
-    refuse_overflow,
+    shown,
     words,
 )
-from raytrace.io.substitutes import NONE, Substitutes
-from raytrace.io.table import surfaces as table_surface
+from raytrace.io.table import surfaces as table_surfaces
 from raytrace.io.table import system as table_system
 from raytrace.io.table.text import Row, Table, cleaned, parse
 from raytrace.materials.glass import AIR
@@ -55,7 +56,7 @@ _IMAGE = re.compile(r"\b(image|ima|img|sensor|detector|bild|bildebene)\b|像面|
 _OBJECT = re.compile(r"\b(object|obj|objekt|objet)\b|物体|物面", re.IGNORECASE)
 
 
-#: Where a row may be called the stop, and by what; the first column that has one counts.
+#: Columns in which a row may be called the stop, and its names there; the first column that has one counts.
 _STOP_MARKS = (
     ("stop", re.compile(r"x|yes|true|1|stop|sto|\*|y", re.IGNORECASE).fullmatch),
     ("type", _STOP.search),
@@ -64,66 +65,57 @@ _STOP_MARKS = (
 )
 
 
-def read(
-    text: str,
-    file: str,
-    *,
-    catalogs: Sequence[Path] = (),
-    strict: bool = False,
-    substitutes: Substitutes = NONE,
-) -> tuple[Lens, ImportReport]:
-    """The lens of a table's text and the report of its import.
-
-    file: its name, for messages. catalogs: further glass catalogs (.agf). strict: every warning is an error.
-    substitutes: of glasses.
-    Raises LensFileError, UnsupportedSurface and UnknownGlass.
-    """
-    report = Draft(file, "table", substitutes)
-    return build(parse(text, file, report), catalogs=catalogs), report.finished(strict=strict)
+def read(text: str, file: str, report: Draft, catalogs: Sequence[Path] = ()) -> Lens:
+    """The lens of a table's text; report: filled. Raises LensFileError, UnsupportedSurface and UnknownGlass."""
+    return build(parse(text, file, report), catalogs=catalogs)
 
 
 def build(table: Table, *, catalogs: Sequence[Path] = (), packed: AtHand | None = None) -> Lens:
-    """The lens of a table taken apart. packed: glass catalogs that come with it, instead of those beside its file."""
-    unit, rows = _unit(table), _numbered(table)
+    """The lens of a parsed table. packed: its glass catalogs, instead of those in the folder of its file."""
+    value, place = table.metadata.get("units", ("mm", table.place))
+    if value.upper() not in MILLIMETRES:
+        raise LensFileError(f"units is {shown(value)}, expected mm, cm, in or m", place)
+    unit, rows = MILLIMETRES[value.upper()], _numbered(table)
     names = tuple(words(table.value("catalogs")))
-    at_hand = catalogs_at_hand(names, catalogs, table.report, packed)
-    surfaces = [table_surface.build(row, unit, at_hand, catalogs, table.report) for row in rows]
-    _refuse_all_air(table, surfaces)
+    came = catalogs_of_lens(names, catalogs, table.report, packed)
+    surfaces = [table_surfaces.build(row, unit, came, catalogs, table.report) for row in rows]
+    # a table that names no medium would refract nothing: its column was lost, or its heading not understood
+    has_media = any(column == "glass" or column.startswith("index ") for column in table.columns if column)
+    if not has_media and any(s.curvature is not None for s in surfaces) and all(s.glass is AIR for s in surfaces):
+        message = "no column names a medium, and every surface would be in air"
+        raise LensFileError(f"{message}; add a column 'glass', or 'nd' and 'Vd'", table.place)
     surfaces = _with_object(surfaces, rows, table, unit)
     surfaces += _missing_image(rows, surfaces, table.report)
     _warn_of_zero_radii(rows, surfaces, table.report)
-    stop = _stop(rows, table, len(surfaces))
-    wavelengths, weights, primary = table_system.wavelengths(table)
-    lens = Lens(
-        surfaces=tuple(surfaces),
+    stop, place = _stop(rows, table)
+    semi_diameter = surfaces[stop].semi_diameter if 0 <= stop < len(surfaces) else None
+    kind, size = table_system.aperture(table, semi_diameter, unit)
+    draft = LensDraft(
+        surfaces=surfaces,
         stop=stop,
-        aperture=table_system.aperture(table, surfaces[stop].semi_diameter, unit),
-        fields=table_system.fields(table, unit),
-        wavelengths=wavelengths,
-        wavelength_weights=weights,
-        primary_wavelength=primary,
+        aperture_kind=kind,
+        aperture=size,
+        **table_system.fields(table, unit),
+        **table_system.wavelengths(table),
         name=plain_text(table.value("title")),
         notes=tuple(table.notes),
         catalogs=names,
         ray_aiming=table_system.ray_aiming(table),
         environment=table_system.environment(table),
+        sources={
+            key.replace(" ", "_"): (f"the {key}", table.metadata[key][1])
+            for key in ("wavelengths", "wavelength weights", "primary wavelength")
+            if key in table.metadata
+        },
     )
-    refuse_overflow(lens, table.place.file)
-    _warn_of_environment(lens, rows, table)
-    return lens
-
-
-def _warn_of_environment(lens: Lens, rows: list[Row], table: Table) -> None:
+    draft.sources["stop"] = ("the stop", place)
+    value, place = table.metadata.get("aperture", ("", table.place))
+    draft.sources["aperture"] = (f"the aperture is {shown(value)}", place)
+    lens = assemble(draft, table.place.file)
     places = {row.place.surface: row.place for row in rows}
     for surface, message in unknown_changes(lens).items():
         table.report.warn(message, places.get(surface, table.place))
-
-
-def _unit(table: Table) -> float:
-    value, place = table.metadata.get("units", ("mm", table.place))
-    if value.upper() not in MILLIMETRES:
-        raise LensFileError(f"units is {shown(value)}, expected mm, cm, in or m", place)
-    return MILLIMETRES[value.upper()]
+    return lens
 
 
 def _words(row: Row) -> str:
@@ -133,41 +125,30 @@ def _words(row: Row) -> str:
 def _numbered(table: Table) -> list[Row]:
     """The rows with their surface numbers, unsupported types refused."""
     if len(table.rows) < 2:
-        raise LensFileError(
-            f"{len(table.rows)} rows of surfaces, expected at least one surface and the image", table.place
-        )
+        message = f"{len(table.rows)} rows of surfaces, expected at least one surface and the image"
+        raise LensFileError(message, table.place)
     first = table.rows[0]
     label = first.cells.get("label", "")
-    start = (
-        0 if _OBJECT.search(_words(first)) or (is_number(label) and number(label, "surface", first.place) == 0) else 1
-    )
+    is_object = _OBJECT.search(_words(first)) or (is_number(label) and number(label, "surface", first.place) == 0)
+    start = 0 if is_object else 1
     rows = cleaned([Row(row.place._replace(surface=k), row.cells) for k, row in enumerate(table.rows, start)])
-    table_surface.refuse_unsupported(rows)
+    table_surfaces.refuse_unsupported(rows)
     return rows
 
 
 def _with_object(surfaces: list[Surface], rows: list[Row], table: Table, unit: float) -> list[Surface]:
     """The surfaces with the object before them, at the distance of its row or of the header."""
     has_row = rows[0].place.surface == 0
-    told = has_row and rows[0].cells.get("thickness", "-").lower() not in ("-", "nan", "none")
+    is_given = has_row and rows[0].cells.get("thickness", "-").lower() not in ("-", "nan", "none")
     value, place = table.metadata.get("object distance", ("inf", None))
     infinite = is_infinite(value) and not value.startswith("-")
     distance = torch.inf if infinite else number(value.removesuffix("mm").strip(), "object distance", place) * unit
-    if told and place and float(surfaces[0].thickness) != distance:
-        raise LensFileError(f"object distance {value}, but the row of the object says otherwise", place)
-    if told:
+    if is_given and place and float(surfaces[0].thickness) != distance:
+        raise LensFileError(f"object distance {value}, but the row of the object has another", place)
+    if is_given:
         return surfaces
     own, others = (surfaces[0], surfaces[1:]) if has_row else (Surface(thickness=double(distance)), surfaces)
     return [dataclasses.replace(own, thickness=double(distance)), *others]
-
-
-def _refuse_all_air(table: Table, surfaces: list[Surface]) -> None:
-    """A table that names no medium would bend no ray: its column was lost, or its heading not understood."""
-    told = any(column == "glass" or column.startswith("index ") for column in table.columns if column)
-    curved = any(surface.curvature is not None for surface in surfaces)
-    if curved and not told and all(surface.glass is AIR for surface in surfaces):
-        message = "no column names a medium, and every surface would stand in air"
-        raise LensFileError(f"{message}; add a column 'glass', or 'nd' and 'Vd'", table.place)
 
 
 def _missing_image(rows: list[Row], surfaces: list[Surface], report: Draft) -> list[Surface]:
@@ -197,39 +178,28 @@ def _missing_image(rows: list[Row], surfaces: list[Surface], report: Draft) -> l
 
 
 def _warn_of_zero_radii(rows: list[Row], surfaces: list[Surface], report: Draft) -> None:
-    """Radius 0 is how programs and people write a plane, and how a lost number looks."""
-    found = [
-        row
-        for row in rows
-        if is_number(row.cells.get("radius", "")) and number(row.cells["radius"], "radius", row.place) == 0
-    ]
-    bends = [k for k in range(1, len(surfaces)) if surfaces[k].glass is not surfaces[k - 1].glass]
-    found = [row for row in found if row.place.surface in bends]
-    if found:
-        listed = ", ".join(str(row.place.surface) for row in found)
+    """Warn of radius 0 of a refracting surface, which is a plane or a missing number."""
+    refracting = [k for k in range(1, len(surfaces)) if surfaces[k].glass is not surfaces[k - 1].glass]
+    places = []
+    for row in rows:
+        radius = row.cells.get("radius", "")
+        if row.place.surface in refracting and is_number(radius) and number(radius, "radius", row.place) == 0:
+            places.append(row.place)
+    if places:
+        listed = ", ".join(str(place.surface) for place in places)
         message = f"radius 0 of surface {listed} is taken as a plane; write inf if it is one"
-        report.warn(message, found[0].place._replace(surface=None))
+        report.warn(message, places[0]._replace(surface=None))
 
 
-def _stop(rows: list[Row], table: Table, count: int) -> int:
+def _stop(rows: list[Row], table: Table) -> tuple[int, Place]:
     """The stop by the header, by the column of stops, by the type, or by the name of the row."""
     if "stop" in table.metadata:
         value, place = table.metadata["stop"]
-        stop = integer(value, "stop", place)
-    else:
-        place = _stop_row(rows, table).place
-        stop = place.surface
-    if not 0 < stop < count - 1:
-        raise LensFileError(f"the stop is surface {stop}, expected 1 to {count - 2}", place)
-    return stop
-
-
-def _stop_row(rows: list[Row], table: Table) -> Row:
+        return integer(value, "stop", place), place
     for column, mark in _STOP_MARKS:
-        found = [row for row in rows if mark(row.cells.get(column, ""))]
-        if len(found) > 1:
-            message = f"a second stop; surface {found[0].place.surface} is the stop already"
-            raise LensFileError(message, found[1].place)
-        if found:
-            return found[0]
+        marked = [row.place for row in rows if mark(row.cells.get(column, ""))]
+        if len(marked) > 1:
+            raise LensFileError(f"a second stop; surface {marked[0].surface} is the stop already", marked[1])
+        if marked:
+            return marked[0].surface, marked[0]
     raise LensFileError("no row is the stop; call one 'Stop', or write the header line '# stop: 6'", table.place)

@@ -1,7 +1,4 @@
-"""A row of a prescription table as a `Surface`: shape, medium and apertures.
-
-Media of a prescription table by their numbers: indices at spectral lines, Abbe numbers, partial dispersions.
-"""
+"""A row of a prescription table as a `Surface`: shape, medium (by name, or by indices and Abbe numbers), apertures."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -12,8 +9,7 @@ from torch import Tensor
 
 from raytrace.io.materials import by_figures, is_code, listed_glass
 from raytrace.io.report import Draft
-from raytrace.io.source import LensFileError, Place, UnsupportedSurface, shown
-from raytrace.io.spelling import double, is_infinite, is_number, number
+from raytrace.io.source import LensFileError, Place, UnsupportedSurface, double, is_infinite, is_number, number, shown
 from raytrace.io.table.columns import order
 from raytrace.io.table.system import ENVIRONMENT, environment_of
 from raytrace.io.table.text import Row
@@ -25,12 +21,12 @@ from raytrace.system.apertures import SHAPES, Aperture
 from raytrace.system.shapes import KINDS
 from raytrace.system.surface import Surface
 
-#: What an empty or undispersed medium's Abbe number is written as.
+#: Spellings of the Abbe number of air or of a medium without dispersion.
 NOTHING = ("", "-", "0", "0.0", "∞", "inf", "infinity", "nan", "none")
 
 
 def figures(cells: dict[str, str]) -> dict[str, str]:
-    """The cells of a row that tell its medium by numbers, by column: "index d", "abbe d", "pgf", "dpgf"."""
+    """The cells of a row that give its medium by numbers, by column: "index d", "abbe d", "pgf", "dpgf"."""
     named = {name: cell for name, cell in cells.items() if name.startswith(("index ", "abbe ")) or name in _PARTIAL}
     return {name: cell for name, cell in named.items() if cell.lower() not in NOTHING}
 
@@ -41,7 +37,7 @@ _PARTIAL = ("pgf", "dpgf")
 def medium(cells: dict[str, str], place: Place, report: Draft) -> Glass:
     """The medium of a row without a named glass; air where no figure is given.
 
-    One index alone is constant. n_d, V_d and ΔP_gF are kept as they stand; any other set of figures is met by the model
+    One index alone is constant. n_d, V_d and ΔP_gF are kept unchanged; any other set of figures is met by the model
     glass n = A + B/λ + C/λ^3.5 (`raytrace.materials.formulas`), on the normal line of glasses where two are
     given, by least squares where more than three are.
     """
@@ -113,7 +109,7 @@ def _fitted(indices: dict[str, float], given: dict[str, float], place: Place) ->
 _AIR = ("", "air", "-", "none", "nan", "vacuum", "luft", "空気", "空气")
 _MIRROR = re.compile(r"\b(mirror|reflect|reflecting|refl)\b", re.IGNORECASE)
 
-#: What a type may be called, beside the words of `shapes.KINDS`. Any other word is a shape that is not modelled.
+#: Words of a type, in addition to those of `shapes.KINDS`. Any other word is a shape that is not modelled.
 _TYPE = re.compile(
     r"standard|spher(e|ical)|plan(e|o)?|flat|conic(oid)?|aspher(e|ic|ical)|lens|surface|s"
     r"|stop|sto|aperture|diaphragm|iris|image|ima|img|sensor|detector|object|obj"
@@ -128,14 +124,14 @@ _UNSUPPORTED = re.compile(
 
 def refuse_unsupported(rows: Sequence[Row]) -> None:
     """Raise UnsupportedSurface for the first row whose type, or name, is that of a surface that is not modelled."""
-    own = {word for kind in KINDS.values() for word in kind.words}
+    words_of_kinds = {word for kind in KINDS.values() for word in kind.words}
     for row in rows:
         kind, label = row.cells.get("type", ""), row.cells.get("label", "")
-        unknown = any(not _TYPE.fullmatch(word) and word not in own for word in _words(kind))
-        other = _UNSUPPORTED.search(label) and not own & set(_words(label))
-        found = kind if unknown else label if other else ""
-        if found:
-            message = f"type {shown(found)} is not modelled; modelled are conics and {', '.join(KINDS)}s"
+        unknown = any(not _TYPE.fullmatch(word) and word not in words_of_kinds for word in _words(kind))
+        other = _UNSUPPORTED.search(label) and not words_of_kinds & set(_words(label))
+        refused = kind if unknown else label if other else ""
+        if refused:
+            message = f"type {shown(refused)} is not modelled; modelled are conics and {', '.join(KINDS)}s"
             raise UnsupportedSurface(message, row.place)
 
 
@@ -156,17 +152,19 @@ def build(row: Row, unit: float, catalogs: Sequence[str | Catalog], user: Sequen
         kind=kind,
         glass=_glass(row, catalogs, user, report),
         semi_diameter=_semi_diameter(row, unit),
-        apertures=tuple(_aperture(text, unit, place) for text in _several(cells.get("apertures", ""))),
+        apertures=tuple(
+            _aperture(text, unit, place) for text in re.split(r"\s\+\s", cells.get("apertures", "")) if text.strip()
+        ),
         environment=_environment(cells, place),
         comment=cells.get("comment") or ("" if is_number(cells.get("label", "0")) else cells["label"]),
     )
 
 
 def _environment(cells: Mapping[str, str], place: Place) -> Environment | None:
-    told = [key for key in ENVIRONMENT if key in cells]
-    if len(told) == 1:
-        raise LensFileError(f"a {told[0]} alone; give {' and '.join(ENVIRONMENT)}, or neither", place)
-    return environment_of(cells, place) if told else None
+    keys = [key for key in ENVIRONMENT if key in cells]
+    if len(keys) == 1:
+        raise LensFileError(f"a {keys[0]} alone; give {' and '.join(ENVIRONMENT)}, or neither", place)
+    return environment_of(cells, place) if keys else None
 
 
 def _cell(row: Row, column: str) -> float | None:
@@ -181,8 +179,8 @@ def _thickness(row: Row) -> float:
     text = row.cells.get("thickness", "")
     if is_infinite(text) and row.place.surface == 0 and not text.startswith("-"):
         return float("inf")
-    found = _cell(row, "thickness")
-    return 0.0 if found is None else found
+    thickness = _cell(row, "thickness")
+    return 0.0 if thickness is None else thickness
 
 
 def _curvature(row: Row, unit: float) -> Tensor | None:
@@ -192,8 +190,8 @@ def _curvature(row: Row, unit: float) -> Tensor | None:
         raise LensFileError(f"radius is {radius:g}, too small", row.place)
     if radius and curvature and abs(radius * curvature - 1) > 1e-3:
         raise LensFileError(f"curvature {curvature:g} and radius {radius:g} contradict each other", row.place)
-    found = curvature if curvature is not None else 1 / radius if radius else 0.0
-    return double(found / unit) if found else None
+    value = curvature if curvature is not None else 1 / radius if radius else 0.0
+    return double(value / unit) if value else None
 
 
 def _terms(row: Row, unit: float) -> tuple[str, Tensor | None]:
@@ -210,20 +208,22 @@ def _terms(row: Row, unit: float) -> tuple[str, Tensor | None]:
 
 def _semi_diameter(row: Row, unit: float) -> float | None:
     semi_diameter, diameter = _cell(row, "semi_diameter"), _cell(row, "diameter")
-    found = semi_diameter if semi_diameter is not None else (diameter or 0.0) / 2
-    if found < 0:
-        raise LensFileError(f"semi-diameter is {found:g}, expected 0 or more", row.place)
-    return found * unit or None
+    size = semi_diameter if semi_diameter is not None else (diameter or 0.0) / 2
+    if size < 0:
+        raise LensFileError(f"semi-diameter is {size:g}, expected 0 or more", row.place)
+    return size * unit or None
 
 
 def _glass(row: Row, catalogs: Sequence[str | Catalog], user: Sequence[Path], report: Draft) -> Glass:
     text, place = row.cells.get("glass", ""), row.place
-    given = figures(row.cells)
-    if text.lower() in _AIR or (given and text.lower() == "unknown"):
-        found = MIRROR if _MIRROR.search(row.cells.get("type", "")) else medium(row.cells, place, report)
-        if text and text.lower() in _AIR[1:] and text != "-" and found not in (AIR, MIRROR):
-            raise LensFileError(f"the medium is {shown(text)}, but its figures are {', '.join(given.values())}", place)
-        return found
+    numbers = figures(row.cells)
+    if text.lower() in _AIR or (numbers and text.lower() == "unknown"):
+        glass = MIRROR if _MIRROR.search(row.cells.get("type", "")) else medium(row.cells, place, report)
+        if text and text.lower() in _AIR[1:] and text != "-" and glass not in (AIR, MIRROR):
+            raise LensFileError(
+                f"the medium is {shown(text)}, but its figures are {', '.join(numbers.values())}", place
+            )
+        return glass
     if text.lower() in ("mirror", "refl", "reflect"):
         return MIRROR
     name, equals, digits = text.partition("=")
@@ -234,20 +234,15 @@ def _glass(row: Row, catalogs: Sequence[str | Catalog], user: Sequence[Path], re
         return mil_glass(text)
     if equals or all(is_number(part.strip()) for part in digits.split("/")):
         return _by_figures(name, digits, place, report)
-    how = {"catalogs": catalogs, "user": user, "place": place, "report": report}
-    glass = listed_glass(text, **how, figures=_d_line(given, place))
-    for name, cell in given.items():
+    d_line = [numbers.get(name) for name in ("index d", "abbe d")]
+    nearest = None if None in d_line else tuple(number(cell, "index or Abbe number", place) for cell in d_line)
+    glass = listed_glass(text, catalogs=catalogs, user=user, place=place, report=report, figures=nearest)
+    for name, cell in numbers.items():
         kind, _, line = name.partition(" ")
         listed = float(refractive_index(glass, double(LINES[line]))) if kind == "index" else 0.0
         if kind == "index" and abs(listed - number(cell, name, place)) > 2e-3:
             report.warn(f"index {cell} stated for {text}, whose n{line} is {listed:.5f}; the catalog is used", place)
     return glass
-
-
-def _d_line(given: dict[str, str], place: Place) -> tuple[float, float] | None:
-    """n_d and V_d among the cells of a row, None where they do not both stand there."""
-    cells = [given.get(name) for name in ("index d", "abbe d")]
-    return None if None in cells else tuple(number(cell, "figure of the glass", place) for cell in cells)
 
 
 def _by_figures(name: str, digits: str, place: Place, report: Draft) -> Glass:
@@ -258,13 +253,8 @@ def _by_figures(name: str, digits: str, place: Place, report: Draft) -> Glass:
         raise LensFileError(f"glass is {shown(digits)}, expected an index, nd/Vd or nd/Vd/ΔPgF", place)
     if nd == 1 and vd == 0 and not name:
         return AIR
-    report.glass(place.surface, name, f"constant index {nd!r}" if vd == dpgf == 0 else f"model glass {figures}")
+    report.glass(place.surface, name, f"constant index {nd!r}" if vd == dpgf == 0 else f"model glass {digits}")
     return by_figures(nd, vd, dpgf, name)
-
-
-def _several(text: str) -> list[str]:
-    """The apertures of a cell, joined by a plus between blanks."""
-    return [part for part in re.split(r"\s\+\s", text) if part.strip()]
 
 
 def _aperture(text: str, unit: float, place: Place) -> Aperture:
@@ -274,9 +264,8 @@ def _aperture(text: str, unit: float, place: Place) -> Aperture:
     at = words.index("at") if "at" in words else len(words)
     shape = SHAPES.get(words[0]) if words else None
     if shape is None or at - 1 != (shape.sizes or at - 1) or len(words[at + 1 :]) != (2 if words[at:] else 0):
-        raise LensFileError(
-            f"aperture is {shown(text)}, expected for example 'circular 0 12.5' or 'rectangular 3 4'", place
-        )
+        expected = "expected for example 'circular 0 12.5' or 'rectangular 3 4'"
+        raise LensFileError(f"aperture is {shown(text)}, {expected}", place)
     sizes = tuple(number(word, "size of the aperture", place) * unit for word in words[1:at])
     x, y = [number(word, "centre of the aperture", place) * unit for word in words[at + 1 :]] or [0.0, 0.0]
     if shape.objection(sizes):

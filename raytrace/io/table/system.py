@@ -29,12 +29,23 @@ from pathlib import Path
 from torch import Tensor
 
 from raytrace.io.materials import catalogs_needed
-from raytrace.io.source import LensFileError, Place, shown
-from raytrace.io.spelling import double, exact, exact_list, integer, is_number, number, quoted, word
+from raytrace.io.source import (
+    LensFileError,
+    Place,
+    double,
+    exact,
+    exact_list,
+    integer,
+    is_number,
+    number,
+    quoted,
+    shown,
+    word,
+)
 from raytrace.io.table.text import Table
 from raytrace.materials.environment import REFERENCE, Environment, objection
 from raytrace.materials.glass import LINES
-from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, RAY_AIMING, Fields, Lens, SystemAperture
+from raytrace.system.lens import APERTURE_KINDS, FIELD_UNITS, RAY_AIMING, Lens
 
 #: Short names of the system aperture, longest first, as patterns.
 _APERTURES = (
@@ -46,15 +57,15 @@ _APERTURES = (
     (r"stop|float by stop", "float_by_stop"),
 )
 
-#: Assumed where neither the header nor the stop's semi-diameter tells the aperture: slow enough for any lens.
+#: Assumed where neither the header nor the stop's semi-diameter gives the aperture: slow enough for any lens.
 DEFAULT_F_NUMBER = 10.0
 
-#: µm: a wavelength this long needs its unit in the table, for one in nm that has none is likely.
+#: µm: a wavelength this long needs its unit in the table, for it is likely in nm.
 _LONGEST = 100.0
 
 _NUMBERS = re.compile(r"[\s,;]+")
 _NO, _YES = ("no", "off", "false", "0", ""), ("yes", "on", "true", "1")
-#: What tells an environment, and the unit that may stand behind it.
+#: Header keys of the environment, and the unit that may follow the number.
 ENVIRONMENT = {"temperature": "C", "pressure": "atm"}
 _VIGNETTING = ("vdx", "vdy", "vcx", "vcy", "van")
 
@@ -81,42 +92,41 @@ def ray_aiming(table: Table) -> str:
 
 
 def environment(table: Table) -> Environment | None:
-    """Temperature in °C and pressure in atm; None where the header tells neither."""
-    told = {key: table.metadata[key] for key in ENVIRONMENT if key in table.metadata}
-    return environment_of({key: value for key, (value, _) in told.items()}, [*told.values()][-1][1]) if told else None
+    """Temperature in °C and pressure in atm; None where the header has neither."""
+    lines = {key: table.metadata[key] for key in ENVIRONMENT if key in table.metadata}
+    if not lines:
+        return None
+    return environment_of({key: value for key, (value, _) in lines.items()}, [*lines.values()][-1][1])
 
 
 def environment_of(cells: Mapping[str, str], place: Place) -> Environment:
-    """Of texts for the temperature and the pressure; what is missing is that of catalogs."""
+    """Of texts for the temperature and the pressure; a missing one is that of catalogs."""
     numbers = [double(normal) for normal in REFERENCE]
     for k, (key, unit) in enumerate(ENVIRONMENT.items()):
         if key in cells:
             bare = cells[key].strip()
             numbers[k] = double(number(bare.removesuffix(unit).rstrip("° ") if bare != unit else bare, key, place))
-    found = Environment(*numbers)
-    if wrong := objection(found):
+    air = Environment(*numbers)
+    if wrong := objection(air):
         raise LensFileError(wrong.replace("`", ""), place)
-    return found
+    return air
 
 
-def aperture(table: Table, stop_semi_diameter: float | None, unit: float) -> SystemAperture:
-    """The system aperture: of the header, else the stop's semi-diameter, else F/10 with a warning."""
+def aperture(table: Table, stop_semi_diameter: float | None, unit: float) -> tuple[str, float]:
+    """Kind and size of the system aperture: of the header, else the stop's semi-diameter, else F/10 with a warning."""
     if "aperture" not in table.metadata:
         if stop_semi_diameter:
             table.report.note("no aperture in the header: the beam fills the stop's semi-diameter")
-            return SystemAperture("float_by_stop", double(stop_semi_diameter))
+            return "float_by_stop", stop_semi_diameter
         message = f"no aperture: F/{DEFAULT_F_NUMBER:g} is assumed; write it, as '# aperture: EPD 33.33'"
         table.report.warn(message, table.place)
-        return SystemAperture("image_f_number", double(DEFAULT_F_NUMBER))
+        return "image_f_number", DEFAULT_F_NUMBER
     value, place = table.metadata["aperture"]
     kind, size = _aperture_words(value, place)
     if not size and kind == "float_by_stop" and stop_semi_diameter:
-        return SystemAperture(kind, double(stop_semi_diameter))
-    found = number(size.removesuffix("mm").removesuffix("deg").strip() or "?", "aperture", place)
-    if found <= 0:
-        raise LensFileError(f"the aperture is {found:g}, expected a positive number", place)
-    scaled = kind in ("entrance_pupil_diameter", "float_by_stop")
-    return SystemAperture(kind, double(found * unit if scaled else found))
+        return kind, stop_semi_diameter
+    amount = number(size.removesuffix("mm").removesuffix("deg").strip() or "?", "aperture", place)
+    return kind, amount * unit if kind in ("entrance_pupil_diameter", "float_by_stop") else amount
 
 
 def _aperture_words(value: str, place: Place) -> tuple[str, str]:
@@ -126,13 +136,13 @@ def _aperture_words(value: str, place: Place) -> tuple[str, str]:
         if text.lower().startswith(name):
             return kind, text[len(name) :].strip()
     for pattern, kind in _APERTURES:
-        found = re.fullmatch(rf"(?:{pattern})\s*((?:\d|\.|[+-]\s*\d).*|)", text, re.IGNORECASE)
-        if found:
-            return kind, found[1]
+        match = re.fullmatch(rf"(?:{pattern})\s*((?:\d|\.|[+-]\s*\d).*|)", text, re.IGNORECASE)
+        if match:
+            return kind, match[1]
     raise LensFileError(f"aperture is {shown(value)}, expected for example 'EPD 33.33', 'F/3', 'NA 0.1'", place)
 
 
-def fields(table: Table, unit: float) -> Fields:
+def fields(table: Table, unit: float) -> dict:
     """The field points of the header; on axis, with a warning, if there are none."""
     kind, points = "angle", [(0.0, 0.0)]
     if "fields" in table.metadata:
@@ -140,15 +150,14 @@ def fields(table: Table, unit: float) -> Fields:
     else:
         table.report.warn("no fields: on axis only; write them, as '# fields: angle 0 10 14'", table.place)
     length = 1.0 if kind == "angle" else unit
-    vignetting = double([_per_field(table, key, len(points), 0.0) for key in _VIGNETTING])
-    return Fields(
-        kind=kind,
-        x=double([length * x for x, _ in points]),
-        y=double([length * y for _, y in points]),
-        weight=double(_per_field(table, "field weights", len(points), 1.0)),
-        vignetting=vignetting if bool(vignetting.any()) else None,
-        telecentric=_choice(table, "telecentric", [*_NO, *_YES], "yes or no") in _YES,
-    )
+    return {
+        "field_kind": kind,
+        "x": [length * x for x, _ in points],
+        "y": [length * y for _, y in points],
+        "field_weights": _per_field(table, "field weights", len(points), 1.0),
+        "vignetting": [_per_field(table, key, len(points), 0.0) for key in _VIGNETTING],
+        "telecentric": _choice(table, "telecentric", [*_NO, *_YES], "yes or no") in _YES,
+    }
 
 
 def _field_points(value: str, place: Place) -> tuple[str, list[tuple[float, float]]]:
@@ -159,15 +168,13 @@ def _field_points(value: str, place: Place) -> tuple[str, list[tuple[float, floa
     rest = text[len(kind) :].strip() if kind else text
     kind = kind or "angle"
     pairs = re.fullmatch(r"(?:\([^()]*\)[\s,;]*)+", rest)
-    listed = [
-        point for point in (re.findall(r"\(([^()]*)\)", rest) if pairs else _NUMBERS.split(rest)) if point.strip()
-    ]
+    listed = re.findall(r"\(([^()]*)\)", rest) if pairs else _NUMBERS.split(rest)
     points = []
-    for point in listed:
-        found = [number(part, "field", place) for part in _NUMBERS.split(point.strip())]
-        if pairs and len(found) != 2:
+    for point in filter(str.strip, listed):
+        numbers = [number(part, "field", place) for part in _NUMBERS.split(point.strip())]
+        if pairs and len(numbers) != 2:
             raise LensFileError(f"field ({shown(point)}), expected (x, y)", place)
-        points.append((found[0], found[1]) if pairs else (0.0, found[0]))
+        points.append((numbers[0], numbers[1]) if pairs else (0.0, numbers[0]))
     if not points or len(points) > 1000:
         expected = f"a kind ({', '.join(kind.replace('_', ' ') for kind in FIELD_UNITS)}) and numbers"
         raise LensFileError(f"fields is {shown(value)}, expected {expected}", place)
@@ -175,32 +182,29 @@ def _field_points(value: str, place: Place) -> tuple[str, list[tuple[float, floa
 
 
 def _per_field(table: Table, key: str, count: int, default: float) -> list[float]:
-    found = _numbers(table, key)
-    if found is None:
+    numbers = _numbers(table, key)
+    if numbers is None:
         return [default] * count
-    if len(found) != count:
-        raise LensFileError(f"{key} has {len(found)} values for {count} fields", table.metadata[key][1])
-    return found
+    if len(numbers) != count:
+        raise LensFileError(f"{key} has {len(numbers)} values for {count} fields", table.metadata[key][1])
+    return numbers
 
 
-def wavelengths(table: Table) -> tuple[Tensor, Tensor, int]:
+def wavelengths(table: Table) -> dict:
     """Wavelengths in µm, weights, number of the primary one; the d line, with a warning, if there are none."""
-    found, report = [LINES["d"]], table.report
+    waves, report = [LINES["d"]], table.report
     if "wavelengths" in table.metadata:
-        found = _wavelengths(*table.metadata["wavelengths"])
+        waves = _wavelengths(*table.metadata["wavelengths"])
     else:
         report.warn(f"no wavelengths: {LINES['d']} µm (d) is taken; write '# wavelengths: 0.5876'", table.place)
-    weights = _numbers(table, "wavelength weights") or [1.0] * len(found)
-    if len(weights) != len(found) or min(weights) < 0:
-        message = f"{len(weights)} wavelength weights for {len(found)} wavelengths, expected as many, 0 or more"
-        raise LensFileError(message, table.metadata["wavelength weights"][1])
     value, place = table.metadata.get("primary wavelength", ("1", table.place))
-    primary = integer(value, "primary wavelength", place)
-    if not 1 <= primary <= len(found):
-        raise LensFileError(f"primary wavelength is {value}, expected a number from 1 to {len(found)}", place)
-    if "primary wavelength" not in table.metadata and len(found) > 1:
+    if "primary wavelength" not in table.metadata and len(waves) > 1:
         report.note("no primary wavelength in the header: the first is taken")
-    return double(found), double(weights), primary
+    return {
+        "wavelengths": waves,
+        "wavelength_weights": _numbers(table, "wavelength weights") or None,
+        "primary_wavelength": integer(value, "primary wavelength", place),
+    }
 
 
 def _wavelengths(value: str, place: Place) -> list[float]:
@@ -209,30 +213,29 @@ def _wavelengths(value: str, place: Place) -> list[float]:
     powers = {"": 0, "µm": 0, "μm": 0, "um": 0, "micron": 0, "microns": 0, "nm": -3}
     if unit not in powers or not words or len(words) > 1000:
         raise LensFileError(f"wavelengths is {shown(value)}, expected numbers in µm (or with the unit, nm)", place)
-    found = [_decimal(word, powers[unit], place) for word in words]
-    for wavelength in found:
+    waves = [_decimal(word, powers[unit], place) for word in words]
+    for wavelength in waves:
         if not 0 < wavelength < (math.inf if unit else _LONGEST):
             expected = f"expected 0 to {_LONGEST:g} µm; in nm write '587.6 nm', and '3000 µm' where that is meant"
             raise LensFileError(f"a wavelength of {wavelength:g} µm, {expected}", place)
-    return found
+    return waves
 
 
 def _decimal(word: str, power: int, place: Place) -> float:
     """A number times a power of ten, rounded once: 486.1 nm is 0.4861 µm."""
-    found = number(word, "wavelength", place)
-    return float(Decimal(repr(found)).scaleb(power))
+    return float(Decimal(repr(number(word, "wavelength", place))).scaleb(power))
 
 
-def written_environment(found: Environment | None, place: Place) -> dict[str, str]:
+def written_environment(air: Environment | None, place: Place) -> dict[str, str]:
     """The texts of an environment by their keys; none where there is none."""
-    return {} if found is None else {key: exact(getattr(found, key), key, place) for key in ENVIRONMENT}
+    return {} if air is None else {key: exact(getattr(air, key), key, place) for key in ENVIRONMENT}
 
 
 def written(lens: Lens, place: Place, catalogs: Sequence[Path] = ()) -> list[tuple[str, str]]:
     """The system of a lens as keys and values of header lines."""
 
-    def listed(numbers: Tensor, what: str) -> str:
-        return " ".join(exact_list(numbers, what, place))
+    def listed(numbers: Tensor, quantity: str) -> str:
+        return " ".join(exact_list(numbers, quantity, place))
 
     fields, aperture = lens.fields, lens.aperture
     size = exact(aperture.value, "system aperture", place)

@@ -1,4 +1,4 @@
-"""The text of a prescription table as header lines, headings and rows of cells, numbers made plain."""
+"""The text of a prescription table as header lines, headings and rows of cells, with normalised numbers."""
 
 import csv
 import difflib
@@ -9,11 +9,10 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from raytrace.io.report import READ, Draft
-from raytrace.io.source import MAX_SURFACES, LensFileError, Place, shown
-from raytrace.io.spelling import is_infinite, is_number, plain_text
+from raytrace.io.source import MAX_SURFACES, LensFileError, Place, is_infinite, is_number, plain_text, shown
 from raytrace.io.table.columns import UNREAD, columns, is_header, order, squeezed
 
-#: Header keys, each with its further spellings; a note may stand more than once.
+#: Header keys, each with its further spellings; a note may occur more than once.
 _KEYS = (
     "title, name; note, notes; units, unit; ignore; object distance; stop, stop surface; aperture, system aperture"
     "; fields, field; field weights; vdx; vdy; vcx; vcy; van; telecentric; wavelengths, wavelength"
@@ -37,7 +36,7 @@ class Row:
 
 @dataclass
 class Table:
-    """A table taken apart: header lines (key, value, place), notes, rows; and the report on it."""
+    """A parsed table: header lines (key, value, place), notes, rows; and the report on it."""
 
     place: Place
     report: Draft
@@ -53,7 +52,7 @@ class Table:
 
 
 def parse(text: str, file: str, report: Draft) -> Table:
-    """Take a text apart. Separators are tabs, semicolons, commas, bars or aligned blanks, as the headings show."""
+    """Parse a text. Separators are tabs, semicolons, commas, bars or aligned blanks, as the headings show."""
     table = Table(Place(file), report)
     lines = text.split("\n")
     split, skipped = None, 0
@@ -96,7 +95,7 @@ def add_row(table: Table, cells: Sequence[str], place: Place) -> None:
     for heading, column, cell in zip(table.headings, table.columns, cells, strict=False):
         cell = plain_text(cell) if column == "comment" else " ".join(cell.split())
         if column == UNREAD and is_number(cell.replace(",", ".").strip("*")):
-            message = f"column {shown(heading)} holds numbers ({cell}), but what they are is not known"
+            message = f"column {shown(heading)} holds numbers ({cell}), but its quantity is not known"
             fix = f"name it, as radius, thickness, nd, Vd, conic, A4, or write the header line '# ignore: {heading}'"
             raise LensFileError(f"{message}; {fix}", place)
         if column and column != UNREAD and cell:
@@ -134,7 +133,7 @@ def add_metadata(table: Table, name: str, value: str, place: Place) -> None:
     if _bare(name) not in KEYS:
         near = difflib.get_close_matches(_bare(name), KEYS, n=1, cutoff=0.8) if len(_bare(name)) < 40 else []
         if near:
-            message = f"unknown header {shown(name.strip())}, taken as a note; is '{near[0]}' meant?"
+            message = f"unknown header {shown(name.strip())}, taken as a note; did you mean '{near[0]}'?"
             table.report.warn(message, place)
         value = f"{name.strip()}: {value}" if name.strip() else value
         table.notes += [value] if value else []
@@ -142,7 +141,7 @@ def add_metadata(table: Table, name: str, value: str, place: Place) -> None:
         table.notes += [plain_text(value)] if value else []
     else:
         if key in table.metadata:
-            table.report.warn(f"'{key}' stands again; the last is used", place)
+            table.report.warn(f"'{key}' occurs again; the last is used", place)
         table.metadata[key] = (value, place)
     table.report.met(key, READ, place)
 
@@ -155,7 +154,7 @@ def _preamble(table: Table, line: str, place: Place) -> None:
 
 
 def _headings(line: str, following: list[str], place: Place) -> tuple[Callable, list[str], int] | None:
-    """(what splits lines like these into cells, the headings, lines they take beyond the first), or None.
+    """(a function that splits lines into cells, the headings, further lines of headings), or None.
 
     A second line of words or units, as "curvature" and "(mm)" under "Radius of", belongs to the headings.
     """
@@ -207,7 +206,7 @@ def _spans(line: str, gap: str) -> list[tuple[int, int]]:
 
 
 def _aligned(gap: str, spans: list[tuple[int, int]], line: str, place: Place) -> list[str]:
-    """Cells of a line aligned under headings: in order if each column has one, else by the heading they stand under."""
+    """Cells of a line aligned under headings: in order if each column has one, else by the heading above them."""
     line = line.expandtabs()
     words = _spans(line, gap)
     if len(words) == len(spans):
@@ -225,7 +224,7 @@ def _aligned(gap: str, spans: list[tuple[int, int]], line: str, place: Place) ->
     return cells
 
 
-# -- cells as people write numbers: minus signs, commas, planes, and marks of the stop -------------------------------
+# -- spellings of numbers in cells: minus signs, commas, planes, and marks of the stop -------------------------------
 
 _MINUS = str.maketrans("−–—―‐‑‒﹣－", "-" * 9)
 _PLANE = re.compile(r"plan[eo]?|flat|平面|plan[- ]?o?|無限大?|无限大?|\(?plane\)?", re.IGNORECASE)
@@ -259,7 +258,7 @@ def plain(text: str) -> str:
 
 
 def cleaned(rows: list[Row]) -> list[Row]:
-    """The rows with their numbers plain, a stop marked in a radius or label moved to its column.
+    """The rows with normalised numbers, a stop marked in a radius or label moved to its column.
 
     Raises LensFileError for a comma that may be a decimal or a thousands separator, for a distance that is variable,
     and for lines of aspheric coefficients.

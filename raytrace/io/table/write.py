@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from raytrace.io.materials import is_code, is_left_out, is_listed, listed_name
-from raytrace.io.source import LensFileError, Place
-from raytrace.io.spelling import exact, exact_list, quoted, refuse_departure, thickness
+from raytrace.io.source import LensFileError, Place, exact, exact_list, quoted, refuse_sag_terms, thickness
 from raytrace.io.table.columns import order
 from raytrace.io.table.system import ENVIRONMENT, written, written_environment
 from raytrace.materials.glass import Glass, mil_glass
@@ -21,8 +20,8 @@ def write(lens: Lens, file: str, *, catalogs: Sequence[Path] = (), separator: st
     """The content of a table: header lines '# key: value', headings, one row per surface; UTF-8.
 
     file: its name, for messages. catalogs: the user's glass catalogs that the lens was read with.
-    Raises LensFileError for what a table cannot hold: a batch of lenses, nan, a glass whose figures are not those
-    of its catalog. Texts come back whatever they hold (`spelling.quoted`).
+    Raises LensFileError for data that a table cannot hold: a batch of lenses, nan, a glass whose coefficients are not
+    those of its catalog. All texts come back (`source.quoted`).
     """
     text = io.StringIO()
     for key, value in written(lens, Place(file), catalogs):
@@ -45,7 +44,7 @@ def rows(lens: Lens, file: str) -> dict[str, list[str]]:
 
 
 def _row(lens: Lens, number: int, surface: Surface, place: Place) -> dict[str, str]:
-    refuse_departure(surface, place)
+    refuse_sag_terms(surface, place)
     last = len(lens.surfaces) - 1
     kind = None if surface.coefficients is None else KINDS[surface.kind]
     roles = [name for k, name in ((0, "object"), (lens.stop, "stop"), (last, "image")) if k == number]
@@ -61,8 +60,8 @@ def _row(lens: Lens, number: int, surface: Surface, place: Place) -> dict[str, s
     if surface.semi_diameter is not None:
         row["semi_diameter"] = exact(surface.semi_diameter, "semi-diameter", place)
     if kind is not None:
-        found = exact_list(surface.coefficients, "aspheric terms", place)
-        row |= {f"a{kind.step * j}": term for j, term in enumerate(found, 1)}
+        terms = exact_list(surface.coefficients, "aspheric terms", place)
+        row |= {f"a{kind.step * j}": term for j, term in enumerate(terms, 1)}
     if surface.apertures:
         row["apertures"] = " + ".join(_aperture(aperture, place) for aperture in surface.apertures)
     row |= written_environment(surface.environment, place)

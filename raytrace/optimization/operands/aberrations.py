@@ -1,6 +1,6 @@
 """Operands of aberrations: colours, Seidel's sums, field curvature and distortion.
 
-Seidel's by the sums of `analysis.seidel` (Welford 1986), here with the derivatives of a moment; the others by rays.
+Seidel's by the sums of `analysis.seidel` (Welford 1986), here with the derivatives of a state; the others by rays.
 """
 
 from collections.abc import Callable, Sequence
@@ -10,13 +10,13 @@ import numpy as np
 import torch
 
 from raytrace.maths.dual import value_of
-from raytrace.optimization.context import BadRow, Evaluate, Found, Line, Now, Operand, Planner
-from raytrace.optimization.lens_state import Moment
+from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Found, Line, Operand, Planner
+from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.operands.paraxial import along, chief_ray, field_of, listed, paraxial_image_distance
 from raytrace.optimization.operands.rays import known
 from raytrace.system.surface import is_even
-from raytrace.tracing.axis import is_bent
-from raytrace.tracing.vignetting import vignette
+from raytrace.tracing.aiming import is_bent
+from raytrace.tracing.launch import vignette
 
 _NEAR_AXIS = 1e-4  # of the field: its chief ray tells the scale of the image
 _NEAR_CHIEF = 1e-3  # of the pupil: close rays tell where they meet
@@ -55,16 +55,16 @@ def _axial_colour(lines: Sequence[Line], planner: Planner) -> Evaluate:
         for line, zone, pair in zip(lines, zones, waves, strict=True)
     ]
 
-    def number(now: Now, pair, asked):
+    def number(context: EvaluationContext, pair, asked):
         if asked is None:
-            return paraxial_image_distance(now.moment, pair[0]) - paraxial_image_distance(now.moment, pair[1])
-        hits = now.hits(np.array(asked))
+            return paraxial_image_distance(context.state, pair[0]) - paraxial_image_distance(context.state, pair[1])
+        hits = context.hits(np.array(asked))
         crossing = known(hits.valid, hits.position[2] - hits.position[1] * hits.direction[2] / hits.direction[1])
         return crossing[0] - crossing[1]
 
-    def evaluate(now: Now) -> Found:
-        told = [side * number(now, pair, asked) for pair, asked in zip(waves, rays, strict=True)]
-        return Found(listed(told, now.moment.count))
+    def evaluate(context: EvaluationContext) -> Found:
+        told = [side * number(context, pair, asked) for pair, asked in zip(waves, rays, strict=True)]
+        return Found(listed(told, context.state.count))
 
     return evaluate
 
@@ -79,15 +79,15 @@ def _lateral_colour(lines: Sequence[Line], planner: Planner) -> Evaluate:
         for k in range(2)
     )
 
-    def evaluate(now: Now) -> Found:
-        one, other = now.hits(first), now.hits(second)
+    def evaluate(context: EvaluationContext) -> Found:
+        one, other = context.hits(first), context.hits(second)
         return Found(known(one.valid & other.valid, side * (one.position[1] - other.position[1])))
 
     return evaluate
 
 
 def _side(planner: Planner) -> float:
-    return 1.0 if planner.readings.colour == "first" else -1.0
+    return 1.0 if planner.conventions.colour == "first" else -1.0
 
 
 def _two_wavelengths(line: Line, planner: Planner) -> tuple[int, int]:
@@ -113,12 +113,12 @@ class _Rays(NamedTuple):
     H: object
 
 
-def _seidel(moment: Moment, wavelength: int, shapes: "_Shapes"):
+def _seidel(state: LensState, wavelength: int, shapes: "_Shapes"):
     """S1 to S5 in mm, (K,) each, of the surfaces 1 to the last before the image."""
-    rays = _paraxial_rays(moment, wavelength)
+    rays = _paraxial_rays(state, wavelength)
     y, A, y_bar, A_bar, bending, c, (n, n_behind), H = rays
     inverse = 1 / n_behind - 1 / n
-    asphere = 8 * shapes.departures(moment, c) * (n_behind - n)
+    asphere = 8 * shapes.departures(state, c) * (n_behind - n)
     y2, y_bar2 = y * y, y_bar * y_bar
     return (
         -A * A * bending + asphere * y2 * y2,
@@ -131,10 +131,10 @@ def _seidel(moment: Moment, wavelength: int, shapes: "_Shapes"):
     )
 
 
-def _paraxial_rays(moment: Moment, wavelength: int) -> _Rays:
-    n, c = moment.index(wavelength), moment.vertex_curvature
-    y, omega = moment.marginal_height, n[0] * moment.marginal_height / moment.object_distance
-    y_bar, slope = chief_ray(moment)
+def _paraxial_rays(state: LensState, wavelength: int) -> _Rays:
+    n, c = state.index(wavelength), state.vertex_curvature
+    y, omega = state.marginal_height, n[0] * state.marginal_height / state.object_distance
+    y_bar, slope = chief_ray(state)
     omega_bar = n[0] * slope
     H = omega_bar * y - omega * y_bar
     rows, last = [], len(c) - 2
@@ -143,11 +143,11 @@ def _paraxial_rays(moment: Moment, wavelength: int) -> _Rays:
         behind, behind_bar = omega - power * y, omega_bar - power * y_bar
         bending = y * (behind / n[k] ** 2 - omega / n[k - 1] ** 2)
         rows.append((y, omega + n[k - 1] * c[k] * y, y_bar, omega_bar + n[k - 1] * c[k] * y_bar, bending))
-        gap = moment.thickness[k] / n[k]
+        gap = state.thickness[k] / n[k]
         y, omega, y_bar, omega_bar = y + gap * behind, behind, y_bar + gap * behind_bar, behind_bar
-    columns = [listed(column, moment.count) for column in zip(*rows, strict=True)]
-    indices = [listed(n[place : place + last], moment.count) for place in (0, 1)]
-    return _Rays(*columns, listed(c[1 : last + 1], moment.count), tuple(indices), H)
+    columns = [listed(column, state.count) for column in zip(*rows, strict=True)]
+    indices = [listed(n[place : place + last], state.count) for place in (0, 1)]
+    return _Rays(*columns, listed(c[1 : last + 1], state.count), tuple(indices), H)
 
 
 class _Shapes:
@@ -164,14 +164,14 @@ class _Shapes:
             if surface.coefficients is not None and len(surface.coefficients) > 1
         ]
 
-    def departures(self, moment: Moment, vertex):
+    def departures(self, state: LensState, vertex):
         """G (K,) in 1/mm³: (1+k) c³/8 + a₄ less an eighth of the cube of the vertex curvature."""
-        c, count = listed(moment.curvature[1:-1], moment.count), moment.count
+        c, count = listed(state.curvature[1:-1], state.count), state.count
         shape, terms = [1.0] * len(value_of(c)), [0.0] * len(value_of(c))
         for k, stored in self.conics:
-            shape[k - 1] = 1 + moment.numbers.get((k, "conic"), stored)
+            shape[k - 1] = 1 + state.numbers.get((k, "conic"), stored)
         for k, stored in self.terms:
-            terms[k - 1] = moment.numbers.get((k, "a4"), stored)
+            terms[k - 1] = state.numbers.get((k, "a4"), stored)
         return (listed(shape, count) * c * c * c - vertex * vertex * vertex) / 8 + listed(terms, count)
 
 
@@ -185,15 +185,15 @@ def _of_seidel(which: int) -> Callable[[Sequence[Line], Planner], Evaluate]:
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
         _need_seidel(lines[0], planner)
         shapes = planner.shared(_Shapes)
-        share = OF_WAVEFRONT[which] if planner.readings.seidel == "wavefront" else 1
+        share = OF_WAVEFRONT[which] if planner.conventions.seidel == "wavefront" else 1
 
-        def number(now: Now, line: Line):
-            sums = now.moment.kept(_seidel, line.wavelength, shapes)[which]
+        def number(context: EvaluationContext, line: Line):
+            sums = context.state.kept(_seidel, line.wavelength, shapes)[which]
             surface = line.row.integers[0]
             told = sums[surface - 1] if surface else sums.sum()
             return told / (share * 1e-3 * planner.view.wavelengths[line.wavelength])
 
-        return lambda now: Found(listed([number(now, line) for line in lines], now.moment.count))
+        return lambda context: Found(listed([number(context, line) for line in lines], context.state.count))
 
     return plan
 
@@ -204,7 +204,7 @@ def _need_seidel(line: Line, planner: Planner) -> None:
         raise BadRow(line, "is of a straight axis: tilts and decentres bend this one")
     for k, surface in enumerate(planner.lens.surfaces):
         if not is_even(surface):
-            raise BadRow(line, f"is of even powers of r: surface {k} has other terms, a departure or a phase")
+            raise BadRow(line, f"is of even powers of r: surface {k} has other terms, added sag or a phase")
 
 
 def _distortion_sum(lines: Sequence[Line], planner: Planner) -> Evaluate:
@@ -214,12 +214,12 @@ def _distortion_sum(lines: Sequence[Line], planner: Planner) -> Evaluate:
     parts = [(of_lens, _distortion), (of_surface, _of_seidel(4))]
     planned = [(rows, plan(rows, planner)) for rows, plan in parts if rows]
 
-    def evaluate(now: Now) -> Found:
+    def evaluate(context: EvaluationContext) -> Found:
         told = {}
         for rows, found in planned:
-            values = found(now).values
+            values = found(context).values
             told |= {line.number: values[k] for k, line in enumerate(rows)}
-        return Found(listed([told[line.number] for line in lines], now.moment.count))
+        return Found(listed([told[line.number] for line in lines], context.state.count))
 
     return evaluate
 
@@ -242,8 +242,8 @@ def _distortion(lines: Sequence[Line], planner: Planner) -> Evaluate:
     scale = np.array([_length(planner, field) / _length(planner, at) for field, at in zip(fields, close, strict=True)])
     absolute = np.array([bool(line.row.numbers[0]) for line in lines])
 
-    def evaluate(now: Now) -> Found:
-        hits, ideal = now.hits(far), now.hits(near)
+    def evaluate(context: EvaluationContext) -> Found:
+        hits, ideal = context.hits(far), context.hits(near)
         h, h0 = (part.position[0] * x + part.position[1] * y for part in (hits, ideal))
         h0 = h0 * scale
         return Found(known(hits.valid & ideal.valid, np.where(absolute, (h - h0) / planner.unit, 100 * (h / h0 - 1))))
@@ -266,7 +266,7 @@ def _largest_distortion(lines: Sequence[Line], planner: Planner) -> Evaluate:
     """|distortion|, or the target where that is met."""
     found = _distortion(lines, planner)
     targets = np.array([line.row.target for line in lines])
-    return lambda now: Found(np.maximum(np.abs(found(now).values), targets))
+    return lambda context: Found(np.maximum(np.abs(found(context).values), targets))
 
 
 def _calibrated_distortion(lines: Sequence[Line], planner: Planner) -> Evaluate:
@@ -274,13 +274,13 @@ def _calibrated_distortion(lines: Sequence[Line], planner: Planner) -> Evaluate:
     if planner.lens.fields.kind != "angle" or not _largest(planner):
         kind = planner.lens.fields.kind.replace("_", " ")
         raise BadRow(lines[0], f"is of angles of the field; this lens has a field of {kind}")
-    steps = _FIELDS if planner.readings.f_theta == "axis left out" else _FIELDS - 1
+    steps = _FIELDS if planner.conventions.f_theta == "axis left out" else _FIELDS - 1
     parts = [(k + 1) / steps for k in range(steps)]
     theta = np.deg2rad(_largest(planner)) * np.array(parts)
     rays = [np.array([_chief(line, planner, (0.0, part), line.wavelength) for part in parts]) for line in lines]
 
-    def number(now: Now, line: Line, asked: np.ndarray):
-        hits = now.hits(asked)
+    def number(context: EvaluationContext, line: Line, asked: np.ndarray):
+        hits = context.hits(asked)
         if not hits.valid.all():
             return np.nan
         y = hits.position[1]
@@ -288,9 +288,9 @@ def _calibrated_distortion(lines: Sequence[Line], planner: Planner) -> Evaluate:
         off = np.abs((y - ideal) / planner.unit if line.row.numbers[0] else 100 * (y / ideal - 1))
         return off[int(np.argmax(value_of(off)))]
 
-    def evaluate(now: Now) -> Found:
-        told = [number(now, line, asked) for line, asked in zip(lines, rays, strict=True)]
-        return Found(listed(told, now.moment.count))
+    def evaluate(context: EvaluationContext) -> Found:
+        told = [number(context, line, asked) for line, asked in zip(lines, rays, strict=True)]
+        return Found(listed(told, context.state.count))
 
     return evaluate
 
@@ -314,8 +314,8 @@ def _field_curvature(across: bool) -> Callable[[Sequence[Line], Planner], Evalua
         )
         x, y = np.array(sections).T
 
-        def evaluate(now: Now) -> Found:
-            one, other = now.hits(first), now.hits(second)
+        def evaluate(context: EvaluationContext) -> Found:
+            one, other = context.hits(first), context.hits(second)
             apart = (one.position[0] - other.position[0]) * x + (one.position[1] - other.position[1]) * y
             opening = sum(
                 (one.direction[k] / one.direction[2] - other.direction[k] / other.direction[2]) * part
@@ -329,7 +329,7 @@ def _field_curvature(across: bool) -> Callable[[Sequence[Line], Planner], Evalua
 
 
 _SEIDEL = "S{} in waves: of a surface (0: all of them), at a wavelength"
-_SEIDEL_READING = "Seidel's coefficient S{} itself over the wavelength; `seidel` wavefront: S{}/{}"
+_SEIDEL_CONVENTION = "Seidel's coefficient S{} itself over the wavelength; `seidel` wavefront: S{}/{}"
 _CONTRIBUTION = "contribution", "wavelength"
 _CLOSE = "without vignetting factors, by rays at a thousandth of the pupil"
 
@@ -338,7 +338,7 @@ def _sum_row(which: int, word: str, share: int) -> Operand:
     return Operand(
         _of_seidel(which - 1),
         f"{word} " + _SEIDEL.format(which),
-        reading=_SEIDEL_READING.format(which, which, share),
+        convention=_SEIDEL_CONVENTION.format(which, which, share),
         takes=_CONTRIBUTION,
     )
 
@@ -349,14 +349,14 @@ ABERRATIONS = {
         "axial colour: where one wavelength meets the axis less where another does; paraxial, or of the real ray at "
         "the height of the pupil in the column of Hx",
         length=1,
-        reading="the first wavelength's less the second's; `colour` second: the other way round",
+        convention="the first wavelength's less the second's; `colour` second: the other way round",
         takes=("shortest", "longest"),
     ),
     "LACL": Operand(
         _lateral_colour,
         "lateral colour: y of the chief ray of one wavelength less that of another, of the largest field",
         length=1,
-        reading="real chief rays; the first wavelength's less the second's; `colour` second: the other way round",
+        convention="real chief rays; the first wavelength's less the second's; `colour` second: the other way round",
         takes=("shortest", "longest"),
     ),
     "SPHA": _sum_row(1, "spherical aberration", 8),
@@ -367,37 +367,37 @@ ABERRATIONS = {
         _distortion_sum,
         "distortion S5 in waves of a surface at a wavelength; of surface 0 that of the largest field in %, or in "
         "lengths where the number in the column of Hx is not 0",
-        reading="S5 itself over the wavelength, `seidel` wavefront: S5/2; of surface 0 by the real chief ray, against "
-        "one near the axis",
+        convention="S5 itself over the wavelength, `seidel` wavefront: S5/2; of surface 0 by the real chief ray, "
+        "against one near the axis",
         takes=_CONTRIBUTION,
     ),
     "DIMX": Operand(
         _largest_distortion,
         "|distortion| of a field (0: the largest) at a wavelength is meant to be below the target: its value in %, or "
         "in lengths where the number in the column of Hx is not 0, or the target itself where that is met",
-        reading="of the largest field alone where the field is 0; the ideal height by a chief ray near the axis",
+        convention="of the largest field alone where the field is 0; the ideal height by a chief ray near the axis",
         takes=("field", "wavelength"),
     ),
     "DISC": Operand(
         _calibrated_distortion,
         "largest distortion from y = f θ at a wavelength, in %, or in lengths where the number in the column of Hx is "
         "not 0",
-        reading=f"{_FIELDS} fields along y at even steps, the axis left out, f by least squares over them; `f_theta` "
-        f"axis included: {_FIELDS - 1} steps and the axis",
+        convention=f"{_FIELDS} fields along y at even steps, the axis left out, f by least squares over them; "
+        f"`f_theta` axis included: {_FIELDS - 1} steps and the axis",
         takes=("", "wavelength"),
     ),
     "FCGS": Operand(
         _field_curvature(True),
         "sagittal field curvature of a field Hx Hy: from the image to the focus of close rays",
         length=1,
-        reading=_CLOSE,
+        convention=_CLOSE,
         takes=("", "wavelength"),
     ),
     "FCGT": Operand(
         _field_curvature(False),
         "tangential field curvature of a field Hx Hy: from the image to the focus of close rays",
         length=1,
-        reading=_CLOSE,
+        convention=_CLOSE,
         takes=("", "wavelength"),
     ),
 }

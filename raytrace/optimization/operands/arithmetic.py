@@ -10,7 +10,7 @@ from graphlib import CycleError, TopologicalSorter
 import numpy as np
 
 from raytrace.maths.dual import Dual, value_of
-from raytrace.optimization.context import SETTINGS, BadRow, Evaluate, Found, Line, Now, Operand, Planner
+from raytrace.optimization.context import SETTINGS, BadRow, Evaluate, EvaluationContext, Found, Line, Operand, Planner
 from raytrace.optimization.operands.paraxial import listed
 from raytrace.system.optimization_data import Row
 
@@ -63,23 +63,23 @@ def in_order(referred: dict[int, Sequence[int]]) -> list[int]:
         ) from None
 
 
-def _operand(tell: Callable, refers: Callable, text: str, reading: str = "", bounds: str = "") -> Operand:
+def _operand(tell: Callable, refers: Callable, text: str, convention: str = "", bounds: str = "") -> Operand:
     """tell: of the row and of the values that it takes."""
 
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
         taken = [refers(line, planner.rows) for line in lines]
 
-        def evaluate(now: Now) -> Found:
+        def evaluate(context: EvaluationContext) -> Found:
             with np.errstate(all="ignore"):
                 told = [
-                    tell(line.row, *(now.values[n] for n in numbers))
+                    tell(line.row, *(context.values[n] for n in numbers))
                     for line, numbers in zip(lines, taken, strict=True)
                 ]
-                return Found(_finite(listed(told, now.moment.count)))
+                return Found(_finite(listed(told, context.state.count)))
 
         return evaluate
 
-    return Operand(plan, text, reading=reading, refers=refers, bounds=bounds)
+    return Operand(plan, text, convention=convention, refers=refers, bounds=bounds)
 
 
 def _finite(number):

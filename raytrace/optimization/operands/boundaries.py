@@ -9,13 +9,13 @@ Semi-diameters: how far the light of all fields reaches from the vertex of every
 
     s = (1 + a/100) max √(x² + y²) + c
 
-over all fields and wavelengths and the ends of the two diameters of the pupil, at every moment; a per cent and c mm are
-the margin of `Intent`, which neither the stop nor the image has. The derivative is that of the ray that is largest.
+over all fields and wavelengths and the ends of the two diameters of the pupil, at every state; a per cent and c mm are
+the margin of `OptimizationData`, which neither the stop nor the image has. The derivative is that of the largest ray.
 
 Gaps: what stands behind the surfaces of a lens: thicknesses at centre and edge, and sags, with derivatives.
 
 A gap goes from a surface to the next one that is no coordinate break. All of them are found at once, when the first row
-asks at a moment; arrays (S,) have an entry for every surface, of which only those that were asked for mean anything.
+asks at a state; arrays (S,) have an entry for every surface, of which only those that were asked for mean anything.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -25,13 +25,13 @@ import torch
 
 from raytrace.materials.glass import is_air
 from raytrace.maths.dual import Dual, value_of
-from raytrace.optimization.context import Evaluate, Found, Line, Now, Operand, Planner
-from raytrace.optimization.lens_state import ENDS, Moment
+from raytrace.optimization.context import Evaluate, EvaluationContext, Found, Line, Operand, Planner
+from raytrace.optimization.lens_state import ENDS, LensState
 from raytrace.optimization.ray_bundle import Bundle, Marks
 from raytrace.system.lens import Lens
 from raytrace.system.shapes import EVEN
 from raytrace.system.surface import Surface, sag_at
-from raytrace.tracing.sequence import media
+from raytrace.tracing.trace import media
 
 
 class SemiDiameters:
@@ -40,7 +40,7 @@ class SemiDiameters:
     def __init__(self, planner: Planner):
         lens, view = planner.lens, planner.view
         self.given = given_semi_diameters(view)
-        percent, length = (0.0, 0.0) if lens.intent is None else lens.intent.semi_diameter_margin
+        percent, length = (0.0, 0.0) if lens.optimization_data is None else lens.optimization_data.semi_diameter_margin
         without = (lens.stop, planner.image)
         surfaces = range(len(lens.surfaces))
         self.factors = np.array([1.0 if k in without else 1 + percent / 100 for k in surfaces])
@@ -51,23 +51,23 @@ class SemiDiameters:
         """Tell, while rows are planned, whose semi-diameters will be looked at."""
         self.asked |= set(surfaces)
 
-    def at(self, now: Now):
+    def at(self, context: EvaluationContext):
         """mm (S,) of all surfaces; nan of those that were not asked for, and where no ray arrives."""
-        return now.once(self._found)
+        return context.once(self._found)
 
-    def _found(self, now: Now):
+    def _found(self, context: EvaluationContext):
         found = np.full(len(self.factors), np.nan)
         follow = sorted(self.asked - set(self.given))
-        slopes = np.zeros((now.moment.count, len(found)))
+        slopes = np.zeros((context.state.count, len(found)))
         if follow:
             places = np.array(follow) - 1
-            heights, by = largest_heights(self.bundle(follow[-1]).marks(now.moment), places)
+            heights, by = largest_heights(self.bundle(follow[-1]).marks(context.state), places)
             found[follow] = self.factors[follow] * heights + self.lengths[follow]
             if by is not None:
                 slopes[:, follow] = self.factors[follow] * by
         for surface, number in self.given.items():
             found[surface] = number
-        return Dual(found, slopes) if now.moment.count else found
+        return Dual(found, slopes) if context.state.count else found
 
     def bundle(self, last: int) -> Bundle:
         """The rays up to a surface; `last` is the same in every call, once rows are planned."""
@@ -78,8 +78,8 @@ class SemiDiameters:
 
 def given_semi_diameters(view) -> dict[int, float]:
     """mm, by surface: those that stay as they are; the object's is 0 where none is told."""
-    surfaces, intent = view.lens.surfaces, view.lens.intent
-    stay = range(len(surfaces)) if intent is None else intent.semi_diameters
+    surfaces, optimization_data = view.lens.surfaces, view.lens.optimization_data
+    stay = range(len(surfaces)) if optimization_data is None else optimization_data.semi_diameters
     told = {k: float(surfaces[k].semi_diameter) for k in stay if surfaces[k].semi_diameter}
     return {0: surfaces[0].semi_diameter or 0.0} | told
 
@@ -139,86 +139,86 @@ class Gaps:
         """Tell, while rows are planned, behind which surfaces edges will be looked at."""
         self.semi_diameters.ask([k for start in surfaces for k in (start, int(self.end[start]))])
 
-    def numbers(self, moment: Moment, quantity: str):
+    def numbers(self, state: LensState, quantity: str):
         """A number (S,) of all surfaces."""
         values, slopes = self.stored[quantity].copy(), None
-        for (surface, name), number in moment.numbers.items():
+        for (surface, name), number in state.numbers.items():
             if name == quantity:
                 values[surface] = value_of(number)
                 if isinstance(number, Dual):
-                    slopes = np.zeros((moment.count, len(values))) if slopes is None else slopes
+                    slopes = np.zeros((state.count, len(values))) if slopes is None else slopes
                     slopes[:, surface] = number.slope
         return values if slopes is None else Dual(values, slopes)
 
-    def centre(self, now: Now):
+    def centre(self, context: EvaluationContext):
         """mm on the axis, as the lens has them."""
-        return now.once(self._centre)
+        return context.once(self._centre)
 
-    def _centre(self, now: Now):
-        own = found = self.numbers(now.moment, "thickness")
+    def _centre(self, context: EvaluationContext):
+        own = found = self.numbers(context.state, "thickness")
         start = np.arange(len(self.end))
         for step in range(1, int((self.end - start).max())):
             within = start + step < self.end
             found = found + np.where(within, own[np.where(within, start + step, 0)], 0.0)
         return found
 
-    def edge(self, now: Now, code: int = 0):
+    def edge(self, context: EvaluationContext, code: int = 0):
         """mm at the edge: t + z′ - z, each surface at its own semi-diameter; code: the number of a side in `SIDES`."""
-        return now.once(self._edge, code)
+        return context.once(self._edge, code)
 
-    def _edge(self, now: Now, code: int):
-        z = self.sag(now, code)
-        return self.centre(now) + (z[self.end] - z)
+    def _edge(self, context: EvaluationContext, code: int):
+        z = self.sag(context, code)
+        return self.centre(context) + (z[self.end] - z)
 
-    def whole(self, now: Now, code: int = 0):
+    def whole(self, context: EvaluationContext, code: int = 0):
         """mm along the axis between what stands out furthest, of both surfaces, be it at the centre or at the edge."""
-        z = self.sag(now, code)
-        return self.centre(now) + (np.maximum(z[self.end], 0.0) - np.minimum(z, 0.0))
+        z = self.sag(context, code)
+        return self.centre(context) + (np.maximum(z[self.end], 0.0) - np.minimum(z, 0.0))
 
-    def sag(self, now: Now, code: int = 0):
+    def sag(self, context: EvaluationContext, code: int = 0):
         """mm at the semi-diameters."""
-        return now.once(self._sag, code)
+        return context.once(self._sag, code)
 
-    def _sag(self, now: Now, code: int):
-        heights = self.semi_diameters.at(now)
-        found = self._even_sag(now.moment, heights)
+    def _sag(self, context: EvaluationContext, code: int):
+        heights = self.semi_diameters.at(context)
+        found = self._even_sag(context.state, heights)
         asked = [k for k in self.others if not np.isnan(value_of(heights)[k])]
         if not asked:
             return found
-        count = now.moment.count
+        count = context.state.count
         found = found if isinstance(found, Dual) or not count else Dual(found, np.zeros((count, 1)))
         values, slopes = value_of(found).copy(), found.full().copy() if count else None
         for k in asked:
-            one = _sag_by_torch(now.moment, k, heights[k], SIDES[code])
+            one = _sag_by_torch(context.state, k, heights[k], SIDES[code])
             values[k] = value_of(one)
             if count:
                 slopes[:, k] = one.slope
         return Dual(values, slopes) if count else values
 
-    def shortfall(self, now: Now):
+    def shortfall(self, context: EvaluationContext):
         """mm by which surfaces fall short of their semi-diameters s, below 0 where they reach them: s (q - 1)/2.
 
         q = (1+k) c² s² is 1 where a conic closes at s; near there it is s - 1/(|c| √(1+k)).
         """
-        return now.once(self._shortfall)
+        return context.once(self._shortfall)
 
-    def _shortfall(self, now: Now):
-        heights = self.semi_diameters.at(now)
-        return 0.5 * heights * (self._closing(now.moment, heights * heights) - 1.0)
+    def _shortfall(self, context: EvaluationContext):
+        heights = self.semi_diameters.at(context)
+        return 0.5 * heights * (self._closing(context.state, heights * heights) - 1.0)
 
-    def _closing(self, moment: Moment, u):
+    def _closing(self, state: LensState, u):
         """(1+k) c² u, which is 1 at the edge of a closed conic."""
-        c = self.numbers(moment, "curvature")
-        return (1 + self.numbers(moment, "conic")) * (c * c) * u
+        c = self.numbers(state, "curvature")
+        return (1 + self.numbers(state, "conic")) * (c * c) * u
 
-    def _even_sag(self, moment: Moment, heights):
+    def _even_sag(self, state: LensState, heights):
         """c u/(1 + √(1 - q)) + Σ a_j u^j, u = s², q = (1+k) c² u.
 
         Of a conic that closes within s, from 1 - q = ε on, 1 - q is ε/(1 + τ + τ²), τ = 1 - (1 - q)/ε: above 0, with
         two continuous derivatives.
         """
-        u, c = heights * heights, self.numbers(moment, "curvature")
-        left = 1 - self._closing(moment, u)
+        u, c = heights * heights, self.numbers(state, "curvature")
+        left = 1 - self._closing(state, u)
         closed = value_of(left) < _EDGE
         if closed.any():
             over = np.where(closed, 1 - left / _EDGE, 0.0)
@@ -226,14 +226,14 @@ class Gaps:
         found = c * u / (1 + np.sqrt(left))
         power = u
         for name in self.terms:
-            found = found + power * self.numbers(moment, name)
+            found = found + power * self.numbers(state, name)
             power = power * u
         return found
 
 
 def is_even(surface: Surface) -> bool:
     """Whether the sag is that of a conic with even terms at most, which is told here in numpy."""
-    return surface.departure is None and (surface.coefficients is None or surface.kind == EVEN)
+    return surface.sag_terms is None and (surface.coefficients is None or surface.kind == EVEN)
 
 
 def _even_terms(surface: Surface) -> list[float]:
@@ -255,22 +255,22 @@ def _in_air_of_gaps(lens: Lens) -> np.ndarray:
     return np.array(found)
 
 
-def _sag_by_torch(moment: Moment, surface: int, height, side: tuple[float, float]):
+def _sag_by_torch(state: LensState, surface: int, height, side: tuple[float, float]):
     """The sag of a surface of any kind, a number ()."""
     with torch.enable_grad():
-        leaves, lens = moment.view.leaves({at: value_of(n) for at, n in moment.numbers.items()})
+        leaves, lens = state.view.leaves({at: value_of(n) for at, n in state.numbers.items()})
         s = torch.tensor(float(value_of(height)), dtype=torch.float64, requires_grad=True)
         z = sag_at(lens.surfaces[surface], side[0] * s, side[1] * s)
-        if not moment.count:
+        if not state.count:
             return float(z.detach())
         by_height = torch.autograd.grad(z, s, retain_graph=True)[0]
-        return moment.chained(z, leaves) + float(by_height) * (height - value_of(height))
+        return state.chained(z, leaves) + float(by_height) * (height - value_of(height))
 
 
 _AT_LEAST, _AT_MOST = 1.0, -1.0
 
-#: What is compared: numbers (S,) of all surfaces at a moment.
-Amounts = Callable[[Now], object]
+#: What is compared: numbers (S,) of all surfaces at a state.
+Amounts = Callable[[EvaluationContext], object]
 
 #: How rows are prepared to be compared: of a planner, the surfaces they look at, and their code.
 Prepared = Callable[[Planner, Sequence[int], int], Amounts]
@@ -286,13 +286,13 @@ def _centre(planner: Planner, surfaces: Sequence[int], code: int) -> Amounts:
 def _edge(planner: Planner, surfaces: Sequence[int], code: int) -> Amounts:
     gaps = planner.shared(Gaps)
     gaps.ask_edges(surfaces)
-    return lambda now: gaps.edge(now, code)
+    return lambda context: gaps.edge(context, code)
 
 
 def _whole(planner: Planner, surfaces: Sequence[int], code: int) -> Amounts:
     gaps = planner.shared(Gaps)
     gaps.ask_edges(surfaces)
-    return lambda now: gaps.whole(now, code)
+    return lambda context: gaps.whole(context, code)
 
 
 def _along_light(prepared: Prepared) -> Prepared:
@@ -300,9 +300,9 @@ def _along_light(prepared: Prepared) -> Prepared:
 
     def prepare(planner: Planner, surfaces: Sequence[int], code: int) -> Amounts:
         amounts, side = prepared(planner, surfaces, 0), planner.shared(Gaps).side
-        if planner.readings.behind_mirrors == "signed" or (side > 0).all():
+        if planner.conventions.behind_mirrors == "signed" or (side > 0).all():
             return amounts
-        return lambda now: side * amounts(now)
+        return lambda context: side * amounts(context)
 
     return prepare
 
@@ -315,20 +315,20 @@ def _semi_diameter(planner: Planner, surfaces: Sequence[int], code: int) -> Amou
 
 def _diameter(planner: Planner, surfaces: Sequence[int], code: int) -> Amounts:
     found = _semi_diameter(planner, surfaces, code)
-    return lambda now: 2.0 * found(now)
+    return lambda context: 2.0 * found(context)
 
 
 def _slenderness(planner: Planner, surfaces: Sequence[int], code: int) -> Amounts:
     """Diameter over centre thickness."""
     diameter, thickness = _diameter(planner, surfaces, code), _along_light(_centre)(planner, surfaces, code)
     asked = np.isin(np.arange(planner.image + 1), surfaces)
-    return lambda now: diameter(now) / np.where(asked, thickness(now), 1.0)
+    return lambda context: diameter(context) / np.where(asked, thickness(context), 1.0)
 
 
 def _number(quantity: str) -> Prepared:
     def prepare(planner: Planner, surfaces: Sequence[int], code: int) -> Amounts:
         gaps = planner.shared(Gaps)
-        return lambda now: gaps.numbers(now.moment, quantity)
+        return lambda context: gaps.numbers(context.state, quantity)
 
     return prepare
 
@@ -344,10 +344,10 @@ def _of_glass(tell: Callable) -> Prepared:
                 tell(*indices[k].expand(3)) if k in surfaces else torch.zeros(()) for k in range(len(lens.surfaces))
             ]
 
-        def amounts(now: Now):
-            found = now.moment.through_torch(numbers)
+        def amounts(context: EvaluationContext):
+            found = context.state.through_torch(numbers)
             values = np.array([float(value_of(number)) for number in found])
-            return Dual(values, np.stack([number.slope for number in found], -1)) if now.moment.count else values
+            return Dual(values, np.stack([number.slope for number in found], -1)) if context.state.count else values
 
         return amounts
 
@@ -386,7 +386,7 @@ Chosen = Callable[[Line, Planner], list[tuple[int, int]]]
 
 
 class _Places:
-    """The surfaces (P,) of all rows: `rows`, of which row each is; `at`, their amounts at a moment."""
+    """The surfaces (P,) of all rows: `rows`, of which row each is; `at`, their amounts at a state."""
 
     def __init__(self, prepared: Prepared, chosen: Chosen, lines: Sequence[Line], planner: Planner):
         found = [(number, *pair) for number, line in enumerate(lines) for pair in chosen(line, planner)]
@@ -396,19 +396,19 @@ class _Places:
             for code in sorted(set(self.codes.tolist()))
         }
 
-    def values(self, now: Now) -> np.ndarray:
+    def values(self, context: EvaluationContext) -> np.ndarray:
         """Without derivatives."""
         found = np.zeros(len(self.rows))
         for code, tell in self.amounts.items():
             own = self.codes == code
-            found[own] = value_of(tell(now))[self.surfaces[own]]
+            found[own] = value_of(tell(context))[self.surfaces[own]]
         return found
 
-    def at(self, now: Now, places: np.ndarray):
+    def at(self, context: EvaluationContext, places: np.ndarray):
         """Those of some places, with derivatives."""
         found = np.zeros(len(places))
         for code, tell in self.amounts.items():
-            own = tell(now)[self.surfaces[places]]
+            own = tell(context)[self.surfaces[places]]
             found = own if len(self.amounts) == 1 else np.where(self.codes[places] == code, own, found)
         return found
 
@@ -422,27 +422,27 @@ def within(prepared: Prepared, chosen: Chosen, side: float, length: int, also: P
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
         places = _Places(prepared, chosen, lines, planner)
         targets = np.array([line.row.target for line in lines]) * planner.unit**length
-        counted = LACKS[planner.readings.boundary]
+        counted = LACKS[planner.conventions.boundary]
         closed = None if also is None else _Places(also, _both(chosen), lines, planner)
         rows = places.rows if closed is None else np.concatenate([places.rows, closed.rows])
         surfaces = places.surfaces if closed is None else np.concatenate([places.surfaces, closed.surfaces])
 
-        def lacking(now: Now, chosen: np.ndarray):
+        def lacking(context: EvaluationContext, chosen: np.ndarray):
             """What some places lack, with derivatives."""
             first = chosen[chosen < len(places.rows)]
-            lacks = side * (targets[places.rows[first]] - places.at(now, first))
+            lacks = side * (targets[places.rows[first]] - places.at(context, first))
             further = chosen[chosen >= len(places.rows)] - len(places.rows)
-            return np.concatenate([lacks, closed.at(now, further)]) if len(further) else lacks
+            return np.concatenate([lacks, closed.at(context, further)]) if len(further) else lacks
 
-        def evaluate(now: Now) -> Found:
-            lacks = side * (targets[places.rows] - places.values(now))
-            lacks = lacks if closed is None else np.concatenate([lacks, closed.values(now)])
-            sides = (rows, lacking(now, np.arange(len(rows))), surfaces) if counted is _all else ()
+        def evaluate(context: EvaluationContext) -> Found:
+            lacks = side * (targets[places.rows] - places.values(context))
+            lacks = lacks if closed is None else np.concatenate([lacks, closed.values(context)])
+            sides = (rows, lacking(context, np.arange(len(rows))), surfaces) if counted is _all else ()
             passed = counted(np.flatnonzero(~(lacks <= 0)), rows, lacks)  # nan is none that complies
             if not passed.size:
                 return Found(targets, sides=sides)
             of_row = (rows[passed] == np.arange(len(lines))[:, None]).astype(float)
-            return Found(targets - side * (of_row @ lacking(now, passed)), sides=sides)
+            return Found(targets - side * (of_row @ lacking(context, passed)), sides=sides)
 
         return evaluate
 
@@ -476,7 +476,7 @@ def _largest(passed: np.ndarray, rows: np.ndarray, lacks: np.ndarray) -> np.ndar
     return order[np.unique(rows[order], return_index=True)[1]]
 
 
-#: Which of the places that pass a target count, by `Readings.boundary`.
+#: Which of the places that pass a target count, by `Conventions.boundary`.
 LACKS = {"sum": _all, "largest": _largest}
 
 
@@ -486,7 +486,7 @@ def value(prepared: Prepared):
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
         places = _Places(prepared, _single, lines, planner)
         every = np.arange(len(lines))
-        return lambda now: Found(places.at(now, every))
+        return lambda context: Found(places.at(context, every))
 
     return plan
 
@@ -530,7 +530,7 @@ def _of_range(tail: str, prepared: Prepared, surfaces, text: str, length: int = 
             within(prepared, surfaces, side, length),
             f"{word} {text}, surfaces int1 to int2",
             length=length,
-            reading=_SUM,
+            convention=_SUM,
             bounds=_RELATIONS[side],
         )
         for head, side, word in _SIDES
@@ -538,7 +538,7 @@ def _of_range(tail: str, prepared: Prepared, surfaces, text: str, length: int = 
 
 
 def _of_one(
-    head: str, prepared: Prepared, text: str, length: int = 0, reading: str = "", also: Prepared | None = None
+    head: str, prepared: Prepared, text: str, length: int = 0, convention: str = "", also: Prepared | None = None
 ) -> dict[str, Operand]:
     """GT, LT and VA of a number of surface int1."""
     bounds = {
@@ -546,12 +546,12 @@ def _of_one(
             within(prepared, _single, side, length, also),
             f"{text}, {word} the target",
             length,
-            reading,
+            convention,
             bounds=_RELATIONS[side],
         )
         for tail, side, word in _BOUNDS
     }
-    return bounds | {f"{head}VA": Operand(value(prepared), text, length, reading)}
+    return bounds | {f"{head}VA": Operand(value(prepared), text, length, convention)}
 
 
 BOUNDARIES: dict[str, Operand] = {

@@ -1,7 +1,7 @@
 """Rows of any function of a lens, and what counts as lost where such a function has no number.
 
 Its derivatives are those that torch finds backward through all that it does, from a lens whose numbers are those of
-the moment, carried on through solves and pickups.
+the state, carried on through solves and pickups.
 """
 
 import dataclasses
@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
-from raytrace.optimization.context import BadRow, Evaluate, Found, Line, Now, Operand, Planner
+from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Found, Line, Operand, Planner
 from raytrace.optimization.operands.paraxial import listed
 from raytrace.system.lens import Lens
 from raytrace.system.optimization_data import Row
@@ -53,15 +53,15 @@ def _planned(function: Callable) -> Callable[[Sequence[Line], Planner], Evaluate
             alone[:] = [found.dim() == 0]
             return list(found.reshape(-1))
 
-        numbers = OrLost(one, lambda now: now.moment.through_torch(told, clips=True))
+        numbers = OrLost(one, lambda context: context.state.through_torch(told, clips=True))
 
-        def evaluate(now: Now) -> Found:
-            found = numbers(now)
+        def evaluate(context: EvaluationContext) -> Found:
+            found = numbers(context)
             if found is None or alone[0]:
-                return Found(listed([np.nan if found is None else found[0]] * len(lines), now.moment.count))
+                return Found(listed([np.nan if found is None else found[0]] * len(lines), context.state.count))
             length = np.sqrt(sum(number * number for number in found))
-            parts = tuple(listed([number] * len(lines), now.moment.count) for number in found)
-            return Found(listed([length] * len(lines), now.moment.count), parts)
+            parts = tuple(listed([number] * len(lines), context.state.count) for number in found)
+            return Found(listed([length] * len(lines), context.state.count), parts)
 
         return evaluate
 
@@ -69,17 +69,17 @@ def _planned(function: Callable) -> Callable[[Sequence[Line], Planner], Evaluate
 
 
 class OrLost:
-    """Numbers of a moment, or None where they cannot be had of the lens that an optimisation tries.
+    """Numbers of a state, or None where they cannot be had of the lens that an optimisation tries.
 
     A lens to begin with that does not have them is an error of the row. Raises BadRow.
     """
 
-    def __init__(self, line: Line, tell: Callable[[Now], Sequence]):
+    def __init__(self, line: Line, tell: Callable[[EvaluationContext], Sequence]):
         self.line, self.tell, self.had = line, tell, False
 
-    def __call__(self, now: Now) -> Sequence | None:
+    def __call__(self, context: EvaluationContext) -> Sequence | None:
         try:
-            found = self.tell(now)
+            found = self.tell(context)
         except ValueError as error:
             if not self.had:
                 raise BadRow(self.line, f"has no value: {error}") from error

@@ -2,7 +2,7 @@
 
 The MTF of diffraction follows from a few rings of rays (`sheared.py`), that of rays is a sum over a beam; both are
 traced with all the rows' rays. What remains, a beam that apertures clip and the Strehl ratio, are the functions of
-`analysis.mtf` and `psf_models.diffraction`, with their derivatives by torch.
+`analysis.mtf` and `psf_models.wave`, with their derivatives by torch.
 
 Beams whose modulation of diffraction is asked for: their rays, and the MTF of all of them with its derivatives.
 """
@@ -19,7 +19,7 @@ from raytrace.analysis.mtf import clear_circle, cutoff, modulation, otf_along
 from raytrace.analysis.pupil_autocorrelation import Fit, exit_pupil, layout_of, otf
 from raytrace.analysis.setting import scene_of
 from raytrace.maths.dual import Dual, slope_of, value_of
-from raytrace.optimization.context import BadRow, Evaluate, Found, Line, Now, Operand, Planner
+from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Found, Line, Operand, Planner
 from raytrace.optimization.operands.custom import OrLost
 from raytrace.optimization.operands.paraxial import listed
 from raytrace.optimization.operands.wavefront import (
@@ -32,9 +32,9 @@ from raytrace.optimization.operands.wavefront import (
     rings,
     sphere_of,
 )
-from raytrace.psf_models.diffraction import strehl
+from raytrace.psf_models.wave import strehl
 from raytrace.system.lens import Lens
-from raytrace.tracing.axis import is_bent
+from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.scene import Scene
 
 _MISSED = 0.02  # waves of RMS that the polynomials of a wave may leave
@@ -103,15 +103,15 @@ class Sent(NamedTuple):
     valid: np.ndarray
 
 
-def sent(now: Now, beams: Sequence[Pupil]) -> Sent:
+def sent(context: EvaluationContext, beams: Sequence[Pupil]) -> Sent:
     """The waves of beams of one kind, those of one beam after those of another."""
     rays, chiefs, colours = (
         np.concatenate([getattr(beam, name) for beam in beams]) for name in ("rays", "chiefs", "colours")
     )
-    shape, each, count = rays.shape, np.repeat(np.arange(len(rays)), rays.shape[1]), now.moment.count
-    hits, chief = now.hits(rays.ravel(), clips=True), now.hits(chiefs, clips=True)
-    sphere, index = sphere_of(now, chief, is_bent(now.planner.lens)), image_index(now, colours)
-    per_wave = 1e3 / np.array(now.planner.view.wavelengths)[colours]
+    shape, each, count = rays.shape, np.repeat(np.arange(len(rays)), rays.shape[1]), context.state.count
+    hits, chief = context.hits(rays.ravel(), clips=True), context.hits(chiefs, clips=True)
+    sphere, index = sphere_of(context, chief, is_bent(context.planner.lens)), image_index(context, colours)
+    per_wave = 1e3 / np.array(context.planner.view.wavelengths)[colours]
     path = path_to(sphere.at(each), hits, index[each]) - path_to(sphere, chief, index)[each]
     scale = (index * per_wave)[each]
     found = [path * per_wave[each], *(scale * part for part in directions_to(sphere.at(each), hits)[:2])]
@@ -135,13 +135,15 @@ def _turned(beams: Sequence[Pupil], x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.concatenate([np.stack(beam.turned(x[at], y[at])) for beam, at in zip(beams, places, strict=True)], -2)
 
 
-def modulations(now: Now, beams: Sequence[Pupil], sections: Sequence[Section]) -> tuple[Dual | np.ndarray, np.ndarray]:
+def modulations(
+    context: EvaluationContext, beams: Sequence[Pupil], sections: Sequence[Section]
+) -> tuple[Dual | np.ndarray, np.ndarray]:
     """MTF (F, Q) of beams of one kind in sections, and for which of them (F,) their rays tell it."""
-    light, colours = sent(now, beams), len(beams[0].colours)
+    light, colours = sent(context, beams), len(beams[0].colours)
     told = light.valid.all(-1).reshape(-1, colours).all(-1)
     values, slopes = (
         np.full((len(beams), len(sections)), np.nan),
-        np.zeros((now.moment.count, len(beams), len(sections))),
+        np.zeros((context.state.count, len(beams), len(sections))),
     )
     rule = _rule(light.blur.reshape(-1, colours).max(-1), sections)
     told &= rule > 0
@@ -149,10 +151,10 @@ def modulations(now: Now, beams: Sequence[Pupil], sections: Sequence[Section]) -
         some = _picked(light, (chosen[:, None] * colours + np.arange(colours)).ravel())
         fit = Fit(beams[0].layout, some.wave[0], some.directions[0])
         shares = np.stack([beams[k].shares for k in chosen])
-        found = _modulated(fit, some, sections, shares, int(rule[chosen].max()), now.moment.count)
+        found = _modulated(fit, some, sections, shares, int(rule[chosen].max()), context.state.count)
         values[chosen], slopes[:, chosen] = found
         told[chosen] &= (fit.missed.reshape(-1, colours) < _MISSED).all(-1)
-    return (Dual(values, slopes) if now.moment.count else values), told
+    return (Dual(values, slopes) if context.state.count else values), told
 
 
 def _picked(light: Sent, rows: np.ndarray) -> Sent:
@@ -258,8 +260,8 @@ class Wave:
         self.planner, self.field, self.colours = planner, field_of(line, planner), colours_of(line, planner)
         self.least = _POINTS * 2 ** (line.row.integers[0] - 1)
         self.asked: dict[tuple[float, str], int] = {}
-        self._numbers = OrLost(line, lambda now: now.moment.through_torch(self.told, clips=True))
-        self._found: tuple[Now | None, Sequence | None] = None, None
+        self._numbers = OrLost(line, lambda context: context.state.through_torch(self.told, clips=True))
+        self._found: tuple[EvaluationContext | None, Sequence | None] = None, None
         degree = min(_DEGREE + 2 * line.row.integers[0], _HIGHEST)
         self.beam = Pupil(planner, int(line.row.numbers[0]) - 1, self.colours, degree)
 
@@ -273,10 +275,10 @@ class Wave:
         at = {frequency: k for k, frequency in enumerate(frequencies)}
         return [sum(share * m[at[f]] for share, m in zip(_SHARES[s], both, strict=True)) for f, s in self.asked]
 
-    def __call__(self, now: Now) -> Sequence | None:
-        if self._found[0] is not now:
-            told = now.once(_by_few_rays, self.planner.shared(Waves)).get(self)
-            self._found = now, self._numbers(now) if told is None else told
+    def __call__(self, context: EvaluationContext) -> Sequence | None:
+        if self._found[0] is not context:
+            told = context.once(_by_few_rays, self.planner.shared(Waves)).get(self)
+            self._found = context, self._numbers(context) if told is None else told
         return self._found[1]
 
 
@@ -300,13 +302,13 @@ class Waves:
         return list(found.values())
 
 
-def _by_few_rays(now: Now, waves: Waves) -> dict[Wave, list]:
+def _by_few_rays(context: EvaluationContext, waves: Waves) -> dict[Wave, list]:
     """What waves are asked for, of those that a few rays tell."""
     found = {}
     for some in waves.by_kind():
         asked = {(f, axis) for one in some for f, s in one.asked for axis in range(2) if _SHARES[s][1 - axis]}
         sections = [Section(*each) for each in sorted(asked)]
-        modulation, told = modulations(now, [one.beam for one in some], sections)
+        modulation, told = modulations(context, [one.beam for one in some], sections)
         at = {section: k for k, section in enumerate(sections)}
         for k in np.flatnonzero(told):
             found[some[k]] = [_shared(modulation[k], at, *each) for each in some[k].asked]
@@ -329,9 +331,9 @@ def by_waves(section: str) -> Callable[[Sequence[Line], Planner], Evaluate]:
             wave = planner.shared(Waves).of(line)
             asked.append((wave, wave.ask(line.row.numbers[1], section)))
 
-        def evaluate(now: Now) -> Found:
-            found = [(wave(now), place) for wave, place in asked]
-            return Found(listed([np.nan if n is None else n[place] for n, place in found], now.moment.count))
+        def evaluate(context: EvaluationContext) -> Found:
+            found = [(wave(context), place) for wave, place in asked]
+            return Found(listed([np.nan if n is None else n[place] for n, place in found], context.state.count))
 
         return evaluate
 
@@ -357,13 +359,13 @@ def strehl_ratio(lines: Sequence[Line], planner: Planner) -> Evaluate:
             ratios = strehl(view_of(lens, field, colours))[0, 0]
             return [(shares_of(colours, ratios) * ratios).sum()]
 
-        return OrLost(line, lambda now: now.moment.through_torch(told, clips=True))
+        return OrLost(line, lambda context: context.state.through_torch(told, clips=True))
 
     tell = [of(line) for line in lines]
 
-    def evaluate(now: Now) -> Found:
-        found = [numbers(now) for numbers in tell]
-        return Found(listed([np.nan if n is None else n[0] for n in found], now.moment.count))
+    def evaluate(context: EvaluationContext) -> Found:
+        found = [numbers(context) for numbers in tell]
+        return Found(listed([np.nan if n is None else n[0] for n in found], context.state.count))
 
     return evaluate
 
@@ -376,12 +378,12 @@ def by_rays(section: str) -> Callable[[Sequence[Line], Planner], Evaluate]:
 
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
         tell = [_of_rays(line, section, planner) for line in lines]
-        return lambda now: Found(listed([one(now) for one in tell], now.moment.count))
+        return lambda context: Found(listed([one(context) for one in tell], context.state.count))
 
     return plan
 
 
-def _of_rays(line: Line, section: str, planner: Planner) -> Callable[[Now], object]:
+def _of_rays(line: Line, section: str, planner: Planner) -> Callable[[EvaluationContext], object]:
     _check(line)
     frequency = line.row.numbers[1]
     beam = _beam(line, planner)
@@ -391,14 +393,14 @@ def _of_rays(line: Line, section: str, planner: Planner) -> Callable[[Now], obje
         parts = clear_circle(frequency / cutoff(lens, lens.wavelengths[list(colours)]))
         return [(shares_of(colours, parts) * parts).sum()]
 
-    def tell(now: Now):
-        hits = now.hits(beam.rays, clips=True)
+    def tell(context: EvaluationContext):
+        hits = context.hits(beam.rays, clips=True)
         weights = beam.weights(hits.valid)
         if weights is None:
             return np.nan
         shares = zip((1, 0), _SHARES[section], strict=True)
         found = sum(share * _modulation(weights, hits.position[k], frequency) for k, share in shares if share)
-        return found if line.row.numbers[2] else found * now.moment.through_torch(perfect)[0]
+        return found if line.row.numbers[2] else found * context.state.through_torch(perfect)[0]
 
     return tell
 
@@ -430,17 +432,17 @@ _SECTIONS = {"T": "along y", "S": "along x", "A": "mean of both sections"}
 
 MODULATION = {
     **{
-        f"MTF{s}": Operand(by_waves(s), f"diffraction MTF {text}; {_COLUMNS}", reading=_WAVES, takes=_TAKES)
+        f"MTF{s}": Operand(by_waves(s), f"diffraction MTF {text}; {_COLUMNS}", convention=_WAVES, takes=_TAKES)
         for s, text in _SECTIONS.items()
     },
     **{
-        f"GMT{s}": Operand(by_rays(s), f"geometric MTF {text}; {_COLUMNS}", reading=_RAYS, takes=_TAKES)
+        f"GMT{s}": Operand(by_rays(s), f"geometric MTF {text}; {_COLUMNS}", convention=_RAYS, takes=_TAKES)
         for s, text in _SECTIONS.items()
     },
     "STRH": Operand(
         strehl_ratio,
         "Strehl ratio; int2 wavelength (0: all by weight), field number",
-        reading="the best point of the image; as many rays as it needs, int1 is not read; of all wavelengths the mean",
+        convention="the best point of the image; as many rays as it needs, int1 is not read; mean of all wavelengths",
         takes=_TAKES,
     ),
 }

@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from raytrace.maths.dual import Dual, slope_of, value_of
-from raytrace.optimization.context import Evaluate, Found, Line, Now, Operand, Planner
-from raytrace.optimization.lens_state import Moment
+from raytrace.optimization.context import Evaluate, EvaluationContext, Found, Line, Operand, Planner
+from raytrace.optimization.lens_state import LensState
 from raytrace.optimization.operands.arguments import need
 from raytrace.optimization.operands.rays import known
 from raytrace.optimization.ray_bundle import Hits
@@ -17,23 +17,23 @@ from raytrace.optimization.ray_bundle import Hits
 _RIM = 32  # rays by which the outline of a cone is known
 
 
-def one_by_one(tell: Callable[[Now, Line], object]) -> Callable[[Sequence[Line], Planner], Evaluate]:
-    """Rows that share nothing: a number for each, of the moment and the row."""
+def one_by_one(tell: Callable[[EvaluationContext, Line], object]) -> Callable[[Sequence[Line], Planner], Evaluate]:
+    """Rows that share nothing: a number for each, of the state and the row."""
 
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
-        return lambda now: Found(listed([tell(now, line) for line in lines], now.moment.count))
+        return lambda context: Found(listed([tell(context, line) for line in lines], context.state.count))
 
     return plan
 
 
-def of_moment(tell: Callable[[Moment], object]) -> Callable[[Sequence[Line], Planner], Evaluate]:
+def of_state(tell: Callable[[LensState], object]) -> Callable[[Sequence[Line], Planner], Evaluate]:
     """A number of the lens, whatever the row says."""
-    return one_by_one(lambda now, line: tell(now.moment))
+    return one_by_one(lambda context, line: tell(context.state))
 
 
-def at_wavelength(tell: Callable[[Moment, int], object]) -> Callable[[Sequence[Line], Planner], Evaluate]:
+def at_wavelength(tell: Callable[[LensState, int], object]) -> Callable[[Sequence[Line], Planner], Evaluate]:
     """A number of the lens at the wavelength of the row."""
-    return one_by_one(lambda now, line: tell(now.moment, line.wavelength))
+    return one_by_one(lambda context, line: tell(context.state, line.wavelength))
 
 
 def listed(numbers: Sequence, count: int):
@@ -50,127 +50,127 @@ def over(a, b):
 # -- focal length, pupils and conjugates -------------------------------------------------------------------------------
 
 
-def _focal_length(now: Now, line: Line):
-    data = now.moment.gaussian(line.wavelength)
-    return over(-1.0, data.C) if now.planner.readings.focal_length == "in air" else data.effective_focal_length
+def _focal_length(context: EvaluationContext, line: Line):
+    data = context.state.gaussian(line.wavelength)
+    return over(-1.0, data.C) if context.planner.conventions.focal_length == "in air" else data.effective_focal_length
 
 
-def _exit_pupil_position(moment: Moment):
-    data = moment.gaussian(moment.primary)
-    return over(-data.n_image * data.rear[0], data.rear[1]) - moment.thickness[-2]
+def _exit_pupil_position(state: LensState):
+    data = state.gaussian(state.primary)
+    return over(-data.n_image * data.rear[0], data.rear[1]) - state.thickness[-2]
 
 
-def _exit_pupil_diameter(moment: Moment):
-    data = moment.gaussian(moment.primary)
-    return moment.entrance_pupil_diameter * np.abs(over(data.front[0], data.rear[1]))
+def _exit_pupil_diameter(state: LensState):
+    data = state.gaussian(state.primary)
+    return state.entrance_pupil_diameter * np.abs(over(data.front[0], data.rear[1]))
 
 
-def _vergence(moment: Moment, wavelength: int):
+def _vergence(state: LensState, wavelength: int):
     """n / object distance; 0 for an object at infinity."""
-    return moment.index(wavelength)[0] / moment.object_distance
+    return state.index(wavelength)[0] / state.object_distance
 
 
-def _magnification(moment: Moment, wavelength: int):
-    data, vergence = moment.gaussian(wavelength), _vergence(moment, wavelength)
+def _magnification(state: LensState, wavelength: int):
+    data, vergence = state.gaussian(wavelength), _vergence(state, wavelength)
     return over(vergence, data.C + data.D * vergence)
 
 
-def _angular_magnification(moment: Moment, wavelength: int):
-    data = moment.gaussian(wavelength)
+def _angular_magnification(state: LensState, wavelength: int):
+    data = state.gaussian(wavelength)
     return over(data.n_object * data.rear[1], data.n_image * data.front[0])
 
 
-def image_slope(moment: Moment):
+def image_slope(state: LensState):
     """u′ of the paraxial marginal ray behind the lens."""
-    data = moment.gaussian(moment.primary)
-    return moment.marginal_height * (data.C + data.D * moment.vergence) / data.n_image
+    data = state.gaussian(state.primary)
+    return state.marginal_height * (data.C + data.D * state.vergence) / data.n_image
 
 
-def _image_na(moment: Moment):
-    return np.abs(moment.gaussian(moment.primary).n_image * np.sin(np.arctan(image_slope(moment))))
+def _image_na(state: LensState):
+    return np.abs(state.gaussian(state.primary).n_image * np.sin(np.arctan(image_slope(state))))
 
 
-def _f_number(moment: Moment):
-    return np.abs(moment.gaussian(moment.primary).effective_focal_length) / moment.entrance_pupil_diameter
+def _f_number(state: LensState):
+    return np.abs(state.gaussian(state.primary).effective_focal_length) / state.entrance_pupil_diameter
 
 
-def paraxial_image_distance(moment: Moment, wavelength: int):
+def paraxial_image_distance(state: LensState, wavelength: int):
     """mm from the last surface before the image."""
-    data, vergence = moment.gaussian(wavelength), _vergence(moment, wavelength)
+    data, vergence = state.gaussian(wavelength), _vergence(state, wavelength)
     return over(-data.n_image * (data.A + data.B * vergence), data.C + data.D * vergence)
 
 
 # -- the chief ray of the largest field --------------------------------------------------------------------------------
 
 
-def extent_of_field(moment: Moment):
+def extent_of_field(state: LensState):
     """Slope of the largest field at infinity, or mm of the object; real image heights as if they were paraxial ones."""
-    fields, data = moment.lens.fields, moment.gaussian(moment.primary)
+    fields, data = state.lens.fields, state.gaussian(state.primary)
     largest = float(np.hypot(fields.x.numpy(), fields.y.numpy()).max())
-    at_infinity = np.isinf(value_of(moment.thickness[0]))
+    at_infinity = np.isinf(value_of(state.thickness[0]))
     if fields.kind == "angle":
         slope = np.tan(np.deg2rad(largest))
-        return slope if at_infinity else -slope * (moment.thickness[0] + data.entrance_pupil_position)
+        return slope if at_infinity else -slope * (state.thickness[0] + data.entrance_pupil_position)
     if fields.kind == "object_height":
         return largest
-    return largest * (-data.C / data.n_object if at_infinity else 1 / _magnification(moment, moment.primary))
+    return largest * (-data.C / data.n_object if at_infinity else 1 / _magnification(state, state.primary))
 
 
-def chief_ray(moment: Moment) -> tuple:
+def chief_ray(state: LensState) -> tuple:
     """(ȳ, ū) in front of surface 1 of the chief ray of the largest field, upwards, at every wavelength."""
-    extent, pupil = extent_of_field(moment), moment.gaussian(moment.primary).entrance_pupil_position
-    distance = moment.thickness[0]
+    extent, pupil = extent_of_field(state), state.gaussian(state.primary).entrance_pupil_position
+    distance = state.thickness[0]
     if np.isinf(value_of(distance)):
         return -pupil * extent, extent
-    if moment.lens.fields.telecentric or not np.isfinite(value_of(pupil)):
+    if state.lens.fields.telecentric or not np.isfinite(value_of(pupil)):
         return extent, 0.0
     slope = -extent / (distance + pupil)
     return -pupil * slope, slope
 
 
-def _image_height(moment: Moment, wavelength: int):
+def _image_height(state: LensState, wavelength: int):
     """Of the largest field, in the paraxial image: m h, or -n u/C of an object at infinity."""
-    extent, data = extent_of_field(moment), moment.gaussian(wavelength)
-    if np.isinf(value_of(moment.thickness[0])):
+    extent, data = extent_of_field(state), state.gaussian(wavelength)
+    if np.isinf(value_of(state.thickness[0])):
         return over(-data.n_object * extent, data.C)
-    return _magnification(moment, wavelength) * extent
+    return _magnification(state, wavelength) * extent
 
 
 # -- lengths -----------------------------------------------------------------------------------------------------------
 
 
-def _total_thickness(now: Now, line: Line):
+def _total_thickness(context: EvaluationContext, line: Line):
     first, last = sorted(line.row.integers)
-    return sum(now.moment.thickness[first : last + 1])
+    return sum(context.state.thickness[first : last + 1])
 
 
-def _total_track(now: Now, line: Line):
+def _total_track(context: EvaluationContext, line: Line):
     """Between the leftmost and the rightmost vertex of surface 1 to the image, on a straight axis."""
-    if now.planner.readings.total_track == "sum":
-        return sum(now.moment.thickness[1:-1])
+    if context.planner.conventions.total_track == "sum":
+        return sum(context.state.thickness[1:-1])
     places = [0.0]
-    for thickness in now.moment.thickness[1:-1]:
+    for thickness in context.state.thickness[1:-1]:
         places.append(places[-1] + thickness)
     values = [value_of(place) for place in places]
     return places[int(np.argmax(values))] - places[int(np.argmin(values))]
 
 
-def petzval_curvature(moment: Moment, wavelength: int):
+def petzval_curvature(state: LensState, wavelength: int):
     """1/mm of the surface on which an image without astigmatism lies: -n′ Σ c (n′ - n)/(n n′)."""
-    n, c = moment.index(wavelength), moment.vertex_curvature
+    n, c = state.index(wavelength), state.vertex_curvature
     last = len(c) - 1
     return -n[last - 1] * sum(c[k] * ((n[k] - n[k - 1]) / (n[k] * n[k - 1])) for k in range(1, last))
 
 
-def _petzval_radius(moment: Moment, wavelength: int):
-    return over(1.0, petzval_curvature(moment, wavelength))
+def _petzval_radius(state: LensState, wavelength: int):
+    return over(1.0, petzval_curvature(state, wavelength))
 
 
 # -- cones of real rays ------------------------------------------------------------------------------------------------
 
 
-def index_before_image(moment: Moment, wavelength: int):
-    return np.abs(moment.index(wavelength)[-2])
+def index_before_image(state: LensState, wavelength: int):
+    return np.abs(state.index(wavelength)[-2])
 
 
 def field_of(planner: Planner, number: int) -> tuple[float, float]:
@@ -200,10 +200,10 @@ def across_rims(which: str) -> Callable[[Sequence[Line], Planner], Evaluate]:
         rays = [_rims(line, wave, planner, which) for line, wave in zip(lines, waves, strict=True)]
         ahead, back = np.array(rays).T
 
-        def evaluate(now: Now) -> Found:
-            one, other = now.hits(ahead), now.hits(back)
+        def evaluate(context: EvaluationContext) -> Found:
+            one, other = context.hits(ahead), context.hits(back)
             squares = sum((a - b) ** 2 for a, b in zip(one.direction, other.direction, strict=True))
-            index = listed([index_before_image(now.moment, wave) for wave in waves], now.moment.count)
+            index = listed([index_before_image(context.state, wave) for wave in waves], context.state.count)
             return Found(known(one.valid & other.valid, 1 / (index * np.sqrt(squares))))
 
         return evaluate
@@ -231,15 +231,15 @@ def _effective_f_number(lines: Sequence[Line], planner: Planner) -> Evaluate:
     ]
     around = _derivative(_RIM) * (2 * np.pi / _RIM)
 
-    def number(now: Now, hits: Hits, wavelength: int):
+    def number(context: EvaluationContext, hits: Hits, wavelength: int):
         if not hits.valid.all():
             return np.nan
         L, M, _ = hits.direction
-        return np.sqrt(np.pi / np.abs((L * (around @ M)).sum())) / (2 * index_before_image(now.moment, wavelength))
+        return np.sqrt(np.pi / np.abs((L * (around @ M)).sum())) / (2 * index_before_image(context.state, wavelength))
 
-    def evaluate(now: Now) -> Found:
-        told = [number(now, now.hits(rim), line.wavelength) for rim, line in zip(rays, lines, strict=True)]
-        return Found(listed(told, now.moment.count))
+    def evaluate(context: EvaluationContext) -> Found:
+        told = [number(context, context.hits(rim), line.wavelength) for rim, line in zip(rays, lines, strict=True)]
+        return Found(listed(told, context.state.count))
 
     return evaluate
 
@@ -257,7 +257,7 @@ PARAXIAL = {
         one_by_one(_focal_length),
         "effective focal length at a wavelength",
         length=1,
-        reading="n′/power, as of the slope behind the lens, where that is not air; `focal_length` in air: 1/power",
+        convention="n′/power, as of the slope behind the lens, where that is not air; `focal_length` in air: 1/power",
         takes=("", "wavelength"),
     ),
     "PMAG": Operand(at_wavelength(_magnification), "paraxial magnification at a wavelength", takes=("", "wavelength")),
@@ -272,56 +272,56 @@ PARAXIAL = {
         length=1,
         takes=("", "wavelength"),
     ),
-    "ISNA": Operand(of_moment(_image_na), "numerical aperture n′ sin u′ behind the lens, by the paraxial marginal ray"),
+    "ISNA": Operand(of_state(_image_na), "numerical aperture n′ sin u′ behind the lens, by the paraxial marginal ray"),
     "OBSN": Operand(
-        of_moment(
-            lambda moment: np.abs(
-                moment.gaussian(moment.primary).n_object
-                * np.sin(np.arctan(moment.marginal_height / moment.object_distance))
+        of_state(
+            lambda state: np.abs(
+                state.gaussian(state.primary).n_object
+                * np.sin(np.arctan(state.marginal_height / state.object_distance))
             )
         ),
         "numerical aperture n sin u in front of the lens, by the paraxial marginal ray",
     ),
-    "ISFN": Operand(of_moment(_f_number), "F-number: focal length / entrance pupil diameter"),
+    "ISFN": Operand(of_state(_f_number), "F-number: focal length / entrance pupil diameter"),
     "WFNO": Operand(
         across_rims("axial"),
         "working F-number 1/(2 n′ sin θ′) of the axis by the real marginal rays",
-        reading="of the rays that the vignetting factors of the axis leave",
+        convention="of the rays that the vignetting factors of the axis leave",
     ),
     "TFNO": Operand(
         across_rims("tangential"),
         "tangential working F-number, of a field (0: the largest) and wavelength",
-        reading="1/(n′ |d₊ - d₋|) of the directions of the rays through the upper and the lower rim",
+        convention="1/(n′ |d₊ - d₋|) of the directions of the rays through the upper and the lower rim",
         takes=("field", "wavelength"),
     ),
     "SFNO": Operand(
         across_rims("sagittal"),
         "sagittal working F-number, of a field (0: the largest) and wavelength",
-        reading="1/(n′ |d₊ - d₋|) of the directions of the rays through the left and the right rim",
+        convention="1/(n′ |d₊ - d₋|) of the directions of the rays through the left and the right rim",
         takes=("field", "wavelength"),
     ),
     "EFNO": Operand(
         _effective_f_number,
         "effective F-number √(π/Ω)/(2 n′) by the projected solid angle Ω of a cone: wavelength, in the column of Hx a "
         "field (0: the largest)",
-        reading="Ω inside the outline of 32 rays through the rim, as vignetting factors leave it; the first integer, a "
-        "sampling, is not looked at",
+        convention="Ω inside the outline of 32 rays through the rim as vignetting factors leave; the first integer, "
+        "a sampling, is not looked at",
         takes=("", "wavelength"),
     ),
     "ENPP": Operand(
-        of_moment(lambda moment: moment.gaussian(moment.primary).entrance_pupil_position),
+        of_state(lambda state: state.gaussian(state.primary).entrance_pupil_position),
         "entrance pupil, from surface 1",
         length=1,
     ),
-    "EPDI": Operand(of_moment(lambda moment: moment.entrance_pupil_diameter), "entrance pupil diameter", length=1),
-    "EXPP": Operand(of_moment(_exit_pupil_position), "exit pupil, from the image", length=1),
-    "EXPD": Operand(of_moment(_exit_pupil_diameter), "exit pupil diameter", length=1),
+    "EPDI": Operand(of_state(lambda state: state.entrance_pupil_diameter), "entrance pupil diameter", length=1),
+    "EXPP": Operand(of_state(_exit_pupil_position), "exit pupil, from the image", length=1),
+    "EXPD": Operand(of_state(_exit_pupil_diameter), "exit pupil diameter", length=1),
     "TOTR": Operand(
         one_by_one(_total_track),
         "total track, surface 1 to image",
         length=1,
-        reading="from the leftmost to the rightmost vertex on a straight axis; `total_track` sum: of the thicknesses, "
-        "which differs where some are negative",
+        convention="from the leftmost to the rightmost vertex on a straight axis; `total_track` sum: of the "
+        "thicknesses, which differs where some are negative",
     ),
     "TTHI": Operand(
         one_by_one(_total_thickness),

@@ -11,11 +11,12 @@ from torch import Tensor
 
 from raytrace.maths.dual import Dual, value_of
 from raytrace.maths.numerics import dot, safe_sqrt
-from raytrace.optimization.context import Evaluate, Found, Line, Now, Operand, Planner
+from raytrace.optimization.context import Evaluate, EvaluationContext, Found, Line, Operand, Planner
 from raytrace.optimization.ray_bundle import Hits
+from raytrace.system.intersection import normal
 from raytrace.system.lens import Lens
 from raytrace.system.poses import Gap, direction_in
-from raytrace.system.surface import gap_behind, normal
+from raytrace.system.surface import gap_behind
 
 
 def from_centroid(component: int | None, part: str = "position") -> Callable[[Sequence[Line], Planner], Evaluate]:
@@ -32,8 +33,8 @@ def from_centroid(component: int | None, part: str = "position") -> Callable[[Se
         on_y = np.array([planner.view.is_symmetric and line.field[0] == 0 for line in lines])
         on_axis = on_y & np.array([line.field[1] == 0 for line in lines])
 
-        def evaluate(now: Now) -> Found:
-            hits = now.hits(rays)
+        def evaluate(context: EvaluationContext) -> Found:
+            hits = context.hits(rays)
             weights = mean * hits.valid
             weights = weights / np.maximum(weights.sum(-1, keepdims=True), 1e-300)
             x, y = (getattr(hits, part)[k] for k in range(2))
@@ -55,8 +56,8 @@ def from_chief(component: int | None, part: str = "position") -> Callable[[Seque
         rays = planner.rays(lines)
         chief = planner.rays(lines, pupil=(0.0, 0.0), wavelength=planner.primary)
 
-        def evaluate(now: Now) -> Found:
-            hits, centre = now.hits(rays), now.hits(chief)
+        def evaluate(context: EvaluationContext) -> Found:
+            hits, centre = context.hits(rays), context.hits(chief)
             x, y = (getattr(hits, part)[k] - getattr(centre, part)[k] for k in range(2))
             return _told(hits.valid & centre.valid, x, y, component)
 
@@ -89,19 +90,19 @@ def known(valid: np.ndarray, number):
 def at_surface(tell: Callable[[Hits], object]) -> Callable[[Sequence[Line], Planner], Evaluate]:
     """A number of the ray on the surface that the row names, in the axes of its vertex, behind it."""
 
-    def number(now: Now, rays: dict[int, np.ndarray], surface: int):
-        hits = now.hits(rays[surface], surface=surface)
+    def number(context: EvaluationContext, rays: dict[int, np.ndarray], surface: int):
+        hits = context.hits(rays[surface], surface=surface)
         return known(hits.valid, tell(hits))
 
     return by_surface(number, lambda surface: (surface,))
 
 
 def by_surface(
-    tell: Callable[[Now, dict[int, np.ndarray], int], object], needs: Callable[[int], Sequence[int]]
+    tell: Callable[[EvaluationContext, dict[int, np.ndarray], int], object], needs: Callable[[int], Sequence[int]]
 ) -> Callable[[Sequence[Line], Planner], Evaluate]:
     """A number of the ray on the surface that the row names; needs: the surfaces on which it is looked at for that.
 
-    tell: of the moment, the rays of all rows on one surface, by where they are looked at, and the surface.
+    tell: of the state, the rays of all rows on one surface, by where they are looked at, and the surface.
     """
 
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
@@ -110,15 +111,15 @@ def by_surface(
             here = [line for line in lines if line.row.integers[0] == surface]
             rays[surface] = {at: planner.rays(here, surface=at) for at in needs(surface)}
 
-        def evaluate(now: Now) -> Found:
+        def evaluate(context: EvaluationContext) -> Found:
             found = np.full(len(lines), np.nan)
-            slopes = np.zeros((now.moment.count, len(lines)))
+            slopes = np.zeros((context.state.count, len(lines)))
             for surface, asked in rays.items():
-                number = tell(now, asked, surface)
+                number = tell(context, asked, surface)
                 found[surfaces == surface] = value_of(number)
                 if isinstance(number, Dual):
                     slopes[:, surfaces == surface] = number.full()
-            return Found(Dual(found, slopes) if now.moment.count else found)
+            return Found(Dual(found, slopes) if context.state.count else found)
 
         return evaluate
 
@@ -193,7 +194,7 @@ RAYS = {
     "RANG": Operand(
         at_surface(_axial_angle),
         "angle of a ray behind a surface to z, radians",
-        reading="to the axis of the surface, from 0 to π/2: also where the ray runs towards -z",
+        convention="to the axis of the surface, from 0 to π/2: also where the ray runs towards -z",
         takes=("surface", "wavelength"),
     ),
 }
@@ -202,9 +203,9 @@ RAYS = {
 def _to_normal(tell: Callable[[Tensor, Tensor], Tensor], *, behind: bool) -> Callable:
     """A number of |cosine| and sine of the angle to the normal, of the ray in front of the surface or behind it."""
 
-    def number(now: Now, rays: dict[int, np.ndarray], surface: int):
-        here = now.hits(rays[surface], surface=surface)
-        ray = here if behind else now.hits(rays[surface - 1], surface=surface - 1)
+    def number(context: EvaluationContext, rays: dict[int, np.ndarray], surface: int):
+        here = context.hits(rays[surface], surface=surface)
+        ray = here if behind else context.hits(rays[surface - 1], surface=surface - 1)
 
         def of(lens: Lens, *numbers: Tensor) -> Tensor:
             position, direction = numbers[:3], list(numbers[3:])
@@ -215,7 +216,7 @@ def _to_normal(tell: Callable[[Tensor, Tensor], Tensor], *, behind: bool) -> Cal
             length = torch.sqrt(dot(n, n))
             return tell(dot(n, direction).abs() / length, safe_sqrt(dot(across, across)) / length)
 
-        found = now.moment.each_through_torch(of, (*here.position, *ray.direction))
+        found = context.state.each_through_torch(of, (*here.position, *ray.direction))
         return known(here.valid & ray.valid, found)
 
     return by_surface(number, lambda surface: (surface,) if behind else (surface - 1, surface))

@@ -17,11 +17,11 @@ import numpy as np
 
 from raytrace.maths.dual import Dual, slope_of, value_of
 from raytrace.maths.pupil import gauss_rings, square
-from raytrace.optimization.context import BadRow, Evaluate, Found, Line, Now, Operand, Planner
+from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Found, Line, Operand, Planner
 from raytrace.optimization.operands.paraxial import listed
 from raytrace.optimization.operands.rays import known
 from raytrace.optimization.ray_bundle import Hits
-from raytrace.tracing.axis import is_bent
+from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.base_ray import base_ray
 
 
@@ -35,7 +35,7 @@ class Sphere(NamedTuple):
         return Sphere(tuple(part[places] for part in self.centre), self.curvature[places])
 
 
-def sphere_of(now: Now, chief: Hits, bent: bool) -> Sphere:
+def sphere_of(context: EvaluationContext, chief: Hits, bent: bool) -> Sphere:
     """About where chief rays land, through the exit pupil of the primary wavelength; κ = 0 for one at infinity.
 
         κ = D sign(v·d)/|v|,   v = D (C - E),   E_z = -n′ B/D - T
@@ -45,24 +45,24 @@ def sphere_of(now: Now, chief: Hits, bent: bool) -> Sphere:
     """
     centre = x, y, z = chief.position
     if bent:
-        (bx, by, bz, *along), weight = _pupil_on_base_ray(now)
+        (bx, by, bz, *along), weight = _pupil_on_base_ray(context)
         v = tuple(weight * (c - b) - d for c, b, d in zip(centre, (bx, by, bz), along, strict=True))
     else:
-        data = now.moment.gaussian(now.planner.primary)
+        data = context.state.gaussian(context.planner.primary)
         B, weight = data.rear
-        v = weight * x, weight * y, weight * (z + now.moment.thickness[-2]) + data.n_image * B
+        v = weight * x, weight * y, weight * (z + context.state.thickness[-2]) + data.n_image * B
     side = np.sign(value_of(dot(v, chief.direction)))
     return Sphere(centre, side * weight / np.sqrt(dot(v, v)))
 
 
-def _pupil_on_base_ray(now: Now) -> tuple[list, object]:
+def _pupil_on_base_ray(context: EvaluationContext) -> tuple[list, object]:
     """Where the base ray meets the image and its direction there, and the mean vergence 1/mm of the exit pupils."""
 
     def told(lens):
-        base = base_ray(lens, lens.wavelengths[now.planner.primary])
+        base = base_ray(lens, lens.wavelengths[context.planner.primary])
         return *base.position, *base.direction, 0.5 * (1 / base.exit_pupil_position).sum(0)
 
-    *numbers, vergence = now.moment.through_torch(told)
+    *numbers, vergence = context.state.through_torch(told)
     return numbers, vergence
 
 
@@ -97,7 +97,7 @@ def dot(a, b):
 
 def opd_of(
     rays: np.ndarray, beams: Sequence[tuple], planner: Planner, *, clips: bool = False
-) -> Callable[[Now], tuple[np.ndarray, object]]:
+) -> Callable[[EvaluationContext], tuple[np.ndarray, object]]:
     """OPD (R,) in waves of rays by their numbers, and which of them and their chief rays arrive.
 
     beams: (wavelength from 0, field) of each; clips: whether apertures stop rays, though not chief rays.
@@ -106,16 +106,16 @@ def opd_of(
     of = np.array([every[beam] for beam in beams])
     chief = np.array([planner.ask(w, field, (0.0, 0.0)) for w, field in every])
     about = chief
-    if planner.readings.opd_chief == "primary":
+    if planner.conventions.opd_chief == "primary":
         about = np.array([planner.ask(planner.primary, field, (0.0, 0.0)) for _, field in every])
     wavelength = np.array([w for w, _ in every])
     waves = 1e-3 * np.array(planner.view.wavelengths)[wavelength]
-    waves = waves if planner.readings.opd_sign == "longer" else -waves
+    waves = waves if planner.conventions.opd_sign == "longer" else -waves
     bent = is_bent(planner.lens)
 
-    def opd(now: Now) -> tuple[np.ndarray, object]:
-        hits, chiefs, centres = now.hits(rays, clips=clips), now.hits(chief), now.hits(about)
-        sphere, index = sphere_of(now, centres, bent), image_index(now, wavelength)
+    def opd(context: EvaluationContext) -> tuple[np.ndarray, object]:
+        hits, chiefs, centres = context.hits(rays, clips=clips), context.hits(chief), context.hits(about)
+        sphere, index = sphere_of(context, centres, bent), image_index(context, wavelength)
         zero = path_to(sphere, chiefs, index)
         found = (path_to(sphere.at(of), hits, index[of]) - zero[of]) / waves[of]
         return hits.valid & (chiefs.valid & centres.valid)[of], found
@@ -123,10 +123,10 @@ def opd_of(
     return opd
 
 
-def image_index(now: Now, wavelengths: np.ndarray):
+def image_index(context: EvaluationContext, wavelengths: np.ndarray):
     """Index in front of the image at wavelengths, counted from 0."""
-    found = [np.abs(now.moment.index(w)[-2]) for w in wavelengths]
-    return listed(found, now.moment.count) if any(isinstance(n, Dual) for n in found) else np.array(found)
+    found = [np.abs(context.state.index(w)[-2]) for w in wavelengths]
+    return listed(found, context.state.count) if any(isinstance(n, Dual) for n in found) else np.array(found)
 
 
 def opd_less(terms: Callable[[Sequence[Line], Planner], np.ndarray]):
@@ -136,8 +136,8 @@ def opd_less(terms: Callable[[Sequence[Line], Planner], np.ndarray]):
         opd = opd_of(planner.rays(lines), [(line.wavelength, line.field) for line in lines], planner)
         fit = Fit(terms(lines, planner), _weights(lines))
 
-        def evaluate(now: Now) -> Found:
-            valid, found = opd(now)
+        def evaluate(context: EvaluationContext) -> Found:
+            valid, found = opd(context)
             return Found(known(valid, fit.less(found, valid)))
 
         return evaluate
@@ -191,7 +191,7 @@ def piston(lines: Sequence[Line], planner: Planner) -> np.ndarray:
 
 
 def piston_and_tilt(lines: Sequence[Line], planner: Planner) -> np.ndarray:
-    """1 for each field and wavelength, and the pupil point, by the reading `opd_tilt`.
+    """1 for each field and wavelength, and the pupil point, by the convention `opd_tilt`.
 
     A field that is mirrored in a plane through the axis, of whose pupil rows leave out half, has no tilt out of it. A
     tilt that all wavelengths have in common is one of the path: so many waves more the shorter they are.
@@ -201,7 +201,7 @@ def piston_and_tilt(lines: Sequence[Line], planner: Planner) -> np.ndarray:
         on_y = np.array([line.field[0] == 0 for line in lines])
         x, y = np.where(on_y, 0.0, x), np.where(on_y & [line.field[1] == 0 for line in lines], 0.0, y)
     groups = _groups(lines)
-    if planner.readings.opd_tilt == "common":
+    if planner.conventions.opd_tilt == "common":
         groups = _groups(lines, colours=False)
         waves = np.array(planner.view.wavelengths)[[line.wavelength for line in lines]]
         x, y = x / waves, y / waves
@@ -226,12 +226,14 @@ def between_surfaces(leg: Callable[[Line, Planner], tuple[int, int, int]]):
 
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
         paths = [_path_of(line, *leg(line, planner), planner) for line in lines]
-        return lambda now: Found(listed([path(now) for path in paths], now.moment.count))
+        return lambda context: Found(listed([path(context) for path in paths], context.state.count))
 
     return plan
 
 
-def _path_of(line: Line, first: int, last: int, wavelength: int, planner: Planner) -> Callable[[Now], object]:
+def _path_of(
+    line: Line, first: int, last: int, wavelength: int, planner: Planner
+) -> Callable[[EvaluationContext], object]:
     """Reduced path between the surfaces, and that of the axis, which it lacks."""
     first, last = sorted((first, last))
     source = planner.lens.surfaces[0]
@@ -241,13 +243,13 @@ def _path_of(line: Line, first: int, last: int, wavelength: int, planner: Planne
     first = max(first, 1)
     begin, end = (np.array([planner.ray(line, surface=s, wavelength=wavelength)]) for s in (first, max(last, 1)))
 
-    def path(now: Now):
-        hits, behind = now.hits(begin, surface=first), now.hits(end, surface=max(last, 1))
-        index, gaps = now.moment.index(wavelength), now.moment.thickness
+    def path(context: EvaluationContext):
+        hits, behind = context.hits(begin, surface=first), context.hits(end, surface=max(last, 1))
+        index, gaps = context.state.index(wavelength), context.state.thickness
         axis = sum(index[k] * gaps[k] for k in range(first, last))
         found = behind.opl - hits.opl + axis
         if from_object:
-            start = now.starts(begin, surface=first)
+            start = context.starts(begin, surface=first)
             way = (start.position[2] + gaps[0]) / start.direction[2]
             found = found + (hits.opl - start.opl) + index[0] * way
         return known(hits.valid & behind.valid, found)[0]
@@ -265,27 +267,27 @@ def _from_one_to_another(line: Line, planner: Planner) -> tuple[int, int, int]:
 
 _WAVELENGTH = "", "wavelength"
 _SPHERE = (
-    "about the image point of the chief ray of the row's wavelength (reading `opd_chief`), through the axial point of "
-    "the exit pupil; a longer path is positive (`opd_sign`)"
+    "about the image point of the chief ray of the row's wavelength (convention `opd_chief`), through the axial point "
+    "of the exit pupil; a longer path is positive (`opd_sign`)"
 )
 
 PATH = {
     "OPDC": Operand(
         opd_less(nothing),
         "optical path difference to the chief ray, waves; Hx Hy Px Py",
-        reading=_SPHERE,
+        convention=_SPHERE,
         takes=_WAVELENGTH,
     ),
     "OPDM": Operand(
         opd_less(piston),
         "the same less its mean over the rows of its field and wavelength, by weight",
-        reading=_SPHERE,
+        convention=_SPHERE,
         takes=_WAVELENGTH,
     ),
     "OPDX": Operand(
         opd_less(piston_and_tilt),
         "the same less the piston and tilt that fit its field and wavelength best, by weight",
-        reading=f"{_SPHERE}; a tilt for every wavelength (`opd_tilt`)",
+        convention=f"{_SPHERE}; a tilt for every wavelength (`opd_tilt`)",
         takes=_WAVELENGTH,
     ),
     "OPTH": Operand(
@@ -363,8 +365,8 @@ def rms_of(vectors: Callable, rule: Callable, *, clips: bool) -> Callable[[Seque
     def plan(lines: Sequence[Line], planner: Planner) -> Evaluate:
         tell = vectors([beam_of(line, rule, clips, planner) for line in lines], planner)
 
-        def evaluate(now: Now) -> Found:
-            parts = _side_by_side(tell(now), now.moment.count)
+        def evaluate(context: EvaluationContext) -> Found:
+            parts = _side_by_side(tell(context), context.state.count)
             return Found(np.sqrt((parts * parts).sum(0)), (parts,))
 
         return evaluate
@@ -390,11 +392,11 @@ def _side_by_side(vectors: Sequence, count: int):
 def spot(*, about_chief: bool):
     """√w (x - x₀) and √w (y - y₀) mm on the image, from the centroid or the primary wavelength's chief ray."""
 
-    def vectors(beams: Sequence[Beam], planner: Planner) -> Callable[[Now], list]:
+    def vectors(beams: Sequence[Beam], planner: Planner) -> Callable[[EvaluationContext], list]:
         chiefs = [np.array([planner.ask(planner.primary, beam.line.field, (0.0, 0.0))]) for beam in beams]
 
-        def of(beam: Beam, chief: np.ndarray, now: Now):
-            hits, centre = now.hits(beam.rays, clips=beam.clips), now.hits(chief)
+        def of(beam: Beam, chief: np.ndarray, context: EvaluationContext):
+            hits, centre = context.hits(beam.rays, clips=beam.clips), context.hits(chief)
             weights = beam.weights(hits.valid)
             if weights is None or (about_chief and not centre.valid[0]):
                 return None
@@ -404,7 +406,7 @@ def spot(*, about_chief: bool):
                 parts.append(root * (place - (centre.position[k][0] if about_chief else weights @ place)))
             return np.concatenate(parts)
 
-        return lambda now: [of(beam, chief, now) for beam, chief in zip(beams, chiefs, strict=True)]
+        return lambda context: [of(beam, chief, context) for beam, chief in zip(beams, chiefs, strict=True)]
 
     return vectors
 
@@ -412,7 +414,7 @@ def spot(*, about_chief: bool):
 def wave(*, tilted: bool):
     """√w W, waves, about the mean of each colour on its own sphere; tilted: about its tilt too, the centroid's."""
 
-    def vectors(beams: Sequence[Beam], planner: Planner) -> Callable[[Now], list]:
+    def vectors(beams: Sequence[Beam], planner: Planner) -> Callable[[EvaluationContext], list]:
         rays = np.concatenate([beam.rays for beam in beams])
         own = [(w, beam.line.field) for beam in beams for w in beam.colours.tolist()]
         opd = opd_of(rays, own, planner, clips=beams[0].clips)
@@ -420,8 +422,8 @@ def wave(*, tilted: bool):
         places = [slice(end - len(beam.rays), end) for beam, end in zip(beams, ends, strict=True)]
         fits = [Fit(_terms(beam, tilted), beam.shares) for beam in beams]
 
-        def tell(now: Now) -> list:
-            valid, found = opd(now)
+        def tell(context: EvaluationContext) -> list:
+            valid, found = opd(context)
             return [of(*one, valid, found) for one in zip(beams, fits, places, strict=True)]
 
         return tell
@@ -458,7 +460,7 @@ QUALITY = {
         rms_of(vector, rings if whole else rectangular, clips=not whole),
         f"{text}; int1 rays, int2 wavelength (0: all by weight), Hx Hy",
         length=1 if name.startswith("RS") else 0,
-        reading=_RINGS if whole else _GRID,
+        convention=_RINGS if whole else _GRID,
         takes=("", "colour"),
     )
     for name, (vector, whole, text) in _TABLE.items()

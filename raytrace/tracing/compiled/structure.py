@@ -16,13 +16,13 @@ from torch.utils._pytree import tree_leaves
 
 from raytrace.system.apertures import SHAPES
 from raytrace.system.phases import Facets, HologramPath, IdealLens, Phase, PolynomialPath, RadialPath, kind_of, path_of
-from raytrace.system.polynomials import PowerSag
 from raytrace.system.poses import Gap, Turn, passage
-from raytrace.system.shapes import DEPARTURES, EVEN, KINDS, Departure
+from raytrace.system.sag_terms import PowerSag
+from raytrace.system.shapes import EVEN, KINDS, SAG_TERMS, SagTerms
 from raytrace.system.surface import Surface, gap_behind
 
 _TURN, _PLANE, _SPHERE, _CONIC = range(-1, 3)  # and the codes of shapes.KINDS
-_DEPARTED, _FRAME = 7, 4  # kDeparted of sags.h; kFrame of departures.h, its numbers before the coefficients
+_WITH_SAG_TERMS, _FRAME = 7, 4  # kWithSagTerms of sags.h; kFrame of sag_terms.h, its numbers before the coefficients
 _NONE, _REFRACT, _REFLECT = range(3)
 
 #: What a phase becomes before it is traced, by `Form` of paths.h.
@@ -48,8 +48,8 @@ class _Row(NamedTuple):
     phase: int = 0
     phase_terms: int = 0
     phase_numbers: int = 0
-    departure_terms: int = 0
-    departure_numbers: int = 0
+    sag_term_count: int = 0
+    sag_term_numbers: int = 0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -64,14 +64,14 @@ class Structure:
 
 
 def is_expressible(surface: Surface) -> bool:
-    """Whether the compiled trace knows the surface: kind, departure, phase and apertures compiled, few terms."""
+    """Whether the compiled trace knows the surface: kind, sag_terms, phase and apertures compiled, few terms."""
     if surface.is_break:
         return True
     if surface.phase is not None and not _is_known(surface):
         return False
     if any(SHAPES[aperture.shape].code is None for aperture in surface.apertures):
         return False
-    if surface.departure is not None and not (surface.kind == EVEN and _has_powers(surface.departure)):
+    if surface.sag_terms is not None and not (surface.kind == EVEN and _has_powers(surface.sag_terms)):
         return False
     kind = KINDS[surface.kind]
     return surface.coefficients is None or (kind.code is not None and len(surface.coefficients) <= kind.compiled)
@@ -81,13 +81,13 @@ def _is_known(surface: Surface) -> bool:
     """Whether the compiled trace knows the phase of a surface; facets only of an even asphere that light passes."""
     kind = kind_of(surface.phase)
     if kind.flat:
-        return surface.kind == EVEN and surface.departure is None and not surface.is_mirror
+        return surface.kind == EVEN and surface.sag_terms is None and not surface.is_mirror
     return kind.slopes or kind.path is not None
 
 
-def _has_powers(departure: Departure) -> bool:
-    """Whether the compiled trace knows a departure: as powers of x and y, not too many, the same for all rays."""
-    kind, numbers = DEPARTURES[type(departure).__name__], tree_leaves(departure)
+def _has_powers(sag_terms: SagTerms) -> bool:
+    """Whether the compiled trace knows sag terms: as powers of x and y, not too many, the same for all rays."""
+    kind, numbers = SAG_TERMS[type(sag_terms).__name__], tree_leaves(sag_terms)
     few = kind.compiled is None or all(number.numel() <= kind.compiled for number in numbers)
     return kind.powers is not None and few and all(number.dim() <= 1 for number in numbers)
 
@@ -161,7 +161,7 @@ def _row(
         surface = dataclasses.replace(surface, curvature=None, conic=None, coefficients=None)
     terms = () if surface.coefficients is None else surface.coefficients.unbind(0)
     first_term, rim = table.place_all(terms), table.place_rim(surface)
-    departure = _numbers_of(surface.departure)
+    sag_terms = _numbers_of(surface.sag_terms)
     return _Row(
         kind=_kind(surface),
         bend=_REFLECT if surface.is_mirror else _NONE if n2 is n1 else _REFRACT,
@@ -179,8 +179,8 @@ def _row(
         phase=form,
         phase_terms=len(phase),
         phase_numbers=table.place_all(phase),
-        departure_terms=max(len(departure) - _FRAME, 0),
-        departure_numbers=table.place_all(departure),
+        sag_term_count=max(len(sag_terms) - _FRAME, 0),
+        sag_term_numbers=table.place_all(sag_terms),
     )
 
 
@@ -194,11 +194,11 @@ def _facets_of(surface: Surface, n1: Tensor) -> tuple[int, Sequence[Tensor]]:
     return FORMS.index(Facets), (*shape, *(() if surface.coefficients is None else surface.coefficients.unbind(0)))
 
 
-def _numbers_of(departure: Departure | None) -> Sequence[Tensor]:
-    """Those of a departure as departures.h has them."""
-    if departure is None:
+def _numbers_of(sag_terms: SagTerms | None) -> Sequence[Tensor]:
+    """Those of sag terms as sag_terms.h has them."""
+    if sag_terms is None:
         return ()
-    *frame, coefficients = tree_leaves(DEPARTURES[type(departure).__name__].powers(departure))
+    *frame, coefficients = tree_leaves(SAG_TERMS[type(sag_terms).__name__].powers(sag_terms))
     return *frame, *coefficients.unbind(0)
 
 
@@ -264,7 +264,7 @@ def _rebuilt(row: _Row, surface: Surface, numbers: Sequence[Tensor]) -> Surface:
         conic=number(row.conic),
         coefficients=surface.coefficients if not terms else torch.stack(list(terms)),
         phase=_phase_of(row, numbers),
-        departure=_departure_of(row, numbers),
+        sag_terms=_sag_terms_of(row, numbers),
         before=None,
         after=None,
     )
@@ -282,12 +282,12 @@ def _phase_of(row: _Row, numbers: Sequence[Tensor]) -> Phase | None:
     return FORMS[row.phase](torch.stack(torch.broadcast_tensors(*own)) if own else none, *constant)
 
 
-def _departure_of(row: _Row, numbers: Sequence[Tensor]) -> PowerSag | None:
+def _sag_terms_of(row: _Row, numbers: Sequence[Tensor]) -> PowerSag | None:
     """Its numbers are the same in every row of a table: those of the first one are taken."""
-    if row.kind != _DEPARTED:
+    if row.kind != _WITH_SAG_TERMS:
         return None
-    last = row.departure_numbers + _FRAME + row.departure_terms
-    own = torch.stack([number.reshape(-1)[0] for number in numbers[row.departure_numbers : last]])
+    last = row.sag_term_numbers + _FRAME + row.sag_term_count
+    own = torch.stack([number.reshape(-1)[0] for number in numbers[row.sag_term_numbers : last]])
     return PowerSag(*own[:_FRAME].unbind(0), own[_FRAME:])
 
 
@@ -298,8 +298,8 @@ def _turned(row: _Row, numbers: Sequence[Tensor]) -> Surface:
 
 
 def _kind(surface: Surface) -> int:
-    if surface.departure is not None:
-        return _DEPARTED
+    if surface.sag_terms is not None:
+        return _WITH_SAG_TERMS
     if surface.coefficients is not None:
         return KINDS[surface.kind].code
     if surface.curvature is None:

@@ -32,7 +32,7 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
   const T gap = s.gap, c = s.c, k = s.k, shape = T(1) + k, n1 = s.n1, n2 = s.n2;
   const T mu = n1 / n2, D = (n2 - n1) * (n2 + n1), over_n2 = T(1) / n2, side = T(s.at->side);
   const bool has_gap = s.at->gap >= 0;
-  if constexpr (is_departed(kind)) departure_on<true>(to, notes, n, s);
+  if constexpr (has_sag_terms(kind)) sag_terms_on<true>(to, notes, n, s);
   T sum_gap = 0, sum_c = 0, sum_k = 0, sum_n1 = 0, sum_n2 = 0, sum_first = 0, sum_second = 0;
 #pragma omp simd reduction(+ : sum_gap, sum_c, sum_k, sum_n1, sum_n2, sum_first, sum_second)
   for (int i = 0; i < n; i++) {
@@ -50,7 +50,7 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
     } else if (has_terms(kind)) {
       sag<kind, true>(s, terms, u, S, dS, d2S);
       nx = T(-2) * dS * hx, ny = T(-2) * dS * hy, w = T(1) + T(4) * dS * dS * u;
-    } else if constexpr (is_departed(kind)) {
+    } else if constexpr (has_sag_terms(kind)) {
       sag<kind, true>(s, terms, u, S, dS, d2S);
       nx = T(-2) * dS * hx - notes.added.x[i], ny = T(-2) * dS * hy - notes.added.y[i], w = T(1) + nx * nx + ny * ny;
     } else if constexpr (is_freeform(kind)) {
@@ -127,7 +127,7 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
       T third = over_w * over_w * over_w;
       sum_c += T(0.5) * gdS * third;
       sum_k += T(0.25) * gdS * c * c * c * u * third;
-    } else if constexpr (is_departed(kind)) {
+    } else if constexpr (has_sag_terms(kind)) {
       gx = T(-2) * nx * gw - gnx, gy = T(-2) * ny * gw - gny;
       gdS = T(2) * (hx * gx + hy * gy);
       T radicand = T(1) - shape * c * c * u;
@@ -152,11 +152,11 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
     if (kind == kSphere || kind == kConic) {
       sum_c += T(0.5) * s_bar * (u + shape * hz * hz);
       if (kind == kConic) sum_k += T(0.5) * s_bar * c * hz * hz;
-    } else if (has_terms(kind) || is_departed(kind)) {
+    } else if (has_terms(kind) || has_sag_terms(kind)) {
       sum_c += s_bar * u * over_w * over_w / (over_w + T(1));
       sum_k += T(0.5) * s_bar * c * conic_sag * conic_sag * over_w;
       notes.px[i] = s_bar, notes.py[i] = gdS;
-      if constexpr (is_departed(kind)) notes.t[i] = gx, notes.active[i] = gy;
+      if constexpr (has_sag_terms(kind)) notes.t[i] = gx, notes.active[i] = gy;
     } else if constexpr (is_freeform(kind)) {
       const Shares<T> shares = sheet.pulled(s_bar, gx, gy);
       sum_c += shares.c, sum_k += shares.k, sum_first += shares.first, sum_second += shares.second;
@@ -169,7 +169,7 @@ Sums<T> pull(const Rays<T>& from, const Rays<T>& to, Cotangents<T>& g, Notes<T>&
   }
   Sums<T> sums;
   sums.gap = sum_gap, sums.c = sum_c, sums.k = sum_k, sums.n1 = sum_n1, sums.n2 = sum_n2;
-  if constexpr (has_terms(kind) || is_departed(kind)) sum_terms<kind>(to, notes, n, s.at->terms, sums.a);
+  if constexpr (has_terms(kind) || has_sag_terms(kind)) sum_terms<kind>(to, notes, n, s.at->terms, sums.a);
   if constexpr (is_freeform(kind)) sums.a[0] = sum_first;
   if constexpr (kind == kBiconic) sums.a[1] = sum_second;
   if constexpr (kind == kToroidal && terms > 1) sum_series<1, false, true>(to, notes, n, s.at->terms - 1, sums.a + 1);

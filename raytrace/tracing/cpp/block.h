@@ -23,7 +23,7 @@ struct Layout {
   int32_t gap, curvature, conic, coefficients, before, behind;
   int32_t rim;  // place in the constants
   int32_t phase, phase_terms, phase_numbers;  // form of phases.h, 0 for none; how many numbers, and the first of them
-  int32_t departure_terms, departure_numbers;  // powers of departures.h, and the first of its numbers
+  int32_t sag_term_count, sag_term_numbers;  // powers of sag_terms.h, and the first of its numbers
 };
 static_assert(sizeof(Layout) == kFields * sizeof(int32_t), "structure.py writes 18 integers");
 
@@ -34,7 +34,7 @@ struct Surface {
   T gap, c, k, n1, n2;  // 0 where not modelled; n1, n2 before and behind
   T a[kTerms];
   const T* phase;  // numbers of the phase
-  const T* departure;  // and of the departure
+  const T* sag_terms;  // and of the sag terms
   double rim;
 };
 
@@ -50,7 +50,7 @@ Surface<T> surface_of(const Layout& at, const T* row, const double* constants) {
   s.n2 = number(at.behind);
   for (int j = 0; j < at.terms; j++) s.a[j] = row[at.coefficients + j];
   s.phase = row + at.phase_numbers;
-  s.departure = row + at.departure_numbers;
+  s.sag_terms = row + at.sag_term_numbers;
   s.rim = constants[at.rim];
   return s;
 }
@@ -68,7 +68,7 @@ struct alignas(64) Normals {
 };
 
 // A path or a sag p(x, y) at `size` points, its slopes and second derivatives; q: a polynomial on the way there; u, v: the
-// points as a departure counts them.
+// points as sag terms counts them.
 template <typename T, int size>
 struct alignas(64) Added {
   T p[size], x[size], y[size], xx[size], xy[size], yy[size], q[size], dq[size], d2q[size];

@@ -9,12 +9,12 @@
 namespace raytrace {
 
 inline const Surface<double>& in_double(const Surface<double>& s, std::vector<double>&) { return s; }
-inline Surface<double> in_double(const Surface<float>& s, std::vector<double>& departure) {
+inline Surface<double> in_double(const Surface<float>& s, std::vector<double>& sag_terms) {
   Surface<double> d{};
   d.at = s.at, d.gap = s.gap, d.c = s.c, d.k = s.k, d.n1 = s.n1, d.n2 = s.n2, d.rim = s.rim;
   for (int j = 0; j < kTerms; j++) d.a[j] = s.a[j];
-  if (is_departed(s.at->kind)) departure.assign(s.departure, s.departure + kFrame + s.at->departure_terms);
-  d.departure = departure.data();
+  if (has_sag_terms(s.at->kind)) sag_terms.assign(s.sag_terms, s.sag_terms + kFrame + s.at->sag_term_count);
+  d.sag_terms = sag_terms.data();
   return d;
 }
 
@@ -24,7 +24,7 @@ struct Ray { double x, y, z, L, M, N, path; };
 // Path from the foot of the perpendicular; whether there is a crossing.
 inline bool crossing(const Surface<double>& s, double x, double y, double z, double L, double M, double N, double& t) {
   if (has_terms(s.at->kind)) return AsphereSearch{s, x, y, z, L, M, N}(t);
-  if (is_departed(s.at->kind)) return DepartedSearch{s, x, y, z, L, M, N}(t);
+  if (has_sag_terms(s.at->kind)) return DepartedSearch{s, x, y, z, L, M, N}(t);
   if (is_freeform(s.at->kind)) return FreeformSearch{s, x, y, z, L, M, N}(t);
   double c = s.c, shape = 1 + s.k;
   double A = c * (L * L + M * M + shape * N * N);
@@ -57,7 +57,7 @@ bool carry(Ray& ray, const Surface<double>& s, const C* phase, double farthest, 
     if (asphere) {
       Slope at = slope_at(s, hx * hx + hy * hy);
       F = hz - at.S, dF = N - 2 * at.dS * (hx * L + hy * M);
-    } else if (is_departed(s.at->kind)) {
+    } else if (has_sag_terms(s.at->kind)) {
       Height at = departed_at(s, hx, hy);
       F = hz - at.z, dF = N - (at.x * L + at.y * M);
     } else if (freeform) {
@@ -72,7 +72,7 @@ bool carry(Ray& ray, const Surface<double>& s, const C* phase, double farthest, 
     if (asphere) {
       double dS = slope_at(s, hx * hx + hy * hy).dS;
       nx = -2 * dS * hx, ny = -2 * dS * hy, w = 1 + 4 * dS * dS * (hx * hx + hy * hy);
-    } else if (is_departed(s.at->kind)) {
+    } else if (has_sag_terms(s.at->kind)) {
       Height at = departed_at(s, hx, hy);
       nx = -at.x, ny = -at.y, w = 1 + nx * nx + ny * ny;
     } else if (freeform) {
@@ -111,8 +111,8 @@ bool carry(Ray& ray, const Surface<double>& s, const C* phase, double farthest, 
 template <typename T, bool path>
 void cross_carefully(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int i, const Surface<T>& s) {
   Ray ray{from.x[i], from.y[i], from.z[i], from.L[i], from.M[i], from.N[i], path ? from.path[i] : T(0)};
-  std::vector<double> departure;
-  if (!carry(ray, in_double(s, departure), s.phase, std::sqrt(double(std::numeric_limits<T>::max())), path)) {
+  std::vector<double> sag_terms;
+  if (!carry(ray, in_double(s, sag_terms), s.phase, std::sqrt(double(std::numeric_limits<T>::max())), path)) {
     ray = {0, 0, 0, 0, 0, 1, 0};
     notes.valid[i] = 0, notes.lost[i] = notes.surface, notes.any_lost = true;
   }

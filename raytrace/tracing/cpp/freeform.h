@@ -1,4 +1,4 @@
-// Sags that differ along x and y by their kind, raytrace/system/freeform.py: at a point, with what their derivatives and
+// Sags that differ along x and y by their kind, raytrace/system/shapes.py: at a point, with what their derivatives and
 // their numbers do. A kind is a `Sheet`, in `by_kind_of_terms` of sags.h and `sheet_at`.
 //
 //     toroidal   z = g + c_x x²/(q + w),  w = √(q² - c_x² x²) = 1 - c_x z,  q = 1 - c_x g,  g = g(y); a[0] is c_x

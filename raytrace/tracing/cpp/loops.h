@@ -1,6 +1,6 @@
 // The surfaces as loops over a block: the algebra of raytrace/system/surface.py and trace.py where nothing can go wrong.
 #pragma once
-#include "departures.h"
+#include "sag_terms.h"
 #include "freeform.h"
 
 namespace raytrace {
@@ -160,7 +160,7 @@ void newton(const Rays<T>& from, Notes<T>& notes, int n, const Surface<T>& s) {
   }
   for (int step = 0; step < kSteps; step++) {
     int going = 0;
-    if constexpr (is_departed(kind)) departure_along(from, notes, n, s);
+    if constexpr (has_sag_terms(kind)) sag_terms_along(from, notes, n, s);
 #pragma omp simd reduction(+ : going)
     for (int i = 0; i < n; i++) {
       T L = from.L[i], M = from.M[i], N = from.N[i], t = notes.t[i];
@@ -177,7 +177,7 @@ void newton(const Rays<T>& from, Notes<T>& notes, int n, const Surface<T>& s) {
           sag<kind, false>(s, terms, u, S, dS, d2S);
           dF = N - T(2) * dS * (x * L + y * M);
         }
-        if constexpr (is_departed(kind)) S += notes.added.p[i], dF -= notes.added.x[i] * L + notes.added.y[i] * M;
+        if constexpr (has_sag_terms(kind)) S += notes.added.p[i], dF -= notes.added.x[i] * L + notes.added.y[i] * M;
         change = (z - S) / dF;
       }
       bool active = notes.active[i] > 0;
@@ -193,7 +193,7 @@ void newton(const Rays<T>& from, Notes<T>& notes, int n, const Surface<T>& s) {
 template <typename T, int kind, int bend, bool path, int terms>
 int cross_asphere(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, const Surface<T>& s) {
   newton<T, kind, terms>(from, notes, n, s);
-  if constexpr (is_departed(kind)) departure_along(from, notes, n, s);
+  if constexpr (has_sag_terms(kind)) sag_terms_along(from, notes, n, s);
   const Law<T, bend> law(s);
   const bool has_gap = s.at->gap >= 0;
   const T gap = s.gap, side = T(s.at->side), rim_squared = T(s.rim) * T(s.rim);
@@ -226,7 +226,7 @@ int cross_asphere(const Rays<T>& from, Rays<T>& to, Notes<T>& notes, int n, cons
       nx = -slope * hx, ny = -slope * hy, cosine = N - slope * (hx * L + hy * M);
       w = T(1) + slope * slope * u;
     }
-    if constexpr (is_departed(kind)) {
+    if constexpr (has_sag_terms(kind)) {
       off -= notes.added.p[i], size += magnitude(notes.added.p[i]);
       nx -= notes.added.x[i], ny -= notes.added.y[i];
       cosine = N + nx * L + ny * M, w = T(1) + nx * nx + ny * ny;
@@ -248,7 +248,7 @@ template <typename T, int kind, int terms>
 void normals(const Rays<T>& at, Notes<T>& notes, int n, const Surface<T>& s) {
   const T c = s.c, shape = T(1) + s.k;
   Normals<T>& to = notes.normal;
-  if constexpr (is_departed(kind)) departure_on<false>(at, notes, n, s);
+  if constexpr (has_sag_terms(kind)) sag_terms_on<false>(at, notes, n, s);
 #pragma omp simd
   for (int i = 0; i < n; i++) {
     T x = at.x[i], y = at.y[i], u = x * x + y * y, nx = 0, ny = 0, nz = 1, w = 1;
@@ -259,7 +259,7 @@ void normals(const Rays<T>& at, Notes<T>& notes, int n, const Surface<T>& s) {
       T S, dS, d2S;
       sag<kind, false>(s, terms, u, S, dS, d2S);
       nx = T(-2) * dS * x, ny = T(-2) * dS * y, w = T(1) + T(4) * dS * dS * u;
-    } else if constexpr (is_departed(kind)) {
+    } else if constexpr (has_sag_terms(kind)) {
       T S, dS, d2S;
       sag<kind, false>(s, terms, u, S, dS, d2S);
       nx = T(-2) * dS * x - notes.added.x[i], ny = T(-2) * dS * y - notes.added.y[i], w = T(1) + nx * nx + ny * ny;

@@ -7,11 +7,11 @@
 
 namespace raytrace {
 
-enum Kind { kPlane, kSphere, kConic, kEven, kOdd, kToroidal, kBiconic, kDeparted };
+enum Kind { kPlane, kSphere, kConic, kEven, kOdd, kToroidal, kBiconic, kWithSagTerms };
 
 constexpr bool has_terms(int kind) { return kind == kEven || kind == kOdd; }
 constexpr bool is_freeform(int kind) { return kind == kToroidal || kind == kBiconic; }  // see freeform.h
-constexpr bool is_departed(int kind) { return kind == kDeparted; }  // an even asphere and what departures.h adds
+constexpr bool has_sag_terms(int kind) { return kind == kWithSagTerms; }  // an even asphere and what sag_terms.h adds
 constexpr bool is_searched(int kind) { return kind >= kEven; }
 
 template <int number>
@@ -96,8 +96,8 @@ void by_kind_of_terms(const Layout& at, Work work) {
   else if (at.kind == kToroidal && at.terms == 1) work(Constant<kToroidal>{}, Constant<1>{});
   else if (at.kind == kToroidal) work(Constant<kToroidal>{}, Constant<8>{});
   else if (at.kind == kBiconic) work(Constant<kBiconic>{}, Constant<2>{});
-  else if (at.kind == kDeparted && at.terms == 0) work(Constant<kDeparted>{}, Constant<0>{});
-  else if (at.kind == kDeparted) work(Constant<kDeparted>{}, Constant<kTerms>{});
+  else if (at.kind == kWithSagTerms && at.terms == 0) work(Constant<kWithSagTerms>{}, Constant<0>{});
+  else if (at.kind == kWithSagTerms) work(Constant<kWithSagTerms>{}, Constant<kTerms>{});
   else if (at.terms <= 4) work(Constant<kEven>{}, Constant<4>{});
   else if (at.terms <= 8) work(Constant<kEven>{}, Constant<8>{});
   else work(Constant<kEven>{}, Constant<kTerms>{});
@@ -123,7 +123,7 @@ inline Slope slope_at(const Surface<double>& s, double u) {
   double sizes[kTerms], d = 0, d2 = 0;
   for (int j = 0; j < kTerms; j++) sizes[j] = std::fabs(s.a[j]);
   by_kind_of_terms(*s.at, [&](auto kind, auto) {
-    if constexpr (has_terms(kind()) || is_departed(kind())) {
+    if constexpr (has_terms(kind()) || has_sag_terms(kind())) {
       found.inside = sag<kind(), false>(s, s.at->terms, u, found.S, found.dS, d2);
       add_terms<kind(), false>(sizes, s.at->terms, u, found.size, d, d2);
     }

@@ -196,10 +196,10 @@ inline Height height_at(const Surface<double>& s, double x, double y) {
   return found;
 }
 
-// The same of a round sag with a departure.
+// The same of a round sag with sag terms.
 [[gnu::noinline]] inline Height departed_at(const Surface<double>& s, double x, double y) {
   const Slope base = slope_at(s, x * x + y * y);
-  const Added<double, 1> D = departure_at(s, x, y);
+  const Added<double, 1> D = sag_terms_at(s, x, y);
   return {base.S + D.p[0], 2 * base.dS * x + D.x[0], 2 * base.dS * y + D.y[0], base.size, base.inside};
 }
 
@@ -228,7 +228,7 @@ inline Extent extent_of(const Surface<double>& s, double limit) {
   return {std::fmin(widest / std::fabs(c_x), limit), y};
 }
 
-// A round sag with a departure: that of the sag alone, and what the departure adds.
+// A round sag with sag terms: that of the sag alone, and what the sag terms adds.
 struct DepartedSearch : Search<DepartedSearch> {
   const AsphereSearch round;
   const Surface<double>& s;
@@ -239,9 +239,9 @@ struct DepartedSearch : Search<DepartedSearch> {
   Residual residual(double t) const {
     Residual found = round.residual(t);
     const double hx = x + t * L, hy = y + t * M;
-    const Added<double, 1> D = departure_at(s, hx, hy);
+    const Added<double, 1> D = sag_terms_at(s, hx, hy);
     found.F -= D.p[0], found.dF -= D.x[0] * L + D.y[0] * M;
-    found.scale += departure_size(s, std::sqrt(found.u));
+    found.scale += sag_terms_size(s, std::sqrt(found.u));
     found.scale += (std::fabs(D.x[0]) + std::fabs(D.y[0])) * (std::fabs(hx) + std::fabs(hy) + std::fabs(t));
     return found;
   }
@@ -249,7 +249,7 @@ struct DepartedSearch : Search<DepartedSearch> {
   double start() const { return round.start(); }
 
   Stretch stretch(double rim) const {
-    double radius = round.radius(rim), beside = departure_size(s, radius);
+    double radius = round.radius(rim), beside = sag_terms_size(s, radius);
     auto [low, high] = round.heights(radius);
     return between(low - beside, high + beside, 0.05, round.cylinder(radius));
   }

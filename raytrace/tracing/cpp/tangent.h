@@ -15,7 +15,7 @@ namespace raytrace {
 template <typename T>
 struct Change {
   T gap, c, k, n1, n2, a[kTerms];
-  const T *phase, *departure;
+  const T *phase, *sag_terms;
   bool any;
 };
 
@@ -30,8 +30,8 @@ Change<T> change_of(const Layout& at, const T* row) {
   for (int j = 0; j < at.terms; j++) change.any |= change.a[j] != 0;
   change.phase = row + at.phase_numbers;
   for (int j = 0; j < at.phase_terms; j++) change.any |= change.phase[j] != 0;
-  change.departure = row + at.departure_numbers;
-  for (int j = 0; is_departed(at.kind) && j < kFrame + at.departure_terms; j++) change.any |= change.departure[j] != 0;
+  change.sag_terms = row + at.sag_term_numbers;
+  for (int j = 0; has_sag_terms(at.kind) && j < kFrame + at.sag_term_count; j++) change.any |= change.sag_terms[j] != 0;
   return change;
 }
 
@@ -43,7 +43,7 @@ void push(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, Notes<T>& notes, i
   const T mu = n1 / n2, D = (n2 - n1) * (n2 + n1), over_n2 = T(1) / n2;
   const T dmu = (dn1 - mu * dn2) * over_n2, dD = T(2) * (n2 * dn2 - n1 * dn1);
   const bool has_gap = s.at->gap >= 0;
-  if constexpr (is_departed(kind)) departure_change(to, notes, n, s, change.departure);
+  if constexpr (has_sag_terms(kind)) sag_terms_change(to, notes, n, s, change.sag_terms);
 #pragma omp simd
   for (int i = 0; i < n; i++) {
     T x = from.x[i], y = from.y[i], z = from.z[i], L = from.L[i], M = from.M[i], N = from.N[i];
@@ -59,7 +59,7 @@ void push(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, Notes<T>& notes, i
       nx = -c * hx, ny = -c * hy, nz = T(1) - shape * c * hz;
       if (kind == kConic) w = T(1) - k * c * c * u;
       moved = T(-0.5) * ((u + shape * hz * hz) * dc + c * hz * hz * dk);
-    } else if (has_terms(kind) || is_departed(kind)) {
+    } else if (has_terms(kind) || has_sag_terms(kind)) {
       sag<kind, true>(s, terms, u, S, dS, d2S);
       nx = T(-2) * dS * hx, ny = T(-2) * dS * hy, w = T(1) + T(4) * dS * dS * u;
       T radicand = T(1) - shape * c * c * u, over_w = T(1) / root(radicand > 0 ? radicand : T(1));
@@ -68,7 +68,7 @@ void push(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, Notes<T>& notes, i
       add_terms<kind, false>(change.a, terms, u, P, dP, d2P);
       moved = -(dc * u * over_w * over_w / (over_w + T(1)) + T(0.5) * dk * c * conic_sag * conic_sag * over_w + P);
       slope = T(0.5) * dc * third + T(0.25) * dk * c * (c * c * u) * third + dP;
-      if constexpr (is_departed(kind)) {
+      if constexpr (has_sag_terms(kind)) {
         nx -= notes.added.x[i], ny -= notes.added.y[i], w = T(1) + nx * nx + ny * ny;
         moved -= notes.px[i];
       }
@@ -105,13 +105,13 @@ void push(const Rays<T>& from, const Rays<T>& to, Rays<T>& d, Notes<T>& notes, i
     if (kind == kSphere || kind == kConic) {
       dnx = -c * px - dc * hx, dny = -c * py - dc * hy, dnz = -shape * (c * pz + dc * hz) - dk * c * hz;
       if (kind == kConic) dw = -c * (c * u * dk + T(2) * k * (u * dc + hx * (c * px) + hy * (c * py)));
-    } else if (has_terms(kind) || is_departed(kind)) {
+    } else if (has_terms(kind) || has_sag_terms(kind)) {
       // No product of two lengths, as hx px, stands alone: it leaves the range of numbers before its factors do.
       slope += T(2) * (d2S * hx * px + d2S * hy * py);
       slope += T(0.5) * shape * steep * (steep * hx * (steep * px) + steep * hy * (steep * py));
       dnx = T(-2) * (slope * hx + dS * px), dny = T(-2) * (slope * hy + dS * py);
       dw = T(8) * (dS * u * slope + dS * hx * (dS * px) + dS * hy * (dS * py));
-      if constexpr (is_departed(kind)) {
+      if constexpr (has_sag_terms(kind)) {
         const Added<T, kBlock>& D = notes.added;
         dnx -= notes.py[i] + D.xx[i] * px + D.xy[i] * py, dny -= notes.pz[i] + D.xy[i] * px + D.yy[i] * py;
         dw = T(2) * (nx * dnx + ny * dny);

@@ -128,7 +128,7 @@ class Trace {
           pull_phase(rays[k], rays[k + 1], *g, *notes, n, step.surface, row);
         }
         add(row, *step.surface.at, step.pulls(rays[k], rays[k + 1], *g, *notes, n, step.surface));
-        if (is_departed(step.surface.at->kind)) sum_departure(*notes, n, step.surface, row);
+        if (has_sag_terms(step.surface.at->kind)) sum_sag_terms(*notes, n, step.surface, row);
       }
       store(call_.by_rays, *g, at, count);
     });

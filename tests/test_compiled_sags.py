@@ -4,17 +4,16 @@ import dataclasses
 
 import pytest
 import torch
-from fused_rays import CLOSE, assert_same_rays, both, some_rays, with_leaves
+from compiled_rays import CLOSE, assert_same_rays, both, some_rays, with_leaves
 from problems import scalar, vector
 from torch.autograd import gradcheck, gradgradcheck
 from torch.utils._pytree import tree_flatten, tree_leaves, tree_unflatten
 
 from raytrace.materials.glass import MIRROR
 from raytrace.maths.value import to
-from raytrace.system.polynomials import IrregularSag, PolynomialSag, PowerSag, TiltSag
 from raytrace.system.rays import Rays
-from raytrace.system.sag_terms import FringeSag, GridSag, ZernikeSag
-from raytrace.system.shapes import DEPARTURES
+from raytrace.system.sag_terms import FringeSag, GridSag, IrregularSag, PolynomialSag, PowerSag, TiltSag, ZernikeSag
+from raytrace.system.shapes import SAG_TERMS
 from raytrace.system.surface import Surface
 from raytrace.tracing.compiled import trace_engine
 from raytrace.tracing.compiled.structure import is_expressible
@@ -27,9 +26,9 @@ def freeform(kind: str, curvature, conic, *coefficients: float, thickness: float
     return Surface(scalar(thickness), c, k, vector(*coefficients), kind=kind, **others)
 
 
-def departed(departure, curvature=None, conic=None, *coefficients: float) -> Surface:
+def departed(sag_terms, curvature=None, conic=None, *coefficients: float) -> Surface:
     c, k = (None if number is None else scalar(number) for number in (curvature, conic))
-    return Surface(scalar(4.0), c, k, vector(*coefficients) if coefficients else None, departure=departure)
+    return Surface(scalar(4.0), c, k, vector(*coefficients) if coefficients else None, sag_terms=sag_terms)
 
 
 def drawn(count: int, size: float, seed: int = 3) -> torch.Tensor:
@@ -81,9 +80,9 @@ def test_rays_of_all_fates_are_traced_as_by_torch(name, dtype, with_path):
     surfaces, rays = to(systems(name), dtype=dtype), some_rays(dtype=dtype)
     assert all(is_expressible(surface) for surface in surfaces)
     rays = rays if with_path else dataclasses.replace(rays, opl=None)
-    fused, eager = both(lambda: trace_surfaces(surfaces, rays, indices=indices(dtype)))
+    compiled, eager = both(lambda: trace_surfaces(surfaces, rays, indices=indices(dtype)))
     assert 5 < int((~eager.valid).sum()) < 690
-    assert_same_rays(fused, eager, 10 * CLOSE[dtype])
+    assert_same_rays(compiled, eager, 10 * CLOSE[dtype])
 
 
 @each
@@ -117,8 +116,8 @@ def test_the_adjoint_is_what_autograd_finds(name, dtype, close, with_path):
 def test_the_tangents_are_those_of_torch(name, dtype, close):
     rays = some_rays(200, dtype=dtype)
     surfaces, media, leaves = with_leaves(to(systems(name), dtype=dtype), indices(dtype))
-    fused, eager = both(lambda: hit_jacobian(surfaces, rays, leaves, indices=media))
-    for f, e in zip(fused, eager, strict=True):
+    compiled, eager = both(lambda: hit_jacobian(surfaces, rays, leaves, indices=media))
+    for f, e in zip(compiled, eager, strict=True):
         assert float((f - e).abs().max()) <= close * (float(e.abs().max()) + 1.0)
 
 
@@ -136,13 +135,13 @@ def test_gradients_by_differences_and_their_gradients_with_lost_rays(name):
         return torch.where(end.valid, end.position[:2], 0.0)
 
     numbers = [scalar(0.03) if n is None else n for n in (face.curvature, face.conic)]
-    more = {name: getattr(face, name) for name in ("coefficients", "departure") if getattr(face, name) is not None}
+    more = {name: getattr(face, name) for name in ("coefficients", "sag_terms") if getattr(face, name) is not None}
     if "coefficients" in more:
         share = 3.0 ** (-2 * torch.arange(len(more["coefficients"]), dtype=torch.float64))  # so that all weigh alike
         more["coefficients"] = more["coefficients"] / share
     others, kinds = tree_flatten(more)
     numbers = tuple(number.clone().requires_grad_() for number in (*numbers, *others))
-    with trace_engine("fused"):
+    with trace_engine("compiled"):
         assert gradcheck(hits, numbers, atol=1e-6)
         assert gradgradcheck(hits, numbers, atol=1e-5, fast_mode=True)
 
@@ -161,7 +160,7 @@ def test_rays_do_not_depend_on_their_neighbours_nor_gradients_on_threads(name):
         finally:
             torch.set_num_threads(before)
 
-    with trace_engine("fused"):
+    with trace_engine("compiled"):
         for a, b in zip(gradient(1), gradient(2), strict=True):
             assert a is b is None or torch.equal(a, b)
         some = slice(1237, 1300)
@@ -171,20 +170,20 @@ def test_rays_do_not_depend_on_their_neighbours_nor_gradients_on_threads(name):
     assert torch.equal(alone.direction, among.direction[:, some])
 
 
-@pytest.mark.parametrize("name", [name for name, face in FACES.items() if face.departure is not None])
-def test_powers_are_the_departure(name):
+@pytest.mark.parametrize("name", [name for name, face in FACES.items() if face.sag_terms is not None])
+def test_powers_are_the_sag_terms(name):
     """At points all over and beyond its disc, with slopes and second derivatives."""
-    departure = FACES[name].departure
-    kind = DEPARTURES[type(departure).__name__]
-    powers = kind.powers(departure)
+    sag_terms = FACES[name].sag_terms
+    kind = SAG_TERMS[type(sag_terms).__name__]
+    powers = kind.powers(sag_terms)
     x, y = drawn(200, 6.0, seed=1), drawn(200, 6.0, seed=2)
     given, expected = (
         row.sag(tree_leaves(row.prepare(of)), x, y, 2)
-        for row, of in ((DEPARTURES["PowerSag"], powers), (kind, departure))
+        for row, of in ((SAG_TERMS["PowerSag"], powers), (kind, sag_terms))
     )
     for g, e in zip(given, expected, strict=True):
         assert float((g - e).abs().max()) <= 1e-11 * (1.0 + float(e.abs().max()))
-    bound = DEPARTURES["PowerSag"].size(tree_leaves(powers), torch.hypot(x, y))
+    bound = SAG_TERMS["PowerSag"].size(tree_leaves(powers), torch.hypot(x, y))
     assert bool((expected.z.abs() <= bound * (1 + 1e-12)).all())
 
 

@@ -1,4 +1,4 @@
-"""Departures from a conic: the spline and Zernike sags, rays through them, derivatives, and who must know of them."""
+"""Sag terms from a conic: the spline and Zernike sags, rays through them, derivatives, and who must know of them."""
 
 import dataclasses
 import math
@@ -14,10 +14,11 @@ from raytrace.maths import zernike
 from raytrace.maths.grid import grid
 from raytrace.maths.value import to
 from raytrace.psf_models import psf
+from raytrace.system.intersection import intersect, normal
 from raytrace.system.rays import start
 from raytrace.system.sag_terms import GridSag, ZernikeSag, spline
 from raytrace.system.shapes import Relief, relief
-from raytrace.system.surface import intersect, normal, sag, sag_at
+from raytrace.system.surface import sag, sag_at
 from raytrace.tracing.launch import launch
 from raytrace.tracing.paraxial import first_order
 from raytrace.tracing.scene import scene, symmetry
@@ -61,17 +62,17 @@ def bumpy() -> ZernikeSag:
 
 
 ALL = {
-    "zernike": dataclasses.replace(surface(0.03, 5.0, 1.5, conic=-0.6), departure=bumpy()),
-    "zernike on an asphere": dataclasses.replace(surface(0.02, 5.0, 1.5, coefficients=[1e-3, 1e-5]), departure=bumpy()),
-    "grid": dataclasses.replace(surface(0.03, 5.0, 1.5), departure=sampled(wavy, 12)),
-    "grid on a plane": dataclasses.replace(surface(None, 5.0, 1.5), departure=sampled(wavy, 12)),
+    "zernike": dataclasses.replace(surface(0.03, 5.0, 1.5, conic=-0.6), sag_terms=bumpy()),
+    "zernike on an asphere": dataclasses.replace(surface(0.02, 5.0, 1.5, coefficients=[1e-3, 1e-5]), sag_terms=bumpy()),
+    "grid": dataclasses.replace(surface(0.03, 5.0, 1.5), sag_terms=sampled(wavy, 12)),
+    "grid on a plane": dataclasses.replace(surface(None, 5.0, 1.5), sag_terms=sampled(wavy, 12)),
 }
 
 
-@pytest.mark.parametrize("departure", [bumpy(), sampled(wavy, 12)], ids=["zernike", "grid"])
-def test_slopes_are_the_derivatives_of_the_sag(departure):
+@pytest.mark.parametrize("sag_terms", [bumpy(), sampled(wavy, 12)], ids=["zernike", "grid"])
+def test_slopes_are_the_derivatives_of_the_sag(sag_terms):
     x, y = points(50, 3.0).requires_grad_().unbind()
-    found = relief(departure).sag(x, y)
+    found = relief(sag_terms).sag(x, y)
     of_x, of_y = torch.autograd.grad(found.z.sum(), (x, y), create_graph=True)
     of_xx, of_xy = torch.autograd.grad(of_x.sum(), (x, y), retain_graph=True)
     (of_yy,) = torch.autograd.grad(of_y.sum(), y)
@@ -93,11 +94,11 @@ def test_spline_passes_through_its_heights_and_its_error_falls_with_the_fourth_p
     x, y = points(2000, 4.0)
     errors = []
     for size in (16, 32, 64):
-        departure = sampled(wavy, size)
-        line = (torch.arange(size, dtype=torch.float64) - 0.5 * (size - 1)) * departure.pitch
-        at = relief(departure).sag(line.expand(size, size), line[:, None].expand(size, size)).z
-        assert (at - departure.heights).abs().max() < 1e-15
-        errors.append(float((relief(departure).sag(x, y).z - wavy(x, y)).abs().max()))
+        sag_terms = sampled(wavy, size)
+        line = (torch.arange(size, dtype=torch.float64) - 0.5 * (size - 1)) * sag_terms.pitch
+        at = relief(sag_terms).sag(line.expand(size, size), line[:, None].expand(size, size)).z
+        assert (at - sag_terms.heights).abs().max() < 1e-15
+        errors.append(float((relief(sag_terms).sag(x, y).z - wavy(x, y)).abs().max()))
     assert errors[0] / errors[1] > 10
     assert errors[1] / errors[2] > 12
     assert errors[2] < 4e-6  # mm; near the rim one-sided: 1.3 h⁴ of a fourth derivative of 0.07
@@ -108,8 +109,8 @@ def test_cubics_are_splines_exactly():
         return 0.01 * x**3 - 0.02 * x * x * y + 0.03 * y**3 + x * y + 0.5
 
     x, y = points(100, 4.0)
-    departure = sampled(cubic, 9)
-    assert (relief(departure).sag(x, y).z - cubic(x, y)).abs().max() < 1e-13
+    sag_terms = sampled(cubic, 9)
+    assert (relief(sag_terms).sag(x, y).z - cubic(x, y)).abs().max() < 1e-13
 
 
 def test_large_grids_are_filtered_in_parts_as_in_one_go():
@@ -137,7 +138,7 @@ def test_a_spline_found_once_is_the_grid_bit_for_bit_with_its_gradients():
     for prepared in (lambda grid: grid, spline):
         grid = sampled(wavy, 12)
         inputs = [grid.heights.clone().requires_grad_(), grid.pitch.clone().requires_grad_()]
-        face = dataclasses.replace(ALL["grid"], departure=prepared(GridSag(*inputs)))
+        face = dataclasses.replace(ALL["grid"], sag_terms=prepared(GridSag(*inputs)))
         found = through(face, start(*oblique()))
         gradients.append((found.detach(), *torch.autograd.grad((found * found.detach().cos()).sum(), inputs)))
     for a, b in zip(*gradients, strict=True):
@@ -150,26 +151,26 @@ def test_a_grid_of_three_heights_is_refused():
         relief(GridSag(torch.zeros(3, 5, dtype=torch.float64), RADIUS))
 
 
-def beyond(front, departure_free, tolerance):
+def beyond(front, sag_terms_free, tolerance):
     """Hits, normals and refracted directions of one surface against those of another of the same shape."""
     rays = start(*oblique())
     for one, other in zip(
-        *(list(steps([s], rays, indices=vector(1.0, 1.5))) for s in (front, departure_free)), strict=True
+        *(list(steps([s], rays, indices=vector(1.0, 1.5))) for s in (front, sag_terms_free)), strict=True
     ):
         assert torch.equal(one.rays.valid, other.rays.valid)
         assert (one.rays.position - other.rays.position).abs().max() < tolerance
         assert (one.rays.direction - other.rays.direction).abs().max() < 10 * tolerance
     at = intersect(front, *oblique())[0]
-    unit = [torch.stack(normal(s, at)[0]) for s in (front, departure_free)]
+    unit = [torch.stack(normal(s, at)[0]) for s in (front, sag_terms_free)]
     unit = [n / torch.linalg.vector_norm(n, dim=0) for n in unit]
     assert (unit[0] - unit[1]).abs().max() < 10 * tolerance
 
 
-def test_even_terms_as_a_departure_are_the_asphere():
+def test_even_terms_as_sag_terms_are_the_asphere():
     asphere = surface(0.03, 5.0, 1.5, conic=-0.6, coefficients=[2e-3, -3e-5])
-    beyond(dataclasses.replace(asphere, coefficients=None, departure=even_terms(2e-3, -3e-5)), asphere, 1e-13)
+    beyond(dataclasses.replace(asphere, coefficients=None, sag_terms=even_terms(2e-3, -3e-5)), asphere, 1e-13)
     flat = surface(None, 5.0, 1.5, coefficients=[2e-3, -3e-5])
-    beyond(dataclasses.replace(flat, coefficients=None, departure=even_terms(2e-3, -3e-5)), flat, 1e-13)
+    beyond(dataclasses.replace(flat, coefficients=None, sag_terms=even_terms(2e-3, -3e-5)), flat, 1e-13)
 
 
 def test_even_terms_on_a_grid_are_the_asphere_but_for_the_error_of_the_spline():
@@ -177,15 +178,15 @@ def test_even_terms_on_a_grid_are_the_asphere_but_for_the_error_of_the_spline():
     asphere = surface(0.03, 5.0, 1.5, coefficients=[0.0, -3e-5])
     for size in (16, 64):
         gridded = sampled(lambda x, y: -3e-5 * (x * x + y * y) ** 2, size)
-        plain = dataclasses.replace(asphere, coefficients=None, departure=gridded)
+        plain = dataclasses.replace(asphere, coefficients=None, sag_terms=gridded)
         beyond(plain, asphere, 1e-6 * (16 / size) ** 3)
 
 
 def test_tilt_is_a_prism():
     """A plane tilted by α refracts a ray along the axis by asin(n sin α) - α towards the thicker side."""
     slope = 0.1
-    tilted = dataclasses.replace(surface(None, 10.0), departure=noll(z3=slope * float(RADIUS) / 2))
-    linear = dataclasses.replace(surface(None, 10.0), departure=sampled(lambda x, y: slope * y + 0 * x, 8))
+    tilted = dataclasses.replace(surface(None, 10.0), sag_terms=noll(z3=slope * float(RADIUS) / 2))
+    linear = dataclasses.replace(surface(None, 10.0), sag_terms=sampled(lambda x, y: slope * y + 0 * x, 8))
     rays = start(
         torch.stack([*points(10, 3.0), torch.full((10,), -5.0, dtype=torch.float64)]), vector(0, 0, 1)[:, None]
     )
@@ -215,8 +216,8 @@ def test_hits_lie_on_ray_and_surface_and_snells_invariant_holds(face):
 
 def test_rays_beyond_the_grid_miss_and_leave_no_trace_in_gradients():
     face = ALL["grid"]
-    heights = face.departure.heights.clone().requires_grad_()
-    face = dataclasses.replace(face, departure=GridSag(heights, face.departure.pitch))
+    heights = face.sag_terms.heights.clone().requires_grad_()
+    face = dataclasses.replace(face, sag_terms=GridSag(heights, face.sag_terms.pitch))
     position, direction = torch.tensor([[0.0, 3.9, 4.5], [1.0, 0, 0], [-3.0, -3, -3]]), torch.tensor([0.0, 0, 1])
     rays = start(position.double(), direction.double()[:, None])
     (crossing,) = steps([face], rays, indices=vector(1.0, 1.5))
@@ -229,7 +230,7 @@ def test_rays_beyond_the_grid_miss_and_leave_no_trace_in_gradients():
 def test_a_ray_that_newton_throws_off_is_found_by_the_bracketed_search():
     """Ripples of 0.8 mm, 2 mm long, seen at 60°: Newton's method from the plane wanders; the hit is a true crossing."""
     rippled = dataclasses.replace(
-        surface(None, 5.0, semi_diameter=6.0), departure=sampled(lambda x, y: 0.4 * torch.sin(3 * y) + 0 * x, 120, 12.0)
+        surface(None, 5.0, semi_diameter=6.0), sag_terms=sampled(lambda x, y: 0.4 * torch.sin(3 * y) + 0 * x, 120, 12.0)
     )
     y = torch.linspace(-3, 3, 61, dtype=torch.float64)
     direction = torch.tensor([0.0, math.sin(1.0), math.cos(1.0)], dtype=torch.float64)[:, None]
@@ -258,18 +259,18 @@ def with_lost_rays():
 def test_first_and_second_derivatives_by_every_number_with_lost_rays(kind, direction):
     """First derivatives along one random direction of all numbers, or by each of them; second ones along one."""
     face = dataclasses.replace(ALL[kind], curvature=vector(-0.03)[0], semi_diameter=4.0)
-    departure, rays = noll(z2=0.02, z3=-0.01, z5=0.008, z7=0.006), with_lost_rays()
+    sag_terms, rays = noll(z2=0.02, z3=-0.01, z5=0.008, z7=0.006), with_lost_rays()
     if kind == "grid":
-        departure = sampled(wavy, 4)
+        sag_terms = sampled(wavy, 4)
 
     def traced(shape, scale, curvature, height):
-        changed = dataclasses.replace(face, departure=type(departure)(shape, scale), curvature=curvature)
+        changed = dataclasses.replace(face, sag_terms=type(sag_terms)(shape, scale), curvature=curvature)
         lifted = rays.position + torch.stack([0 * height, height, 0 * height])[:, None]
         return through(changed, dataclasses.replace(rays, position=lifted))
 
-    shape, scale = (getattr(departure, field.name) for field in dataclasses.fields(departure))
+    shape, scale = (getattr(sag_terms, field.name) for field in dataclasses.fields(sag_terms))
     inputs = [t.clone().requires_grad_() for t in (shape, scale, face.curvature, vector(0.0)[0])]
-    (crossing,) = steps([dataclasses.replace(face, departure=departure)], rays, indices=vector(1.5, 1.0))
+    (crossing,) = steps([dataclasses.replace(face, sag_terms=sag_terms)], rays, indices=vector(1.5, 1.0))
     assert crossing.rays.valid.tolist() == [True, True, kind == "zernike", False]
     assert gradcheck(traced, inputs, atol=1e-6, fast_mode=direction == "one")
     assert gradgradcheck(traced, inputs, atol=1e-5, rtol=1e-3, fast_mode=True)
@@ -286,13 +287,13 @@ def test_float32_rays(face):
 
 @pytest.mark.parametrize("kind", ["zernike", "grid"])
 def test_transforms_of_torch_func(kind):
-    """vmap over departures and over rays is a loop; forward and backward derivatives are the same."""
+    """vmap over sag_terms and over rays is a loop; forward and backward derivatives are the same."""
     face, rays = ALL[kind], start(*oblique(6))
     name = "coefficients" if kind == "zernike" else "heights"
-    shape = getattr(face.departure, name)
+    shape = getattr(face.sag_terms, name)
 
     def traced(shape, position=rays.position):
-        changed = dataclasses.replace(face, departure=dataclasses.replace(face.departure, **{name: shape}))
+        changed = dataclasses.replace(face, sag_terms=dataclasses.replace(face.sag_terms, **{name: shape}))
         return through(changed, dataclasses.replace(rays, position=position))
 
     several = torch.stack([shape, 0.5 * shape, 0 * shape])
@@ -304,12 +305,12 @@ def test_transforms_of_torch_func(kind):
     assert (forward - backward).abs().max() < 1e-13
 
 
-def singlet(departure, **others):
-    front = dataclasses.replace(surface(0.02, 4.0, 1.5), departure=departure)
+def singlet(sag_terms, **others):
+    front = dataclasses.replace(surface(0.02, 4.0, 1.5), sag_terms=sag_terms)
     return lens([front, surface(-0.02, 48.0)], aperture=("entrance_pupil_diameter", 6.0), **others)
 
 
-def test_a_departure_is_not_round_whatever_its_numbers():
+def test_sag_terms_is_not_round_whatever_its_numbers():
     """Astigmatism seen by one meridian would look round; the covariance of all models shows both axes."""
     round_lens, astigmatic = singlet(None), singlet(noll(z6=2e-3))
     axis = vector(0.0, 0.0)[:, None]
@@ -331,12 +332,12 @@ def test_paraxial_power_sees_the_mean_curvature_of_the_vertex():
     expected = float(first_order(bent).effective_focal_length)
     gridded = sampled(lambda x, y: 1e-3 * (x * x + y * y), 8)
     twisted = ZernikeSag(torch.cat([even_terms(1e-3, 0.0).coefficients[:4], vector(0.01, 0.02)]), RADIUS)
-    for departure in (even_terms(1e-3, 0.0), gridded, twisted):
-        assert float(first_order(singlet(departure)).effective_focal_length) == pytest.approx(expected, rel=1e-12)
+    for sag_terms in (even_terms(1e-3, 0.0), gridded, twisted):
+        assert float(first_order(singlet(sag_terms)).effective_focal_length) == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("name", ["lens.csv", "lens.zmx"])
-def test_no_file_holds_a_departure(name, tmp_path):
+def test_no_file_holds_a_sag_terms(name, tmp_path):
     with pytest.raises(LensFileError, match=r"surface 1.*[zZ]ernike ?[sS]ag"):
         write_lens(singlet(bumpy()), tmp_path / name)
 
@@ -347,8 +348,8 @@ def test_sag_by_radius_alone_is_refused():
 
 
 def test_media_and_dummies_do_not_care():
-    """A departure between equal media bends nothing."""
-    idle = lens([dataclasses.replace(surface(None, 5.0), departure=bumpy()), surface(None, 5.0)])
+    """sag terms between equal media bends nothing."""
+    idle = lens([dataclasses.replace(surface(None, 5.0), sag_terms=bumpy()), surface(None, 5.0)])
     rays = launch(idle, points(5, 0.5))
     assert len(media(idle, idle.wavelengths[0])) == 4
     assert torch.equal(trace_lens(idle, rays, idle.wavelengths[0]).direction, rays.direction)

@@ -27,19 +27,19 @@ def some_rays(count: int = 700, dtype=torch.float64, seed: int = 4) -> Rays:
 
 def both(call):
     found = []
-    for name in ("fused", "eager"):
+    for name in ("compiled", "eager"):
         with trace_engine(name):
             found.append(call())
     return found
 
 
-def assert_same_rays(fused: Rays, eager: Rays, close: float, size: float = 100.0) -> None:
+def assert_same_rays(compiled: Rays, eager: Rays, close: float, size: float = 100.0) -> None:
     """To a share `close` of the size (mm) of the system."""
-    assert torch.equal(fused.valid, eager.valid)
-    assert_close(fused.position, eager.position, rtol=0, atol=close * size)
-    assert_close(fused.direction, eager.direction, rtol=0, atol=close)
+    assert torch.equal(compiled.valid, eager.valid)
+    assert_close(compiled.position, eager.position, rtol=0, atol=close * size)
+    assert_close(compiled.direction, eager.direction, rtol=0, atol=close)
     if eager.opl is not None:
-        assert_close(fused.opl, eager.opl, rtol=close, atol=close * size)
+        assert_close(compiled.opl, eager.opl, rtol=close, atol=close * size)
 
 
 def leaves_of_rays(rays: Rays):
@@ -54,7 +54,7 @@ def with_leaves(surfaces, indices):
         leaves.append(number.detach().clone().requires_grad_())
         return leaves[-1]
 
-    names = ("thickness", "curvature", "conic", "coefficients", "departure", "phase", "before", "after")
+    names = ("thickness", "curvature", "conic", "coefficients", "sag_terms", "phase", "before", "after")
     own = [
         dataclasses.replace(s, **{n: pytree.tree_map(leaf, getattr(s, n)) for n in names if getattr(s, n) is not None})
         for s in surfaces

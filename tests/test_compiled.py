@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from fused_rays import CLOSE, assert_same_rays, both, leaves_of_rays, some_rays, with_leaves
+from compiled_rays import CLOSE, assert_same_rays, both, leaves_of_rays, some_rays, with_leaves
 from problems import both_engines, double_gauss, lens, scalar, surface, vector, vignetting_aperture
 from torch.autograd import gradcheck, gradgradcheck
 from torch.testing import assert_close
@@ -22,7 +22,7 @@ from raytrace.system.rays import Rays, start
 from raytrace.system.sag_terms import ZernikeSag
 from raytrace.system.surface import Aperture
 from raytrace.tracing.compiled import engine, prepare, trace_engine
-from raytrace.tracing.compiled.engine_choice import is_fused
+from raytrace.tracing.compiled.library import uses_compiled
 from raytrace.tracing.compiled.run import task_of, trace_compiled
 from raytrace.tracing.compiled.structure import with_numbers
 from raytrace.tracing.jacobian import hit_jacobian, pushed
@@ -57,9 +57,9 @@ def test_shipped_lenses_are_traced_as_by_torch(path, dtype):
     system = to(read_lens(path), dtype=dtype)
     with torch.no_grad(), trace_engine("eager"):
         rays = launch(system, sobol(301)[0].to(dtype))
-    fused, eager = both(lambda: trace_lens(system, rays, system.wavelengths[:, None]))
+    compiled, eager = both(lambda: trace_lens(system, rays, system.wavelengths[:, None]))
     size = max(float(s.thickness.abs()) for s in system.surfaces[1:])
-    assert_same_rays(fused, eager, CLOSE[dtype], max(size, 10.0))
+    assert_same_rays(compiled, eager, CLOSE[dtype], max(size, 10.0))
     assert eager.valid.any()
 
 
@@ -68,9 +68,9 @@ def test_shipped_lenses_are_traced_as_by_torch(path, dtype):
 def test_every_kind_of_surface_and_of_loss(dtype, with_path):
     system, rays = to(EVERYTHING, dtype=dtype), some_rays(dtype=dtype)
     rays = rays if with_path else dataclasses.replace(rays, opl=None)
-    fused, eager = both(lambda: trace_lens(system, rays, system.wavelengths[0]))
+    compiled, eager = both(lambda: trace_lens(system, rays, system.wavelengths[0]))
     assert 20 < int((~eager.valid).sum()) < 600
-    assert_same_rays(fused, eager, 10 * CLOSE[dtype])
+    assert_same_rays(compiled, eager, 10 * CLOSE[dtype])
 
 
 @pytest.mark.parametrize(("dtype", "close"), [(torch.float64, 1e-11), (torch.float32, 2e-3)])
@@ -91,8 +91,8 @@ def test_the_adjoint_is_what_autograd_finds(dtype, close, with_path):
         inputs = [*leaves, *given, *([opl] if with_path else [])]
         return torch.autograd.grad(merit, inputs, allow_unused=True)
 
-    fused, eager = both(gradients)
-    for f, e in zip(fused, eager, strict=True):
+    compiled, eager = both(gradients)
+    for f, e in zip(compiled, eager, strict=True):
         if e is None:
             assert f is None or not f.any()
             continue
@@ -108,9 +108,9 @@ def test_the_forward_derivatives_of_every_number_are_those_of_torch(dtype, close
     """∂hit/∂v by every number of the lens, through the compiled tangents and through jvp."""
     system, rays = to(EVERYTHING, dtype=dtype), some_rays(200, dtype=dtype)
     surfaces, indices, leaves = with_leaves(system.surfaces[1:], media(system, system.wavelengths[0]))
-    fused, eager = both(lambda: hit_jacobian(surfaces, rays, leaves, indices=indices))
-    assert fused.shape == (sum(x.numel() for x in leaves), 2, 200)
-    for f, e in zip(fused, eager, strict=True):
+    compiled, eager = both(lambda: hit_jacobian(surfaces, rays, leaves, indices=indices))
+    assert compiled.shape == (sum(x.numel() for x in leaves), 2, 200)
+    for f, e in zip(compiled, eager, strict=True):
         assert float((f - e).abs().max()) <= close * (float(e.abs().max()) + 1.0)
 
 
@@ -154,7 +154,7 @@ def test_gradients_of_gradients_pass_through_the_eager_trace():
         return trace_lens(changed, rays, system.wavelengths[0]).position[:2]
 
     arguments = system.surfaces[1].curvature.clone().requires_grad_(), scalar(0.5).requires_grad_()
-    with trace_engine("fused"):
+    with trace_engine("compiled"):
         assert gradcheck(spread, arguments, atol=1e-5, rtol=1e-4)
         assert gradgradcheck(spread, arguments, atol=1e-3, rtol=1e-3)
 
@@ -173,7 +173,7 @@ def test_a_ray_does_not_depend_on_its_neighbours_nor_gradients_on_threads():
         finally:
             torch.set_num_threads(before)
 
-    with trace_engine("fused"):
+    with trace_engine("compiled"):
         together = trace_lens(EVERYTHING, rays, wavelength)
         chosen = torch.tensor([0, 1, 15, 16, 17, 50, 255, 256, 300, 39_999])
         alone = trace_lens(EVERYTHING, Rays(*(x[..., chosen] for x in leaves_of_rays(rays))), wavelength)
@@ -197,10 +197,10 @@ def test_populations_and_wavelengths_get_rows_of_their_own(axes):
         (gradient,) = torch.autograd.grad((end.position**2).sum(), factor)
         return end, gradient
 
-    (fused, by_fused), (eager, by_eager) = both(outcome)
-    assert fused.shape == eager.shape
-    assert_same_rays(fused, eager, 1e-12)
-    assert_close(by_fused, by_eager, rtol=1e-10, atol=1e-8)
+    (compiled, by_compiled), (eager, by_eager) = both(outcome)
+    assert compiled.shape == eager.shape
+    assert_same_rays(compiled, eager, 1e-12)
+    assert_close(by_compiled, by_eager, rtol=1e-10, atol=1e-8)
 
 
 def test_what_differs_along_the_last_axis_is_left_to_torch():
@@ -208,34 +208,34 @@ def test_what_differs_along_the_last_axis_is_left_to_torch():
     surfaces = [surface(vector(0.01, 0.02, 0.03), 5.0, 1.5)]
     how = {"indices": [scalar(1.0), scalar(1.5)], "side": 1, "gap": None}
     assert trace_compiled(surfaces, rays, **how, eager=None) is None
-    fused, eager = both(lambda: trace_surfaces(surfaces, rays, indices=how["indices"]))
-    assert torch.equal(fused.position, eager.position)
+    compiled, eager = both(lambda: trace_surfaces(surfaces, rays, indices=how["indices"]))
+    assert torch.equal(compiled.position, eager.position)
 
 
-def test_surfaces_with_a_departure_are_traced_between_compiled_ones():
+def test_surfaces_with_sag_terms_are_traced_between_compiled_ones():
     bump = ZernikeSag(vector(0.0, 0.0, 0.0, 1e-3, 2e-3), scalar(10.0))
-    surfaces = [*EVERYTHING.surfaces[1:4], surface(0.01, 2.0, 1.5, departure=bump), *EVERYTHING.surfaces[4:]]
+    surfaces = [*EVERYTHING.surfaces[1:4], surface(0.01, 2.0, 1.5, sag_terms=bump), *EVERYTHING.surfaces[4:]]
     system = dataclasses.replace(EVERYTHING, surfaces=(EVERYTHING.surfaces[0], *surfaces))
-    fused, eager = both(lambda: trace_lens(system, some_rays(), system.wavelengths[0]))
-    assert_same_rays(fused, eager, 1e-12)
+    compiled, eager = both(lambda: trace_lens(system, some_rays(), system.wavelengths[0]))
+    assert_same_rays(compiled, eager, 1e-12)
 
 
 def test_transforms_other_dtypes_and_the_switch_leave_it_to_torch():
     rays, number = some_rays(4), scalar(1.0)
-    with trace_engine("fused"):
-        assert is_fused(rays, number, 1)
-        assert not is_fused(Rays(*(x.to("meta") for x in leaves_of_rays(rays))), number, 1)
-        assert not is_fused(dataclasses.replace(rays, position=rays.position.float()), number, 1)
+    with trace_engine("compiled"):
+        assert uses_compiled(rays, number, 1)
+        assert not uses_compiled(Rays(*(x.to("meta") for x in leaves_of_rays(rays))), number, 1)
+        assert not uses_compiled(dataclasses.replace(rays, position=rays.position.float()), number, 1)
         seen = []
-        torch.func.vmap(lambda x: seen.append(is_fused(dataclasses.replace(rays, position=x), number, 1)) or x)(
+        torch.func.vmap(lambda x: seen.append(uses_compiled(dataclasses.replace(rays, position=x), number, 1)) or x)(
             rays.position[None]
         )
         assert seen == [False]
     with trace_engine("eager"):
         assert engine() == "eager"
-        assert not is_fused(rays, number, 10**9)
+        assert not uses_compiled(rays, number, 10**9)
         assert prepare() == "eager"
-    with pytest.raises(ValueError, match="'quick': expected one of auto, eager, fused"), trace_engine("quick"):
+    with pytest.raises(ValueError, match="'quick': expected one of auto, eager, compiled"), trace_engine("quick"):
         pass
 
 
@@ -243,7 +243,7 @@ PROBE = """
 import raytrace, torch
 from raytrace.tracing.trace import trace_lens
 from raytrace.tracing.compiled import library
-from raytrace.tracing.compiled.engine_choice import is_fused
+from raytrace.tracing.compiled.library import uses_compiled
 from raytrace.system.rays import Rays, start
 library.FLAGS = tuple(flag for flag in library.FLAGS if flag != "-O3")  # compiled in 2 s instead of 14 s
 lens = raytrace.read_lens({lens!r})
@@ -253,7 +253,7 @@ like[2] = 1.0
 rays = Rays(0 * like, like, torch.ones(count, dtype=torch.bool))
 with torch.no_grad():
     trace_lens(lens, rays, lens.wavelengths[0])
-print(is_fused(Rays(like[:, :1], like[:, :1], rays.valid[:1]), lens.wavelengths, 1))
+print(uses_compiled(Rays(like[:, :1], like[:, :1], rays.valid[:1]), lens.wavelengths, 1))
 """
 
 

@@ -5,7 +5,7 @@ import random
 
 import pytest
 import torch
-from fused_rays import CLOSE, assert_same_rays, both, leaves_of_rays, some_rays, with_leaves
+from compiled_rays import CLOSE, assert_same_rays, both, leaves_of_rays, some_rays, with_leaves
 from problems import lens, scalar, surface, vector
 from torch.autograd import gradcheck, gradgradcheck
 from torch.testing import assert_close
@@ -13,10 +13,9 @@ from torch.testing import assert_close
 import raytrace as rt
 from raytrace.materials.glass import MIRROR
 from raytrace.maths.value import to
-from raytrace.system.polynomials import PolynomialSag, TiltSag
 from raytrace.system.poses import Gap, Pose, direction_in, passage, point_in
 from raytrace.system.rays import Rays, start
-from raytrace.system.sag_terms import FringeSag
+from raytrace.system.sag_terms import FringeSag, PolynomialSag, TiltSag
 from raytrace.system.shapes import EVEN
 from raytrace.system.surface import Aperture, Surface, gap_behind
 from raytrace.tracing.compiled import trace_engine
@@ -85,8 +84,8 @@ SYSTEMS = {
         surface(None, 5.0, 1.6, phase=HOLOGRAM),
         surface(-0.01, 8.0, conic=0.3, phase=HOLOGRAM, before=posed(tilt_x=9.0)),
         surface(0.004, -20.0, MIRROR, phase=HOLOGRAM, before=posed(tilt_x=12.0), after=posed(tilt_x=-3.0)),
-        surface(None, -7.0, departure=FringeSag(drawn(37, size=0.01), scalar(30.0), scalar(1.0), scalar(-2.0))),
-        surface(None, -7.0, departure=TiltSag(scalar(0.1), scalar(-0.2)), phase=GRATING),
+        surface(None, -7.0, sag_terms=FringeSag(drawn(37, size=0.01), scalar(30.0), scalar(1.0), scalar(-2.0))),
+        surface(None, -7.0, sag_terms=TiltSag(scalar(0.1), scalar(-0.2)), phase=GRATING),
     ],
     "facets": [
         surface(0.03, 5.0, 1.6, phase=rt.Facets(), conic=-0.5),
@@ -127,8 +126,8 @@ def traced(name: str, dtype=torch.float64, **options):
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_rays_are_those_of_torch(name, dtype, with_path):
-    fused, eager = traced(name, dtype, with_path=with_path)
-    assert_same_rays(fused, eager, 20 * CLOSE[dtype])
+    compiled, eager = traced(name, dtype, with_path=with_path)
+    assert_same_rays(compiled, eager, 20 * CLOSE[dtype])
     assert eager.shape == (3, 300)
     assert 0 < int(eager.valid.sum()) < 900
 
@@ -142,8 +141,8 @@ def test_all_of_a_system_is_compiled(name):
     assert isinstance(gap, Gap) == (name == "tilted")
     behind = trace_surfaces(surfaces[:1], rays, **{**how, "indices": how["indices"][:2]})
     assert trace_compiled(surfaces[1:], behind, **later, gap=gap, eager=None) is not None
-    fused, eager = both(lambda: trace_surfaces(surfaces[1:], behind, **later, gap=gap))
-    assert_same_rays(fused, eager, 20 * CLOSE[torch.float64])
+    compiled, eager = both(lambda: trace_surfaces(surfaces[1:], behind, **later, gap=gap))
+    assert_same_rays(compiled, eager, 20 * CLOSE[torch.float64])
 
 
 @pytest.mark.parametrize("with_path", [True, False])
@@ -162,8 +161,8 @@ def test_the_adjoint_is_what_autograd_finds(name, dtype, close, with_path):
         merit = sum((w * x).sum() for w, x in zip(weights.split([3, 3, 1]), out, strict=False))
         return torch.autograd.grad(merit, [*leaves, *start, *([opl] if with_path else [])], allow_unused=True)
 
-    fused, eager = both(gradients)
-    for f, e in zip(fused, eager, strict=True):
+    compiled, eager = both(gradients)
+    for f, e in zip(compiled, eager, strict=True):
         if e is None:
             assert f is None or not f.any()
             continue
@@ -177,7 +176,7 @@ def test_forward_derivatives_are_the_gradients_of_torch(name):
     surfaces, rays, how = given(name, count=40)
     weights = drawn(7, 3, 40, seed=8)
     own, indices, leaves = with_leaves(surfaces, how["indices"])
-    with trace_engine("fused"):
+    with trace_engine("compiled"):
         hits = hit_jacobian(own, rays, leaves, indices=indices, wavelength=WAVELENGTHS)
         task = task_of(own, rays, indices=indices, wavelength=WAVELENGTHS)
         table = task.given[3]
@@ -210,7 +209,7 @@ def test_rays_behind_all_surfaces_at_once_are_those_behind_each(name):
     indices, wavelength = how["indices"], WAVELENGTHS
     task = task_of(surfaces, rays, indices=indices, wavelength=wavelength)
     change = drawn(2, *task.given[3].shape, size=0.01, seed=3) * task.given[3].abs()
-    with trace_engine("fused"):
+    with trace_engine("compiled"):
         found = push_everywhere(task, change)
         bare = push_everywhere(task, change[:0])
         for number, row in enumerate(rows_of(task.structure, surfaces), 1):
@@ -258,7 +257,7 @@ def test_whether_an_order_is_evanescent_is_not_left_to_rounding(glass):
 
 SHAPES = [("plane", None), ("sphere", None), ("conic", None), ("free", EVEN), ("free", "toroidal"), ("free", "biconic")]
 SHAPES += [("departed", None), ("departed", EVEN)]
-DEPARTURES = [
+SAG_TERMS = [
     TiltSag(scalar(0.1), scalar(-0.05)),
     PolynomialSag(drawn(9, size=0.1), scalar(20.0)),
     FringeSag(drawn(20, size=0.01), scalar(20.0), scalar(1.0), scalar(-2.0)),
@@ -287,7 +286,7 @@ def drawn_system(seed: int) -> list[Surface]:
                 conic=chance.uniform(-2.0, 1.0) if shape == "conic" else None,
                 coefficients=[1e-3, chance.uniform(-1e-6, 1e-6)] if kind else None,
                 kind=kind or EVEN,
-                departure=chance.choice(DEPARTURES) if shape == "departed" else None,
+                sag_terms=chance.choice(SAG_TERMS) if shape == "departed" else None,
                 phase=chance.choice(phases),
                 before=poses[0],
                 after=poses[1],
@@ -319,10 +318,10 @@ def test_systems_drawn_at_random(seed):
         merit = merit if end.opl is None else merit + (weights[6] * end.opl).sum()
         return end, torch.autograd.grad(merit, leaves, allow_unused=True)
 
-    (fused, by_fused), (eager, by_eager) = both(outcome)
+    (compiled, by_compiled), (eager, by_eager) = both(outcome)
     size = max(100.0, float(eager.position.detach().abs().max()))
-    assert_same_rays(fused, eager, 1e-12, size)
-    for f, e in zip(by_fused, by_eager, strict=True):
+    assert_same_rays(compiled, eager, 1e-12, size)
+    for f, e in zip(by_compiled, by_eager, strict=True):
         assert (e is None) or float((f - e).abs().max()) <= 1e-10 * (float(e.abs().max()) + size)
 
 
@@ -350,7 +349,7 @@ def test_gradients_are_differences_and_have_gradients_of_their_own():
 
     start = (mean * 0.2, scalar(8.0), vector(-3.0, 2.0), scalar(0.01), *(scalar(0.5 * a) for a in ANGLES.values()))
     start = [x.clone().requires_grad_() for x in start]
-    with trace_engine("fused"):
+    with trace_engine("compiled"):
         assert gradcheck(trace, start, rtol=1e-5, atol=1e-6)
         assert gradgradcheck(lambda *x: trace(*x)[0][..., 1:3], start, rtol=1e-4, atol=1e-5)
         assert gradgradcheck(lambda *x: trace(*x)[2][..., 1:3], start, rtol=1e-4, atol=1e-5)
@@ -369,7 +368,7 @@ def test_neither_neighbours_nor_threads_change_anything():
         finally:
             torch.set_num_threads(before)
 
-    with trace_engine("fused"):
+    with trace_engine("compiled"):
         for one, two in zip(outcome(1), outcome(2), strict=True):
             assert one is two is None or torch.equal(one, two)
         chosen = torch.tensor([1, 15, 16, 17, 255, 256, 300, 19_999])

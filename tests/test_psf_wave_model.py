@@ -10,7 +10,7 @@ from problems import scene_of, vector
 
 from raytrace.maths.grid import grid
 from raytrace.maths.pupil import gauss_rings
-from raytrace.psf_models import diffraction
+from raytrace.psf_models import wave
 from raytrace.psf_models.dft import Aliased, EmptyPupil, fft_psf, huygens, phasor, to_grid, to_grid_mirrored
 from raytrace.system.lens import with_sensor_distance
 from raytrace.system.surface import Aperture
@@ -34,10 +34,10 @@ def test_airy_disc():
     """Profile within 5e-5 of the peak, first dark ring within 0.1 % of 0.6098 λ/NA."""
     lens = stigmatic()
     scale = 0.55e-3 * 50.0 / 0.5
-    light = diffraction.waves(scene_of(lens), 3 * scale, order=1)
+    light = wave.waves(scene_of(lens), 3 * scale, order=1)
 
     def intensity(x, y):
-        U = diffraction.amplitude(light, x, y)[0, 0, 0]
+        U = wave.amplitude(light, x, y)[0, 0, 0]
         return U.real**2 + U.imag**2
 
     peak = intensity(vector(0.0), vector(0.0))[0, 0]
@@ -81,10 +81,10 @@ def test_three_ways_to_sum_waves_agree():
 def test_traced_wave_agrees_with_the_huygens_sum_from_the_exit_pupil():
     """10° off axis, every ray a wavelet on the reference sphere: the difference is what `residual` announces."""
     s = scene_of(gauss(), 10.0, 25e3)
-    light = diffraction.waves(s, 0.04)
+    light = wave.waves(s, 0.04)
     front = light.wavefront
     x, y = torch.linspace(-0.02, 0.02, 5, dtype=torch.float64), torch.linspace(-0.03, 0.03, 5, dtype=torch.float64)
-    U = diffraction.amplitude(light, x, y)[0, 0, 0].flatten()
+    U = wave.amplitude(light, x, y)[0, 0, 0].flatten()
     both = [torch.cat([t, t * sign]) for t, sign in zip(front.direction[:, 0, 0, 0], (-1, 1, 1), strict=True)]
     q = -front.radius[0, 0, 0] * torch.stack(both)
     v, h = (a.flatten() for a in torch.meshgrid(y, x, indexing="ij"))
@@ -95,13 +95,13 @@ def test_traced_wave_agrees_with_the_huygens_sum_from_the_exit_pupil():
         huygens(points, q, front.radius[0, 0, 0], path=path, amplitude=amplitude, wavelength=wavelength) / wavelength
     )
     ours, reference = (a.real**2 + a.imag**2 for a in (U, direct))
-    residual = diffraction.kernels(s, grid(0.005, 11, chief(s))).residual[0, 0, 0]
+    residual = wave.kernels(s, grid(0.005, 11, chief(s))).residual[0, 0, 0]
     assert (ours - reference).abs().sum() / reference.sum() < residual < 0.01
 
 
 def test_mirrored_waves_are_the_full_sum():
     s = scene_of(gauss(), 7.0, 25e3)
-    light = diffraction.waves(s, 0.01)
+    light = wave.waves(s, 0.01)
     front, field = light.wavefront, light.amplitude[0, 0, 0].to(torch.complex128)
     L, M, _ = front.direction[:, 0, 0, 0]
     x, y, wavelength = vector(0.0, 0.004), vector(-0.003, 0.002, 0.0), 1e-3 * front.wavelength[0]
@@ -114,9 +114,9 @@ def test_symmetry_changes_nothing(angle):
     """A field that asks for gradients is summed over the whole pupil, one that does not over a part of it."""
     s = scene_of(gauss(), angle, 25e3)
     window = grid(0.005, 3, chief(s))
-    part = diffraction.kernels(s, window)
+    part = wave.kernels(s, window)
     s.fields.requires_grad_()
-    whole = diffraction.kernels(s, window)
+    whole = wave.kernels(s, window)
     assert part.rays < whole.rays
     assert (part.kernel - whole.kernel.detach()).abs().max() < 1e-4 * part.kernel.max()
     assert (part.covariance - whole.covariance.detach()).abs().max() < 1e-10
@@ -125,7 +125,7 @@ def test_symmetry_changes_nothing(angle):
 def test_orders_converge():
     s = scene_of(gauss(), 10.0, 1e4)
     window = grid(0.005, 9, chief(s))
-    found = [diffraction.kernels(s, window, order=order).kernel for order in range(4)]
+    found = [wave.kernels(s, window, order=order).kernel for order in range(4)]
     errors = [((k - found[3]).abs().sum() / found[3].sum()).item() for k in found[:3]]
     assert errors[0] < 1e-3
     assert errors[1] < 0.3 * errors[0]
@@ -136,7 +136,7 @@ def test_orders_converge():
 def test_energy_is_the_transmitted_fraction(angle):
     """A window far wider than the blur holds all that is not blocked but the rings' tail, 2/(π v) = 0.8 %."""
     s = scene_of(gauss(57.9, aperture=("entrance_pupil_diameter", 12.0)), angle, 25e3)
-    result = diffraction.kernels(s, grid(0.02, 11, chief(s)))
+    result = wave.kernels(s, grid(0.02, 11, chief(s)))
     assert 0 < 1 - result.kernel.sum() < 9e-3
     lens = gauss(57.9, aperture=("entrance_pupil_diameter", 12.0))
     surfaces = list(lens.surfaces)
@@ -145,7 +145,7 @@ def test_energy_is_the_transmitted_fraction(angle):
     s = scene_of(
         type(lens)(**{**{f: getattr(lens, f) for f in lens.__slots__}, "surfaces": tuple(surfaces)}), angle, 25e3
     )
-    result = diffraction.kernels(s, grid(0.02, 11, chief(s)))
+    result = wave.kernels(s, grid(0.02, 11, chief(s)))
     points, weights = gauss_rings(60, 240)
     passed = wavefront_of(s, points, weights).energy.sum()
     assert 0.3 < passed < 0.8
@@ -161,7 +161,7 @@ def test_strehl_is_marechals_for_small_aberrations(diameter):
     opd = without(front, 3)
     sigma = torch.sqrt((weights * opd**2).sum(-1)) / 0.53e-3
     expected = torch.exp(-((2 * math.pi * sigma) ** 2))
-    found = diffraction.strehl(s)
+    found = wave.strehl(s)
     assert 0.1 < expected < 0.99
     assert abs(found - expected) < 0.1 * (1 - expected) ** 1.5
     assert rms(front) > 0
@@ -173,7 +173,7 @@ def test_geometric_limit():
     front = wavefront_of(s, *gauss_rings(200, 4))
     rays = torch.linalg.vector_norm(front.landing[:, 0, 0, 0], dim=0)
     pitch = float(rays.max()) / 35
-    result = diffraction.kernels(s, grid(pitch, 81))
+    result = wave.kernels(s, grid(pitch, 81))
     line = (torch.arange(81, dtype=torch.float64) - 40) * pitch
     distance = torch.hypot(line[:, None], line)
     for radius in (0.3, 0.5, 0.7, 0.8):
@@ -185,27 +185,27 @@ def test_geometric_limit():
 def test_longer_paths_at_the_top_move_the_light_up():
     s = scene_of(gauss(57.6, aperture=("entrance_pupil_diameter", 5.0)), 5.0, 25e3)
     window = grid(0.003, 21, chief(s))
-    light = diffraction.waves(s, 0.05)
+    light = wave.waves(s, 0.05)
     y = torch.linspace(-0.03, 0.03, 61, dtype=torch.float64)
 
     def top(opd):
         front = light.wavefront
         tilted = type(front)(**{**{f: getattr(front, f) for f in front.__slots__}, "opd": opd})
-        U = diffraction.amplitude(diffraction.Waves(light.amplitude, tilted, light.symmetry), vector(0.0), y)
+        U = wave.amplitude(wave.Waves(light.amplitude, tilted, light.symmetry), vector(0.0), y)
         return y[(U.real**2 + U.imag**2)[0, 0, 0, :, 0].argmax()]
 
     front = light.wavefront
     assert top(front.opd + 1e-3 * front.pupil[1]) > top(front.opd) + 0.015
-    kernel = diffraction.kernels(s, window).kernel[0, 0, 0]
+    kernel = wave.kernels(s, window).kernel[0, 0, 0]
     assert kernel.sum() > 0.9
 
 
 def test_scaling_law():
     """Twice the lens, the wavelength and the pixel: the same kernel."""
-    one = diffraction.kernels(scene_of(stigmatic(4.0), 1.0), grid(2e-3, 5, vector(0.0, 0.87)))
+    one = wave.kernels(scene_of(stigmatic(4.0), 1.0), grid(2e-3, 5, vector(0.0, 0.87)))
     twice = stigmatic(8.0, 100.0, wavelengths=(1.1,))
     twice = twice.replace(1, thickness=20.0)
-    two = diffraction.kernels(scene_of(twice, 1.0), grid(4e-3, 5, vector(0.0, 1.74)))
+    two = wave.kernels(scene_of(twice, 1.0), grid(4e-3, 5, vector(0.0, 1.74)))
     assert one.kernel.sum() > 0.01
     assert (one.kernel - two.kernel).abs().max() < 1e-9 * one.kernel.max()
 
@@ -219,19 +219,19 @@ def test_a_blocked_pupil_gives_zero_energy_and_no_nan():
     lens = type(lens)(**{**{f: getattr(lens, f) for f in lens.__slots__}, "surfaces": tuple(surfaces)})
     for angle in (0.0, 5.0):
         s = scene_of(lens, angle, 25e3)
-        result = diffraction.kernels(s, grid(0.005, 3, chief(s)))
+        result = wave.kernels(s, grid(0.005, 3, chief(s)))
         total = result.kernel.sum() + result.centroid.sum() + result.covariance.sum()
         assert result.kernel.abs().max() == 0
         (gradient,) = torch.autograd.grad(total, thickness)
         assert torch.isfinite(gradient)
-    assert diffraction.strehl(scene_of(lens, 5.0, 25e3)).abs().max() == 0
+    assert wave.strehl(scene_of(lens, 5.0, 25e3)).abs().max() == 0
     with pytest.raises(EmptyPupil):
         fft_psf(torch.zeros(4, 4), torch.zeros(4, 4), pad=2)
 
 
 def test_a_window_far_from_the_light_is_refused():
     with pytest.raises(ValueError, match="Centre the window"):
-        diffraction.kernels(scene_of(gauss(), 10.0, 25e3), grid(0.005, 5))
+        wave.kernels(scene_of(gauss(), 10.0, 25e3), grid(0.005, 5))
 
 
 def test_an_undersampled_wavefront_is_reported():
@@ -256,7 +256,7 @@ def test_gradients(angle, rim):
             problems.surface(None, sensor, apertures=apertures),
         ]
         lens = problems.lens(surfaces, stop=1, aperture=("entrance_pupil_diameter", 2.0))
-        return diffraction.kernels(scene_of(lens, angle), grid(pitch, 3, vector(0.0, centre))).kernel
+        return wave.kernels(scene_of(lens, angle), grid(pitch, 3, vector(0.0, centre))).kernel
 
     start = [torch.tensor(t, dtype=torch.float64, requires_grad=True) for t in (0.02, 56.0, 0.01)]
     lens = problems.lens(

@@ -9,8 +9,7 @@ from problems import number, relative_l1, sharp_double_gauss
 
 from raytrace.io import read_lens
 from raytrace.maths.grid import Grid, grid
-from raytrace.psf_models import drt as raymap
-from raytrace.psf_models import rays
+from raytrace.psf_models import drt
 from raytrace.psf_models.drt import fit, kernels, kernels_and_reason, reference
 from raytrace.system.lens import Lens
 from raytrace.tracing.scene import scene
@@ -25,7 +24,7 @@ def scene_of(lens: Lens, *fields: float, distance: float = 1e4):
 
 
 def window(of, pitch: float = 0.005, size: int = 21) -> Grid:
-    centre = rays.kernels(of, grid(pitch, 3), order=2).centroid.detach()
+    centre = drt.kernels_of_rays(of, grid(pitch, 3), order=2).centroid.detach()
     return Grid(number(pitch), size, size, centre)
 
 
@@ -55,7 +54,7 @@ def test_agrees_with_a_histogram_of_a_million_rays():
     of = scene_of(sharp_double_gauss(), 14.0)
     where = window(of)
     with torch.no_grad():
-        counted = rays.kernels(of, where, rays=2**20, width=0).kernel
+        counted = drt.kernels_of_rays(of, where, rays=2**20, width=0).kernel
     assert relative_l1(kernels(of, where, order=4).kernel, counted) < 0.003
 
 
@@ -64,7 +63,7 @@ def test_smooth_vignetting_edges_are_mapped():
     of = scene_of(sharp_double_gauss(stop=11.5), 10.0)
     where = window(of)
     with torch.no_grad():
-        counted = rays.kernels(of, where, rays=2**19, width=0).kernel
+        counted = drt.kernels_of_rays(of, where, rays=2**19, width=0).kernel
         found, reason = kernels_and_reason(of, where, order=4)
     assert reason.startswith("map")
     assert float(counted.sum()) < 0.97
@@ -140,7 +139,7 @@ def test_half_of_a_symmetric_fan_stands_for_all_of_it(monkeypatch):
         return found.kernel.detach(), found.centroid.detach(), found.covariance.detach(), gradient
 
     half = outcome()
-    monkeypatch.setattr(raymap, "_is_symmetric", lambda grid: False)
+    monkeypatch.setattr(drt, "_is_symmetric", lambda grid: False)
     whole = outcome()
     assert float(half[0].sum()) > 0.5
     assert not torch.equal(half[0], whole[0])
