@@ -10,12 +10,12 @@ from merit_cases import LENSES, check_derivatives, lens_of, model_of, values_of
 from problems import fields
 
 import raytrace as rt
+from raytrace.analysis.seidel import OF_WAVEFRONT
 from raytrace.files import shipped
 from raytrace.optimization.context import BadRow
 from raytrace.optimization.conventions import Conventions
 from raytrace.optimization.lens_model import Model
 from raytrace.optimization.merit_rows import Evaluation
-from raytrace.optimization.operands.aberrations import OF_WAVEFRONT
 from raytrace.system.optimization_data import Row
 from raytrace.tracing.paraxial import first_order
 
@@ -31,7 +31,7 @@ def test_seidel_sums_are_those_of_the_verb(name):
     lens = lens_of(name)
     found = rt.seidel(lens, kind="waves").contributions[:5, 0].numpy()
     last = len(lens.surfaces) - 2
-    for which, (operand, share) in enumerate(zip((*SUMS, "DIST"), OF_WAVEFRONT, strict=True)):
+    for which, (operand, share) in enumerate(zip((*SUMS, "DIST"), OF_WAVEFRONT[:5], strict=True)):
         told = values_of(name, [Row(operand, (k, 0)) for k in range(1, last + 1)])
         size = np.abs(found).max()
         assert told / share == pytest.approx(found[which], rel=1e-10, abs=1e-12 * size), operand
@@ -142,7 +142,7 @@ def test_other_readings():
     rows = [Row("AXCL"), Row("LACL"), *(Row(operand) for operand in SUMS), Row("DIST", (2, 0))]
     conventions = Conventions(colour="second", seidel="wavefront", f_theta="axis included")
     first, other = told_of(lens, rows), Evaluation(Model(lens), rows, conventions=conventions)(np.zeros(0)).values
-    assert first / other == pytest.approx([-1, -1, *OF_WAVEFRONT], rel=1e-12)
+    assert first / other == pytest.approx([-1, -1, *OF_WAVEFRONT[:5]], rel=1e-12)
     theta = np.deg2rad(20.0) * np.arange(1, 30) / 29
     y = told_of(lens, [Row("REAY", (8, 2), (0.0, k / 29, 0.0, 0.0)) for k in range(1, 30)])
     off = 100 * np.abs(y / (theta * (y @ theta) / (theta @ theta)) - 1).max()

@@ -68,17 +68,22 @@ def signed(surfaces: Sequence[Surface], indices: Sequence[Tensor]) -> list[Tenso
     return result
 
 
-def brackets(powers: Sequence, gaps: Sequence) -> tuple:
-    """(A, B, C, D) with y′ = A y + B ω, ω′ = C y + D ω through surfaces and the gaps behind them.
+def ynu(y, omega, powers: Sequence, gaps: Sequence) -> list[tuple]:
+    """(y, ω) of a paraxial ray before each surface, and at last behind the last surface, or its gap if that is given.
 
-    powers: of the surfaces; gaps: t/n behind all of them, or all but the last. Numbers of any arithmetic. Gauss's
-    brackets (Herzberger 1943).
+    powers: of the surfaces, 1/mm; gaps: t/n behind all of them, or all but the last. Any number type.
     """
-    A, B, C, D = 1.0, 0.0, 0.0, 1.0
+    rays = [(y, omega)]
     for k, power in enumerate(powers):
-        C, D = C - power * A, D - power * B
-        if k < len(gaps):
-            A, B = A + gaps[k] * C, B + gaps[k] * D
+        omega = omega - power * y
+        y = y + gaps[k] * omega if k < len(gaps) else y
+        rays.append((y, omega))
+    return rays
+
+
+def brackets(powers: Sequence, gaps: Sequence) -> tuple:
+    """(A, B, C, D) with y′ = A y + B ω, ω′ = C y + D ω; arguments as for `ynu`. Gauss's brackets (Herzberger 1943)."""
+    (A, C), (B, D) = (ynu(y, omega, powers, gaps)[-1] for y, omega in ((1.0, 0.0), (0.0, 1.0)))
     return A, B, C, D
 
 

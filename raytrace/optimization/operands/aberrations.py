@@ -4,11 +4,11 @@ Seidel's by the sums of `analysis.seidel` (Welford 1986), here with the derivati
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import torch
 
+from raytrace.analysis.seidel import OF_WAVEFRONT, departure_from_sphere, third_order
 from raytrace.maths.dual import value_of
 from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Found, Line, Operand, Planner
 from raytrace.optimization.lens_state import LensState
@@ -17,6 +17,7 @@ from raytrace.optimization.operands.rays import known
 from raytrace.system.surface import is_even
 from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.launch import vignette
+from raytrace.tracing.paraxial import ynu
 
 _NEAR_AXIS = 1e-4  # of the field: its chief ray tells the scale of the image
 _NEAR_CHIEF = 1e-3  # of the pupil: close rays tell where they meet
@@ -100,54 +101,21 @@ def _two_wavelengths(line: Line, planner: Planner) -> tuple[int, int]:
 # -- Seidel ------------------------------------------------------------------------------------------------------------
 
 
-class _Rays(NamedTuple):
-    """What the sums need at surfaces 1 to the last before the image: (K,) each, but for the invariant H."""
-
-    y: object
-    A: object
-    y_bar: object
-    A_bar: object
-    bending: object
-    c: object
-    n: tuple
-    H: object
-
-
 def _seidel(state: LensState, wavelength: int, shapes: "_Shapes"):
-    """S1 to S5 in mm, (K,) each, of the surfaces 1 to the last before the image."""
-    rays = _paraxial_rays(state, wavelength)
-    y, A, y_bar, A_bar, bending, c, (n, n_behind), H = rays
-    inverse = 1 / n_behind - 1 / n
-    asphere = 8 * shapes.departures(state, c) * (n_behind - n)
-    y2, y_bar2 = y * y, y_bar * y_bar
-    return (
-        -A * A * bending + asphere * y2 * y2,
-        -A * A_bar * bending + asphere * y2 * y * y_bar,
-        -A_bar * A_bar * bending + asphere * y2 * y_bar2,
-        -H * H * c * inverse,
-        -(A_bar * A_bar * A_bar) * y * (1 / (n_behind * n_behind) - 1 / (n * n))
-        + A_bar * y_bar * c * inverse * (H + A_bar * y)
-        + asphere * y * y_bar2 * y_bar,
-    )
-
-
-def _paraxial_rays(state: LensState, wavelength: int) -> _Rays:
+    """S1 to S5 in mm, (K,) each, of surfaces 1 to the last before the image."""
     n, c = state.index(wavelength), state.vertex_curvature
-    y, omega = state.marginal_height, n[0] * state.marginal_height / state.object_distance
-    y_bar, slope = chief_ray(state)
-    omega_bar = n[0] * slope
-    H = omega_bar * y - omega * y_bar
-    rows, last = [], len(c) - 2
-    for k in range(1, last + 1):
-        power = c[k] * (n[k] - n[k - 1])
-        behind, behind_bar = omega - power * y, omega_bar - power * y_bar
-        bending = y * (behind / n[k] ** 2 - omega / n[k - 1] ** 2)
-        rows.append((y, omega + n[k - 1] * c[k] * y, y_bar, omega_bar + n[k - 1] * c[k] * y_bar, bending))
-        gap = state.thickness[k] / n[k]
-        y, omega, y_bar, omega_bar = y + gap * behind, behind, y_bar + gap * behind_bar, behind_bar
-    columns = [listed(column, state.count) for column in zip(*rows, strict=True)]
-    indices = [listed(n[place : place + last], state.count) for place in (0, 1)]
-    return _Rays(*columns, listed(c[1 : last + 1], state.count), tuple(indices), H)
+    surfaces = range(1, len(c) - 1)
+    powers = [c[k] * (n[k] - n[k - 1]) for k in surfaces]
+    gaps = [state.thickness[k] / n[k] for k in surfaces[:-1]]
+    y, (y_bar, slope) = state.marginal_height, chief_ray(state)
+    omega, omega_bar = n[0] * y / state.object_distance, n[0] * slope
+    rays = [ynu(*ray, powers, gaps)[:-1] for ray in ((y, omega), (y_bar, omega_bar))]
+    marginal, chief = ([listed(column, state.count) for column in zip(*ray, strict=True)] for ray in rays)
+    vertex = listed(c[1:-1], state.count)
+    indices = [listed([n[k + side] for k in surfaces], state.count) for side in (-1, 0)]
+    return third_order(
+        marginal, chief, vertex, indices, shapes.departures(state, vertex), omega_bar * y - omega * y_bar
+    )
 
 
 class _Shapes:
@@ -165,18 +133,14 @@ class _Shapes:
         ]
 
     def departures(self, state: LensState, vertex):
-        """G (K,) in 1/mm³: (1+k) c³/8 + a₄ less an eighth of the cube of the vertex curvature."""
+        """G (K,) in 1/mm³."""
         c, count = listed(state.curvature[1:-1], state.count), state.count
         shape, terms = [1.0] * len(value_of(c)), [0.0] * len(value_of(c))
         for k, stored in self.conics:
             shape[k - 1] = 1 + state.numbers.get((k, "conic"), stored)
         for k, stored in self.terms:
             terms[k - 1] = state.numbers.get((k, "a4"), stored)
-        return (listed(shape, count) * c * c * c - vertex * vertex * vertex) / 8 + listed(terms, count)
-
-
-#: Seidel's coefficients S1 to S5 by those of the wavefront, W040, W131, W222, W220P and W311.
-OF_WAVEFRONT = 8, 2, 2, 4, 2
+        return departure_from_sphere(c, listed(shape, count), listed(terms, count), vertex)
 
 
 def _of_seidel(which: int) -> Callable[[Sequence[Line], Planner], Evaluate]:
