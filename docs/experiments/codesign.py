@@ -110,7 +110,7 @@ def claims(
     return [_answered(evidence, pending, *row) for row in CLAIMS]
 
 
-class _Untold(LookupError):
+class _Unanswered(LookupError):
     """Why a claim cannot be answered, in words."""
 
 
@@ -123,7 +123,7 @@ def _answered(
 ) -> Claim:
     try:
         return Claim(text, criterion, *judge(evidence))
-    except _Untold as why:
+    except _Unanswered as why:
         return Claim(text, criterion, None, str(why))
     except KeyError as missing:
         model = missing.args[0]
@@ -142,8 +142,8 @@ def _focus_of_simple(given: Evidence) -> tuple[bool, str]:
     of = {name: given.simple(column) for column, name in _DEFINITIONS.items()}
     departs = {name: _departure(places, _papers(2, SIMPLE)) for name, places in of.items()}
     least = min(departs, key=departs.get)
-    told = "; ".join(f"{_metres(places)}, {name}" for name, places in of.items())
-    return departs[least] <= _METRES, f"{told}: {departs[least]:.1f} m off at most, {least}"
+    figures = "; ".join(f"{_metres(places)}, {name}" for name, places in of.items())
+    return departs[least] <= _METRES, f"{figures}: {departs[least]:.1f} m off at most, {least}"
 
 
 def _papers(column: int, models: Iterable[str]) -> list[float]:
@@ -171,8 +171,8 @@ def _another_place(given: Evidence) -> tuple[bool, str]:
 
 def _nearer(given: Evidence) -> tuple[bool, str]:
     ours = given.of[OURS].mean
-    told = ", ".join(f"{ours[column]:.1f} m {name}" for column, name in _DEFINITIONS.items())
-    return all(ours[column] < min(given.simple(column)) for column in _DEFINITIONS), told
+    figures = ", ".join(f"{ours[column]:.1f} m {name}" for column, name in _DEFINITIONS.items())
+    return all(ours[column] < min(given.simple(column)) for column in _DEFINITIONS), figures
 
 
 def _at_27_m(given: Evidence) -> tuple[bool, str]:
@@ -195,8 +195,8 @@ def _rises(*models: str, points: float) -> Callable[[Evidence], tuple[bool, str]
 def _order_of_step_1(given: Evidence) -> tuple[bool, str]:
     found = {model: given.of[model].mean["l1_joint"] for model in PAPER}
     order = sorted(found, key=found.get)
-    told = ", ".join(f"{NAMES[model]} {found[model]:.4f}" for model in order)
-    return order == sorted(PAPER, key=lambda model: PAPER[model][0]), told
+    figures = ", ".join(f"{NAMES[model]} {found[model]:.4f}" for model in order)
+    return order == sorted(PAPER, key=lambda model: PAPER[model][0]), figures
 
 
 def _as_large(given: Evidence) -> tuple[bool, str]:
@@ -210,10 +210,10 @@ def _as_large(given: Evidence) -> tuple[bool, str]:
 
 def _wins(given: Evidence) -> tuple[bool, str]:
     ours, others = given.of[OURS].mean["l1_drt"], given.simple("l1_drt")
-    told = [
+    figures = [
         f"{loss:.4f} ({NAMES[name]}, {percent(loss / ours - 1)})" for name, loss in zip(SIMPLE, others, strict=True)
     ]
-    return ours < min(others), f"{ours:.4f} beside {' and '.join(told)}"
+    return ours < min(others), f"{ours:.4f} beside {' and '.join(figures)}"
 
 
 def _wins_by_as_much(given: Evidence) -> tuple[bool, str]:
@@ -225,8 +225,8 @@ def _wins_by_as_much(given: Evidence) -> tuple[bool, str]:
 
 def _wins_everywhere(given: Evidence) -> tuple[bool, str]:
     gains = given.gains()
-    told = ", ".join(f"{percent(gain)} at {distance / 1e3:g} m" for distance, gain in gains.items())
-    return min(gains.values()) > 0, f"loss of the better of both, over its own: {told}"
+    figures = ", ".join(f"{percent(gain)} at {distance / 1e3:g} m" for distance, gain in gains.items())
+    return min(gains.values()) > 0, f"loss of the better of both, over its own: {figures}"
 
 
 def _most_at_20_to_30_m(given: Evidence) -> tuple[bool, str]:
@@ -241,15 +241,15 @@ def _less_at_10_than_15_m(given: Evidence) -> tuple[bool, str]:
     distances, losses = losses_by_distance(given.runs)
     near, next_one = (distances.index(z) if z in distances else None for z in (10e3, 15e3))
     if near is None or next_one is None:
-        raise _Untold("no losses at 10 and 15 m")
+        raise _Unanswered("no losses at 10 and 15 m")
     of = {model: [statistics.fmean(column) for column in zip(*losses[model], strict=True)] for model in PAPER}
-    told = "; ".join(f"{NAMES[model]} {of[model][near]:.4f} and {of[model][next_one]:.4f}" for model in PAPER)
-    return all(of[model][near] < of[model][next_one] for model in PAPER), told
+    figures = "; ".join(f"{NAMES[model]} {of[model][near]:.4f} and {of[model][next_one]:.4f}" for model in PAPER)
+    return all(of[model][near] < of[model][next_one] for model in PAPER), figures
 
 
 def _settled(given: Evidence) -> tuple[bool, str]:
     if given.runs and not given.seen.settled:
-        raise _Untold("answered only where the sensor alone varies")
+        raise _Unanswered("answered only where the sensor alone varies")
     found = {model: given.seen.settled[model] for model in PAPER}
     return max(found.values()) <= 0.5, ", ".join(f"{NAMES[model]} after {part:.0%}" for model, part in found.items())
 
@@ -268,20 +268,20 @@ def _falls_with_distance(given: Evidence) -> tuple[bool, str]:
 
 def _larger_far_away(given: Evidence) -> tuple[bool, str]:
     far = {model: _blur(given, model)[-1] for model in PAPER}
-    told = ", ".join(f"{NAMES[model]} {1e3 * width:.1f} µm" for model, width in far.items())
-    return far[OURS] > max(far[model] for model in SIMPLE), f"at {given.seen.distances[-1]:g} m {told}"
+    figures = ", ".join(f"{NAMES[model]} {1e3 * width:.1f} µm" for model, width in far.items())
+    return far[OURS] > max(far[model] for model in SIMPLE), f"at {given.seen.distances[-1]:g} m {figures}"
 
 
 def _smaller_overall(given: Evidence) -> tuple[bool, str]:
     of = {model: statistics.fmean(_blur(given, model)) for model in PAPER}
-    told = ", ".join(f"{NAMES[model]} {1e3 * width:.1f} µm" for model, width in of.items())
-    return of[OURS] < min(of[model] for model in SIMPLE), f"in the mean {told}"
+    figures = ", ".join(f"{NAMES[model]} {1e3 * width:.1f} µm" for model, width in of.items())
+    return of[OURS] < min(of[model] for model in SIMPLE), f"in the mean {figures}"
 
 
 def _varies_less(given: Evidence) -> tuple[bool, str]:
     of = {model: max(_blur(given, model)) - min(_blur(given, model)) for model in PAPER}
-    told = ", ".join(f"{NAMES[model]} by {1e3 * width:.1f} µm" for model, width in of.items())
-    return of[OURS] < min(of[model] for model in SIMPLE), told
+    figures = ", ".join(f"{NAMES[model]} by {1e3 * width:.1f} µm" for model, width in of.items())
+    return of[OURS] < min(of[model] for model in SIMPLE), figures
 
 
 def _simple_cheaper(given: Evidence) -> tuple[bool, str]:

@@ -423,7 +423,7 @@ def _training_figures(given: Experiment, study: Path, found: Sequence[Outcome]) 
 
 
 def _distances(given: Experiment) -> np.ndarray:
-    """Object distances in mm over which blur is told."""
+    """Object distances in mm of the blur curves."""
     return np.linspace(given.settings.near, given.settings.far, 41)
 
 

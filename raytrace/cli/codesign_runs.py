@@ -343,8 +343,8 @@ class Learned(Result):
         return plain({"settings": settings, **self.given.about, "limits": limits, **self.found.document()})
 
     def __str__(self) -> str:
-        told = _outcome if isinstance(self.found, Outcome) else _optimum
-        return "\n".join(told(self.found, _lens(self.found, self.given.limits)))
+        lines = _outcome if isinstance(self.found, Outcome) else _optimum
+        return "\n".join(lines(self.found, _lens(self.found, self.given.limits)))
 
 
 def _outcome(found: Outcome, lens: Iterator[str]) -> Iterator[str]:

@@ -65,7 +65,7 @@ class Outcome:
     l1_joint: on test pictures after step 1, with the PSFs of its own model; l1_drt: after step 2, with DRT PSFs;
     l1_before: between the two, the network of step 1 on DRT PSFs. focus_paraxial_m, focus_rms_m: object distance from
     vertex 1 in focus, of paraxial rays and of least RMS spot. by_distance: L1 with DRT PSFs after step 2. penalty: mm²
-    of what thicknesses lack (`limits.violation`), no part of the losses; no_optimum: why the lens is none of least loss
+    of what thicknesses lack (`Variables.violation`), no part of the losses; no_optimum: why the lens is none of least loss
     ("" where nothing speaks against it). *_last_epochs: means over the end of step 1, and over what the sensor
     moves there, which a study adds.
     """
@@ -385,7 +385,7 @@ class Place:
     """Where one model put the lens.
 
     error: mean square error of a pixel with the model's own PSFs; error_drt: of the same lens with DRT PSFs and the
-    filter that is best for them; penalty: mm² of what thicknesses lack (`limits.violation`), no part of the errors.
+    filter that is best for them; penalty: mm² of what thicknesses lack (`Variables.violation`), no part of the errors.
     Focus distances in m as for `Outcome`; no_optimum: why this lens is none of least error, "" where it is one.
     downhill_mm: the sensor of the optimum downhill from where the search began, another than `sensor_mm` where that one
     is only a local one (`least_of_closed_form`).
