@@ -385,7 +385,7 @@ class Place:
     """Where one model put the lens.
 
     error: mean square error of a pixel with the model's own PSFs; error_drt: of the same lens with DRT PSFs and the
-    filter that is best for them; penalty: mm² of what thicknesses lack (`Variables.violation`), no part of the errors.
+    filter that is best for them; penalty: mm², violation of the limits, no part of the errors.
     Focus distances in m as for `Outcome`; no_optimum: why this lens is none of least error, "" where it is one.
     downhill_mm: the sensor of the optimum downhill from where the search began, another than `sensor_mm` where that one
     is only a local one (`least_of_closed_form`).
