@@ -64,8 +64,8 @@ class Outcome:
 
     l1_joint: on test pictures after step 1, with the PSFs of its own model; l1_drt: after step 2, with DRT PSFs;
     l1_before: between the two, the network of step 1 on DRT PSFs. focus_paraxial_m, focus_rms_m: object distance from
-    vertex 1 in focus, of paraxial rays and of least RMS spot. by_distance: L1 with DRT PSFs after step 2. penalty: mm²
-    of what thicknesses lack (`Variables.violation`), no part of the losses; no_optimum: why the lens is none of least loss
+    vertex 1 in focus, of paraxial rays and of least RMS spot. by_distance: L1 with DRT PSFs after step 2. penalty:
+    mm², violation of the thickness limits, no part of the losses; no_optimum: why the lens is none of least loss
     ("" where nothing speaks against it). *_last_epochs: means over the end of step 1, and over what the sensor
     moves there, which a study adds.
     """
@@ -162,7 +162,7 @@ def camera(lens: Lens, settings: CodesignSettings) -> Camera:
 
 def begin(own: Camera, settings: CodesignSettings, spectrum: Tensor) -> Course:
     """Bring the variables of a camera to the optimum of a closed form: of its own model, or of Gaussian DRT, as
-    `settings.start` says."""
+    the `start` of the settings says."""
     model = "gaussian" if settings.start == GAUSSIAN else settings.model
     first = camera(own.variables.lens, dataclasses.replace(settings, model=model))
     course, _ = least_of_closed_form(first, spectrum, distances=even_distances(first, spread=settings.spread))
