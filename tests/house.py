@@ -22,7 +22,7 @@ from raytrace.tracing.trace import cross, media
 
 PACKAGE = Path(__file__).parents[1] / "raytrace"
 #: Rooms that nothing imports: experiments and measurements, no part of the library.
-APART = ("studies", "bench")
+APART = ("bench",)
 
 
 def lines_of_rooms() -> Counter[str]:

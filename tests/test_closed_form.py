@@ -3,10 +3,10 @@
 import pytest
 import torch
 
+from raytrace.imaging.closed_form import power_spectrum
 from raytrace.imaging.image import transfer_functions
+from raytrace.imaging.pictures import dead_leaves
 from raytrace.imaging.restoration import depth_invariant_wiener, errors, errors_knowing
-from raytrace.studies.codesign.closed_form import power_spectrum
-from raytrace.studies.pictures import dead_leaves
 
 SIZE = 24
 

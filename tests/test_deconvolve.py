@@ -8,6 +8,7 @@ import torch
 from problems import covariance, draws
 
 from raytrace.imaging.image import blur, transfer_functions
+from raytrace.imaging.pictures import dead_leaves
 from raytrace.imaging.restoration import (
     depth_invariant_error,
     depth_invariant_wiener,
@@ -24,7 +25,6 @@ from raytrace.imaging.restoration import (
     wiener,
     within,
 )
-from raytrace.studies.pictures import dead_leaves
 
 
 def gaussians(*widths: float, size: int = 11) -> torch.Tensor:

@@ -281,7 +281,7 @@ def test_a_lens_shows_itself():
 
 # -- one verb, one door ------------------------------------------------------------------------------------------------
 
-#: Commands that are a verb, each in a file of its own; those of studies and of bench are none.
+#: Commands that are a verb, each in a file of its own; those of bench, codesign and wave are none.
 VERBS = [one for one in COMMANDS if not isinstance(one.run, str) and runner._verb(one.run) in rt.PUBLIC]
 OF_A_LENS = [command for command in VERBS if not hasattr(command.run, "run")]
 

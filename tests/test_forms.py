@@ -28,12 +28,8 @@ from raytrace.words import did_you_mean
 DIFFERENT = {
     "--rays": "a fixed form of trace is a table of rays; elsewhere a number, of bench several",
     "--output": "a folder, where what a command makes is a run; height maps may be pictures",
-    "--start": "compare chooses from two places, wave free several, codesign takes a distance, too",
+    "--start": "compare chooses from two places, codesign takes a distance, too",
     "--element": "named elements, kinds that are learned, and several of either",
-    "--levels": "quantise compares several",
-    "--tolerance": "quantise compares several",
-    "--steps": "quantise may take none",
-    "--starts": "superres may take none",
     "--configuration": "layout draws all of them in one figure",
     "--log": "optimize writes one; elsewhere the scale of a figure",
     "--resume": "codesign finds its own runs",
@@ -77,9 +73,8 @@ def test_data_pixels_and_figures_have_their_own_options(name):
     if "-o" in known:
         assert known["-o"].option_strings == ["-o", "--output"]
         assert "figure" not in known["-o"].help
-        if name != "wave focus":
-            with pytest.raises(argparse.ArgumentTypeError, match="is a picture: figures are saved by --plot"):
-                known["-o"].type("x.png")
+        with pytest.raises(argparse.ArgumentTypeError, match="is a picture: figures are saved by --plot"):
+            known["-o"].type("x.png")
     if "--size" in known:
         assert known["--size"].help.startswith("pixels across")
     if "--plot" in known:
@@ -200,8 +195,6 @@ def test_rays_of_a_table_keep_their_form(command):
         ("spot double_gauss --plto spot.png", 2, "unknown option --plto; did you mean --plot?"),
         ("wave psf --elment=cubic", 2, "unknown option --elment; did you mean --element?"),
         ("wave psf --element cubc", 1, "did you mean cubic?"),
-        ("wave table --rows frsnel", 1, "did you mean fresnel?"),
-        ("wave quantise --element frsnel", 1, "did you mean fresnel?"),
         ("codesign compar double_gauss", 1, "did you mean compare?"),
         ("codesign double_gauss --field 5,5 --loss spectral", 1, "co-design takes field points along y"),
         ("psf double_gauss -o psf.png", 2, "'psf.png' is a picture: figures are saved by --plot"),

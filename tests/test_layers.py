@@ -22,6 +22,7 @@ FLOORS = {
     "maths": 1,
     "pages": 1,
     "stores": 1,
+    "settings": 1,
     # nouns
     "materials": 2,
     "system": 3,
@@ -36,24 +37,25 @@ FLOORS = {
     "optimization": 9,
     # people
     "plotting": 10,
-    "cli": 11,
-    # experiments and measurements: nothing imports them
-    "studies": 12,
-    "bench": 12,
+    # pages of experiments
+    "experiments": 11,
+    "cli": 12,
+    # measurements: nothing imports them
+    "bench": 13,
     # the package's door
-    "public": 13,
-    "__init__": 13,
-    "__main__": 13,
+    "public": 14,
+    "__init__": 14,
+    "__main__": 14,
 }
 
 #: Commands, whose imports may wait until they run.
-COMMANDS = re.compile(r"cli(\.|$)|studies\.\w+\.(\w+_)?command$")
+COMMANDS = re.compile(r"cli(\.|$)")
 
 #: What only these files may import.
 RESERVED = {
-    "matplotlib": (r"plotting", r"studies\.(\w+\.)?figures", r"bench\.figures"),
+    "matplotlib": (r"plotting", r"bench\.figures"),
     "pandas": (r"io\.(frames|ray_tables)", r"cli", r"bench"),
-    "tqdm": (r"cli", r"studies\.codesign\.setup", r"bench"),
+    "tqdm": (r"cli", r"bench"),
     "optiland": (r"bench\.peers(_\w+)?",),
 }
 

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from raytrace.files import append_text
+from raytrace.imaging.codesign import Outcome
 from raytrace.imaging.training import DamagedRun, Run
 from raytrace.materials.catalogs import find_glass
 from raytrace.optimization.journal import BadSearch, Ended, Journal
@@ -30,7 +31,6 @@ from raytrace.stores import (
     text,
     whole,
 )
-from raytrace.studies.codesign.experiment import Outcome
 from raytrace.wave_optics.element import Element, Rings
 from raytrace.wave_optics.element_files import read_label, write_element
 from raytrace.wave_optics.height_maps import HeightMapError

@@ -68,7 +68,7 @@ def _carry_out(command: ModuleType, arguments: argparse.Namespace) -> int:
 
 
 def takes(command: ModuleType, keyword: str) -> bool:
-    """Whether the verb of a command has a keyword; those of studies and of bench are no verbs."""
+    """Whether the verb of a command has a keyword; those of codesign, wave and bench are no verbs."""
     return _verb(command) in raytrace.PUBLIC and keyword in inspect.signature(verb_of(command)).parameters
 
 

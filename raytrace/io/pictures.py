@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from raytrace.files import read_bytes
+from raytrace.files import read_bytes, write_atomically
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 
@@ -47,3 +47,27 @@ def decoded(content: bytes) -> Image.Image:
     except Exception as error:  # decoders raise whatever their parsing meets, struct.error and KeyError too
         raise PictureError(" ".join(str(error).split())[:200] or type(error).__name__) from error
     return picture
+
+
+def read_channels(path: str | Path, channels: int) -> np.ndarray:
+    """A picture as (channels, H, W) in [0, 1], float64: luma for one channel, red, green and blue for three.
+
+    Raises PictureError for a file that is no picture, and for another number of channels.
+    """
+    if channels not in (1, 3):
+        raise PictureError(f"{path}: a picture has 1 or 3 channels, not one for each of {channels} wavelengths")
+    try:
+        picture = np.asarray(decoded(read_bytes(path, _MOST_BYTES)).convert("L" if channels == 1 else "RGB"))
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+        raise PictureError(f"{path}: cannot be read as a picture ({reason}); remove it or convert it") from error
+    return np.atleast_3d(picture).transpose(2, 0, 1) / 255.0
+
+
+def write_picture(path: str | Path, channels: np.ndarray) -> None:
+    """Write channels (1 or 3, H, W) in [0, 1] as a PNG file of 8 bits."""
+    values = np.round(255 * channels).astype(np.uint8)
+    picture = Image.fromarray(values[0] if len(values) == 1 else values.transpose(1, 2, 0))
+    packed = io.BytesIO()
+    picture.save(packed, format="PNG")
+    write_atomically(Path(path), lambda file: file.write(packed.getvalue()))
