@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from raytrace.maths.numerics import safe_sqrt
+
 
 class Dual:
     """value: a number, or an array (...); slope: its derivatives by n variables, n and an axis for each of the value's.
@@ -124,6 +126,24 @@ def quotient(a, b):
 def select(condition, a, b):
     """a where a condition holds, else b: entry by entry of tensors, else one or the other number."""
     return torch.where(condition, a, b) if isinstance(condition, Tensor) else a if condition else b
+
+
+def root(x):
+    """√x, 0 where x is negative, of a tensor, an array or dual numbers."""
+    return safe_sqrt(x) if isinstance(x, Tensor) else np.sqrt(np.maximum(x, 0.0))
+
+
+class Vector(tuple):
+    """Three numbers, arrays or dual numbers with the arithmetic of a tensor (3, ...)."""
+
+    __slots__ = ()
+    __array_ufunc__ = None
+
+    def __sub__(self, other):
+        return Vector(a - b for a, b in zip(self, other, strict=True))
+
+    def __mul__(self, factor):
+        return Vector(part * factor for part in self)
 
 
 def _dim(one: Dual, other) -> int:

@@ -23,7 +23,8 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from raytrace.maths.dual import Dual, slope_of, value_of
+from raytrace.maths.dual import Dual, Vector, slope_of, value_of
+from raytrace.maths.numerics import dot
 from raytrace.optimization.lens_model import GLASS, unbent
 from raytrace.optimization.lens_state import LensState
 from raytrace.system.lens import Lens
@@ -61,10 +62,6 @@ def launched(state: LensState, field: np.ndarray, pupil: np.ndarray):
     if is_backward:
         path = -path if is_virtual else -path - 2 * far
     return aim, direction, index * path
-
-
-def dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 _STEPS = 12
@@ -215,6 +212,12 @@ class _Components:
         if k not in self._found:
             self._found[k] = self._hits.component(self._first + k)
         return self._found[k]
+
+    def __sub__(self, other) -> Vector:
+        return Vector(self) - other
+
+    def __mul__(self, factor) -> Vector:
+        return Vector(self) * factor
 
 
 class Marks(NamedTuple):

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from raytrace.maths import zernike
+from raytrace.maths.dual import root
 from raytrace.maths.numerics import dot, safe_divide, safe_sqrt, unit
 from raytrace.maths.value import value
 from raytrace.system.rays import Rays
@@ -54,30 +55,31 @@ class Wavefront:
     index: Tensor
 
 
-def path_to_reference_sphere(rays: Rays, centre: Tensor, radius: Tensor, index: Tensor) -> Tensor:
+def path_to_reference_sphere(rays, centre, curvature, index):
     """Reduced path W (...) in mm of rays up to the reference sphere they are about to cross; OPD = W - W_chief.
 
-        W = W_rays + n [ -(P - Q)·d + e² / (R (1 + √(1 - e²/R²))) ],   e = |(P - Q) - ((P - Q)·d) d|
+        W = W_rays + n [ κ e²/(1 + √(1 - κ² e²)) - (P - Q)·d ],   e = |(P - Q) - ((P - Q)·d) d|
 
-    less n R of the axial ray, so that no long path is ever formed (Hopkins' equally inclined chord).
-    rays: with `opl`; centre Q: (3, ...) mm in the frame of the rays; radius R: mm, inf allowed; index n behind.
+    less n/κ of the axial ray, so that no long path is ever formed (Hopkins' equally inclined chord).
+    rays: with `opl`; centre Q: (3, ...) mm in the frame of the rays; curvature κ: 1/mm, 0 for a plane; index n behind.
+    Tensors, or vectors of dual numbers.
     """
     offset = rays.position - centre
     along = dot(offset, rays.direction)
-    across = offset - along * rays.direction
+    across = offset - rays.direction * along
     e_squared = dot(across, across)
-    sagitta = e_squared / (radius * (1 + safe_sqrt(1 - e_squared / (radius * radius))))
-    return rays.opl + index * (sagitta - along)
+    bend = curvature * e_squared
+    return rays.opl + index * (bend / (1 + root(1 - curvature * bend)) - along)
 
 
-def towards_centre(rays: Rays, centre: Tensor, radius: Tensor) -> Tensor:
+def towards_centre(rays, centre, curvature):
     """Unit vectors (3, ...) from where rays cross the reference sphere to its centre, (Q - q)/R.
 
-    s = √(1 - e²/R²) d - e/R: the ray's own direction for R = inf. Arguments as for `path_to_reference_sphere`.
+    s = √(1 - κ² e²) d - κ e: the ray's own direction for a plane. Arguments as for `path_to_reference_sphere`.
     """
     offset = rays.position - centre
-    across = (offset - dot(offset, rays.direction) * rays.direction) / radius
-    return safe_sqrt(1 - dot(across, across)) * rays.direction - across
+    across = (offset - rays.direction * dot(offset, rays.direction)) * curvature
+    return rays.direction * root(1 - dot(across, across)) - across
 
 
 def wavefront_of(
@@ -101,9 +103,9 @@ def wavefront_of(
         alone = dataclasses.replace(scene, wavelengths=reference.reshape(1), memo=None)
         centre, radius = _reference_sphere(alone, *_on_sensor(alone, with_chief))
     index = media(scene.lens, scene.wavelengths)[-2]
-    path = path_to_reference_sphere(rays, centre, radius, index[:, None])
+    path = path_to_reference_sphere(rays, centre, 1 / radius, index[:, None])
     opd = torch.where(rays.valid, path - _at_chief(path, rays.valid, usable), 0.0)
-    direction = towards_centre(rays, centre, radius)
+    direction = towards_centre(rays, centre, 1 / radius)
     landing = torch.where(usable, rays.position[:2] - centre[:2], 0.0)
     energy = torch.where(rays.valid[..., 1:], weights * beam_share(scene)[..., None], 0.0)
     return Wavefront(

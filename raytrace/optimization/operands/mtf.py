@@ -26,9 +26,7 @@ from raytrace.optimization.operands.wavefront import (
     Beam,
     beam_of,
     colours_of,
-    directions_to,
     image_index,
-    path_to,
     rings,
     sphere_of,
 )
@@ -36,6 +34,7 @@ from raytrace.psf_models.wave import strehl
 from raytrace.system.lens import Lens
 from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.scene import Scene
+from raytrace.tracing.wavefront import path_to_reference_sphere, towards_centre
 
 _MISSED = 0.02  # waves of RMS that the polynomials of a wave may leave
 _NOTHING = 1e-30  # in the square of a modulation, whose root has a slope there
@@ -112,9 +111,10 @@ def sent(context: EvaluationContext, beams: Sequence[Pupil]) -> Sent:
     hits, chief = context.hits(rays.ravel(), clips=True), context.hits(chiefs, clips=True)
     sphere, index = sphere_of(context, chief, is_bent(context.planner.lens)), image_index(context, colours)
     per_wave = 1e3 / np.array(context.planner.view.wavelengths)[colours]
-    path = path_to(sphere.at(each), hits, index[each]) - path_to(sphere, chief, index)[each]
+    path = path_to_reference_sphere(hits, *sphere.at(each), index[each])
+    path = path - path_to_reference_sphere(chief, *sphere, index)[each]
     scale = (index * per_wave)[each]
-    found = [path * per_wave[each], *(scale * part for part in directions_to(sphere.at(each), hits)[:2])]
+    found = [path * per_wave[each], *(scale * part for part in towards_centre(hits, *sphere.at(each))[:2])]
     values = [value_of(part).reshape(shape) for part in found]
     slopes = [slope_of(part, count).reshape(count, *shape) for part in found]
     offset = [np.abs(value_of(hits.position[k]) - value_of(chief.position[k])[each]).reshape(shape) for k in range(2)]

@@ -5,9 +5,8 @@ solver is given: smooth where the RMS is 0, and no second derivative is lost.
 
 Operands of optical path: the wavefront against a reference sphere, and the paths of single rays.
 
-The sphere is centred where the chief ray meets the image and goes through the axial point of the exit pupil. No two
-long paths are ever subtracted: see `tracing.wavefront.path_to_reference_sphere`, whose formula stands here for dual
-numbers.
+The sphere is centred where the chief ray meets the image and passes through the axial point of the exit pupil; that of
+`wavefront_of` has the radius along the chief ray from the plane of the exit pupil.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,7 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from raytrace.maths.dual import Dual, slope_of, value_of
+from raytrace.maths.dual import Dual, Vector, slope_of, value_of
+from raytrace.maths.numerics import dot
 from raytrace.maths.pupil import gauss_rings, square
 from raytrace.optimization.context import BadRow, Evaluate, EvaluationContext, Found, Line, Operand, Planner
 from raytrace.optimization.operands.paraxial import listed
@@ -23,16 +23,17 @@ from raytrace.optimization.operands.rays import known
 from raytrace.optimization.ray_bundle import Hits
 from raytrace.tracing.aiming import is_bent
 from raytrace.tracing.base_ray import base_ray
+from raytrace.tracing.wavefront import path_to_reference_sphere
 
 
 class Sphere(NamedTuple):
     """Reference spheres (...): centre, three of mm on the image; curvature κ = 1/R in 1/mm along the light."""
 
-    centre: tuple
+    centre: Vector
     curvature: object
 
     def at(self, places: np.ndarray) -> "Sphere":
-        return Sphere(tuple(part[places] for part in self.centre), self.curvature[places])
+        return Sphere(Vector(part[places] for part in self.centre), self.curvature[places])
 
 
 def sphere_of(context: EvaluationContext, chief: Hits, bent: bool) -> Sphere:
@@ -43,7 +44,7 @@ def sphere_of(context: EvaluationContext, chief: Hits, bent: bool) -> Sphere:
     B, D: of the lens behind the stop; T: behind its last surface. Where the axis bends, the pupil lies on the base ray,
     halfway between the images of the stop in both sections by vergence.
     """
-    centre = x, y, z = chief.position
+    centre = x, y, z = Vector(chief.position)
     if bent:
         (bx, by, bz, *along), weight = _pupil_on_base_ray(context)
         v = tuple(weight * (c - b) - d for c, b, d in zip(centre, (bx, by, bz), along, strict=True))
@@ -64,32 +65,6 @@ def _pupil_on_base_ray(context: EvaluationContext) -> tuple[list, object]:
 
     *numbers, vergence = context.state.through_torch(told)
     return numbers, vergence
-
-
-def path_to(sphere: Sphere, hits: Hits, index: np.ndarray):
-    """Reduced path in mm of rays up to the sphere that they are about to cross.
-
-    W = W_ray + n [ κ e²/(1 + √(1 - κ² e²)) - (P - Q)·d ],   e² = |P - Q|² - ((P - Q)·d)²
-    """
-    offset = tuple(at - centre for at, centre in zip(hits.position, sphere.centre, strict=True))
-    along = dot(offset, hits.direction)
-    across = dot(offset, offset) - along * along
-    bend = sphere.curvature * across
-    sagitta = bend / (1 + np.sqrt(np.maximum(1 - sphere.curvature * bend, 0.0)))
-    return hits.opl + index * (sagitta - along)
-
-
-def directions_to(sphere: Sphere, hits: Hits) -> tuple:
-    """Unit vectors from where rays cross the sphere to its centre, √(1 - κ² e²) d - κ e: `wavefront.towards_centre`."""
-    offset = tuple(at - centre for at, centre in zip(hits.position, sphere.centre, strict=True))
-    along = dot(offset, hits.direction)
-    across = [sphere.curvature * (o - along * d) for o, d in zip(offset, hits.direction, strict=True)]
-    root = np.sqrt(np.maximum(1 - dot(across, across), 0.0))
-    return tuple(root * d - e for d, e in zip(hits.direction, across, strict=True))
-
-
-def dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 # -- the wavefront -----------------------------------------------------------------------------------------------------
@@ -116,8 +91,8 @@ def opd_of(
     def opd(context: EvaluationContext) -> tuple[np.ndarray, object]:
         hits, chiefs, centres = context.hits(rays, clips=clips), context.hits(chief), context.hits(about)
         sphere, index = sphere_of(context, centres, bent), image_index(context, wavelength)
-        zero = path_to(sphere, chiefs, index)
-        found = (path_to(sphere.at(of), hits, index[of]) - zero[of]) / waves[of]
+        zero = path_to_reference_sphere(chiefs, *sphere, index)
+        found = (path_to_reference_sphere(hits, *sphere.at(of), index[of]) - zero[of]) / waves[of]
         return hits.valid & (chiefs.valid & centres.valid)[of], found
 
     return opd
